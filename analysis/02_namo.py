@@ -22,7 +22,7 @@ import numpy as np
 
 import pbrl_ppl as pp
 from pbrl_ppl.errors import UninformedWarning
-from pbrl_ppl.report.scene_plots import draw_goal, draw_motion, draw_scene
+from pbrl_ppl.reporting.scene_plots import draw_goal, draw_motion, draw_scene
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models" / "namo"))
 from world import GOAL, SCENE, World, at_rest, follow, go_round, movable, pushes

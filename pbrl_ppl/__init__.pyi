@@ -65,9 +65,9 @@ from .posterior import loo_pit as loo_pit
 from .posterior import save_posterior as save_posterior
 from .posterior import uninformed as uninformed
 from .posterior import updated_scene as updated_scene
-from .report import ManyLoops as ManyLoops
-from .report import close_loop_many as close_loop_many
-from .report import report as report
+from .reporting import ManyLoops as ManyLoops
+from .reporting import close_loop_many as close_loop_many
+from .reporting import report as report
 from .sampling import Calibration as Calibration
 from .sampling import Pooled as Pooled
 from .sampling import calibrate as calibrate

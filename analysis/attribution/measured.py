@@ -27,8 +27,8 @@ from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import trajectory_mode
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.posterior import draws
-from pbrl_ppl.report import plot_rollout, png
-from pbrl_ppl.report.words import verdict_in_words
+from pbrl_ppl.reporting import plot_rollout, png
+from pbrl_ppl.reporting.words import verdict_in_words
 from pbrl_ppl.state import STATE
 
 #: The recordings lie beside the project, which holds no copy.

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from attribution.measured import MEASURED, QUANTITIES, Ahead, Recording, Result
-from pbrl_ppl.report.words import number
+from pbrl_ppl.reporting.words import number
 
 #: The page, and the folder of its results and pictures.
 PAGE = Path(__file__).parents[1] / "docs" / "pages" / "results" / "hardware.md"

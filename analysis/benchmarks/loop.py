@@ -28,7 +28,7 @@ from pbrl_ppl.effects import candidates
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import find_mode, trajectory_mode
 from pbrl_ppl.physics import Physics
-from pbrl_ppl.report import render
+from pbrl_ppl.reporting import render
 
 sys.path.insert(0, str(Path(__file__).parent))
 from engine import MODELS

@@ -14,7 +14,7 @@ import numpy as np
 
 import pbrl_ppl as pp
 from pbrl_ppl.errors import ConvergenceWarning, UninformedWarning
-from pbrl_ppl.report import draw_motion, plot_prior_check, summary
+from pbrl_ppl.reporting import draw_motion, plot_prior_check, summary
 
 ROOT = next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "pyproject.toml").is_file())
 CART = ROOT / "models" / "shopping_cart"

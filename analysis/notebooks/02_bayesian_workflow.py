@@ -22,7 +22,7 @@ from scipy.stats import binom
 
 import pbrl_ppl as pp
 from pbrl_ppl.errors import ConvergenceWarning, UninformedWarning
-from pbrl_ppl.report import plot_prior_check, plot_rank, plot_trace, summary
+from pbrl_ppl.reporting import plot_prior_check, plot_rank, plot_trace, summary
 
 ROOT = next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "pyproject.toml").is_file())
 CART = ROOT / "models" / "shopping_cart"

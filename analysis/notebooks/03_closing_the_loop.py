@@ -15,7 +15,7 @@ import pandas as pd
 
 import pbrl_ppl as pp
 from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, UninformedWarning
-from pbrl_ppl.report import plot_candidates, plot_errors, plot_rollout
+from pbrl_ppl.reporting import plot_candidates, plot_errors, plot_rollout
 
 ROOT = next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "pyproject.toml").is_file())
 CART = ROOT / "models" / "shopping_cart"

@@ -69,7 +69,7 @@ def calibrate(
         declared, (design,) = options.load(
             scene, [history], reading, time_step=time_step, noise=noise
         )
-        import pbrl_ppl.report as report
+        import pbrl_ppl.reporting as report
         from pbrl_ppl.files import write_atomically
         from pbrl_ppl.sampling import calibration
 

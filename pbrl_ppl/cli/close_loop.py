@@ -31,7 +31,7 @@ from pbrl_ppl.errors import OutputError
 if TYPE_CHECKING:
     from pbrl_ppl.criticism import Loop
     from pbrl_ppl.history import History
-    from pbrl_ppl.report import Source
+    from pbrl_ppl.reporting import Source
     from pbrl_ppl.scene import Scene
 
 
@@ -154,7 +154,7 @@ def close_loop(
         )
         catalogue = {"catalogue": effect_files.with_catalogue(effect_file)} if effect_file else {}
         progress("loading the sampler")
-        import pbrl_ppl.report as report
+        import pbrl_ppl.reporting as report
         from pbrl_ppl import criticism
 
         criticism.check_folder(output, overwrite)
@@ -214,7 +214,7 @@ def _remainder(
 ) -> dict[str, dict[str, Any]]:
     """Learn a force for the residual and save it with the results, or return why there is none."""
     from pbrl_ppl.errors import FitError
-    from pbrl_ppl.report import render
+    from pbrl_ppl.reporting import render
 
     path = folder / "remainder.nc"
     path.unlink(missing_ok=True)  # of an earlier run
@@ -243,7 +243,7 @@ def _close_many(
     with interruptible(kept), stages(quiet) as progress:
         check_can_make(output)
         progress("reading the manifest")
-        import pbrl_ppl.report as report
+        import pbrl_ppl.reporting as report
 
         logs = report.read_manifest(manifest)  # its errors come before a cluster is sought
         with _executor(jobs, scheduler) as executor:

@@ -169,7 +169,7 @@ def fit(
 def _summary(idata: Any) -> pd.DataFrame:
     """Return a row for each parameter; for a mode, its value alone."""
     from pbrl_ppl.posterior import scalars
-    from pbrl_ppl.report import summary
+    from pbrl_ppl.reporting import summary
 
     if "max_rhat" not in idata.attrs:
         import pandas as pd

@@ -115,7 +115,7 @@ def plan(
             result.save(output)
         if animate is not None:
             progress("drawing")
-            from pbrl_ppl.report import animate_plan
+            from pbrl_ppl.reporting import animate_plan
 
             animate_plan(result, animate)
     written = [path for path in (output, animate) if path is not None]

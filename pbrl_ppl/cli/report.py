@@ -34,7 +34,7 @@ def report(
         check_file(page, (".html",), overwrite)
         progress("reading the posterior")
         from pbrl_ppl.posterior import load_posterior
-        from pbrl_ppl.report import Source, render_posterior
+        from pbrl_ppl.reporting import Source, render_posterior
 
         idata = load_posterior(posterior)
         progress("computing and drawing")

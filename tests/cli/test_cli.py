@@ -58,7 +58,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, Any, Any, dict[str
         return made_up()
 
     monkeypatch.setattr(criticism, "close_loop", close_loop)
-    monkeypatch.setattr("pbrl_ppl.report.render", lambda *args, **options: "a page")
+    monkeypatch.setattr("pbrl_ppl.reporting.render", lambda *args, **options: "a page")
     return seen
 
 
@@ -269,7 +269,7 @@ def test_an_interrupt_of_the_sampler_ends_with_a_report(
         raise criticism.LoopInterrupted(made_up)
 
     monkeypatch.setattr(criticism, "close_loop", close_loop)
-    monkeypatch.setattr("pbrl_ppl.report.render", lambda *args, **options: "a page")
+    monkeypatch.setattr("pbrl_ppl.reporting.render", lambda *args, **options: "a page")
     assert main(["close-loop", "scene.toml", "train.csv", "-o", "out", "-q"]) == 130
     assert "linear drag on the cart" in capsys.readouterr().out
     assert Path("out/report.html").read_text() == "a page"
@@ -286,7 +286,7 @@ def test_warnings_are_one_line(
         return made_up()
 
     monkeypatch.setattr(criticism, "close_loop", close_loop)
-    monkeypatch.setattr("pbrl_ppl.report.render", lambda *args, **options: "a page")
+    monkeypatch.setattr("pbrl_ppl.reporting.render", lambda *args, **options: "a page")
     assert main(["close-loop", "scene.toml", "train.csv", "-o", "out", "-q"]) == 0
     assert capsys.readouterr().err.strip() == "warning: w_y did not converge"
 

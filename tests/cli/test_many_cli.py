@@ -11,8 +11,8 @@ import pytest
 from pbrl_ppl import criticism
 from pbrl_ppl.cli import main
 from pbrl_ppl.cli.close_loop import OneProcessEach
-from pbrl_ppl.report import many
-from pbrl_ppl.report.logs import Settings, close_log, settle
+from pbrl_ppl.reporting import many
+from pbrl_ppl.reporting.logs import Settings, close_log, settle
 from tests.helpers.fleet import made_logs, pretend
 from tests.helpers.processes import dies
 

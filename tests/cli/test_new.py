@@ -62,7 +62,7 @@ def test_three_commands_from_a_raw_table_to_a_verdict(
         return made_up()
 
     monkeypatch.setattr(criticism, "close_loop", close_loop)
-    monkeypatch.setattr("pbrl_ppl.report.render", lambda *args, **options: "a page")
+    monkeypatch.setattr("pbrl_ppl.reporting.render", lambda *args, **options: "a page")
     known = "--known arm.mass=0.5 --declare arm=inertia_scale"
     assert run(f"new --history swing.csv {COLUMNS} {UNITS} {PENDULUM} {known}") == 0
     said = capsys.readouterr().out

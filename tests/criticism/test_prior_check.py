@@ -15,7 +15,7 @@ from pbrl_ppl.criticism.prior_check import (
 )
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.history import History
-from pbrl_ppl.report import plot_prior_check, png
+from pbrl_ppl.reporting import plot_prior_check, png
 from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.scene import Body, Scene, Shape
 from pbrl_ppl.state import STATE

@@ -16,7 +16,7 @@ from pbrl_ppl.criticism.results import Unexplained
 from pbrl_ppl.effects import LEARNED_REMAINDER
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.posterior import group, scene_of
-from pbrl_ppl.report import render_posterior
+from pbrl_ppl.reporting import render_posterior
 from tests.helpers.free_puck import BOX, MASS, box2d
 from tests.helpers.made_up import made_up
 

@@ -13,7 +13,7 @@ from matplotlib.patches import Circle, Polygon
 
 import pbrl_ppl as pp
 from pbrl_ppl.errors import ConvergenceWarning, RefitWarning
-from pbrl_ppl.report.scene_plots import draw_goal, draw_motion, draw_scene
+from pbrl_ppl.reporting.scene_plots import draw_goal, draw_motion, draw_scene
 from tests.helpers.places import ROOT
 from tests.helpers.samplers import shorten
 

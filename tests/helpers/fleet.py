@@ -16,9 +16,9 @@ import pytest
 
 from pbrl_ppl.criticism.loop import FILES
 from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.report import Source, close_loop_many
-from pbrl_ppl.report.logs import Log
-from pbrl_ppl.report.many_page import page
+from pbrl_ppl.reporting import Source, close_loop_many
+from pbrl_ppl.reporting.logs import Log
+from pbrl_ppl.reporting.many_page import page
 
 #: One line a log that was begun and one a log that was kept: what was done how often.
 BEGUN, KEPT = "begun.txt", "kept.txt"

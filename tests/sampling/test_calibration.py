@@ -19,7 +19,7 @@ from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem, TransitionLikelihood, declared_problem
 from pbrl_ppl.model import build_model
 from pbrl_ppl.physics import Physics
-from pbrl_ppl.report import plot_calibration, png
+from pbrl_ppl.reporting import plot_calibration, png
 from pbrl_ppl.sampling import calibrate, calibration, physics_model, replication
 from pbrl_ppl.sampling.ranks import MOST_DRAWS, Calibration, bins, holm, rank, uniformity
 from pbrl_ppl.sampling.replication import Record, Truth, draw_truths, simulated

@@ -10,8 +10,8 @@ import pandas as pd
 from markupsafe import Markup
 
 from pbrl_ppl.criticism import NOT_CONVERGED
-from pbrl_ppl.report.page import Cell, Source, Table, render_page
-from pbrl_ppl.report.words import chance, joined, number, plain, quantity
+from pbrl_ppl.reporting.page import Cell, Source, Table, render_page
+from pbrl_ppl.reporting.words import chance, joined, number, plain, quantity
 from pbrl_ppl.sampling import Pooled
 
 Row = Mapping[str, Any]

@@ -23,9 +23,9 @@ from pbrl_ppl.posterior import (
     scalars,
     scene_of,
 )
-from pbrl_ppl.report.loop_tables import loo_table
-from pbrl_ppl.report.page import Source, Table, render_page
-from pbrl_ppl.report.posterior_plots import (
+from pbrl_ppl.reporting.loop_tables import loo_table
+from pbrl_ppl.reporting.page import Source, Table, render_page
+from pbrl_ppl.reporting.posterior_plots import (
     MOST_PRIORS,
     Coverage,
     coverage,
@@ -38,9 +38,9 @@ from pbrl_ppl.report.posterior_plots import (
     plot_rank,
     plot_trace,
 )
-from pbrl_ppl.report.posterior_tables import parameter_section
-from pbrl_ppl.report.scene_plots import plot_recording
-from pbrl_ppl.report.words import plain
+from pbrl_ppl.reporting.posterior_tables import parameter_section
+from pbrl_ppl.reporting.scene_plots import plot_recording
+from pbrl_ppl.reporting.words import plain
 from pbrl_ppl.state import Floats
 
 #: Fewest draws for diagnostics of chains, densities and cross-validation.

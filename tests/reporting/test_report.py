@@ -2,7 +2,6 @@
 
 import copy
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,13 +18,13 @@ from pbrl_ppl.history import UnusedVelocity
 from pbrl_ppl.parameters import BODY_PARAMETERS
 from pbrl_ppl.posterior.cross_validation import Comparison, LeaveOneOut
 from pbrl_ppl.posterior.identifiability import Direction, Identifiability, Width
-from pbrl_ppl.report import page as page_module
-from pbrl_ppl.report.error_plots import plot_rollout, unwrap
-from pbrl_ppl.report.page import Source
-from pbrl_ppl.report.posterior_plots import MOST_PARAMETERS, most_interesting, summary
-from pbrl_ppl.report.posterior_tables import PARAMETERS
-from pbrl_ppl.report.report import render
-from pbrl_ppl.report.words import number, rejected_in_words, remains_in_words, verdict_in_words
+from pbrl_ppl.reporting import page as page_module
+from pbrl_ppl.reporting.error_plots import plot_rollout, unwrap
+from pbrl_ppl.reporting.page import Source
+from pbrl_ppl.reporting.posterior_plots import MOST_PARAMETERS, most_interesting, summary
+from pbrl_ppl.reporting.posterior_tables import PARAMETERS
+from pbrl_ppl.reporting.report import render
+from pbrl_ppl.reporting.words import number, rejected_in_words, remains_in_words, verdict_in_words
 from tests.helpers.html import Page, stands_alone
 from tests.helpers.made_up import DRAG, idata, made_up, made_up_posterior
 from tests.helpers.revised import revised, unexplained
@@ -475,12 +474,6 @@ def test_report_alone(tmp_path: Path) -> None:
         with pytest.raises(OutputError, match="cannot be written"):
             pp.report(made_up(), place)
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
-
-
-def test_report_is_function_and_subpackage() -> None:
-    """Whichever was imported first."""
-    assert callable(pp.report)
-    assert pp.report is sys.modules["pbrl_ppl.report"] is pp.report.report
 
 
 def test_velocities_that_are_not_used_are_named() -> None:

@@ -13,7 +13,7 @@ from scipy.stats import norm
 
 from pbrl_ppl.criticism import Loop, diverged_after
 from pbrl_ppl.posterior import HDI_PROB
-from pbrl_ppl.report.style import (
+from pbrl_ppl.reporting.style import (
     AFTER,
     BAND,
     BEFORE,

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from pbrl_ppl.criticism import Loop
 from pbrl_ppl.files import write_text
-from pbrl_ppl.report.effect_plots import (
+from pbrl_ppl.reporting.effect_plots import (
     HARDLY,
     MOST_CANDIDATES,
     plot_added,
@@ -19,15 +19,15 @@ from pbrl_ppl.report.effect_plots import (
     plot_evidence,
     plot_laws,
 )
-from pbrl_ppl.report.error_plots import (
+from pbrl_ppl.reporting.error_plots import (
     plot_correlations,
     plot_errors,
     plot_growth,
     plot_residuals,
     plot_rollout,
 )
-from pbrl_ppl.report.evidence import find_evidence, find_laws
-from pbrl_ppl.report.loop_tables import (
+from pbrl_ppl.reporting.evidence import find_evidence, find_laws
+from pbrl_ppl.reporting.loop_tables import (
     acceleration_table,
     candidate_table,
     carrier_table,
@@ -36,14 +36,14 @@ from pbrl_ppl.report.loop_tables import (
     models_of,
     residual_test_table,
 )
-from pbrl_ppl.report.motion import animation, divergence_in_words, held_out_motions
-from pbrl_ppl.report.page import Source, render_page
-from pbrl_ppl.report.posterior_plots import plot_rank, plot_trace
-from pbrl_ppl.report.posterior_report import recorded_poses, render_posterior
-from pbrl_ppl.report.posterior_tables import parameter_section
-from pbrl_ppl.report.scene_plots import plot_recording
-from pbrl_ppl.report.style import UNITS
-from pbrl_ppl.report.words import (
+from pbrl_ppl.reporting.motion import animation, divergence_in_words, held_out_motions
+from pbrl_ppl.reporting.page import Source, render_page
+from pbrl_ppl.reporting.posterior_plots import plot_rank, plot_trace
+from pbrl_ppl.reporting.posterior_report import recorded_poses, render_posterior
+from pbrl_ppl.reporting.posterior_tables import parameter_section
+from pbrl_ppl.reporting.scene_plots import plot_recording
+from pbrl_ppl.reporting.style import UNITS
+from pbrl_ppl.reporting.words import (
     accepted,
     caution_in_words,
     depends_on_records,

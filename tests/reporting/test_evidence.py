@@ -10,9 +10,9 @@ from pbrl_ppl.criticism.dependence import FEATURES, PRODUCTS
 from pbrl_ppl.criticism.results import Unexplained, diverged_after
 from pbrl_ppl.history import History
 from pbrl_ppl.posterior import compare
-from pbrl_ppl.report.effect_plots import plot_evidence, plot_laws
-from pbrl_ppl.report.evidence import bin_means, find_evidence, find_laws
-from pbrl_ppl.report.motion import animation, distance, divergence_in_words, held_out_motions
+from pbrl_ppl.reporting.effect_plots import plot_evidence, plot_laws
+from pbrl_ppl.reporting.evidence import bin_means, find_evidence, find_laws
+from pbrl_ppl.reporting.motion import animation, distance, divergence_in_words, held_out_motions
 from pbrl_ppl.sampling import fit, physics_model
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.free_puck import DISC, Disc

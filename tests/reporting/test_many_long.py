@@ -5,7 +5,7 @@ import pytest
 
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.posterior import groups, load_posterior
-from pbrl_ppl.report import close_loop_many, read_manifest
+from pbrl_ppl.reporting import close_loop_many, read_manifest
 from pbrl_ppl.scene import Scene
 from tests.helpers.fleet import cluster
 from tests.helpers.free_puck import DISC, Disc

@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 from scipy.stats import binom
 
 from pbrl_ppl.criticism import PriorCheck
-from pbrl_ppl.report.style import AFTER, BAND, BEFORE, PLAIN, UNITS, blank_figure
+from pbrl_ppl.reporting.style import AFTER, BAND, BEFORE, PLAIN, UNITS, blank_figure
 from pbrl_ppl.sampling import Calibration, bins
 
 

@@ -30,7 +30,7 @@ from pbrl_ppl.posterior import (
     scalars,
     separate,
 )
-from pbrl_ppl.report.style import AFTER, BAND, BEFORE, NARROW, PLAIN, WIDE, blank_figure, legend
+from pbrl_ppl.reporting.style import AFTER, BAND, BEFORE, NARROW, PLAIN, WIDE, blank_figure, legend
 from pbrl_ppl.state import Floats
 
 #: Parameters in one picture, at most; the report's tables show all.

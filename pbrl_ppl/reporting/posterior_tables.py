@@ -11,10 +11,10 @@ import pandas as pd
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.parameters import BODY_PARAMETERS, JOINT_ANCHORS
 from pbrl_ppl.posterior import PARETO_K, SIZE, Identifiability, interval, scalars
-from pbrl_ppl.report.page import Table
-from pbrl_ppl.report.posterior_plots import most_interesting, prior_draws, summary
-from pbrl_ppl.report.style import UNITS, acceleration_unit
-from pbrl_ppl.report.words import digits_of, number, plain
+from pbrl_ppl.reporting.page import Table
+from pbrl_ppl.reporting.posterior_plots import most_interesting, prior_draws, summary
+from pbrl_ppl.reporting.style import UNITS, acceleration_unit
+from pbrl_ppl.reporting.words import digits_of, number, plain
 
 #: Of parameters, by the variable's name.
 PARAMETERS = {

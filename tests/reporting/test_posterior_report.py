@@ -9,9 +9,9 @@ import pytest
 from pbrl_ppl.cli import main
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.posterior import DATATREE, from_groups, groups, load_posterior
-from pbrl_ppl.report import page as page_module
-from pbrl_ppl.report import plot_rank, render_posterior
-from pbrl_ppl.report.posterior_plots import (
+from pbrl_ppl.reporting import page as page_module
+from pbrl_ppl.reporting import plot_rank, render_posterior
+from pbrl_ppl.reporting.posterior_plots import (
     coverage,
     most_dependent,
     plot_pairs,

@@ -14,7 +14,7 @@ from matplotlib.patches import Circle, Patch, Polygon
 
 from pbrl_ppl.files import write_atomically
 from pbrl_ppl.planning import Goal, Plan
-from pbrl_ppl.report.style import NARROW, WIDE, blank_figure, legend
+from pbrl_ppl.reporting.style import NARROW, WIDE, blank_figure, legend
 from pbrl_ppl.scene import Body, Scene
 from pbrl_ppl.state import Floats
 

@@ -14,8 +14,8 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from pbrl_ppl.background import background
-from pbrl_ppl.report.style import NARROW, WIDE, png
-from pbrl_ppl.report.words import (
+from pbrl_ppl.reporting.style import NARROW, WIDE, png
+from pbrl_ppl.reporting.words import (
     change,
     digits_of,
     joined,

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from pbrl_ppl.criticism import QUANTITIES, Loop, recorded_quantities
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.posterior import problem_of
-from pbrl_ppl.report.motion import best_vectors
-from pbrl_ppl.report.style import acceleration_unit
-from pbrl_ppl.report.words import depends_on_records
+from pbrl_ppl.reporting.motion import best_vectors
+from pbrl_ppl.reporting.style import acceleration_unit
+from pbrl_ppl.reporting.words import depends_on_records
 from pbrl_ppl.state import STATE, Bools, Floats, Ints
 
 #: Bins of a quantity, each with as many transitions, and the fewest transitions that a bin has.

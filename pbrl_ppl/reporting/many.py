@@ -18,7 +18,7 @@ from pbrl_ppl.effects import Effect
 from pbrl_ppl.errors import OutputError, PbrlError
 from pbrl_ppl.files import write_text
 from pbrl_ppl.posterior import load_posterior
-from pbrl_ppl.report.logs import (
+from pbrl_ppl.reporting.logs import (
     FAILED,
     Log,
     Run,
@@ -30,8 +30,8 @@ from pbrl_ppl.report.logs import (
     row_of,
     settle,
 )
-from pbrl_ppl.report.many_page import effect_table, in_words, page, summary_table
-from pbrl_ppl.report.page import Source
+from pbrl_ppl.reporting.many_page import effect_table, in_words, page, summary_table
+from pbrl_ppl.reporting.page import Source
 from pbrl_ppl.sampling import Pooled, pool
 
 #: Files of all logs together; the first marks the folder.

@@ -6,7 +6,7 @@ from PIL import Image
 from pbrl_ppl.cli import main
 from pbrl_ppl.errors import OutputError
 from pbrl_ppl.planning import plan
-from pbrl_ppl.report import animate_plan
+from pbrl_ppl.reporting import animate_plan
 from tests.helpers.pucks import ACROSS, PUSHES, ROOM, known
 from tests.helpers.stacks import file
 

@@ -14,7 +14,7 @@ import pytest
 
 from pbrl_ppl.criticism.loop import FILES
 from pbrl_ppl.errors import ManifestError, OutputError
-from pbrl_ppl.report import close_loop_many, read_manifest
+from pbrl_ppl.reporting import close_loop_many, read_manifest
 from tests.helpers.fleet import BEGUN, KEPT, cluster, lines, made_logs, pretend
 
 

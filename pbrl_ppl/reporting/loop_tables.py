@@ -12,10 +12,10 @@ from pbrl_ppl.criticism import Candidate, Loop
 from pbrl_ppl.effects import Sensor
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.posterior import Comparison
-from pbrl_ppl.report.evidence import Evidence
-from pbrl_ppl.report.page import Table
-from pbrl_ppl.report.style import UNITS, acceleration_unit
-from pbrl_ppl.report.words import chance, error, number, percent, plain, quantity, share
+from pbrl_ppl.reporting.evidence import Evidence
+from pbrl_ppl.reporting.page import Table
+from pbrl_ppl.reporting.style import UNITS, acceleration_unit
+from pbrl_ppl.reporting.words import chance, error, number, percent, plain, quantity, share
 from pbrl_ppl.scene import units_of
 from pbrl_ppl.state import STATE, Floats
 

@@ -14,9 +14,9 @@ from scipy.stats import chi2, gaussian_kde
 
 from pbrl_ppl.criticism import Loop
 from pbrl_ppl.posterior import scalars
-from pbrl_ppl.report.evidence import Evidence, Law, bin_means
-from pbrl_ppl.report.style import AFTER, BEFORE, PLAIN, WIDE, blank_figure, label, legend
-from pbrl_ppl.report.words import plain
+from pbrl_ppl.reporting.evidence import Evidence, Law, bin_means
+from pbrl_ppl.reporting.style import AFTER, BEFORE, PLAIN, WIDE, blank_figure, label, legend
+from pbrl_ppl.reporting.words import plain
 from pbrl_ppl.scene import units_of
 from pbrl_ppl.state import Floats
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from pbrl_ppl.criticism import ADEQUATE, NOT_CONVERGED, UNEXPLAINED, Added, Loop
-from pbrl_ppl.report.style import UNITS
-from pbrl_ppl.report.words import (
+from pbrl_ppl.reporting.style import UNITS
+from pbrl_ppl.reporting.words import (
     accepted,
     caution_in_words,
     depends_on_records,

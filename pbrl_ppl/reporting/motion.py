@@ -13,7 +13,7 @@ from pbrl_ppl.effects import Effect
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem, along_trajectories
 from pbrl_ppl.posterior import best_draw, parameter_draws, problem_of
-from pbrl_ppl.report.words import number
+from pbrl_ppl.reporting.words import number
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats, wrapped
 
