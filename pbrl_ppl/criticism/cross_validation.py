@@ -10,7 +10,7 @@ from scipy.stats import norm, t, wilcoxon
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.forecast import forecast
-from pbrl_ppl.likelihood import TransitionLikelihood, robust
+from pbrl_ppl.likelihood import robust
 from pbrl_ppl.modes import Mode, profile_sigma
 from pbrl_ppl.parameters import box, differentiate, inside, prior_residual, prior_slopes
 from pbrl_ppl.state import Bools, Floats, Ints
@@ -219,7 +219,7 @@ def _linearised(
     parameters in units of ``scale``. Under Eq. 11 the noise stays.
     """
     problem, phi, p = mode.problem, mode.phi, len(mode.phi)
-    if isinstance(problem.likelihood, TransitionLikelihood):
+    if problem.likelihood.independent:
         z = problem.robust(phi, mode.sigma)
         jacobian = mode.jacobian.reshape(*z.shape, p) * scale
         return lambda own: (mode.sigma, z, jacobian)

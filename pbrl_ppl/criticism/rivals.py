@@ -16,7 +16,6 @@ from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.criticism.selection import refitted
 from pbrl_ppl.effects import Attached, Effect, Noise
 from pbrl_ppl.errors import EffectError, PosteriorError
-from pbrl_ppl.likelihood import TransitionLikelihood
 from pbrl_ppl.modes import Mode, trajectory_mode
 from pbrl_ppl.posterior import best_draw, parameter_draws, problem_of
 from pbrl_ppl.scene import Scene
@@ -121,7 +120,7 @@ def posterior_mode(posterior: Any, catalogue: Iterable[Effect]) -> Mode:
         If the posterior is of single transitions.
     """
     problem = problem_of(posterior, catalogue).with_physics(threads=2)
-    if isinstance(problem.likelihood, TransitionLikelihood):
+    if problem.likelihood.independent:
         raise PosteriorError(
             "posterior: it is of single transitions, which do not separate measurement noise from"
             " process noise; take after.nc of close_loop, or fit with trajectories=True"

@@ -13,7 +13,7 @@ from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.results import Candidate
 from pbrl_ppl.criticism.scan import Look, caps, detectable_sizes, detection_limits_of_scan, looks
 from pbrl_ppl.effects import Attached, Noise
-from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood
+from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import Mode, posterior_slopes
 from pbrl_ppl.parameters import prior_residual, prior_slopes
 from pbrl_ppl.state import Floats, Ints
@@ -333,7 +333,7 @@ def _tail_score(mode: Mode, attached: Attached, test: _Test) -> Signature:
     polynomial over 4, of variance 3/2.
     """
     problem = mode.problem
-    along = isinstance(problem.likelihood, TrajectoryLikelihood)
+    along = problem.likelihood.filtered
     seen = problem.trajectory_noise.seen if along else problem.observations.measured
     whitened = test.residual[: seen.size].reshape(seen.shape)
     # coordinates that never move have no noise, and would make all others look heavy-tailed

@@ -41,9 +41,15 @@ class Likelihood(ABC):
     ----------
     name : str
         As users choose it; see :func:`pbrl_ppl.physics_model`.
+    independent, filtered, simulated : bool
+        Which of the three it is: transitions are independent given measured start states (Eq. 11);
+        trajectories are whitened by a filter; trajectories are simulated from latent start states.
     """
 
     name: ClassVar[str]
+    independent: ClassVar[bool] = False
+    filtered: ClassVar[bool] = False
+    simulated: ClassVar[bool] = False
 
     nu: float | None = None
     prior: NoisePrior | None = None
@@ -173,6 +179,7 @@ class TransitionLikelihood(Likelihood):
     """
 
     name: ClassVar[str] = "transitions"
+    independent: ClassVar[bool] = True
 
     scalar: bool = False
 
@@ -259,6 +266,7 @@ class TrajectoryLikelihood(Likelihood):
     """
 
     name: ClassVar[str] = "trajectories"
+    filtered: ClassVar[bool] = True
 
     noise: TrajectoryNoise
 

@@ -147,6 +147,7 @@ class OutputErrorLikelihood(Likelihood):
     """
 
     name: ClassVar[str] = "simulation"
+    simulated: ClassVar[bool] = True
 
     starts: Starts
     tau: tuple[float, ...]

@@ -17,10 +17,7 @@ from pbrl_ppl.likelihood import (
     DRIFT,
     Likelihood,
     Observations,
-    OutputErrorLikelihood,
     Problem,
-    TrajectoryLikelihood,
-    TransitionLikelihood,
 )
 from pbrl_ppl.model.density import difference, next_state_logp, tail_tensor
 from pbrl_ppl.model.op import OneWorldOp, SimulatorOp
@@ -148,7 +145,7 @@ def _noise(problem: Problem) -> Any:
     if problem.scalar_sigma:
         scalar = pm.LogNormal("sigma", mu=np.log(median).mean(), sigma=spread)
         return pt.ones(len(median)) * scalar
-    if not isinstance(problem.likelihood, TrajectoryLikelihood):
+    if not problem.likelihood.filtered:
         return pm.LogNormal("sigma", mu=np.log(median), sigma=spread, dims="state")
     parts, mu = [pt.zeros(0)], np.log(median)
     for name, own in problem.noise_variables.items():
@@ -175,7 +172,7 @@ def _index(block: Block, layout: Layout, variables: dict[str, Any]) -> Any:
 def _signature(problem: Problem) -> str:
     """Return core dimensions: of one transition, or of all where they are correlated."""
     tail = ",(k)" * bool(problem.tails)
-    if isinstance(problem.likelihood, TransitionLikelihood):
+    if problem.likelihood.independent:
         return f"(h,k,d),(h,k,d),(d){tail}->(h,k,d)"
     return f"(n,h,k,d),(n,h,k,d),(m){tail}->(n,h,k,d)"
 
@@ -191,12 +188,12 @@ def _log_density(
 ) -> Any:
     """Return the log-density of measurements about predictions in parts; ``whole`` is for draws."""
     nu = likelihood.nu
-    if isinstance(likelihood, TransitionLikelihood):
+    if likelihood.independent:
         return next_state_logp(value, predicted, sigma, observations, nu, tail)
     if tail is None:
         tail = np.full(observations.values.shape[2], 0.0 if nu is None else 1.0 / nu)
     linearised = pt.as_tensor(np.nan_to_num(observations.values))
-    if isinstance(likelihood, OutputErrorLikelihood):  # states follow the simulation
+    if likelihood.simulated:  # states follow the simulation
         linearised, predicted = value, pt.switch(observations.measured, predicted, value)
     deviation = difference(value, linearised, observations)
     residual = difference(linearised, predicted, observations)
@@ -242,7 +239,7 @@ def _coords(problem: Problem) -> dict[str, Any]:
 
 
 def _noise_coords(problem: Problem) -> dict[str, Any]:
-    if not isinstance(problem.likelihood, TrajectoryLikelihood):
+    if not problem.likelihood.filtered:
         return {}
     return {_NOISE_DIMS[name]: list(own) for name, own in problem.noise_variables.items()}
 

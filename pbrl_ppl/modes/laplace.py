@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
-from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, log_posterior
+from pbrl_ppl.likelihood import Problem, log_posterior
 from pbrl_ppl.modes.noise import FAR_OFF, best_tails, noise_gaussian, profile_sigma, tail_precision
 from pbrl_ppl.parameters import box, differentiate, inside, most_probable_wheels, prior_residual
 from pbrl_ppl.physics import PartedSimulator
@@ -77,7 +77,7 @@ class Mode:
 
         Shapes (parameter,) and (parameter, parameter).
         """
-        if isinstance(self.problem.likelihood, TrajectoryLikelihood):
+        if self.problem.likelihood.filtered:
             residual = self.problem.residual(self.phi)
             return noise_gaussian(self.problem, residual, self.sigma, self.phi)
         # half the inverse of the number of measurements

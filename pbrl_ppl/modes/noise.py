@@ -10,9 +10,7 @@ from scipy.optimize import minimize
 from scipy.special import wrightomega
 
 from pbrl_ppl.likelihood import (
-    OutputErrorLikelihood,
     Problem,
-    TrajectoryLikelihood,
     TrajectoryNoise,
     exponential,
     least_errors,
@@ -20,6 +18,7 @@ from pbrl_ppl.likelihood import (
     log_noise_prior,
     noise_law,
     noise_prior_slope,
+    output_error,
 )
 from pbrl_ppl.parameters import box
 from pbrl_ppl.scene import state_sizes
@@ -60,12 +59,12 @@ def profile_sigma(
     held : dict of int to float, optional
         Noise parameters of whole trajectories that are given.
     """
-    if isinstance(problem.likelihood, TrajectoryLikelihood):
-        return _of_trajectories(problem, problem.likelihood.noise, residual, phi, held or {})
+    if problem.likelihood.filtered:
+        return _of_trajectories(problem, problem.trajectory_noise, residual, phi, held or {})
     residual = finite(problem, residual)
     ones = np.ones(residual.shape[-1])
-    if isinstance(problem.likelihood, OutputErrorLikelihood):
-        begin = np.log(problem.likelihood.profile(residual, least_errors(problem)))
+    if problem.likelihood.simulated:
+        begin = np.log(output_error(problem).profile(residual, least_errors(problem)))
     else:
         begin = gaussian_log_sigma(problem, (residual**2).sum((0, 1, 2)))
         if problem.nu(phi) is None:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import differential_evolution
 
 from pbrl_ppl.errors import FitError
-from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, estimate_sigma
+from pbrl_ppl.likelihood import Problem, estimate_sigma
 from pbrl_ppl.modes.laplace import STALLED, Mode, Peak, climb, described, finish
 from pbrl_ppl.modes.noise import FAR_OFF, finite, gaussian_profile
 from pbrl_ppl.parameters import box, inside, most_probable_wheels, prior_draws
@@ -166,7 +166,7 @@ def _part(problem: Problem, transitions: int) -> Problem:
     history = problem.data.history
     share = transitions / max(problem.segments.n, 1)
     count = max(2, math.ceil(share * history.n_trajectories))
-    if isinstance(problem.likelihood, TrajectoryLikelihood) or count >= history.n_trajectories:
+    if problem.likelihood.filtered or count >= history.n_trajectories:
         return problem.coarse
     chosen = np.linspace(0, history.n_trajectories - 1, count).astype(int)
     part = problem.coarse.with_data(history=history.select(chosen))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pbrl_ppl.likelihood import NoisePrior, OutputErrorLikelihood, Problem
+from pbrl_ppl.likelihood import NoisePrior, Problem
 from pbrl_ppl.modes.ladder import ladder, with_robust_covariance
 from pbrl_ppl.modes.laplace import Mode
 from pbrl_ppl.modes.search import find_mode
@@ -29,7 +29,7 @@ def find_simulation_mode(problem: Problem, seed: int) -> Mode:
         Result of :func:`simulation_mode`.
     """
     likelihood = problem.likelihood
-    prior = likelihood.prior if isinstance(likelihood, OutputErrorLikelihood) else None
+    prior = likelihood.prior if likelihood.simulated else None
     return simulation_mode(find_trajectory_mode(problem, seed), prior)
 
 

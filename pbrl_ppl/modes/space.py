@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.special import expit
 
-from pbrl_ppl.likelihood import Problem, TransitionLikelihood, exponential, log_noise_prior
+from pbrl_ppl.likelihood import Problem, exponential, log_noise_prior
 from pbrl_ppl.modes.laplace import Mode
 from pbrl_ppl.parameters import Prior, evened, gathered, inside, wheels
 from pbrl_ppl.state import Bools, Floats, Ints, wrapped
@@ -141,7 +141,7 @@ class Space:
     def parts(self) -> tuple[Independent, ...]:
         """Independent parts; one where the likelihood mixes the bodies' residuals."""
         parts = self.problem.simulator.parts
-        if not isinstance(self.problem.likelihood, TransitionLikelihood):
+        if not self.problem.likelihood.independent:
             bodies = np.arange(len(self.problem.scene.moving))
             return (Independent(np.flatnonzero(~self.silent), bodies),)
         return tuple(
@@ -372,7 +372,7 @@ def _noise_gaussian(mode: Mode) -> tuple[Floats, Floats]:
     Shapes (free,) and (free, free).
     """
     problem = mode.problem
-    if not isinstance(problem.likelihood, TransitionLikelihood):
+    if not problem.likelihood.independent:
         return mode.noise_gaussian()
     # the variance of log sigma is half the inverse of the number of measurements
     counts = problem.likelihood.pooled(problem.likelihood.counts(problem.observations))

@@ -8,7 +8,6 @@ import numpy as np
 
 from pbrl_ppl.likelihood import (
     Problem,
-    TrajectoryLikelihood,
     along_trajectories,
     log_posterior,
     single_transitions,
@@ -80,7 +79,7 @@ def trajectory_mode(problem: Problem, phi: Floats, sigma: Floats | None = None) 
     Mode
         Its problem has a :class:`pbrl_ppl.likelihood.TrajectoryLikelihood`.
     """
-    whole = isinstance(problem.likelihood, TrajectoryLikelihood)
+    whole = problem.likelihood.filtered
     if sigma is None or not whole:
         cells = problem.trajectory_noise.cells if whole else None
         rough = along_trajectories(problem.rough, phi, cells=cells)

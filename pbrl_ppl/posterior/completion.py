@@ -22,7 +22,6 @@ from pbrl_ppl.likelihood import (
     CONTACT,
     DRIFT,
     Problem,
-    TrajectoryLikelihood,
     exponential,
     noise_law,
     smoothed,
@@ -124,7 +123,7 @@ def complete(
     if mode is not None:
         stored = packed_mode(problem, mode, phi, sigma, likelihood.sum(axis=1))
         record = replace(record, mode=stored)
-    if isinstance(problem.likelihood, TrajectoryLikelihood) and len(phi) > 1:
+    if problem.likelihood.filtered and len(phi) > 1:
         record = replace(record, linearisation=linearisation(problem, phi, sigma))
     idata = placed(from_groups(result, record.attributes()), places(problem.segments))
     for name in (ATTRIBUTE, PARETO_K, SIZE, *_SAMPLED):
@@ -443,7 +442,7 @@ def _folded(problem: Problem, trace: Any, seed: int | None) -> xr.Dataset:
 def _with_units(problem: Problem, posterior: xr.Dataset) -> xr.Dataset:
     units = {block.name: block.unit for block in problem.layout.blocks}
     units["sigma"] = "the unit of each state dimension"
-    if isinstance(problem.likelihood, TrajectoryLikelihood):
+    if problem.likelihood.filtered:
         units |= dict.fromkeys((ACCELERATION, CONTACT), "m/s^2, of omega rad/s^2")
         units[DRIFT] = "the unit of each position"
     for name in units.keys() & set(posterior.data_vars):

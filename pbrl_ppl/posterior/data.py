@@ -15,7 +15,6 @@ from pbrl_ppl.effects import Effect, LearnedRemainder, catalogue
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.history import History, Segments, from_segments
 from pbrl_ppl.likelihood import (
-    OutputErrorLikelihood,
     Problem,
     Sensitivity,
     TrajectoryLikelihood,
@@ -25,6 +24,7 @@ from pbrl_ppl.likelihood import (
     in_pieces,
     linearised,
     linearised_pieces,
+    output_error,
     with_sensitivity,
 )
 from pbrl_ppl.physics import Physics
@@ -77,7 +77,7 @@ def record_of(problem: Problem, seed: int, method: str) -> PosteriorRecord:
         nu=problem.likelihood.nu,
         library=problem.library,
         learned_remainder=tables[-1] if tables else None,
-        cells=likelihood.noise.cells if isinstance(likelihood, TrajectoryLikelihood) else None,
+        cells=problem.trajectory_noise.cells if likelihood.filtered else None,
     )
 
 
@@ -144,7 +144,7 @@ def problem_of(
         library=record.library,
     )
     stored = with_recording(problem, given, record.data_sha256)
-    if not other or not isinstance(stored.likelihood, TrajectoryLikelihood):
+    if not other or not stored.likelihood.filtered:
         return stored if not other or SMOOTHED not in given else problem
     # linearised at the posterior's best draw
     phi, sigma = vectors(idata, problem.layout, stored.noise_variables)
@@ -176,7 +176,7 @@ def linearised_as(problem: Problem, idata: Any) -> Problem:
             f" likelihood={held!r}"
         )
     record = PosteriorRecord.of(idata)
-    if isinstance(problem.likelihood, OutputErrorLikelihood):
+    if problem.likelihood.simulated:
         problem = in_pieces(problem, record.horizon, problem.data.smoothed_states)
     measured = group(idata, "observed_data")["next_state"].transpose(*CELLS).to_numpy()
     if not np.array_equal(measured, problem.measured, equal_nan=True):
@@ -202,7 +202,7 @@ def likelihood_name(idata: Any) -> str:
 
 def recording(problem: Problem) -> xr.Dataset:
     """Return the recording and linearisation of trajectories; empty for single transitions."""
-    if isinstance(problem.likelihood, TransitionLikelihood):
+    if problem.likelihood.independent:
         return xr.Dataset()
     dataset = problem.data.history.dataset
     kept = dataset.rename(
@@ -211,9 +211,9 @@ def recording(problem: Problem) -> xr.Dataset:
     kept = kept.drop_vars([name for name in kept.coords if name not in kept.dims])
     dims = tuple(f"{_PREFIX}{name}" for name in ("trajectory", "time", "body", "state"))
     kept[SMOOTHED] = (dims, problem.data.smoothed_states)
-    if isinstance(problem.likelihood, OutputErrorLikelihood):
-        kept[_BY_START] = ((*CELLS, "cell_before"), problem.likelihood.starts.slope)
-        kept[_TAU] = (("state",), np.array(problem.likelihood.tau), {"units": "rows"})
+    if problem.likelihood.simulated:
+        kept[_BY_START] = ((*CELLS, "cell_before"), output_error(problem).starts.slope)
+        kept[_TAU] = (("state",), np.array(output_error(problem).tau), {"units": "rows"})
         return kept.assign_attrs({})
     noise = problem.trajectory_noise
     kept["slope"] = (("transition", "cell_after", "cell_before"), noise.slope)

@@ -20,7 +20,6 @@ from scipy.linalg import solve_triangular
 from scipy.special import logsumexp
 
 from pbrl_ppl.errors import FitError
-from pbrl_ppl.likelihood import TransitionLikelihood
 from pbrl_ppl.modes import Mode, Space
 from pbrl_ppl.posterior import MAX_PARETO_K, smoothed
 from pbrl_ppl.state import Bools, Floats, Ints
@@ -372,7 +371,7 @@ class Ensemble:
             Whether the noise moves too.
         """
         rates = []
-        along = not isinstance(self.space.problem.likelihood, TransitionLikelihood)
+        along = not self.space.problem.likelihood.independent
         moves = 0 if not noise else _NOISE_ALONG if along else _NOISE
         for chosen in self.groups():
             self.q[chosen], rate = self._moved(self.q[chosen], target, sweeps, cheap, adapt, moves)

@@ -13,7 +13,7 @@ import pymc as pm
 import xarray as xr
 
 from pbrl_ppl.errors import FitError, MeetingWarning
-from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, TransitionLikelihood
+from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.model import build_model
 from pbrl_ppl.modes import (
     Mode,
@@ -224,8 +224,8 @@ def _at_mode(job: Job, start: Mode | None) -> Job:
     while True:
         model, held = job.model, job.model.mode
         mode = start or held or _SEARCHES[job.problem.likelihood.name](job.problem, seed=job.seed)
-        if mode is not held and not isinstance(mode.problem.likelihood, TransitionLikelihood):
-            if start is not None and isinstance(start.problem.likelihood, TrajectoryLikelihood):
+        if mode is not held and not mode.problem.likelihood.independent:
+            if start is not None and start.problem.likelihood.filtered:
                 mode = following(start)
             model = build_model(mode.problem)  # linearised at the mode
         problem = model.problem

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from pbrl_ppl.likelihood import TransitionLikelihood
 from pbrl_ppl.posterior import MAX_PARETO_K, smoothed
 from pbrl_ppl.sampling.ensemble import Ensemble, Path, Posterior, Reference, anneal, systematic
 from pbrl_ppl.state import Floats
@@ -129,7 +128,7 @@ def _annealed(reference: Reference, batch: int, rng: np.random.Generator) -> Poo
     space = reference.space
     exact, cheap = Posterior(space), Posterior.of_few_steps(space)
     # the engine is cheap beside the filter of each particle's noise
-    alone = isinstance(space.problem.likelihood, TransitionLikelihood)
+    alone = space.problem.likelihood.independent
     times = 1 if alone else _BATCHES
     particles = Ensemble(reference, reference.draw(batch * _BATCHES // times, rng), rng)
     first = None if cheap is None else anneal(particles, reference, cheap)

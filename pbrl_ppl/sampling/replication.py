@@ -19,9 +19,7 @@ from pbrl_ppl.errors import (
 )
 from pbrl_ppl.history import History, from_segments
 from pbrl_ppl.likelihood import (
-    OutputErrorLikelihood,
     Problem,
-    TransitionLikelihood,
     along_trajectories,
     in_pieces,
     simulated_trajectories,
@@ -98,7 +96,7 @@ def draw_truths(design: Problem, n: int, seed: int, colour: float = 0.0) -> tupl
         If too few draws can be simulated.
     """
     model = build_model(design)
-    whole = not isinstance(design.likelihood, TransitionLikelihood)
+    whole = not design.likelihood.independent
     names = [*(block.name for block in design.layout.blocks), *design.noise_variables]
     names += [] if whole else ["next_state"]
     total = n
@@ -123,7 +121,7 @@ def draw_truths(design: Problem, n: int, seed: int, colour: float = 0.0) -> tupl
 def _trajectories(design: Problem, phi: Floats, sigma: Floats, seed: int, colour: float) -> Floats:
     """Return measured states of whole trajectories, one set a draw; 0 where nothing is measured."""
     rngs = [np.random.default_rng([seed, i]) for i in range(len(phi))]
-    if isinstance(design.likelihood, OutputErrorLikelihood):
+    if design.likelihood.simulated:
         every = _simulations(design, phi)
         columns = list(design.observations.columns)
         for states, own, rng in zip(every, sigma, rngs, strict=True):
@@ -180,10 +178,10 @@ def simulated(design: Problem, values: Floats) -> Problem:
         Next states, shape (transition, H, body, state), SI units; of whole trajectories all
         measured states, shape (trajectory, time, body, 6).
     """
-    if not isinstance(design.likelihood, TransitionLikelihood):
+    if not design.likelihood.independent:
         measured = np.isfinite(design.data.history.dataset["observed"].to_numpy())
         values = np.where(measured, values, np.nan)
-        simulation = isinstance(design.likelihood, OutputErrorLikelihood)
+        simulation = design.likelihood.simulated
         return (_remeasured if simulation else with_measurements)(design, values)
     segments, observations = design.segments, design.observations
     observed = np.full((*segments.actions.shape[:3], len(STATE)), np.nan)

@@ -20,7 +20,6 @@ from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import (
     OutputErrorLikelihood,
     Problem,
-    TrajectoryLikelihood,
     along_trajectories,
     declared_problem,
     single_transitions,
@@ -295,7 +294,7 @@ def _weighted(
         weights, k = files.smoothed(log_weights)
         share = 1.0 / (len(weights) * float((weights**2).sum()))
     changed = replace(record, together=tuple(problem.physics.together))
-    if isinstance(problem.likelihood, TrajectoryLikelihood):
+    if problem.likelihood.filtered:
         cells = files.recorded_cells(problem.scene, data["constant_data"])
         changed = replace(changed, cells=cells)
     more_noise = [label for label in changed.noise_labels if label not in problem.noise_labels]
