@@ -17,6 +17,9 @@ POSE = STATE[:3]
 #: Where the state holds the angle, whose differences are wrapped.
 THETA = STATE.index("theta")
 
+#: Offset from a position to its velocity in the state.
+VELOCITY = 3
+
 #: A wrench at the body's origin, in the world frame.
 WRENCH = ("force_x", "force_y", "torque")
 WRENCH_UNITS = ("N", "N", "N m")

@@ -175,7 +175,7 @@ class _Step:
         order = {each: missing.index(each.attached) for each in ranked}
         by_name = sorted(ranked, key=order.__getitem__)
         p_values = {each: _p_value(mode, each) for each in ranked}
-        significant: list[Signature] = []  # of equal ones, the first in the catalogue
+        significant: list[Signature] = []  # the first of a tie in the catalogue
         for each in by_name:
             p_value = p_values[each] * len(ranked)
             if p_value < self.level and not any(twins(each, other) for other in significant):
@@ -224,7 +224,7 @@ class _Step:
         return None
 
     def _decisive_refits(self, mode: Mode, by_name: list[Signature]) -> dict[Signature, _Refit]:
-        """Return significant refits that explain nearly all of the misfit; of equal ones, one."""
+        """Return significant refits that explain nearly all of the misfit, without duplicates."""
         before = float((mode.whitened_residual**2).sum())
         found: dict[Signature, _Refit] = {}
         for signature in by_name:
@@ -243,7 +243,7 @@ class _Step:
 
 
 def _higher(first: Mode, second: Mode) -> Mode:
-    """Return the mode with the higher log-posterior; of equal ones, the first."""
+    """Return the mode with the higher log-posterior, the first of a tie."""
     return max(first, second, key=lambda mode: mode.log_posterior)
 
 

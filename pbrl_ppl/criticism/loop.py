@@ -296,7 +296,7 @@ def check_folder(folder: Path, overwrite: bool) -> Path:
         return nearest
     if not overwrite and any(folder.iterdir()):
         raise OutputError(
-            f"output folder {folder}: it has content already; choose another, or allow"
+            f"output folder {folder}: it is not empty; choose another, or allow"
             " overwriting: overwrite=True"
         )
     for name in (*FILES, REMAINDER):

@@ -28,7 +28,7 @@ from pbrl_ppl.state import POSE, STATE, STATE_UNITS, THETA, Bools, Floats, Ints,
 QUANTILES = (0.5 - HDI_PROB / 2, 0.25, 0.5, 0.75, 0.5 + HDI_PROB / 2)
 _CHUNK = 16
 #: A coordinate that never moves has mean square changes of at most this many times those of its
-#: noise over all times, up to so many intervals or more.
+#: noise, over all times and up to this many intervals or more.
 _STILL, _STILL_INTERVALS = 2.0, 4
 #: Factors of wrong units: m and mm or N and mN; degrees; kg for the weight of a kg.
 _UNITS = {1000.0: "1000", 180 / np.pi: "57.3", 9.81: "9.81"}

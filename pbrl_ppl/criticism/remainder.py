@@ -34,7 +34,8 @@ _MOST = 400
 _SHORTEST, _LONGEST = 0.15, 10.0
 #: How far beyond that range the process extends, as a share of it; there it returns to zero.
 _BEYOND = 0.3
-#: Kernel centres of each force; eigenvectors with this share of its variance, and at most so many.
+#: Kernel centres of each force; the share of its variance that eigenvectors keep, and how many at
+#: most.
 _BUMPS, _SHARE, _FORMS = 48, 0.9995, 24
 #: Draws of each chain; they are independent.
 DRAWS = 250

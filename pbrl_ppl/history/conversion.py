@@ -150,7 +150,7 @@ def in_si(frame: pd.DataFrame, units: Mapping[str, str]) -> pd.DataFrame:
         if name not in frame:
             raise HistoryError(f'units: "{name}" is in {unit}, and the table has no such column')
         values = pd.to_numeric(frame[name], errors="coerce")
-        # what is no number stays, for the message that says so
+        # non-numbers are kept, for the message that names them
         frame[name] = (values * _UNITS[name][unit]).where(values.notna(), frame[name])
     return frame
 

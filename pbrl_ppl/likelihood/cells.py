@@ -12,7 +12,7 @@ from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History, estimate_rates, fill_hinges, hung_bodies
 from pbrl_ppl.physics import touching
 from pbrl_ppl.scene import Scene, state_sizes
-from pbrl_ppl.state import STATE, THETA, Bools, Floats, Ints, wrapped
+from pbrl_ppl.state import STATE, THETA, VELOCITY, Bools, Floats, Ints, wrapped
 
 #: Variable of the process noise: the unexplained acceleration.
 ACCELERATION = "unexplained_acceleration"
@@ -203,8 +203,6 @@ def check_moves(cells: Cells, scene: Scene) -> None:
 
 #: Error of measuring what does not move at all, as a share of the coordinate's typical size.
 _EXACT = 1e-6
-#: A position's velocity is so many places on.
-_RATE = 3
 
 
 def cells_of(scene: Scene, history: History) -> Cells:
@@ -216,13 +214,13 @@ def cells_of(scene: Scene, history: History) -> Cells:
         low = np.where(measured, np.fmin.reduce(observed, axis=(0, 1)), 0.0)
         high = np.where(measured, np.fmax.reduce(observed, axis=(0, 1)), 0.0)
     still = measured & (high == low)
-    still[:, _RATE:] |= still[:, :_RATE]
+    still[:, VELOCITY:] |= still[:, :VELOCITY]
     free = np.array([[not body.kinematic] * len(STATE) for body in scene.moving])
     for i, moving in enumerate(scene.moving):
         if moving.name in hung_bodies(scene) and measured[i, THETA]:
-            free[i] = [d % _RATE == THETA for d in range(len(STATE))]
+            free[i] = [d % VELOCITY == THETA for d in range(len(STATE))]
     if _uncoupled(scene):  # what was not measured moves nothing that was
-        seen = measured[:, :_RATE] | measured[:, _RATE:]
+        seen = measured[:, :VELOCITY] | measured[:, VELOCITY:]
         free &= np.hstack([seen, seen])
     places = np.flatnonzero(free)
     body, dimension = np.divmod(places, len(STATE))
@@ -231,7 +229,7 @@ def cells_of(scene: Scene, history: History) -> Cells:
     given = np.array([name in stated for name in STATE])
     sensed = free & measured & ~still & ~given
     sensors = np.flatnonzero(sensed.any(axis=0))
-    rates = np.flatnonzero((free & ~still).any(axis=0)[_RATE:]) + _RATE
+    rates = np.flatnonzero((free & ~still).any(axis=0)[VELOCITY:]) + VELOCITY
     sensor = np.full(len(places), -1)
     for i, (b, d) in enumerate(zip(body, dimension, strict=True)):
         if sensed[b, d]:
@@ -246,7 +244,7 @@ def cells_of(scene: Scene, history: History) -> Cells:
         for j, d in enumerate(rates):
             if free[b, d] and not still[b, d]:
                 row = np.where((body == b) & (dimension == d), dt, 0.0)
-                place = np.where((body == b) & (dimension == d - _RATE), dt**2, 0.0)
+                place = np.where((body == b) & (dimension == d - VELOCITY), dt**2, 0.0)
                 push.append(row + place / 2)
                 if kind:  # a blow falls at any moment of the interval
                     push.append(place / np.sqrt(12))
@@ -278,7 +276,9 @@ def first_states(history: History) -> Floats:
     states: Floats = dataset["start"].to_numpy().copy()
     seen = np.isfinite(dataset["observed"].to_numpy()).any(axis=(0, 1))
     free = ~dataset["kinematic"].to_numpy()[:, None]
-    rates = np.hstack([np.zeros_like(seen[:, :_RATE]), free & seen[:, :_RATE] & ~seen[:, _RATE:]])
+    rates = np.hstack(
+        [np.zeros_like(seen[:, :VELOCITY]), free & seen[:, :VELOCITY] & ~seen[:, VELOCITY:]]
+    )
     states[:, :, rates] = np.nan
     estimate_rates(states, float(dataset.attrs["time_step"]))
     rows = dataset["n_rows"].to_numpy()

@@ -9,7 +9,7 @@ from pbrl_ppl.likelihood.cells import Cells
 from pbrl_ppl.likelihood.data import least_noise
 from pbrl_ppl.likelihood.problem import Problem
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import STATE, THETA, Floats
+from pbrl_ppl.state import STATE, THETA, VELOCITY, Floats
 
 #: Medians of the log-normal priors of errors of measuring and of contact accelerations, as shares
 #: of what the states do in a step, and their log-scale.
@@ -22,8 +22,6 @@ ACCELERATION_SHARE, ACCELERATION_CHANCE = 0.1, 0.01
 DRIFT_SHARE = 0.01
 #: Median of an exponential law, as a share of what it exceeds with that probability.
 _MEDIAN = np.log(2.0) / -np.log(ACCELERATION_CHANCE)
-#: A position's velocity is so many places on.
-_RATE = 3
 
 
 def noise_medians(cells: Cells, scene: Scene, history: History, states: Floats) -> Floats:
@@ -67,8 +65,8 @@ def ranges(cells: Cells, history: History, states: Floats) -> Floats:
     values = states[real].reshape(-1, states.shape[2] * len(STATE))[:, cells.places]
     extent = np.ptp(values, axis=0)
     dimension = cells.places % len(STATE)
-    turns = dimension % _RATE == THETA
-    place = dimension < _RATE
+    turns = dimension % VELOCITY == THETA
+    place = dimension < VELOCITY
     return np.array([extent[place & (turns == (d == THETA))].max() for d in cells.drifts])
 
 
@@ -82,9 +80,9 @@ def _typical(cells: Cells, changes: list[Floats]) -> Floats:
 
 def _vectors(each: Floats, rates: tuple[int, ...]) -> Floats:
     """Return sizes of velocity changes, x and y as one vector, shape (rate,)."""
-    plane = [d for d in rates if d % _RATE != THETA]
+    plane = [d for d in rates if d % VELOCITY != THETA]
     size = float(np.sqrt((each[plane] ** 2).sum()))
-    return np.array([each[d] if d % _RATE == THETA else size for d in rates])
+    return np.array([each[d] if d % VELOCITY == THETA else size for d in rates])
 
 
 def bodies_acceleration(problem: Problem) -> Floats:

@@ -16,7 +16,7 @@ from pbrl_ppl.likelihood.problem import Problem
 from pbrl_ppl.likelihood.sensitivity import Sensitivity
 from pbrl_ppl.likelihood.trajectory_noise import TrajectoryNoise
 from pbrl_ppl.physics import touching
-from pbrl_ppl.state import STATE, Bools, Floats
+from pbrl_ppl.state import STATE, VELOCITY, Bools, Floats
 
 #: Prior scale of an unmeasured state, as a multiple of its range, beside its typical size.
 _FAR = 10.0
@@ -28,8 +28,6 @@ _STALE = 0.3
 _LITTLE = 0.1
 #: Steps (of the logarithm) by which unexplained accelerations fall to the given ones.
 _SHARES = (0.5, 1.0)
-#: A position's velocity is so many places on.
-_RATE = 3
 
 
 def along_trajectories(
@@ -197,8 +195,8 @@ def _steps(problem: Problem, cells: Cells, sigma: Floats) -> Floats:
     """Return the steps of finite differences by the cells, shape (cell,)."""
     error = cells.errors(sigma)
     known = {place: error[i] / problem.scene.time_step for i, place in enumerate(cells.places)}
-    below = np.array([known.get(place - _RATE, 0.0) for place in cells.places])
-    rate = (cells.places % len(STATE) >= _RATE) & (cells.sensor < 0)
+    below = np.array([known.get(place - VELOCITY, 0.0) for place in cells.places])
+    rate = (cells.places % len(STATE) >= VELOCITY) & (cells.sensor < 0)
     return np.where(rate, np.maximum(error, below), error)
 
 

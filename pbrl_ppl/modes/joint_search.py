@@ -32,8 +32,8 @@ from pbrl_ppl.state import Floats
 #: A log-evidence this far below the best by the Laplace method is not looked at more closely: the
 #: approximation's error is a few units, and the same for all configurations in great part.
 _MARGIN = 25.0
-#: Configurations within this much of the best, and the best few in any case, are sought from more
-#: starts, so many: a wheel's axes may have been caught in a wrong hill.
+#: Configurations within this much of the best, and the best few in any case, are sought from this
+#: many more starts: a wheel's axes may have been caught in a local optimum.
 _CONTENDERS, _BEST, _STARTS, _SCREENED = 100.0, 2, 4, 200
 #: Rounds of the climbs that tell hills apart, and of a first climb with the exact engine. One that
 #: ends this far below the best log-posterior so far is hopeless, and goes no further: wrong joints

@@ -17,7 +17,7 @@ from pbrl_ppl.state import Floats
 from pbrl_ppl.threads import one_blas_thread
 
 #: Transitions used to tell basins apart, and how many of the best are searched with all data; with
-#: no more than so many transitions, all are.
+#: at most this many transitions, all are.
 _PART, _POLISHED, _FEW = 40, 2, 20
 #: Population and generations that look for the hill of few data, how many of them are climbed
 #: from, the most parameters that is for, and the most engine steps it may take.
@@ -59,7 +59,7 @@ def find_modes(
     initial : ndarray, optional
         Where to begin, shape (p,); then there is one local search.
     rounds : int, optional
-        With ``initial``, at most so many rounds, and no polish: a first look at where it leads.
+        With ``initial``, the most rounds, without polish: a first look at where it leads.
 
     Returns
     -------

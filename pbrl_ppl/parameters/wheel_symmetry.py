@@ -20,7 +20,7 @@ from pbrl_ppl.state import Floats, wrapped
 
 #: The parameters that the symmetry mixes: w_theta and w_theta + pi/2 with mu_x, mu_y swapped.
 MIXED = ("w_theta", "mu_x", "mu_y")
-#: What the names begin with, of Table 1's wheel and of the effect's.
+#: Prefixes of a wheel's parameters: Table 1's and the effect's.
 _BEGINNINGS = ("", "wheel_")
 _ANGLES = tuple(f"{begin}w_theta[" for begin in _BEGINNINGS)
 _ROUNDS = 20

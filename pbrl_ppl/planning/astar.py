@@ -56,7 +56,7 @@ def astar(task: Task, *, weight: float = 3.0, improve: bool = False) -> Found:
     weight : float
         Of the heuristic: 1 is A*, which goes on until no node of the queue can lead to a cheaper
         plan. A larger weight is quicker, ends at the first plan and, as far as the heuristic is
-        admissible and cells hold one state, costs at most so many times the least. See
+        admissible and cells hold one state, costs at most this many times the least. See
         :class:`pbrl_ppl.planning.astar.TimeToGo` for where it is.
     improve : bool
         Whether to go on for a cheaper plan until a limit, or until there is none.

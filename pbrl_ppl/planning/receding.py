@@ -121,7 +121,7 @@ def mppi(
     iterations: int = 3,
     intervals: int = 200,
 ) -> Found:
-    """Go towards the goal by a receding horizon, in the model, until it is reached.
+    """Plan with MPPI until the model reaches the goal.
 
     Parameters
     ----------

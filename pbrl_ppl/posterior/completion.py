@@ -406,7 +406,7 @@ def _warnings(
         for i in np.flatnonzero(watched & (share > _STUCK)):
             yield (
                 BoundWarning,
-                f"{problem.layout.labels[i]} is pressed against the end of its support,"
+                f"{problem.layout.labels[i]} is at its bound,"
                 f" {np.median(bound[:, i]):g}: {share[i]:.0%} of the draws are there; check the"
                 " shape and the frame of the body; an effect that the model lacks may press too",
             )

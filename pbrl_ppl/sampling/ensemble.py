@@ -489,7 +489,7 @@ class Ensemble:
     def settle(
         self, target: Target, cheap: Target | None = None, looks: int = _LOOKS
     ) -> tuple[float, float]:
-        """Move until particles have forgotten where they were, or so many times.
+        """Move until particles have decorrelated from where they were, ``looks`` times at most.
 
         Returns
         -------

@@ -150,7 +150,7 @@ def fit(
     MeetingWarning
         If bodies that were apart in the data meet under the parameters found.
     BoundWarning
-        If a parameter is pressed against the end of its support.
+        If a parameter is at its bound.
     UninformedWarning
         If the data say nothing about a parameter.
     """

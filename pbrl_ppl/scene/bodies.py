@@ -87,7 +87,7 @@ class Body:
         label(self.name, "body: name")
         where = f'body "{self.name}"'
         if self.name == WORLD:
-            raise SceneError(f'{where}: "world" is the name of the ground; call the body otherwise')
+            raise SceneError(f'{where}: "world" is the name of the ground; choose another name')
         if not isinstance(self.shape, Shape):
             raise SceneError(f"{where}: shape is {self.shape!r}, expected a Shape")
         for key in ("wheel", "static", "kinematic"):

@@ -126,7 +126,7 @@ def test_close_loop_options(calls: list[Any], capsys: pytest.CaptureFixture[str]
     assert test is None
     assert given == {"seed": 7, "draws": 300, "method": "laplace"}
     assert main(argv) == 2
-    assert "has content already" in capsys.readouterr().err
+    assert "is not empty" in capsys.readouterr().err
     assert len(calls) == 1
     assert main([*argv, "--overwrite"]) == 0
     assert main([*argv, "--overwrite", "--method", "nuts"]) == 2
@@ -205,7 +205,7 @@ def test_output_in_the_way(
     loop = ("close-loop", "scene.toml", "train.csv", "-o")
     assert "is a file" in fails(capsys, *loop, "train.csv")
     assert "is a file" in fails(capsys, *loop, "train.csv/below/it", "--overwrite")
-    assert "has content already" in fails(capsys, *loop, ".")
+    assert "is not empty" in fails(capsys, *loop, ".")
     assert not calls
     assert sorted(p.name for p in files.iterdir()) == ["scene.toml", "test.csv", "train.csv"]
 

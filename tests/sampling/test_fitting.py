@@ -417,7 +417,7 @@ def test_a_parameter_at_its_bound_is_named(model) -> None:
     small = replace(scene.bodies[0], shape=Shape.box(0.7 * abs(CART["w_x"]), 0.5))
     with (
         pytest.warns(ConvergenceWarning),
-        pytest.warns(BoundWarning, match=r"w_x\[cart\] is pressed against .*lacks may press"),
+        pytest.warns(BoundWarning, match=r"w_x\[cart\] is at its bound.*lacks may press"),
     ):
         idata = fit(
             physics_model(scene.replace(bodies=(small,)), model.problem.data.history),
