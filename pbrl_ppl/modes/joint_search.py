@@ -35,7 +35,7 @@ _MARGIN = 25.0
 #: Configurations within this much of the best, and the best few in any case, are sought from this
 #: many more starts: a wheel's axes may have been caught in a local optimum.
 _CONTENDERS, _BEST, _STARTS, _SCREENED = 100.0, 2, 4, 200
-#: Rounds of the climbs that tell hills apart, and of a first climb with the exact engine. One that
+#: Rounds of the climbs that tell modes apart, and of a first climb with the exact engine. One that
 #: ends this far below the best log-posterior so far is hopeless, and goes no further: wrong joints
 #: are explained by masses so unlike that the engine takes a hundred times as long.
 _ROUGH, _FIRST, _HOPELESS = 8, 2, 300.0
@@ -186,7 +186,7 @@ def _apart(problem: Problem, seed: int) -> Mode:
 def _joint(problem: Problem, configuration: Configuration, fewer: Mode, worth: float) -> Mode:
     """Return the mode from anchors by geometry, and bodies of the prior or of fewer joints.
 
-    The hills are told apart with few engine steps; the best is climbed with the exact engine.
+    The modes are told apart with few engine steps; the best is climbed with the exact engine.
     """
     starts = []
     for anchors in _placed(problem, configuration):

@@ -19,7 +19,7 @@ from pbrl_ppl.threads import one_blas_thread
 #: Transitions used to tell basins apart, and how many of the best are searched with all data; with
 #: at most this many transitions, all are.
 _PART, _POLISHED, _FEW = 40, 2, 20
-#: Population and generations that look for the hill of few data, how many of them are climbed
+#: Population and generations that look for the mode of few data, how many of them are climbed
 #: from, the most parameters that is for, and the most engine steps it may take.
 _POPULATION, _GENERATIONS, _EVOLVED, _MOST_EVOLVED, _AFFORDED = 200, 120, 8, 15, 2e7
 #: Gain in log-posterior which shows that the coarse derivative had not led to the top. (Friction
@@ -27,7 +27,7 @@ _POPULATION, _GENERATIONS, _EVOLVED, _MOST_EVOLVED, _AFFORDED = 200, 120, 8, 15,
 _WORTHWHILE = 5.0
 #: Predictions this close (sum of squares, in noise units) are of the same mode.
 _SAME = 10.0
-#: Parameters whose predictions agree are of different hills if by the derivative they should differ
+#: Parameters whose predictions agree are of different modes if by the derivative they should differ
 #: by this (sum of squares, in noise units): ten standard deviations.
 _FAR = 100.0
 #: Log-posterior by which a mode is too low to hold a share of the posterior, however wide it is.
@@ -54,7 +54,7 @@ def find_modes(
         Of the draws from the prior.
     starts, screened : int, optional
         Local searches, and draws from the prior among which their starts are chosen. With few data
-        there are more by default: they cost little there, and friction makes more hills. So it
+        there are more by default: they cost little there, and friction makes more modes. So it
         does that differential evolution looks for the highest too.
     initial : ndarray, optional
         Where to begin, shape (p,); then there is one local search.

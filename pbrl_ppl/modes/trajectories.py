@@ -23,7 +23,7 @@ from pbrl_ppl.threads import one_blas_thread
 #: Rounds at most; one that moves phi by less than this, in standard deviations, is the last.
 _ROUNDS, _SETTLED = 6, 0.2
 #: A second climb begins with unexplained accelerations of this share of their prior's median:
-#: errors of measuring and unexplained accelerations trade places, and have a hill each.
+#: errors of measuring and unexplained accelerations trade places, and have a mode each.
 _QUIET = 0.1
 #: Rounds of a climb between two linearisations.
 _CLIMB = 5
