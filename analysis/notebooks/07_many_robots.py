@@ -91,7 +91,7 @@ manifest
 # One after another here; with `executor=`, any `concurrent.futures.Executor` (processes, or a Dask
 # cluster's) closes several at a time. Robots whose log and settings have not changed are not run
 # again by the same call, and one that fails does not stop the others. At the command line this is
-# `pbrl-ppl close-loop --many logs.csv -o results --jobs 4`.
+# `pbrl-ppl close-logs logs.csv -o results --jobs 4`.
 
 # %%
 loops = pp.close_loop_many(

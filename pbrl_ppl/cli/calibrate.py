@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from pbrl_ppl.sampling import Calibration
 
 
-@command("calibrate", 11, "pbrl-ppl calibrate scene.toml train.csv -o ranks/ --jobs 4")
+@command("calibrate", 12, "pbrl-ppl calibrate scene.toml train.csv -o ranks/ --jobs 4")
 def calibrate(
     scene: options.SceneFile,
     history: Annotated[

@@ -44,9 +44,9 @@ def demo(
         )
     close_loop(
         context,
-        output,
         cart / "scene.toml",
         cart / "recorded" / "train.csv",
+        output,
         cart / "recorded" / "test.csv",
         method=method,
         seed=seed,

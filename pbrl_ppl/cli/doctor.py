@@ -20,7 +20,7 @@ from pbrl_ppl.cli.terminal import FAILED, interruptible, print_result, stages
 _AGREE = 1e-9
 
 
-@command("doctor", 12, "pbrl-ppl doctor --json")
+@command("doctor", 13, "pbrl-ppl doctor --json")
 def doctor(as_json: options.AsJson = False, quiet: options.Quiet = False) -> None:
     """Report versions, whether the compiled engine loop works, and the number of threads.
 

@@ -190,7 +190,7 @@ def _rows(table: pd.DataFrame) -> list[list[str]]:
     ]
 
 
-@command("update", 8, "pbrl-ppl update cart.nc since.csv -o new.nc")
+@command("update", 9, "pbrl-ppl update cart.nc since.csv -o new.nc")
 def update(
     posterior: Annotated[
         Path, typer.Argument(metavar="POSTERIOR", help="Posterior file (.nc); it has the scene.")

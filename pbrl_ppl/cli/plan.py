@@ -14,7 +14,7 @@ from pbrl_ppl.cli.terminal import FAILED, check_file, interruptible, print_resul
 from pbrl_ppl.errors import EffectError, GoalError
 
 
-@command("plan", 9, "pbrl-ppl plan cart.nc --start -2,0,0 --goal 2,1,1.57 -o plan.csv")
+@command("plan", 10, "pbrl-ppl plan cart.nc --start -2,0,0 --goal 2,1,1.57 -o plan.csv")
 def plan(
     posterior: options.PosteriorFile,
     start: options.Starts = None,
@@ -134,7 +134,7 @@ def plan(
         raise typer.Exit(FAILED)
 
 
-@command("suggest", 6, "pbrl-ppl suggest report/after.nc --start 0,0,0 -o next.csv")
+@command("suggest", 7, "pbrl-ppl suggest report/after.nc --start 0,0,0 -o next.csv")
 def suggest(
     posterior: Annotated[
         Path,

@@ -14,7 +14,7 @@ from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.files import write_text
 
 
-@command("report", 7, "pbrl-ppl report cart.nc")
+@command("report", 8, "pbrl-ppl report cart.nc")
 def report(
     context: typer.Context,
     posterior: options.PosteriorFile,

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from pbrl_ppl.scene import Scene
 
 
-@command("simulate", 10, "pbrl-ppl simulate cart.nc plan.csv -o predicted.csv --draws 20")
+@command("simulate", 11, "pbrl-ppl simulate cart.nc plan.csv -o predicted.csv --draws 20")
 def simulate(
     source: Annotated[
         Path,

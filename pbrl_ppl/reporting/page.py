@@ -98,7 +98,7 @@ def render_page(
         Values that the template shows.
     """
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("pbrl_ppl", "report"),
+        loader=jinja2.PackageLoader("pbrl_ppl", "reporting"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,

@@ -525,7 +525,7 @@ def test_a_folder_that_cannot_be_made_is_refused_at_once(
     Path("logs.csv").write_text("name,scene,train\na,scene.toml,train.csv\n")
     for argv in (
         ["close-loop", "scene.toml", "train.csv"],
-        ["close-loop", "--many", "logs.csv"],
+        ["close-logs", "logs.csv"],
         ["calibrate", "scene.toml", "train.csv"],
     ):
         assert "cannot be made" in message(capsys, *argv, "-o", name)

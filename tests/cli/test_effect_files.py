@@ -134,12 +134,6 @@ def test_bad_effect_files(files, capsys, command, text, said) -> None:
     assert not Path(output).exists()
 
 
-def test_many_logs_take_no_effect_file(files, capsys) -> None:
-    argv = ["close-loop", "--many", "logs.csv", "-o", "x", "--effect-file", "laws.py", "--quiet"]
-    assert main(argv) == 2
-    assert "--effect-file is for one log" in " ".join(capsys.readouterr().err.split())
-
-
 def test_the_guide_s_effect_file_is_read(tmp_path) -> None:
     page = (ROOT / "analysis/docs/pages/guides/own_effect.md").read_text()
     (block,) = re.findall(r"^```python\n(# laws\.py.*?)^```", page, re.M | re.S)

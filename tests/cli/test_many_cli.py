@@ -1,4 +1,4 @@
-"""``close-loop --many`` and the options of tables that have names and units of their own."""
+"""``close-logs`` and the options of tables that have names and units of their own."""
 
 import os
 from concurrent.futures.process import BrokenProcessPool
@@ -10,7 +10,7 @@ import pytest
 
 from pbrl_ppl import criticism
 from pbrl_ppl.cli import main
-from pbrl_ppl.cli.close_loop import OneProcessEach
+from pbrl_ppl.cli.close_logs import OneProcessEach
 from pbrl_ppl.reporting import many
 from pbrl_ppl.reporting.logs import Settings, close_log, settle
 from tests.helpers.fleet import made_logs, pretend
@@ -49,7 +49,7 @@ def test_many(logs: list[Settings], capsys: pytest.CaptureFixture[str]) -> None:
         "--seed 7 --draws 300 --substeps 5 --noise x=0.1 --columns x=px,force_y=0 --columns time=t"
         " --units x=mm,theta=deg --time-step 0.2 --estimate-velocities --method laplace"
     )
-    argv = ["close-loop", "--many", "logs.csv", "-o", "out"]
+    argv = ["close-logs", "logs.csv", "-o", "out"]
     assert main([*argv, *options.split()]) == 0
     captured = capsys.readouterr()
     assert captured.out.splitlines() == [
@@ -60,7 +60,7 @@ def test_many(logs: list[Settings], capsys: pytest.CaptureFixture[str]) -> None:
     assert "2/2 blue: adequate" in captured.err
     # the page says what makes it again
     page = Path("out/index.html").read_text()
-    assert "pbrl-ppl close-loop" in page and "--many logs.csv" in page and "--units x=mm" in page
+    assert "pbrl-ppl close-logs" in page and "logs.csv" in page and "--units x=mm" in page
     assert logs == [
         Settings(
             7, 5, 300, "laplace", None, {"x": 0.1}, True,
@@ -83,15 +83,14 @@ def test_many(logs: list[Settings], capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ("--many nope.csv", "nope.csv: there is no such file"),
-        ("--many scene.toml", 'unknown column "a scene"'),
-        ("scene.toml red.csv --many logs.csv", "are in the manifest"),
-        ("", "expected SCENE and TRAIN, or --many"),
-        ("scene.toml", "expected SCENE and TRAIN, or --many"),
-        ("scene.toml red.csv --jobs 2", "are for --many"),
-        ("--many logs.csv --columns x", "is not NAME=VALUE, such as x=pos_x"),
-        ("--many logs.csv --units x=", "is not NAME=VALUE, such as x=mm"),
-        ("--many logs.csv --scheduler tcp://127.0.0.1:9", "no Dask scheduler answers there"),
+        ("nope.csv", "nope.csv: there is no such file"),
+        ("scene.toml", 'unknown column "a scene"'),
+        ("scene.toml red.csv", "unexpected extra argument"),
+        ("", "Missing argument 'MANIFEST'"),
+        ("logs.csv --trim", "No such option: --trim"),
+        ("logs.csv --columns x", "is not NAME=VALUE, such as x=pos_x"),
+        ("logs.csv --units x=", "is not NAME=VALUE, such as x=mm"),
+        ("logs.csv --scheduler tcp://127.0.0.1:9", "no Dask scheduler answers there"),
     ],
 )
 def test_bad_usage(
@@ -104,7 +103,7 @@ def test_bad_usage(
         raise OSError("timed out")
 
     monkeypatch.setattr(distributed, "Client", nobody)
-    assert main(["close-loop", "-o", "out", *options.split()]) == 2
+    assert main(["close-logs", "-o", "out", *options.split()]) == 2
     captured = capsys.readouterr()
     assert captured.out == "" and "Traceback" not in captured.err
     # typer puts usage errors into a box

@@ -59,9 +59,3 @@ def test_check_warns_of_a_held_body_and_trim_leaves_the_rows_out(
 def test_commands_have_it(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([command, "--help"]) == 0
     assert "--trim" in capsys.readouterr().out
-
-
-@pytest.mark.usefixtures("files")
-def test_not_with_many(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["close-loop", "--many", "logs.csv", "-o", "out", "--trim"]) == 2
-    assert "--trim is for one log" in capsys.readouterr().err

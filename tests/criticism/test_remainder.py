@@ -195,9 +195,3 @@ def test_without_the_library_it_says_what_to_install(tmp_path, monkeypatch, caps
     assert main(["close-loop", *files, "--learn-remainder"]) == 2
     assert install in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
-
-
-def test_many_logs_at_once_learn_none(tmp_path, capsys) -> None:
-    command = ["close-loop", "--many", str(tmp_path / "logs.csv"), "-o", str(tmp_path / "out")]
-    assert main([*command, "--learn-remainder"]) == 2
-    assert "is for one log" in " ".join(capsys.readouterr().err.split())

@@ -119,7 +119,7 @@ def many_page(folder: Path) -> tuple[str, tuple[str, ...]]:
     }  # fmt: skip
     pooled: Any = SimpleNamespace(names=tuple(what), table=lambda: pd.DataFrame([row] * 3))
     waiting = {"name": "late", "kind": "", "status": "waiting"}
-    source = Source(command=f"pbrl-ppl close-loop --many {'logs' * 40}.csv -o out")
+    source = Source(command=f"pbrl-ppl close-logs {'logs' * 40}.csv -o out")
     reason = "1 adequate model(s), expected at least 2"
     html = page((*rows, waiting), {"cart": pooled}, {"arm": reason}, source)
     files = [f"{name}/report.html" for name in (*what, "plain", "told")]

@@ -1,0 +1,154 @@
+"""``pbrl-ppl close-logs``: the loop on each log of a manifest."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from pbrl_ppl.cli import options
+from pbrl_ppl.cli.close_loop import Draws, Method, Sampler
+from pbrl_ppl.cli.commands import command
+from pbrl_ppl.cli.terminal import FAILED, check_can_make, interruptible, print_result, stages
+from pbrl_ppl.errors import OutputError
+
+
+@command("close-logs", 6, "pbrl-ppl close-logs logs.csv -o results/ --jobs 4")
+def close_logs(
+    context: typer.Context,
+    manifest: Annotated[
+        Path,
+        typer.Argument(
+            metavar="MANIFEST", help="A CSV file with the columns name, scene, train, test, kind."
+        ),
+    ],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the results.")
+    ],
+    seed: options.Seed = 1,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Run finished logs again.")
+    ] = False,
+    substeps: options.Substeps = None,
+    draws: Draws = None,
+    method: Sampler = Method.IMPORTANCE,
+    noise: options.Noise = None,
+    estimate_velocities: options.Velocities = False,
+    columns: options.Columns = None,
+    units: options.Units = None,
+    time_step: options.TimeStep = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Logs at a time.")] = 1,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="A Dask scheduler that has the workers."),
+    ] = None,
+    as_json: options.AsJson = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Close the loop on each log of a manifest, and report which effects are where.
+
+    The same command goes on after an interrupt. Exits with 1 if some logs failed.
+    """
+    kept = f"finished logs are in {output}; the same command goes on"
+    with interruptible(kept), stages(quiet) as progress:
+        check_can_make(output)
+        progress("reading the manifest")
+        import pbrl_ppl.reporting as report
+
+        logs = report.read_manifest(manifest)  # its errors come before a cluster is sought
+        with _executor(jobs, scheduler) as executor:
+            loops = report.close_loop_many(
+                logs,
+                output,
+                executor=executor,
+                progress=progress,
+                source=report.Source(command=options.command_line(context)),
+                again=overwrite,
+                seed=seed,
+                substeps=substeps,
+                draws=draws,
+                method=method.value,
+                noise=options.noise_of(noise),
+                columns=options.columns_of(columns),
+                units=options.units_of(units),
+                time_step=time_step,
+                estimate_velocities=estimate_velocities,
+            )
+    effects = loops.effects().drop_duplicates(["name", "effect", "body"])
+    found = [
+        f"{effect}[{body}]: {', '.join(each['name'])}"
+        for (effect, body), each in effects.groupby(["effect", "body"], sort=False)
+    ]
+    page = output / "index.html"
+    print_result(
+        as_json,
+        {"page": page, "logs": loops.rows},
+        [*found, report.in_words(loops.rows), f"page: {page}"],
+    )
+    if loops.failed:
+        raise typer.Exit(FAILED)
+
+
+@contextmanager
+def _executor(jobs: int, scheduler: str | None) -> Iterator[Executor | None]:
+    """Yield the executor of a Dask cluster, processes of this machine, or None."""
+    if scheduler is not None:
+        with _cluster(scheduler) as executor:
+            yield executor
+    elif jobs == 1:
+        yield None
+    else:
+        with OneProcessEach(jobs) as pool:  # close_loop_many cancels what has not begun
+            yield pool
+
+
+@contextmanager
+def _cluster(scheduler: str) -> Iterator[Executor]:
+    """Yield the executor of a running Dask scheduler."""
+    try:
+        from distributed import Client
+    except ImportError:
+        raise OutputError(
+            "--scheduler needs Dask distributed, which is not installed: pip install"
+            " 'pbrl_ppl[many]', here and where the workers run"
+        ) from None
+    try:
+        client = Client(scheduler, timeout=10)
+    except (OSError, ValueError) as error:
+        raise OutputError(
+            f"--scheduler {scheduler}: no Dask scheduler answers there ({error}); expected an"
+            " address such as tcp://host:8786"
+        ) from None
+    with client:
+        if not client.scheduler_info()["workers"]:
+            typer.echo(f"no worker at {scheduler} yet; waiting for one", err=True)
+        yield client.get_executor(pure=False)
+
+
+class OneProcessEach(ThreadPoolExecutor):
+    """Executor that runs each call in a fresh process.
+
+    A process that dies, out of memory for instance, does not take others with it, as in a pool; its
+    call is tried once more. PyMC's threads do not survive a fork, so processes are spawned.
+    """
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Schedule a call that can be pickled."""
+        return super().submit(_in_a_process, fn, *args, **kwargs)
+
+
+def _in_a_process(fn: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+    for again in (True, False):
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+            try:
+                return pool.submit(fn, *args, **kwargs).result()
+            except BrokenProcessPool:
+                if not again:
+                    raise
+    return None
