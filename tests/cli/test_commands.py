@@ -94,7 +94,16 @@ def test_options_are_alike() -> None:
             assert {"--json", "--quiet"} <= options, name
         if "--draws" in options:
             assert "--seed" in options, name
-    drawing = {"check", "fit", "close-loop", "plan", "suggest", "simulate", "calibrate"}
+    drawing = {
+        "check",
+        "fit",
+        "close-loop",
+        "close-logs",
+        "plan",
+        "suggest",
+        "simulate",
+        "calibrate",
+    }
     group = typer.main.get_command(app).commands
     assert {
         name for name in NAMES if any("--draws" in each.opts for each in group[name].params)
