@@ -122,6 +122,16 @@ def gains(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def _deviate(slope: Floats, state: Floats, residual: Floats, ahead: Floats) -> None:
+    """Fill ``ahead`` with the deviation after a transition, ``F state - residual``."""
+    for a in range(len(state)):
+        total = -residual[a]
+        for b in range(len(state)):
+            total += slope[a, b] * state[b]
+        ahead[a] = total
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def innovations(
     slope: Floats,
     first: Ints,
@@ -158,11 +168,7 @@ def innovations(
             if first[k]:
                 for a in range(d):
                     state[a] = begin[k, a]
-            for a in range(d):
-                total = -residual[j, k, a]
-                for b in range(d):
-                    total += slope[k, a, b] * state[b]
-                moved[a] = total
+            _deviate(slope[k], state, residual[j, k], moved)
             for i in range(d):
                 if seen[k, i]:
                     innovation = measured[k, i] - moved[i]
@@ -179,8 +185,7 @@ def whitened(
     slope: Floats,
     first: Ints,
     seen: Bools,
-    wide: Floats,
-    known: Floats,
+    variance: Floats,
     sensor: Floats,
     step: Floats,
     kind: Ints,
@@ -196,10 +201,8 @@ def whitened(
     ----------
     slope, first, seen, kind : ndarray
         As of :func:`gains`.
-    wide : ndarray
-        Variance of a first state that was not measured, 0 elsewhere, shape (transition, cell).
-    known : ndarray
-        Variance of one that was, shape (set, cell).
+    variance : ndarray
+        Variance of the state before each first transition, shape (set, transition, cell).
     sensor, step : ndarray
         As of :func:`gains`, shapes (set, cell) and (set, kind, cell, cell).
     residual, begin, measured : ndarray
@@ -215,20 +218,15 @@ def whitened(
     sets, n, d = residual.shape
     white, log_scale = np.zeros((sets, n, d)), np.zeros((sets, n))
     p, moved, gain = np.zeros((d, d)), np.zeros((d, d)), np.zeros(d)
-    state, ahead, variance = np.zeros(d), np.zeros(d), np.zeros(d)
+    state, ahead = np.zeros(d), np.zeros(d)
     for j in range(sets):
         for k in range(n):
             if first[k]:
                 for a in range(d):
                     state[a] = begin[k, a]
-                    variance[a] = wide[k, a] if wide[k, a] > 0.0 else known[j, a]
-                _restart(p, variance)
+                _restart(p, variance[j, k])
             _forward(p, slope[k], step[j, kind[k]], moved)
-            for a in range(d):
-                total = -residual[j, k, a]
-                for b in range(d):
-                    total += slope[k, a, b] * state[b]
-                ahead[a] = total
+            _deviate(slope[k], state, residual[j, k], ahead)
             for i in range(d):
                 if seen[k, i]:
                     innovation = measured[k, i] - ahead[i]

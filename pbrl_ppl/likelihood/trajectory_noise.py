@@ -146,16 +146,14 @@ class TrajectoryNoise:
         """Return the same of residuals (set, transition, cell) that each have their own noise."""
         own, d = self._extended, len(self.cells.places)
         sensor = own.padded(self.cells.white(sigmas) ** 2)
-        known = np.hstack([sensor[:, :d], sigmas[:, self.cells.drifted[1]] ** 2])
-        step = own.steps(sigmas)
-        given = own.slope, self.first, own.seen, own.padded(self.wide)
+        variance, step = self._begin(sigmas), own.steps(sigmas)
         begin, measured = own.padded(self.begin), own.padded(self.measured)
 
         def some(chosen: slice) -> tuple[Floats, Floats]:
             residual = np.ascontiguousarray(own.padded(rows[chosen]))
             found: tuple[Floats, Floats] = whitened(
-                *given, known[chosen], sensor[chosen], step[chosen], self.kind, residual,
-                begin, measured,
+                own.slope, self.first, own.seen, variance[chosen], sensor[chosen], step[chosen],
+                self.kind, residual, begin, measured,
             )  # fmt: skip
             return found
 
@@ -312,12 +310,15 @@ class TrajectoryNoise:
         return result
 
     def _begin(self, sigma: Floats) -> Floats:
-        """Return the variance of the filter's first state of each trajectory."""
-        state = np.where(self.wide > 0, self.wide, self.cells.white(sigma) ** 2)
-        error = np.broadcast_to(
-            sigma[self.cells.drifted[1]] ** 2, (len(state), len(self.cells.drifted[1]))
-        )
-        return np.hstack([state, error])
+        """Return the variance of the filter's first states at sigma (..., parameter).
+
+        Shape (..., transition, coordinate).
+        """
+        sensor = self.cells.white(sigma)[..., None, :] ** 2
+        state = np.where(self.wide > 0, self.wide, sensor)
+        error = sigma[..., None, self.cells.drifted[1]] ** 2
+        error = np.broadcast_to(error, (*state.shape[:-1], error.shape[-1]))
+        return np.concatenate([state, error], axis=-1)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
