@@ -1,15 +1,17 @@
-"""Evaluation of a function in a forked process, beside the caller."""
+"""Evaluation beside the caller: of a function in a forked process, of tasks by an executor."""
 
 from __future__ import annotations
 
 import multiprocessing as mp
 import os
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator, Mapping
+from concurrent.futures import Executor, as_completed
 from contextlib import contextmanager
 from threading import Thread
 from typing import Any, TypeVar
 
+K = TypeVar("K")
 R = TypeVar("R")
 
 
@@ -82,3 +84,34 @@ def _end_with_parent() -> None:
     if parent is not None:
         parent.join()
         os._exit(1)
+
+
+def as_ended(
+    tasks: Mapping[K, Callable[[], R]], executor: Executor | None
+) -> Generator[tuple[K, Callable[[], R]]]:
+    """Yield each task's key, and a call that returns its result or raises its error.
+
+    In the order in which they end; tasks that have not begun are cancelled with the iteration.
+
+    Parameters
+    ----------
+    tasks : mapping of callable
+        Each takes nothing; with an executor of processes they can be pickled.
+    executor : Executor, optional
+        Runs them; without one, the caller's call does.
+
+    Examples
+    --------
+    >>> {key: result() for key, result in as_ended({"a": int, "b": str}, None)}
+    {'a': 0, 'b': ''}
+    """
+    if executor is None:
+        yield from tasks.items()
+        return
+    futures = {executor.submit(task): key for key, task in tasks.items()}
+    try:
+        for future in as_completed(futures):
+            yield futures[future], future.result
+    finally:
+        for future in futures:
+            future.cancel()

@@ -6,8 +6,9 @@ import json
 import pickle
 import time
 from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import Executor, as_completed
-from contextlib import nullcontext
+from concurrent.futures import Executor
+from contextlib import AbstractContextManager, closing, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -17,6 +18,7 @@ from pbrl_ppl.agents.agent import Agent
 from pbrl_ppl.agents.episode import VARIABLES, Episode
 from pbrl_ppl.agents.processes import processes, processors
 from pbrl_ppl.agents.world import Outcome, Task
+from pbrl_ppl.background import as_ended
 from pbrl_ppl.errors import EpisodeError
 from pbrl_ppl.posterior import save_posterior
 from pbrl_ppl.state import STATE, Floats
@@ -227,23 +229,14 @@ def run_episodes(
 
     at_once = min(processors() if workers is None else workers, len(waiting))
     try:
-        if executor is None and at_once < 2:
-            for key, arguments in waiting.items():
-                finished(key, _run_and_save(*arguments))
-        else:
-            if executor is None:
-                _check_pickled(agents, world)
-            with processes(at_once) if executor is None else nullcontext(executor) as pool:
-                futures = {
-                    pool.submit(_run_and_save, *arguments): key
-                    for key, arguments in waiting.items()
-                }
-                try:
-                    for future in as_completed(futures):
-                        finished(futures[future], future.result())
-                finally:
-                    for future in futures:
-                        future.cancel()
+        tasks = {key: partial(_run_and_save, *arguments) for key, arguments in waiting.items()}
+        pool: AbstractContextManager[Executor | None] = nullcontext(executor)
+        if executor is None and at_once > 1:
+            _check_pickled(agents, world)
+            pool = processes(at_once)
+        with pool as runner, closing(as_ended(tasks, runner)) as ended:
+            for key, result in ended:
+                finished(key, result())
     except KeyboardInterrupt:
         message = f"{len(found)} of {len(paths)} episodes are in {folder}; run it again"
         raise KeyboardInterrupt(message) from None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import Executor, as_completed
+from concurrent.futures import Executor
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -13,6 +13,7 @@ from typing import Any
 
 import pandas as pd
 
+from pbrl_ppl.background import as_ended
 from pbrl_ppl.criticism import NOT_CONVERGED, UNEXPLAINED, check_folder
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.errors import OutputError, PbrlError
@@ -179,7 +180,7 @@ def close_loop_many(
     tasks = {log: partial(settle, log, folder, settings, inputs[log.name], run) for log in left}
     write = partial(_write_summary, folder, source)
     write(_ordered(logs, rows), {}, {})
-    with closing(_results(tasks, executor)) as results:
+    with closing(as_ended(tasks, executor)) as results:
         for log, result in results:
             try:
                 row = result()
@@ -198,20 +199,6 @@ def _row_in_words(row: Mapping[str, Any]) -> str:
         return f"{row['name']}: failed: {row['message']}"
     found = ", ".join(f"{each['effect']}[{each['body']}]" for each in row["effects"])
     return f"{row['name']}: {row['verdict']}{f' ({found})' if found else ''}, {row['seconds']:g} s"
-
-
-def _results(tasks: Mapping[Log, Callable[[], Any]], executor: Executor | None) -> Any:
-    """Yield each task's log, and a call that returns its row or raises its error."""
-    if executor is None:
-        yield from tasks.items()
-        return
-    futures = {executor.submit(task): log for log, task in tasks.items()}
-    try:
-        for future in as_completed(futures):
-            yield futures[future], future.result
-    finally:
-        for future in futures:
-            future.cancel()
 
 
 def _ordered(logs: Iterable[Log], rows: Mapping[str, Any]) -> tuple[Mapping[str, Any], ...]:

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Generator, Iterable, Mapping
-from concurrent.futures import Executor, as_completed
+from collections.abc import Iterable, Mapping
+from concurrent.futures import Executor
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -21,6 +21,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
+from pbrl_ppl.background import as_ended
 from pbrl_ppl.effects import Attached, Effect
 from pbrl_ppl.errors import FitError, OutputError
 from pbrl_ppl.files import write_text
@@ -181,7 +182,7 @@ def calibrate(
         else:
             fit_seed = int(np.random.SeedSequence([seed, i]).generate_state(1)[0])
             tasks[i] = partial(replicate, design, truth, fit_seed, settings)
-    with closing(_results(tasks, executor)) as results:
+    with closing(as_ended(tasks, executor)) as results:
         shown = track(
             results,
             f"calibrating, {len(done)} of {replications} done before",
@@ -217,20 +218,6 @@ def calibrate(
         attrs={key: json.dumps(value) for key, value in about.items()} | {"redrawn": redrawn},
         **columns,
     )
-
-
-def _results(tasks: Mapping[int, Any], executor: Executor | None) -> Generator[tuple[int, Any]]:
-    """Yield each task's number, and a call that gives its result or raises its error."""
-    if executor is None:
-        yield from tasks.items()
-        return
-    futures = {executor.submit(task): i for i, task in tasks.items()}
-    try:
-        for future in as_completed(futures):
-            yield futures[future], future.result
-    finally:
-        for future in futures:
-            future.cancel()
 
 
 def _about(design: Problem, seed: int, settings: Mapping[str, Any]) -> dict[str, Any]:
