@@ -31,7 +31,7 @@ from pytensor.graph.op import Op
 import pbrl_ppl as pp
 from pbrl_ppl.history import lever
 from pbrl_ppl.likelihood import Problem
-from pbrl_ppl.model.density import next_state_logp
+from pbrl_ppl.model import LogLikelihoodOp
 from pbrl_ppl.model.table1 import random_variable
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.parameters import WHEEL_PARAMETERS
@@ -281,9 +281,7 @@ def plain_model(model: pm.Model) -> pm.Model:
         )
         median, spread = problem.noise_prior
         sigma = pm.LogNormal("sigma", mu=np.log(median), sigma=spread, dims="state")
-        logp = next_state_logp(
-            problem.observations.values, loop(phi), sigma, problem.observations, None
-        )
+        logp = LogLikelihoodOp(problem)(problem.observations.values, loop(phi), sigma, phi)
         pm.Potential("likelihood", logp.sum())
     return plain
 

@@ -14,7 +14,6 @@ from .data import least_noise as least_noise
 from .data import sigma_prior as sigma_prior
 from .declared import KINDS as KINDS
 from .declared import declared_problem as declared_problem
-from .likelihood import GAUSSIAN as GAUSSIAN
 from .likelihood import Likelihood as Likelihood
 from .likelihood import NoisePrior as NoisePrior
 from .likelihood import TrajectoryLikelihood as TrajectoryLikelihood
@@ -48,6 +47,5 @@ from .smoothing import single_transitions as single_transitions
 from .smoothing import smoothed as smoothed
 from .smoothing import with_sensitivity as with_sensitivity
 from .tails import degrees_of_freedom as degrees_of_freedom
-from .tails import sum_tails as sum_tails
 from .tails import tail_places as tail_places
 from .trajectory_noise import TrajectoryNoise as TrajectoryNoise

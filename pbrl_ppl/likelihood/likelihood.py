@@ -132,6 +132,28 @@ class Likelihood(ABC):
         return robust(self.whiten(residual, sigma), self.whitened_nu(nu, residual.shape))
 
     @abstractmethod
+    def unwhitened_slope(self, pull: Floats, sigma: Floats, shape: tuple[int, ...]) -> Floats:
+        """Return a slope by the residual, of this shape, from minus that by whitened residuals.
+
+        ``pull`` has the shape of :meth:`whiten`.
+        """
+
+    def slope(
+        self, residual: Floats, sigma: Floats, nu: float | Floats | None, weights: Floats
+    ) -> Floats:
+        """Return the derivative of the sum of weighted log-densities by the residual.
+
+        ``weights`` has shape (transition,); the result that of ``residual``.
+        """
+        pull = self.whiten(residual, sigma)
+        nus = self.whitened_nu(nu, residual.shape)
+        if nus is not None:
+            heavy = np.less(nus, GAUSSIAN)
+            nus = np.where(heavy, nus, 1.0)
+            pull = np.where(heavy, (nus + 1) * pull / (nus + pull**2), pull)
+        return self.unwhitened_slope(pull * weights[:, None], sigma, residual.shape)
+
+    @abstractmethod
     def log_density(
         self, residual: Floats, sigma: Floats, measured: Bools, nu: float | Floats | None = None
     ) -> Floats:
@@ -222,6 +244,10 @@ class TransitionLikelihood(Likelihood):
         scaled = residual / np.asarray(sigma)[..., None, None, None, :]
         return np.asarray(scaled.reshape(*scaled.shape[:-3], -1))
 
+    def unwhitened_slope(self, pull: Floats, sigma: Floats, shape: tuple[int, ...]) -> Floats:
+        """Return minus the pull over sigma."""
+        return -pull.reshape(shape) / sigma
+
     def whitened_nu(
         self, nu: float | Floats | None, shape: tuple[int, ...]
     ) -> float | Floats | None:
@@ -296,21 +322,12 @@ class TrajectoryLikelihood(Likelihood):
             return self
         return replace(self, noise=replace(self.noise, measured=measured))
 
-    def slopes(self, residual: Floats, pull: Floats, sigma: Floats) -> tuple[Floats, Floats]:
-        """Return derivatives of the log-density by deviation and residual, shapes of the latter.
-
-        ``pull`` is minus its derivative by the whitened residuals, shape as of :meth:`whiten`.
-        """
-        noise = self.noise
-        by_cell = noise.pulled(pull, sigma)
-        by_deviation, by_residual = np.zeros_like(residual), np.zeros_like(residual)
-        body, place = noise.cells.in_residual
-        by_residual[:, 0, body, place] = by_cell
-        # a measurement moved is a linearised state moved: this residual grows, the next shrinks
-        following = np.where(noise.last[:, None], 0.0, np.roll(by_cell, -1, axis=0))
-        slope = np.roll(noise.slope, -1, axis=0)
-        by_deviation[:, 0, body, place] = by_cell - np.einsum("kab,ka->kb", slope, following)
-        return by_deviation, by_residual
+    def unwhitened_slope(self, pull: Floats, sigma: Floats, shape: tuple[int, ...]) -> Floats:
+        """Return the adjoint of the filter."""
+        result = np.zeros(shape)
+        body, place = self.noise.cells.in_residual
+        result[:, 0, body, place] = self.noise.pulled(pull, sigma)
+        return result
 
     def whiten(self, residual: Floats, sigma: Floats) -> Floats:
         """Return the innovations over their standard deviations."""

@@ -209,13 +209,13 @@ class OutputErrorLikelihood(Likelihood):
         moved = np.einsum("phkdc,pc->phkd", starts.slope, change[..., 0])
         return np.asarray(predicted + moved + sigma * rng.standard_normal(predicted.shape))
 
-    def slopes(self, residual: Floats, pull: Floats, sigma: Floats) -> tuple[Floats, Floats]:
-        """Return derivatives by deviation (none) and residual; see `TrajectoryLikelihood`."""
+    def unwhitened_slope(self, pull: Floats, sigma: Floats, shape: tuple[int, ...]) -> Floats:
+        """Return what start states do not take up, over minus sigma and the root of tau."""
         weight = 1.0 / (np.asarray(sigma) * np.sqrt(self.tau))
         u, _ = self.starts.basis(weight)
         kept = pull - (u @ (np.swapaxes(u, 1, 2) @ pull[..., None]))[..., 0]
         kept = kept[:, : kept.shape[1] - len(self.starts.column)]
-        return np.zeros_like(residual), -kept.reshape(residual.shape) * weight
+        return -kept.reshape(shape) * weight
 
     def unwhitened(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
         """Return projected residuals of the pieces and of their starts, SI units.

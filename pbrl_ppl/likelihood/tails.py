@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from pbrl_ppl.effects import Attached, Noise, at_stage
+from pbrl_ppl.effects import Noise, at_stage
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.state import Floats
 
@@ -40,26 +38,14 @@ def degrees_of_freedom(physics: Physics, phi: Floats, nu: float | None) -> Float
         Gaussian.
     """
     labels = physics.layout.labels
-
-    def value(attached: Attached, variable: str) -> Floats:
-        return np.asarray(phi[..., labels.index(f"{variable}[{attached.body}]")])
-
-    zero = np.full(phi.shape[:-1], 0.0 if nu is None else 1.0 / nu)
-    tails = np.stack(sum_tails(physics, value, zero), axis=-1)[..., None, None, :, None]
+    tails = np.zeros((*phi.shape[:-1], 1, 1, len(physics.scene.moving), 1))
+    tails += 0.0 if nu is None else 1.0 / nu
+    for i, body in enumerate(physics.scene.moving):
+        for attached in at_stage(physics.effects, Noise):
+            if attached.body == body.name and isinstance(attached.effect.stage, Noise):
+                values = (phi[..., labels.index(label)] for label in attached.labels)
+                names = (parameter.name for parameter in attached.effect.parameters)
+                own = attached.effect.stage.tail(dict(zip(names, values, strict=True)))
+                tails[..., 0, 0, i, 0] += own
     with np.errstate(divide="ignore"):
         return np.asarray(1.0 / np.maximum(tails, 0.0))
-
-
-def sum_tails(physics: Physics, value: Any, zero: Any) -> list[Any]:
-    """Return the sum of the effects' tails of each body; ``value`` gives a parameter."""
-    acting = at_stage(physics.effects, Noise)
-    result = []
-    for body in physics.scene.moving:
-        tail = zero
-        for attached in acting:
-            if attached.body == body.name and isinstance(attached.effect.stage, Noise):
-                names = [parameter.name for parameter in attached.effect.parameters]
-                values = [value(attached, variable) for variable in attached.variables]
-                tail = tail + attached.effect.stage.tail(dict(zip(names, values, strict=True)))
-        result.append(tail)
-    return result

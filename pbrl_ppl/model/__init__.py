@@ -3,4 +3,5 @@
 from .declaration import PhysicsModel as PhysicsModel
 from .declaration import build_model as build_model
 from .declaration import prior_predictive_draws as prior_predictive_draws
+from .op import LogLikelihoodOp as LogLikelihoodOp
 from .op import SimulatorOp as SimulatorOp

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pymc as pm
@@ -15,16 +15,12 @@ from pbrl_ppl.likelihood import (
     ACCELERATION,
     CONTACT,
     DRIFT,
-    Likelihood,
-    Observations,
     Problem,
 )
-from pbrl_ppl.model.density import difference, next_state_logp, tail_tensor
-from pbrl_ppl.model.op import OneWorldOp, SimulatorOp
+from pbrl_ppl.model.op import LogLikelihoodOp, SimulatorOp
 from pbrl_ppl.model.table1 import random_variable
-from pbrl_ppl.model.trajectory_op import Correlated, TrajectoryDensityOp
 from pbrl_ppl.parameters import Block, Layout, ParameterLibrary
-from pbrl_ppl.state import INPUT, STATE
+from pbrl_ppl.state import INPUT, STATE, Floats
 
 #: Dimensions of the noise variables along trajectories.
 _NOISE_DIMS = {
@@ -78,18 +74,18 @@ def build_model(problem: Problem, mode: Any = None) -> PhysicsModel:
         # bodies of independent parts never meet in the likelihood; in draws they may
         whole = predicted
         if len(problem.simulator.parts) > 1:
-            whole = OneWorldOp(physics, sensitivity)(phi, start, actions)[..., columns]
-        nu = problem.likelihood.nu
-        tail = [tail_tensor(physics, table1, nu)] if problem.tails else []
+            world = SimulatorOp(physics, sensitivity, one_world=True)
+            whole = world(phi, start, actions)[..., columns]
+        log_likelihood = LogLikelihoodOp(problem)
         pm.CustomDist(
             "next_state",
             predicted,
             whole,
             sigma,
-            *tail,
-            logp=partial(_log_density, problem.likelihood, observations),
-            random=partial(_random, problem.likelihood, np.nan_to_num(observations.values)),
-            signature=_signature(problem),
+            phi,
+            logp=lambda value, predicted, _, *noise: log_likelihood(value, predicted, *noise),
+            random=partial(_random, problem),
+            signature="(n,h,k,d),(n,h,k,d),(m),(p)->(n,h,k,d)",
             observed=np.nan_to_num(problem.measured),
             dims=("transition", "step", "body", "state"),
         )
@@ -169,54 +165,18 @@ def _index(block: Block, layout: Layout, variables: dict[str, Any]) -> Any:
     return pt.stack(held)
 
 
-def _signature(problem: Problem) -> str:
-    """Return core dimensions: of one transition, or of all where they are correlated."""
-    tail = ",(k)" * bool(problem.tails)
-    if problem.likelihood.independent:
-        return f"(h,k,d),(h,k,d),(d){tail}->(h,k,d)"
-    return f"(n,h,k,d),(n,h,k,d),(m){tail}->(n,h,k,d)"
-
-
-def _log_density(
-    likelihood: Likelihood,
-    observations: Observations,
-    value: Any,
-    predicted: Any,
-    whole: Any,
-    sigma: Any,
-    tail: Any = None,
-) -> Any:
-    """Return the log-density of measurements about predictions in parts; ``whole`` is for draws."""
-    nu = likelihood.nu
-    if likelihood.independent:
-        return next_state_logp(value, predicted, sigma, observations, nu, tail)
-    if tail is None:
-        tail = np.full(observations.values.shape[2], 0.0 if nu is None else 1.0 / nu)
-    linearised = pt.as_tensor(np.nan_to_num(observations.values))
-    if likelihood.simulated:  # states follow the simulation
-        linearised, predicted = value, pt.switch(observations.measured, predicted, value)
-    deviation = difference(value, linearised, observations)
-    residual = difference(linearised, predicted, observations)
-    return TrajectoryDensityOp(cast(Correlated, likelihood))(deviation, residual, sigma, tail)
-
-
 def _random(
-    likelihood: Likelihood,
-    linearised: NDArray[np.float64],
-    predicted: Any,
-    whole: Any,
-    sigma: Any,
-    *tail: Any,
-    rng: np.random.Generator | None = None,
-    size: Any = None,
-) -> Any:
+    problem: Problem,
+    predicted: Floats,
+    whole: Floats,
+    sigma: Floats,
+    phi: Floats,
+    rng: np.random.Generator,
+    size: None = None,
+) -> Floats:
     """Draw measurements about the predictions of one world."""
-    nu: Any = likelihood.nu
-    if tail:
-        with np.errstate(divide="ignore"):
-            nu = 1.0 / np.asarray(tail[0], dtype=float)[..., :, None]
-    rng = rng or np.random.default_rng()
-    return likelihood.random(whole, linearised, sigma, rng, nu)
+    linearised = np.nan_to_num(problem.observations.values)
+    return problem.likelihood.random(whole, linearised, sigma, rng, problem.nu(phi))
 
 
 def _coords(problem: Problem) -> dict[str, Any]:

@@ -1,48 +1,126 @@
-"""The engine as a black-box pytensor Op, with its derivative and numba dispatch."""
+"""Black-box pytensor Ops of the engine and of a log-likelihood, with their derivatives."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
-from functools import cached_property, partial
-from typing import Any
+from functools import cached_property
+from typing import Any, ClassVar, cast
 
-import numba
 import numpy as np
 import pytensor.tensor as pt
 from pytensor.gradient import grad_undefined
 from pytensor.graph.basic import Apply
 from pytensor.graph.op import Op
-from pytensor.link.numba.dispatch.basic import numba_funcify
+from pytensor.link.numba.dispatch.basic import generate_fallback_impl, numba_funcify
 
 from pbrl_ppl.errors import ParameterError, SimulationError
-from pbrl_ppl.likelihood import Sensitivity
+from pbrl_ppl.likelihood import Problem, Sensitivity
 from pbrl_ppl.physics import Memory, Physics
 from pbrl_ppl.state import INPUT, WRENCH, Floats
 
 
-class _EngineOp(Op):
-    """Base class of the prediction and its derivative: checks inputs and dispatches."""
+class _BlackBoxOp(Op):
+    """An Op of one output that numpy computes, with the pullback of some inputs.
 
-    __props__ = ("physics", "sensitivity")
+    Attributes
+    ----------
+    evaluate : callable
+        Returns the output for the inputs.
+    pulled : callable
+        Returns derivatives by the differentiable inputs for the inputs and a cotangent.
+    differentiable, reason
+        Places of those inputs, and why there is no derivative by the others.
+    """
 
-    def __init__(self, physics: Physics, sensitivity: Sensitivity | None = None) -> None:
-        self.physics, self.sensitivity = physics, sensitivity
+    evaluate: Callable[..., Floats]
+    pulled: Callable[..., list[Floats]]
+    differentiable: ClassVar[tuple[int, ...]]
+    reason: ClassVar[str]
 
-    @property
-    def _last(self) -> tuple[int, ...]:
-        """Last dimensions of the output, after (transition, H)."""
-        raise NotImplementedError
+    def perform(self, node: Apply, inputs: Sequence[Floats], outputs: Any) -> None:
+        """Compute the output."""
+        outputs[0][0] = self.evaluate(*inputs)
 
-    def _compute(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
-        raise NotImplementedError
+    def pullback(
+        self, inputs: Sequence[Any], outputs: Sequence[Any], cotangents: Sequence[Any]
+    ) -> list[Any]:
+        """Return the vector-Jacobian products by the inputs."""
+        found = _PullbackOp(self)(*inputs, cotangents[0], return_list=True)
+        by = dict(zip(self.differentiable, found, strict=True))
+        return [
+            by[i] if i in by else grad_undefined(self, i, variable, self.reason)
+            for i, variable in enumerate(inputs)
+        ]
 
-    def _following(
-        self, engine: Callable[..., Floats], phi: Floats, start: Floats, actions: Floats
-    ) -> Floats:
-        """Return predictions of an engine from start states that follow phi."""
-        if self.sensitivity is None:
-            return engine(phi, start, actions)
-        return self.sensitivity.predicted(engine, phi, start, actions)
+    L_op = pullback  # its name in pytensor 2
+
+
+class _PullbackOp(Op):
+    """Derivative of a black-box Op's output times a cotangent, the last input."""
+
+    __props__ = ("op",)
+
+    def __init__(self, op: _BlackBoxOp) -> None:
+        self.op = op
+
+    def make_node(self, *inputs: Any) -> Apply:
+        tensors = [pt.as_tensor_variable(value) for value in inputs]
+        return Apply(self, tensors, [tensors[i].type() for i in self.op.differentiable])
+
+    def infer_shape(self, *arguments: Any) -> list[tuple[Any, ...]]:
+        return [arguments[-1][i] for i in self.op.differentiable]
+
+    def perform(self, node: Apply, inputs: Sequence[Floats], outputs: Any) -> None:
+        for place, value in zip(outputs, self.op.pulled(*inputs), strict=True):
+            place[0] = value
+
+
+@numba_funcify.register(_BlackBoxOp)
+@numba_funcify.register(_PullbackOp)
+def _in_object_mode(op: Op, node: Any = None, **kwargs: Any) -> Any:
+    """Dispatch the Op in numba as pytensor does by itself, without its warning."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        return generate_fallback_impl(op, node=node, **kwargs)
+
+
+class SimulatorOp(_BlackBoxOp):
+    """``next_states = f(phi, start, actions)``, the deterministic part of Eq. 7.
+
+    Inputs are phi (p,), start states (transition, body, 6) and wrenches (transition, H, body, 3),
+    or all of :data:`pbrl_ppl.state.INPUT` in place of the 3; the output has shape (transition, H,
+    body, 6); all float64, in SI units. A transition in which the engine diverges is NaN, and so is
+    everything where phi is impossible (a mass that is not positive, say): the likelihood of that is
+    zero. The derivative by phi is by finite differences, all columns in one call of the engine. It
+    leaves out that start states follow phi: the correction to the smoothed starts cancels that.
+
+    Parameters
+    ----------
+    physics : Physics
+        Scene, effects and the engine's settings.
+    sensitivity : Sensitivity, optional
+        Derivative of smoothed start states of whole trajectories by phi.
+    engine : str, optional
+        ``chipmunk`` or ``contact-free`` to force one; see :class:`Physics`.
+    one_world : bool
+        Let bodies of independent parts meet, as draws of next states do.
+    """
+
+    __props__ = ("physics", "sensitivity", "one_world")
+    differentiable = (0,)
+    reason = "the engine is differentiated by phi alone"
+
+    def __init__(
+        self,
+        physics: Physics,
+        sensitivity: Sensitivity | None = None,
+        *,
+        engine: str | None = None,
+        one_world: bool = False,
+    ) -> None:
+        self.physics = physics if engine is None else physics.changed(engine=engine)
+        self.sensitivity, self.one_world = sensitivity, one_world
 
     def make_node(self, phi: Any, start: Any, actions: Any) -> Apply:
         """Check the dimensions and static shapes of the inputs.
@@ -72,123 +150,121 @@ class _EngineOp(Op):
                     f"{type(self).__name__}: {name} has shape {static}, expected ({expected})"
                 )
             inputs.append(tensor)
-        return Apply(self, inputs, [pt.tensor(dtype="float64", shape=(None, None, *self._last))])
+        return Apply(self, inputs, [pt.tensor(dtype="float64", shape=(None, None, k, 6))])
 
     def infer_shape(self, *arguments: Any) -> list[tuple[Any, ...]]:
         """Return (transition, H) from the shape of the actions."""
         actions = arguments[-1][2]  # older stacks pass (fgraph, node, shapes), newer (node, shapes)
-        return [(actions[0], actions[1], *self._last)]
-
-    def perform(self, node: Apply, inputs: Any, outputs: Any) -> None:
-        """Run the engine."""
-        outputs[0][0] = self.predict(*inputs)
-
-    def predict(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
-        """Run the engine; NaN where phi is impossible."""
-        try:
-            return self._compute(phi, start, actions)
-        except ParameterError:  # samplers try such points: their likelihood is zero
-            return np.full((*actions.shape[:2], *self._last), np.nan)
-
-
-class SimulatorOp(_EngineOp):
-    """``next_states = f(phi, start, actions)``, the deterministic part of Eq. 7.
-
-    Inputs are phi (p,), start states (transition, body, 6) and wrenches (transition, H, body, 3),
-    or all of :data:`pbrl_ppl.state.INPUT` in place of the 3; the output has shape (transition, H,
-    body, 6); all float64, in SI units. A transition in which the engine diverges is NaN, and so is
-    everything where phi is impossible (a mass that is not positive, say): the likelihood of that is
-    zero. The derivative by phi is by finite differences, all columns in one call of the engine.
-
-    Parameters
-    ----------
-    physics : Physics
-        Scene, effects and the engine's settings.
-    sensitivity : Sensitivity, optional
-        Derivative of smoothed start states of whole trajectories by phi.
-    engine : str, optional
-        ``chipmunk`` or ``contact-free`` to force one; see :class:`Physics`.
-    """
-
-    def __init__(
-        self,
-        physics: Physics,
-        sensitivity: Sensitivity | None = None,
-        *,
-        engine: str | None = None,
-    ) -> None:
-        super().__init__(physics if engine is None else physics.changed(engine=engine), sensitivity)
-
-    @property
-    def _last(self) -> tuple[int, ...]:
-        return len(self.physics.scene.moving), 6
-
-    def _compute(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
-        if self.sensitivity is None:
-            return self.physics.simulator.recall(phi, start, actions)
-        follow = partial(self._following, self.physics.simulator.recall)
-        # a copy: a graph may write into its arrays
-        return self._memory.recall((phi, start, actions), follow).copy()
+        return [(*actions[:3], 6)]
 
     @cached_property
     def _memory(self) -> Memory:
         return Memory()
 
-    def pullback(
-        self, inputs: Sequence[Any], outputs: Sequence[Any], cotangents: Sequence[Any]
-    ) -> list[Any]:
-        """Return the vector-Jacobian product by phi; start states and actions are data."""
-        jacobian = JacobianOp(self.physics, self.sensitivity)(*inputs)
+    def evaluate(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
+        """Run the engine; NaN where phi is impossible."""
+        try:
+            if self.sensitivity is None:
+                return self._engine(phi, start, actions)
+            # a copy: a graph may write into its arrays
+            return self._memory.recall((phi, start, actions), self._following).copy()
+        except ParameterError:  # samplers try such points: their likelihood is zero
+            return np.full((*actions.shape[:3], 6), np.nan)
+
+    predict = evaluate
+
+    @property
+    def _engine(self) -> Callable[[Floats, Floats, Floats], Floats]:
+        return self.physics.one_world if self.one_world else self.physics.simulator.recall
+
+    def _following(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
+        """Return predictions from start states that follow phi."""
+        return cast(Sensitivity, self.sensitivity).predicted(self._engine, phi, start, actions)
+
+    def pulled(
+        self, phi: Floats, start: Floats, actions: Floats, cotangent: Floats
+    ) -> list[Floats]:
+        """Return the vector-Jacobian product by phi."""
+        try:
+            if self.sensitivity is not None:
+                start = self.sensitivity.begun(self.sensitivity.moved(phi), start)
+            return [np.tensordot(cotangent, self.physics.jacobian(phi, start, actions), 4)]
+        except ParameterError:
+            return [np.full(len(phi), np.nan)]
+
+
+class LogLikelihoodOp(_BlackBoxOp):
+    """Log-likelihood of each transition: Eq. 11, or its density given those before.
+
+    Inputs are measured and predicted next states, shape (transition, H, body, state) each, noise
+    parameters (parameter,) and phi (p,), which the tails of the noise may depend on; the output has
+    shape (transition,). The derivative by the predictions is the likelihood's adjoint, that by the
+    noise parameters and the tails is by finite differences.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its likelihood, and what was measured.
+    """
+
+    __props__ = ("problem",)
+    differentiable = (1, 2, 3)
+    reason = "the log-likelihood is not differentiated by what was measured"
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem, self._likelihood = problem, problem.likelihood
+
+    def make_node(self, *inputs: Any) -> Apply:
+        """Cast the inputs; shapes as in the class."""
+        tensors = [pt.cast(pt.as_tensor_variable(value), "float64") for value in inputs]
+        return Apply(self, tensors, [pt.vector(dtype="float64")])
+
+    def infer_shape(self, *arguments: Any) -> list[tuple[Any, ...]]:
+        """Return (transition,) from the shape of the measurements."""
+        return [(arguments[-1][0][0],)]
+
+    def _residual(self, value: Floats, predicted: Floats) -> Floats:
+        """Return residuals about the linearisation, and set the likelihood to the measurements."""
+        observations, likelihood = self.problem.observations, self.problem.likelihood
+        linearised = np.nan_to_num(observations.values) if likelihood.filtered else value
+        deviation = observations.wrapped(value - linearised)
+        self._likelihood = self._likelihood.measuring(deviation)  # kept, with its gains
+        residual = observations.wrapped(linearised - predicted)
+        return np.where(observations.measured, residual, 0.0)
+
+    def _density(self, residual: Floats, sigma: Floats, phi: Floats) -> Floats:
+        if not (np.isfinite(sigma).all() and (sigma > 0).all()):
+            return np.full(len(residual), -np.inf)
+        measured = self.problem.observations.measured
+        with np.errstate(all="ignore"):  # samplers try points where it overflows
+            return self._likelihood.log_density(residual, sigma, measured, self.problem.nu(phi))
+
+    def evaluate(self, value: Floats, predicted: Floats, sigma: Floats, phi: Floats) -> Floats:
+        """Return the log-likelihoods."""
+        return self._density(self._residual(value, predicted), sigma, phi)
+
+    def pulled(
+        self, value: Floats, predicted: Floats, sigma: Floats, phi: Floats, cotangent: Floats,
+        *, step: float = 1e-5,
+    ) -> list[Floats]:  # fmt: skip
+        """Return derivatives by predictions, noise and phi; ``step`` is relative in the noise."""
+        residual, nu = self._residual(value, predicted), self.problem.nu(phi)
+        slope = self._likelihood.slope(residual, sigma, nu, cotangent)
+
+        def by_differences(point: Floats, i: int, step: float, **others: Floats) -> float:
+            ends = [point.copy(), point.copy()]
+            ends[0][i] += step
+            ends[1][i] = max(point[i] - step, 0.0)
+            name = "sigma" if "phi" in others else "phi"
+            high, low = (self._density(residual, **{name: end}, **others) for end in ends)
+            return float((high - low) @ cotangent / (ends[0][i] - ends[1][i]))
+
+        by_sigma = [by_differences(sigma, i, step * x, phi=phi) for i, x in enumerate(sigma)]
+        by_phi = np.zeros_like(phi)
+        for i in self.problem.tails:
+            by_phi[i] = by_differences(phi, i, step, sigma=sigma)
         return [
-            (cotangents[0][..., None] * jacobian).sum(axis=(0, 1, 2, 3)),
-            *(
-                grad_undefined(self, i, inputs[i], "the engine is differentiated by phi alone")
-                for i in (1, 2)
-            ),
+            np.where(self.problem.observations.measured, -slope, 0.0),
+            np.array(by_sigma),
+            by_phi,
         ]
-
-    L_op = pullback  # its name in pytensor 2
-
-
-class OneWorldOp(_EngineOp):
-    """As :class:`SimulatorOp`, but bodies of different parts may meet; without a derivative.
-
-    Draws of next states (prior and posterior predictive) are about its predictions.
-    """
-
-    @property
-    def _last(self) -> tuple[int, ...]:
-        return len(self.physics.scene.moving), 6
-
-    def _compute(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
-        return self._following(self.physics.one_world, phi, start, actions)
-
-
-class JacobianOp(_EngineOp):
-    """Derivative of :class:`SimulatorOp` by phi, shape (transition, H, body, 6, p).
-
-    It leaves out that start states follow phi: the correction to the smoothed starts cancels that.
-    """
-
-    @property
-    def _last(self) -> tuple[int, ...]:
-        return len(self.physics.scene.moving), 6, self.physics.layout.size
-
-    def _compute(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
-        if self.sensitivity is not None:
-            start = self.sensitivity.begun(self.sensitivity.moved(phi), start)
-        return self.physics.jacobian(phi, start, actions)
-
-
-@numba_funcify.register(_EngineOp)
-def _numba_engine(op: _EngineOp, node: Any = None, **kwargs: Any) -> Any:
-    """Dispatch the Op in numba: a call in object mode."""
-    kind = numba.types.Array(numba.float64, 2 + len(op._last), "C")
-
-    @numba.njit
-    def simulate(phi, start, actions):  # type: ignore[no-untyped-def]
-        with numba.objmode(result=kind):
-            result = op.predict(phi, start, actions)
-        return result
-
-    return simulate

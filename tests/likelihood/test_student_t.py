@@ -9,7 +9,7 @@ from scipy.stats import t as student
 
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import TransitionLikelihood, next_state_random, robust
-from pbrl_ppl.model.density import next_state_logp
+from pbrl_ppl.model import LogLikelihoodOp
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.posterior import draws
 from pbrl_ppl.sampling import fit, physics_model
@@ -55,12 +55,13 @@ def test_density() -> None:
 
 
 def test_the_model_s_density_is_the_same(scene, clean) -> None:
-    """PyTensor's expression against numpy's, at one point."""
+    """The Op against numpy, at one point."""
     problem = physics_model(scene, clean, nu=NU).problem
-    predicted = problem.predict(problem.layout.to_vector(CART))[..., problem.observations.columns]
-    value, mean = (pt.as_tensor(each) for each in (problem.observations.values, predicted))
-    found = next_state_logp(value, mean, np.array(NOISE), problem.observations, NU).eval()
-    residual = problem.residual(problem.layout.to_vector(CART))
+    phi = problem.layout.to_vector(CART)
+    mean = problem.predict(phi)[..., problem.observations.columns]
+    value, sigma = problem.observations.values, np.array(NOISE)
+    found = LogLikelihoodOp(problem)(*map(pt.as_tensor, (value, mean, sigma, phi))).eval()
+    residual = problem.residual(phi)
     np.testing.assert_allclose(found, problem.log_density(residual, np.array(NOISE)))
 
 

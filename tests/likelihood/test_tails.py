@@ -73,6 +73,20 @@ def test_pymc_says_the_same(model) -> None:
     np.testing.assert_allclose(density(given), log_posterior(problem, phi, SIGMA), rtol=1e-6)
 
 
+def test_the_tail_has_a_gradient(model) -> None:
+    name = next(name for name in model.initial_point() if name.startswith("heavy_tails"))
+    point = model.initial_point()
+    logp = model.compile_logp(vars=model.observed_RVs)
+    gradient = model.compile_dlogp(vars=[model["heavy_tails_inverse_nu"]])(point)
+    ends = [float(logp(point | {name: point[name] + h})) for h in (1e-5, -1e-5)]
+    prior = model.compile_logp(vars=[model["heavy_tails_inverse_nu"]])
+    ends = [
+        end + float(prior(point | {name: point[name] + h}))
+        for end, h in zip(ends, (1e-5, -1e-5), strict=True)
+    ]
+    assert gradient.item() == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-4)
+
+
 def test_without_parameters_there_is_no_tail(model) -> None:
     problem = model.problem
     with pytest.raises(ParameterError, match="give phi"):

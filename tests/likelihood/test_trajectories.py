@@ -16,11 +16,11 @@ from pbrl_ppl.likelihood import (
     along_trajectories,
     declared_problem,
     simulated_trajectories,
+    single_transitions,
     smoothed,
     with_measurements,
 )
-from pbrl_ppl.model import build_model
-from pbrl_ppl.model.trajectory_op import TrajectoryDensityOp
+from pbrl_ppl.model import LogLikelihoodOp, build_model
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.scene import Body, Scene, Shape
@@ -173,29 +173,32 @@ def test_smoothing_stops_where_no_motion_fits(problem) -> None:
     np.testing.assert_array_equal(again.data.smoothed_states, states)
 
 
-def test_derivative_is_that_of_differences(problem) -> None:
-    given = [pt.tensor4("deviation"), pt.tensor4("residual"), pt.vector("sigma"), pt.vector("tail")]
-    weights = np.random.default_rng(2).normal(size=problem.segments.n)
-    total = (TrajectoryDensityOp(problem.likelihood)(*given) * weights).sum()
-    value = function(given, total)
-    slopes = function(given, pt.grad(total, given[:3]))
-    deviation = problem.measured - problem.observations.values
+@pytest.mark.parametrize("likelihood", ["transitions", "trajectories"])
+@pytest.mark.parametrize("nu", [None, 5.0])
+def test_derivative_is_that_of_differences(problem, likelihood, nu) -> None:
+    if likelihood == "transitions":
+        problem = single_transitions(problem)
+    problem = problem.with_likelihood(nu=nu)
+    given = [pt.tensor4("value"), pt.tensor4("predicted"), pt.vector("sigma"), pt.vector("phi")]
     rng = np.random.default_rng(3)
-    at = problem.residual(PHI) + 1e-3 * rng.normal(size=problem.residual(PHI).shape)
-    for nu in (0.0, 0.2):
-        tails = np.array([nu])
-        point = deviation, at, NOISE
-        slope = slopes(*point, tails)
-        for _ in range(5):
-            for i, size in enumerate((1e-6, 1e-6, 1e-6 * NOISE)):
-                step = size * rng.normal(size=point[i].shape)
-                ends = [
-                    value(*(x + sign * step if j == i else x for j, x in enumerate(point)), tails)
-                    for sign in (1, -1)
-                ]
-                np.testing.assert_allclose(
-                    2 * (slope[i] * step).sum(), ends[0] - ends[1], rtol=1e-4
-                )
+    weights = rng.normal(size=problem.segments.n)
+    total = (LogLikelihoodOp(problem)(*given) * weights).sum()
+    value = function(given, total)
+    slopes = function(given, pt.grad(total, given[1:3]))
+    states = problem.predict(PHI)[..., problem.observations.columns]
+    predicted = states + 1e-3 * rng.normal(size=states.shape)
+    noise = NOISE[: len(problem.noise_labels)]
+    point = problem.measured, predicted, noise, PHI
+    slope = slopes(*point)
+    for _ in range(5):
+        for i, size in ((1, 1e-6), (2, 1e-6 * noise)):
+            step = size * rng.normal(size=point[i].shape)
+            ends = [
+                value(*(x + sign * step if j == i else x for j, x in enumerate(point)))
+                for sign in (1, -1)
+            ]
+            expected = pytest.approx(ends[0] - ends[1], rel=1e-4)
+            assert 2 * (slope[i - 1] * step).sum() == expected
 
 
 def density_of_the_model(problem) -> float:
