@@ -39,7 +39,7 @@ from pbrl_ppl.state import Floats, Ints
 #: shape (draw, transition), chains joined, which need not be evaluated anew.
 PARETO_K, LIKELIHOOD = "pareto_k", "log_likelihood"
 #: Further attributes of a trace that the posterior keeps.
-_SAMPLED = ("proposals", "rungs", "acceptance", "log_evidence")
+_SAMPLED = ("proposals", "rungs", "acceptance", "log_evidence", "updates")
 #: Pareto k of weights above which they miss a part of the posterior (Vehtari et al., 2024).
 MAX_PARETO_K = 0.7
 #: Largest R-hat and least effective sample size of reliable summaries (Vehtari et al., 2021).
@@ -182,7 +182,7 @@ def evaluate(
         for i in rows[(begin <= rows) & (rows < begin + size)]:
             states = wide.predict(phi[i], wide.one_world)
             predictive.append(problem.next_states(states, sigma[i], rng, phi[i]))
-    return likelihood, np.stack(predictive)
+    return likelihood, np.array(predictive)
 
 
 def parameter_draws(problem: Problem, trace: Any) -> tuple[Floats, Floats]:

@@ -205,8 +205,8 @@ def by_number(idata: Any) -> Any:
     Raises
     ------
     PosteriorError
-        If a group is missing, the draws were reweighted by :func:`pbrl_ppl.update`, or the
-        likelihood is of whole trajectories, whose transitions cannot be left out one by one.
+        If a group is missing, or the likelihood is of whole trajectories, whose transitions cannot
+        be left out one by one.
 
     Examples
     --------
@@ -215,7 +215,6 @@ def by_number(idata: Any) -> Any:
         az.plot_loo_pit(pp.by_number(idata), y="next_state")  # ArviZ 0.x
         az.plot_loo_pit(pp.by_number(idata))  # ArviZ 1.x
     """
-    _check_not_reweighted(idata, "by_number")
     if left_out(idata) == "trajectory":
         raise PosteriorError(
             "by_number: the posterior is of whole trajectories, whose later transitions have seen"
@@ -271,10 +270,8 @@ def loo_pit(idata: Any) -> xr.DataArray:
     Raises
     ------
     PosteriorError
-        If it lacks a group, or its draws were reweighted by :func:`pbrl_ppl.update`, after which
-        the predictions are no longer those of single draws.
+        If it lacks a group.
     """
-    _check_not_reweighted(idata, "loo_pit")
     predictive = group(idata, "posterior_predictive")
     rows = predicted_rows(group(idata, "posterior"), predictive)
     samples = {"sample": ("chain", "draw")}
@@ -287,15 +284,6 @@ def loo_pit(idata: Any) -> xr.DataArray:
     weights /= weights.sum(axis=0)
     below = np.einsum("rt,rthbs->thbs", weights, _deviations(predicted, measured) <= 0.0)
     return measured.copy(data=np.where(np.isfinite(measured), below, np.nan))
-
-
-def _check_not_reweighted(idata: Any, what: str) -> None:
-    """Refuse a posterior whose predictions are not those of single draws."""
-    if "before_updates" in groups(idata):
-        raise PosteriorError(
-            f"{what}: the draws were reweighted by update and do not belong to single predictions;"
-            " fit all data anew"
-        )
 
 
 def _deviations(predicted: xr.DataArray, measured: xr.DataArray) -> Floats:

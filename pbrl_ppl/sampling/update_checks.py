@@ -18,27 +18,12 @@ from pbrl_ppl.posterior import (
 )
 from pbrl_ppl.state import STATE, Floats
 
-#: Fewest draws to resample from.
-_LEAST_DRAWS = 100
-#: Largest difference between stored and recomputed log-likelihoods of a transition (nats).
-_SAME = 0.01
-#: Transitions whose likelihoods are recomputed, at one draw.
-_CHECKED = 50
-#: Difference of mean log-likelihood, in standard errors, from which new data are predicted worse.
-_WORSE = 3.0
-
 
 def check_posterior(idata: Any, history: History) -> PosteriorRecord:
     """Return the record of a posterior; refuse posteriors and data that an update cannot use."""
     for name in ("log_likelihood", "posterior_predictive", "observed_data", "constant_data"):
         group(idata, name)
     record = PosteriorRecord.of(idata)
-    sizes = group(idata, "posterior").sizes
-    if sizes["chain"] * sizes["draw"] < _LEAST_DRAWS:
-        raise PosteriorError(
-            f"update: the posterior has {sizes['chain'] * sizes['draw']} draws, expected at least"
-            f" {_LEAST_DRAWS} to choose from; fit with a method that samples"
-        )
     known = [record.data_sha256]
     for entry in record.updates or ():
         known += [entry["data_sha256"], entry["before_sha256"]]
@@ -96,10 +81,24 @@ def check_history(idata: Any, record: PosteriorRecord, history: History) -> None
         )
 
 
-def check_engine(idata: Any, problem: Problem) -> None:
-    """Refuse a posterior whose stored likelihoods are not what this problem's engine gives."""
+def check_engine(
+    idata: Any, problem: Problem, *, transitions: int = 50, tolerance: float = 0.01
+) -> None:
+    """Refuse a posterior whose stored likelihoods are not what this problem's engine gives.
+
+    Parameters
+    ----------
+    idata : InferenceData or DataTree
+        The posterior.
+    problem : Problem
+        Of the same parameters; its data do not matter.
+    transitions : int
+        How many likelihoods are computed again, at the first draw.
+    tolerance : float
+        Largest median difference from the stored ones (nats).
+    """
     whole = "smoothed" in group(idata, "constant_data")  # neighbours depend on each other
-    some = {"transition": slice(None if whole else _CHECKED)}
+    some = {"transition": slice(None if whole else transitions)}
     few = {name: group(idata, name).isel(some) for name in ("observed_data", "constant_data")}
     held = from_groups(few | {"posterior": group(idata, "posterior")}, idata.attrs)
     first = problem_of(held, {attached.effect for attached in problem.physics.effects})
@@ -107,7 +106,7 @@ def check_engine(idata: Any, problem: Problem) -> None:
     now = first.log_density(first.residual(phi[0]), sigma[0], phi[0])
     then = group(idata, "log_likelihood")["next_state"].isel(chain=0, draw=0).to_numpy()
     off = float(np.median(np.abs(now - then[: len(now)])))
-    if not off < _SAME:
+    if not off < tolerance:
         raise PosteriorError(
             f"update: the posterior's likelihoods are not what this engine gives (half of them are"
             f" off by {off:.2g} or more): it was made with other effects or another"
@@ -115,17 +114,20 @@ def check_engine(idata: Any, problem: Problem) -> None:
         )
 
 
-def judgement(held: Floats, new: Floats) -> str:
+def judgement(held: Floats, new: Floats, worse: float = 3.0) -> str:
     """Return a text on whether new transitions may be of the same bodies as the posterior's.
 
     Parameters
     ----------
     held, new : ndarray
         Log-likelihoods of transitions, shape (..., transition), the draws first.
+    worse : float
+        Fall of the mean log-likelihood, in standard errors, from which new data are predicted
+        worse.
     """
     old, others = (each.reshape(-1, each.shape[-1]).mean(axis=0) for each in (held, new))
     error = float(np.sqrt(old.var() / len(old) + others.var() / len(others)))
-    if not float(old.mean() - others.mean()) < _WORSE * error:
+    if not float(old.mean() - others.mean()) < worse * error:
         return "look whether they are of the same bodies, under the same conditions"
     return (
         "the posterior predicts them as well as its own data, so they may well be of the same"

@@ -103,7 +103,7 @@ def test_its_posterior_goes_on_with_what_is_recorded_after(adequate, clean) -> N
         warnings.simplefilter("ignore", ConvergenceWarning)  # of so few draws
         updated = pp.update(adequate.posterior_after, more, seed=1)
     (entry,) = json.loads(updated.attrs["updates"])
-    assert entry["did"] in ("reweighted", "moved")
+    assert entry["did"] in ("reweighted", "refitted")
     assert entry["transitions"] == 15
     before, after = (
         each["posterior"]["mass"].values for each in (adequate.posterior_after, updated)

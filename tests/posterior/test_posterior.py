@@ -300,7 +300,7 @@ OPTIONAL = {
     "mode": StoredMode({"mass[cart]": 0.1 + 0.2}, {"sigma[x]": 0.1}, -1.5, {"cart": "light"}),
     "linearisation": {"draws": 16, "sd": 0.1, "largest": 0.2, "trajectory": 0},
     "configurations": ({"joints": {"joint1": None}, "probability": 1.0},),
-    "updates": ({"did": "moved", "share": 0.3},),
+    "updates": ({"did": "reweighted", "share": 0.3},),
     "max_rhat": 1.002,
     "min_ess": 401.0,
     "warnings": ("one", "two"),

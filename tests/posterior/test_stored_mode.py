@@ -115,11 +115,12 @@ def test_a_mode_that_is_missing_or_incomplete_is_named(idata) -> None:
         Dynamics.of(broken)
 
 
-def test_an_update_climbs_to_the_mode_of_all_data() -> None:
+def test_an_update_climbs_to_the_mode_of_all_data(monkeypatch) -> None:
     """Of which the log-posterior is no lower than at the old mode."""
+    monkeypatch.setattr("pbrl_ppl.posterior.MIN_ESS", 30)
     before = quick(physics_model(ROOM, recorded(3, 8)), draws=2000)
     more = update(before, recorded(5, 1), progress=False)
-    assert json.loads(more.attrs["updates"])[-1]["did"] in ("reweighted", "moved")
+    assert json.loads(more.attrs["updates"])[-1]["did"] == "reweighted"
     problem = problem_of(more)
     old, new = stored_mode(problem, before), stored_mode(problem, more)
     heights = [float(log_posterior(problem, each.phi, each.sigma)) for each in (old, new)]
