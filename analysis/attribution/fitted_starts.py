@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.criticism.forecast import rollout
 from pbrl_ppl.history import History
-from pbrl_ppl.likelihood import Problem, cells_of, first_states
+from pbrl_ppl.likelihood import Problem, first_states, observed_coordinates
 from pbrl_ppl.scene import state_sizes
 from pbrl_ppl.state import STATE, THETA, wrapped
 
@@ -65,16 +65,16 @@ def _fitted(problem: Problem, phi: Floats, start: Floats, inputs: Floats, rows: 
 
     ``inputs`` has shape (n, rows - 1, body, 3 or 9), ``rows`` (n, rows, body, 6).
     """
-    cells = cells_of(problem.scene, problem.data.history)
-    steps, n, c = _STEP * cells.sizes(problem.scene), len(start), len(cells.places)
+    coordinates = observed_coordinates(problem.scene, problem.data.history)
+    steps, n, c = _STEP * coordinates.sizes(problem.scene), len(start), len(coordinates.places)
     weight = 1.0 / state_sizes(problem.scene)
-    start = cells.completed(problem.scene, start.copy())
+    start = coordinates.completed(problem.scene, start.copy())
 
     def moved(change: Floats) -> Floats:
         """Return start states (k, n, body, 6) moved by (k, n, cell)."""
         states = np.tile(start, (len(change), 1, 1, 1))
-        states.reshape(len(change), n, -1)[..., cells.places] += change
-        return cells.completed(problem.scene, states)
+        states.reshape(len(change), n, -1)[..., coordinates.places] += change
+        return coordinates.completed(problem.scene, states)
 
     def residuals(states: Floats) -> Floats:
         """Return weighted residuals (k, n, row) of states (k, n, body, 6)."""

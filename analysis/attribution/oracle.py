@@ -144,14 +144,14 @@ def _share(mode: Mode, case: Case) -> float:
     problem, null = mode.problem, mode.phi.copy()
     added = true_effect(case).on(str(case.on))
     null[[problem.layout.labels.index(label) for label in added.labels]] = added.effect.null
-    cells = problem.trajectory_noise.cells
-    change = cells.of((problem.predict(mode.phi) - problem.predict(null))[:, 0])
-    velocity = cells.places % len(STATE)
+    coordinates = problem.trajectory_noise.coordinates
+    change = coordinates.of((problem.predict(mode.phi) - problem.predict(null))[:, 0])
+    velocity = coordinates.places % len(STATE)
     square = np.nanmean(change**2, axis=0) / problem.scene.time_step**2
     sizes = bodies_acceleration(problem)
     return max(
         float(np.sqrt(square[velocity == d].mean())) / max(float(size), 1e-300)
-        for d, size in zip(cells.rates, sizes, strict=True)
+        for d, size in zip(coordinates.rates, sizes, strict=True)
     )
 
 

@@ -89,7 +89,7 @@ def correlation_tests(
     white, seen = mode.whitened_residual, noise.seen
     number = np.cumsum(noise.first.astype(np.intp))
     share = innovations_over_steps(mode)
-    scene, places = mode.problem.scene, noise.cells.places
+    scene, places = mode.problem.scene, noise.coordinates.places
     cells = [f"{STATE[p % len(STATE)]} of {scene.moving[p // len(STATE)].name}" for p in places]
     own = _lagged(white, seen, number, None, criteria)
     few = "too few pairs of intervals"

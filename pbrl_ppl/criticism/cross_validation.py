@@ -185,7 +185,7 @@ def forecast_squares(mode: Mode, fold: Ints, left_out: LeftOut, intervals: int) 
         Shape (fold, cell), SI units squared; NaN where no forecast begins, nothing was measured or
         one diverges.
     """
-    cells = len(mode.problem.trajectory_noise.cells.places)
+    cells = len(mode.problem.trajectory_noise.coordinates.places)
     squares = np.full((len(left_out.phi), cells), np.nan)
     for f, (phi, sigma) in enumerate(zip(left_out.phi, left_out.sigma, strict=True)):
         error = forecast(mode.problem, phi, sigma, intervals, within=fold == f).error
@@ -224,7 +224,7 @@ def _linearised(
         jacobian = mode.jacobian.reshape(*z.shape, p) * scale
         return lambda own: (mode.sigma, z, jacobian)
     noise = problem.trajectory_noise
-    nu = noise.of_cells(problem.nu(phi), residual.shape)
+    nu = noise.of_coordinates(problem.nu(phi), residual.shape)
     slopes = _residual_slopes(mode, scale)
     nothing = np.zeros_like(noise.begin)
     still = replace(noise, begin=nothing, measured=nothing)
@@ -246,14 +246,14 @@ def _residual_slopes(mode: Mode, scale: Floats) -> Floats:
     Shape (p, transition, cell).
     """
     problem, priors = mode.problem, mode.problem.layout.priors
-    cells = problem.trajectory_noise.cells
+    coordinates = problem.trajectory_noise.coordinates
     if not priors:
-        return np.zeros((0, problem.segments.n, len(cells.places)))
+        return np.zeros((0, problem.segments.n, len(coordinates.places)))
     lower, upper = box(priors)
     informed = scale * np.abs(prior_slopes(priors, mode.phi)) < _INFORMED
 
     def residual(points: Floats) -> Floats:
-        return np.nan_to_num(cells.of_residual(problem.residual(points)))
+        return np.nan_to_num(coordinates.of_residual(problem.residual(points)))
 
     # a long step of a parameter that the data do not inform would cross thresholds
     steps = np.where(informed, scale, 1e-3 * np.minimum(scale, problem.layout.scale(mode.phi)))

@@ -99,7 +99,7 @@ def find_dependence(
     tests = len(problem.scene.dynamic)
     permutations = _PERMUTATIONS * tests - 1
     chosen = np.sort(rng.permutation(n)[:_MOST])
-    places = mode.problem.trajectory_noise.cells.places
+    places = mode.problem.trajectory_noise.coordinates.places
     innovations = mode.whitened_residual[chosen]
     groups = folds(mode, criteria)[chosen]
     relative = innovations_over_steps(mode)

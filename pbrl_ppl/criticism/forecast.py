@@ -63,18 +63,18 @@ def longest_forecast(problem: Problem) -> int:
 def filtered_states(problem: Problem, phi: Floats, sigma: Floats) -> Floats:
     """Return the filtered states, shape (trajectory, time, body, 6), SI units."""
     noise = problem.trajectory_noise
-    cells, segments = noise.cells, problem.segments
-    residual = cells.of_residual(problem.residual(phi))
+    coordinates, segments = noise.coordinates, problem.segments
+    residual = coordinates.of_residual(problem.residual(phi))
     deviation = noise.filtered(residual[None], sigma)[1][0]
     states = problem.data.smoothed_states.copy()
     flat = states.reshape(*states.shape[:2], -1)
-    flat[segments.trajectory[:, None], segments.step[:, None] + 1, cells.places] += deviation
+    flat[segments.trajectory[:, None], segments.step[:, None] + 1, coordinates.places] += deviation
     # the first row has no earlier one: it is as measured, or as smoothed over the next rows
     few = replace(noise, seen=noise.seen & (segments.step < _SETTLED)[:, None])
     hidden = (noise.wide > 0).any(axis=1, keepdims=True)
     first = np.where(hidden, few.smoothed(residual, sigma)[0], noise.begin)[noise.first]
-    flat[segments.trajectory[noise.first, None], 0, cells.places] += first
-    return cells.completed(problem.scene, states)
+    flat[segments.trajectory[noise.first, None], 0, coordinates.places] += first
+    return coordinates.completed(problem.scene, states)
 
 
 def rollout(problem: Problem, phi: Floats, start: Floats, inputs: Floats) -> Floats:
@@ -173,7 +173,7 @@ def forecast(
         m/s^2 and rad/s^2.
     """
     noise = problem.trajectory_noise
-    cells, segments = noise.cells, problem.segments
+    coordinates, segments = noise.coordinates, problem.segments
     begins = np.flatnonzero(noise.first)
     lengths = np.diff(np.append(begins, segments.n))
     starts = []
@@ -187,34 +187,34 @@ def forecast(
     if within is not None:
         at = at[within[at]]
     if not len(at):
-        none = np.zeros((0, len(cells.places)))
-        return Forecast(none, none, none, cells.places % len(STATE))
+        none = np.zeros((0, len(coordinates.places)))
+        return Forecast(none, none, none, coordinates.places % len(STATE))
     trajectory, step = segments.trajectory[at], segments.step[at]
     every = at[:, None] + np.arange(intervals)
     states = filtered_states(problem, phi, sigma)[trajectory, step]
     inputs = problem.inputs[every, 0]
-    ends = cells.of(rollout(problem, phi, states, inputs)[:, -1])
+    ends = coordinates.of(rollout(problem, phi, states, inputs)[:, -1])
     observed = problem.data.history.dataset["observed"].to_numpy()
-    measured_ends = cells.of(observed[trajectory, step + intervals])
-    error = cells.wrapped(measured_ends - ends)
+    measured_ends = coordinates.of(observed[trajectory, step + intervals])
+    error = coordinates.wrapped(measured_ends - ends)
     error[np.isfinite(measured_ends) & np.isnan(ends)] = np.inf
-    motion = measured_ends - cells.of(states)
+    motion = measured_ends - coordinates.of(states)
     covariance = _spread(noise, sigma, at, step)
-    free, touching = cells.steps(sigma)
+    free, touching = coordinates.steps(sigma)
     contact = touching - free  # uncertainty of how bodies part
-    pushes = np.zeros((len(cells.places), 0))
+    pushes = np.zeros((len(coordinates.places), 0))
     if allowed is not None:
-        rate = cells.pushed[cells.always] - len(cells.sensors)
-        pushes = (cells.push[cells.always] * allowed[rate][:, None]).T
+        rate = coordinates.pushed[coordinates.always] - len(coordinates.sensors)
+        pushes = (coordinates.push[coordinates.always] * allowed[rate][:, None]).T
     pushed = np.zeros((len(at), *pushes.shape))
     for i in range(intervals):
         slope = noise.slope[every[:, i]]
         covariance = slope @ covariance @ slope.transpose(0, 2, 1)
         covariance = covariance + noise.touching[every[:, i], None, None] * contact
         pushed = slope @ pushed + pushes
-    variance = np.diagonal(covariance, axis1=1, axis2=2) + cells.errors(sigma) ** 2
+    variance = np.diagonal(covariance, axis1=1, axis2=2) + coordinates.errors(sigma) ** 2
     variance = variance + (pushed**2).sum(axis=2)
-    return Forecast(error, variance, motion, cells.places % len(STATE))
+    return Forecast(error, variance, motion, coordinates.places % len(STATE))
 
 
 def _spread(noise: TrajectoryNoise, sigma: Floats, at: Ints, step: Ints) -> Floats:
@@ -227,7 +227,7 @@ def _spread(noise: TrajectoryNoise, sigma: Floats, at: Ints, step: Ints) -> Floa
 
 def _first_spread(noise: TrajectoryNoise, sigma: Floats, first: int) -> Floats:
     """Return the covariance of a trajectory's first filtered state, shape (cell, cell)."""
-    error = noise.cells.errors(sigma)
+    error = noise.coordinates.errors(sigma)
     wide = noise.wide[first]
     if not wide.any():
         return np.diag(error**2)

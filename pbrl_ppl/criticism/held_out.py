@@ -13,7 +13,7 @@ from pbrl_ppl.criticism.forecast import forecast, whole_rollouts
 from pbrl_ppl.criticism.results import Errors, Rollout
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History, longest_gap
-from pbrl_ppl.likelihood import Problem, along_trajectories, cells_of
+from pbrl_ppl.likelihood import Problem, along_trajectories, observed_coordinates
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.posterior import parameter_draws
 from pbrl_ppl.scene import Scene, motion_time, state_sizes
@@ -62,16 +62,16 @@ class HeldOut:
         HistoryError
             If they measure what the training history does not.
         """
-        cells = mode.problem.trajectory_noise.cells
-        measured = cells_of(mode.problem.scene, history).sensors
-        if not set(measured) <= set(cells.sensors):
-            names = [", ".join(STATE[d] for d in each) for each in (measured, cells.sensors)]
+        coordinates = mode.problem.trajectory_noise.coordinates
+        measured = observed_coordinates(mode.problem.scene, history).sensors
+        if not set(measured) <= set(coordinates.sensors):
+            names = [", ".join(STATE[d] for d in each) for each in (measured, coordinates.sensors)]
             raise HistoryError(
                 f"test history measures {names[0]}, the training history {names[1]}; they must"
                 " be the same"
             )
         problem = mode.problem.with_data(history=history, states=None)
-        return cls(mode, along_trajectories(problem, mode.phi, mode.sigma, cells))
+        return cls(mode, along_trajectories(problem, mode.phi, mode.sigma, coordinates))
 
     def whitened(self, unit: HeldOut) -> Floats:
         """Return the linearised innovations in units of another model's noise."""
@@ -83,7 +83,7 @@ class HeldOut:
         """Return innovations in units of another model's noise, by state dimension."""
         noise = unit.problem.trajectory_noise
         z = self.whitened(unit)
-        dimension, seen = noise.cells.places % len(STATE), noise.seen
+        dimension, seen = noise.coordinates.places % len(STATE), noise.seen
         return {
             STATE[d]: z[:, dimension == d][seen[:, dimension == d]]
             for d in np.unique(dimension)
@@ -147,7 +147,7 @@ def example_rollout(declared: HeldOut, revised: HeldOut) -> Rollout:
     length = int(dataset["n_rows"].min()) - 1
     measured = dataset["observed"].to_numpy()[0, : length + 1]
     columns = [d for d in range(len(STATE)) if np.isfinite(measured[..., d]).any()]
-    sensors = revised.mode.problem.trajectory_noise.cells.sensors
+    sensors = revised.mode.problem.trajectory_noise.coordinates.sensors
     noise = dict(zip(sensors, revised.mode.sigma.tolist(), strict=False))
     sizes = state_sizes(scene)
     spread = np.nanstd(measured[..., columns], axis=0) / [

@@ -139,7 +139,7 @@ def _acceleration(mode: Mode, excess: UnexplainedAcceleration) -> ResidualTest:
 
 def _most_unexplained(mode: Mode, name: str) -> str:
     """Return the body with the largest innovations of a velocity, or of its position."""
-    d, places = STATE.index(name), mode.problem.trajectory_noise.cells.places
+    d, places = STATE.index(name), mode.problem.trajectory_noise.coordinates.places
     columns = np.flatnonzero(np.isin(places % len(STATE), (d, d - 3)))
     size = (mode.whitened_residual[:, columns] ** 2).mean(axis=0)
     body = int(places[columns[int(np.argmax(size))]] // len(STATE))
@@ -205,7 +205,7 @@ def _forecasts(
         chance = len(dimensions) * float(chi2.sf(total, max(z.size / 2, 1)))
         if np.sqrt(z.mean()) > worst:
             worst, p_value, name = float(np.sqrt(z.mean())), min(1.0, chance), STATE[d]
-            own = int(noise.cells.places[columns[int(np.argmax(np.nansum(square, axis=0)))]])
+            own = int(noise.coordinates.places[columns[int(np.argmax(np.nansum(square, axis=0)))]])
             body = mode.problem.scene.moving[own // len(STATE)].name
     passed = p_value > criteria.false_alarm or worst < criteria.worse_forecast
     dt = mode.problem.scene.time_step

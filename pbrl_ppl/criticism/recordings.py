@@ -16,7 +16,7 @@ from pbrl_ppl.history import (
     unused_velocities,
     without_bad_frames,
 )
-from pbrl_ppl.likelihood import cells_of, check_moves
+from pbrl_ppl.likelihood import check_moves, observed_coordinates
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE, Floats, Ints
@@ -70,7 +70,7 @@ def checked_histories(
     train, test = measured_alone(train, unused), measured_alone(test, unused)
     train, bad = without_bad_frames(train)
     test, more = without_bad_frames(test)
-    check_moves(cells_of(scene, train), scene)
+    check_moves(observed_coordinates(scene, train), scene)
     known, asked = (
         np.isfinite(history.dataset["observed"].to_numpy()).any(axis=(0, 1))
         for history in (train, test)
@@ -108,9 +108,9 @@ def outliers(mode: Mode, criteria: Criteria = DEFAULT) -> Floats:
     """
     problem, limits = mode.problem, criteria.outliers
     noise, segments = problem.trajectory_noise, problem.segments
-    residual = noise.cells.of_residual(problem.residual(mode.phi))
+    residual = noise.coordinates.of_residual(problem.residual(mode.phi))
     sigma = without_acceleration(mode).sigma
-    both, error = noise.auxiliary(residual, sigma), noise.cells.errors(sigma)
+    both, error = noise.auxiliary(residual, sigma), noise.coordinates.errors(sigma)
     size = np.abs(np.concatenate(both))  # of rows that transitions end at, then of first rows
     size[size == 0.0] = np.nan
     off = np.concatenate([noise.measured, noise.begin])
@@ -119,10 +119,10 @@ def outliers(mode: Mode, criteria: Criteria = DEFAULT) -> Floats:
     observed = problem.data.history.dataset["observed"]
     found = np.full(observed.shape, np.nan)
     flat = found.reshape(*found.shape[:2], -1)
-    for cell, place in enumerate(noise.cells.places):
+    for cell, place in enumerate(noise.coordinates.places):
         own = size[:, cell]
         count = np.isfinite(own).sum()
-        if noise.cells.sensor[cell] < 0 or count < limits.least_measurements:
+        if noise.coordinates.sensor[cell] < 0 or count < limits.least_measurements:
             continue
         far = own > limits.deviations * np.nanmedian(own) / norm.isf(0.25)
         far &= np.abs(off[:, cell]) > limits.errors * error[cell]

@@ -123,7 +123,7 @@ def with_correlated_errors(mode: Mode, criteria: Criteria = DEFAULT) -> Mode | N
     Mode or None
         None where they do not explain the data better, or are too large.
     """
-    if mode.problem.trajectory_noise.cells.drifts:
+    if mode.problem.trajectory_noise.coordinates.drifts:
         return None
     if not unexplained_acceleration(mode, criteria).matters.any():
         whiteness, _ = correlation_tests(mode, criteria)[0]
@@ -138,12 +138,13 @@ def with_correlated_errors(mode: Mode, criteria: Criteria = DEFAULT) -> Mode | N
         tried.append((float(density), problem, sigma))
     _, problem, sigma = max(tried, key=lambda each: each[0])
     found = trajectory_mode(problem, mode.phi, sigma)
-    cells = found.problem.trajectory_noise.cells
+    coordinates = found.problem.trajectory_noise.coordinates
     data = found.problem.data
-    extent = ranges(cells, data.history, data.smoothed_states)
-    white = mode.sigma[: len(cells.drifts)]  # as large as the measurement noise of single rows was
+    extent = ranges(coordinates, data.history, data.smoothed_states)
+    # as large as the measurement noise of single rows was
+    white = mode.sigma[: len(coordinates.drifts)]
     most = np.maximum(criteria.negligible * extent, white)
-    if (found.sigma[cells.drift_parameters] > most).any():
+    if (found.sigma[coordinates.drift_parameters] > most).any():
         return None
     gained = trajectory_evidence(found) - trajectory_evidence(mode)
     return found if gained >= criteria.min_evidence else None
@@ -151,7 +152,7 @@ def with_correlated_errors(mode: Mode, criteria: Criteria = DEFAULT) -> Mode | N
 
 def same_noise(mode: Mode, other: Mode) -> Mode:
     """Refit a mode with the correlated measurement errors of another mode's model."""
-    memory = other.problem.trajectory_noise.cells.memory
+    memory = other.problem.trajectory_noise.coordinates.memory
     problem = _with_correlation(mode, memory)
     sigma = profile_sigma(problem, mode.problem.residual(mode.phi), mode.phi)
     return trajectory_mode(problem, mode.phi, sigma)
@@ -161,9 +162,11 @@ def _with_correlation(mode: Mode, memory: float) -> Problem:
     """Return a mode's problem with correlated measurement errors, and a prior of their sizes."""
     problem = mode.problem
     noise = problem.trajectory_noise
-    cells = noise.cells.drifting(memory)
-    every = noise_medians(cells, problem.scene, problem.data.history, problem.data.smoothed_states)
-    medians = every[cells.drift_parameters]
+    coordinates = noise.coordinates.drifting(memory)
+    every = noise_medians(
+        coordinates, problem.scene, problem.data.history, problem.data.smoothed_states
+    )
+    medians = every[coordinates.drift_parameters]
     sigma = np.concatenate([mode.sigma, mode.sigma[: len(medians)]])
     prior = (*problem.noise_prior[0].tolist(), *medians.tolist()), problem.noise_prior[1]
-    return problem.along(replace(noise, cells=cells, sigma=sigma), prior=prior)
+    return problem.along(replace(noise, coordinates=coordinates, sigma=sigma), prior=prior)

@@ -228,9 +228,9 @@ def residual_forces(mode: Mode, body: str) -> tuple[Floats, dict[int, Floats]]:
     if body not in names:
         raise FitError(f"remainder: there is no moving body {body!r}, only {', '.join(names)}")
     index = [moving.name for moving in problem.scene.moving].index(body)
-    cells = problem.trajectory_noise.cells
-    added = cells.of_residual(problem.residual(mode.phi)) / problem.scene.time_step
-    column = {int(place): i for i, place in enumerate(cells.places)}
+    coordinates = problem.trajectory_noise.coordinates
+    added = coordinates.of_residual(problem.residual(mode.phi)) / problem.scene.time_step
+    column = {int(place): i for i, place in enumerate(coordinates.places)}
     places = [column.get(index * len(STATE) + d) for d in (3, 4, 5)]
     theta, vx, vy, omega = problem.segments.start[:, index, 2:].T
     c, s = np.cos(theta), np.sin(theta)

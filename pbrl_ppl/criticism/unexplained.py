@@ -91,10 +91,10 @@ class UnexplainedAcceleration:
 def unexplained_acceleration(mode: Mode, criteria: Criteria = DEFAULT) -> UnexplainedAcceleration:
     """Return the acceleration that a fitted model leaves unexplained."""
     noise = mode.problem.trajectory_noise
-    cells = noise.cells
-    size = mode.sigma[cells.accelerations]
+    coordinates = noise.coordinates
+    size = mode.sigma[coordinates.accelerations]
     relative = size / np.maximum(bodies_acceleration(mode.problem), 1e-300)
-    names = tuple(STATE[d] for d in cells.rates)
+    names = tuple(STATE[d] for d in coordinates.rates)
     return UnexplainedAcceleration(
         names, size, relative, _p_values(mode), _numerical(mode), criteria
     )
@@ -105,7 +105,7 @@ def noise_alone(mode: Mode, excess: UnexplainedAcceleration) -> Floats:
 
     Few data do not tell measurement noise from process noise: the mode gives all to one of them.
     """
-    places = mode.problem.trajectory_noise.cells.accelerations
+    places = mode.problem.trajectory_noise.coordinates.accelerations
     pairs = zip(places, excess.certain, strict=True)
     negligible = [place for place, certain in pairs if not certain]
     return _without(mode, negligible, mode.problem.residual(mode.phi))
@@ -114,7 +114,7 @@ def noise_alone(mode: Mode, excess: UnexplainedAcceleration) -> Floats:
 def measurement_noise(mode: Mode, excess: UnexplainedAcceleration) -> Floats:
     """Return the noise parameters without accelerations that matter, shape (parameter,)."""
     sigma = mode.sigma.copy()
-    places = np.array(mode.problem.trajectory_noise.cells.accelerations)
+    places = np.array(mode.problem.trajectory_noise.coordinates.accelerations)
     sigma[places[excess.matters]] = NOTHING
     return sigma
 
@@ -124,7 +124,7 @@ def without_acceleration(mode: Mode) -> Mode:
 
     A random force follows smooth effects: their scores are small beside it.
     """
-    places = mode.problem.trajectory_noise.cells.accelerations
+    places = mode.problem.trajectory_noise.coordinates.accelerations
     return replace(mode, sigma=_without(mode, places, mode.problem.residual(mode.phi)))
 
 
@@ -137,9 +137,9 @@ def _without(mode: Mode, places: Iterable[int], residual: Floats) -> Floats:
 def innovations_over_steps(mode: Mode) -> Floats:
     """Return the typical innovations over the change in a step, shape (coordinate,)."""
     noise, segments = mode.problem.trajectory_noise, mode.problem.segments
-    cells, dt = noise.cells, mode.problem.scene.time_step
+    coordinates, dt = noise.coordinates, mode.problem.scene.time_step
     change = segments.observed[:, 0] - segments.start
-    body, dimension = np.divmod(cells.places, len(STATE))
+    body, dimension = np.divmod(coordinates.places, len(STATE))
     velocity = np.where(dimension < 3, dimension + 3, dimension)
     typical = np.sqrt(np.mean(change[:, body, velocity] ** 2, axis=0))
     step = np.where(dimension < 3, dt * typical, typical)
@@ -148,12 +148,12 @@ def innovations_over_steps(mode: Mode) -> Floats:
 
 def _numerical(mode: Mode) -> Floats:
     """Return the rms change of accelerations if the substeps are doubled, shape (velocity,)."""
-    problem, cells = mode.problem, mode.problem.trajectory_noise.cells
+    problem, coordinates = mode.problem, mode.problem.trajectory_noise.coordinates
     finer = problem.with_physics(substeps=2 * problem.physics.substeps)
-    change = cells.of((finer.predict(mode.phi) - problem.predict(mode.phi))[:, 0])
+    change = coordinates.of((finer.predict(mode.phi) - problem.predict(mode.phi))[:, 0])
     square = np.nanmean(change**2, axis=0) / problem.scene.time_step**2
-    dimension = cells.places % len(STATE)
-    return np.array([np.sqrt(square[dimension == d].mean()) for d in cells.rates])
+    dimension = coordinates.places % len(STATE)
+    return np.array([np.sqrt(square[dimension == d].mean()) for d in coordinates.rates])
 
 
 def _p_values(mode: Mode) -> Floats:
@@ -168,6 +168,6 @@ def _p_values(mode: Mode) -> Floats:
         return float(problem.log_density(residual, sigma, mode.phi).sum())
 
     here = best(mode.sigma)
-    places = problem.trajectory_noise.cells.accelerations
+    places = problem.trajectory_noise.coordinates.accelerations
     gains = [here - best(_without(mode, [place], residual)) for place in places]
     return np.asarray([0.5 * chi2.sf(max(2 * gain, 0.0), 1) for gain in gains])

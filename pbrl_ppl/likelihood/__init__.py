@@ -1,13 +1,13 @@
 """Likelihoods in numpy: data, noise, Eq. 11, whole trajectories and the log-posterior."""
 
 from .autocovariance import autocovariance as autocovariance
-from .cells import ACCELERATION as ACCELERATION
-from .cells import CONTACT as CONTACT
-from .cells import DRIFT as DRIFT
-from .cells import Cells as Cells
-from .cells import cells_of as cells_of
-from .cells import check_moves as check_moves
-from .cells import first_states as first_states
+from .coordinates import ACCELERATION as ACCELERATION
+from .coordinates import CONTACT as CONTACT
+from .coordinates import DRIFT as DRIFT
+from .coordinates import Coordinates as Coordinates
+from .coordinates import check_moves as check_moves
+from .coordinates import first_states as first_states
+from .coordinates import observed_coordinates as observed_coordinates
 from .data import Observations as Observations
 from .data import estimate_sigma as estimate_sigma
 from .data import least_noise as least_noise

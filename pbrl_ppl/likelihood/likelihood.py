@@ -303,12 +303,13 @@ class TrajectoryLikelihood(Likelihood):
 
     def variables(self, observations: Observations) -> dict[str, tuple[str, ...]]:
         """Return errors of measurement and unexplained accelerations."""
-        return self.noise.cells.variables
+        return self.noise.coordinates.variables
 
     def exponential(self, n: int) -> Bools:
         """Return a mask of the unexplained accelerations and the correlated errors."""
         mask = super().exponential(n)
-        mask[[*self.noise.cells.accelerations, *self.noise.cells.drift_parameters]] = True
+        coordinates = self.noise.coordinates
+        mask[[*coordinates.accelerations, *coordinates.drift_parameters]] = True
         return mask
 
     def of_parameters(self) -> TrajectoryLikelihood:
@@ -317,7 +318,7 @@ class TrajectoryLikelihood(Likelihood):
 
     def measuring(self, deviation: Floats) -> TrajectoryLikelihood:
         """Return the same for other measurements; itself, with its gains, for these."""
-        measured = self.noise.cells.of_residual(deviation)
+        measured = self.noise.coordinates.of_residual(deviation)
         if np.array_equal(measured, self.noise.measured):
             return self
         return replace(self, noise=replace(self.noise, measured=measured))
@@ -325,7 +326,7 @@ class TrajectoryLikelihood(Likelihood):
     def unwhitened_slope(self, pull: Floats, sigma: Floats, shape: tuple[int, ...]) -> Floats:
         """Return the adjoint of the filter."""
         result = np.zeros(shape)
-        body, place = self.noise.cells.in_residual
+        body, place = self.noise.coordinates.in_residual
         result[:, 0, body, place] = self.noise.pulled(pull, sigma)
         return result
 
@@ -337,7 +338,7 @@ class TrajectoryLikelihood(Likelihood):
         self, nu: float | Floats | None, shape: tuple[int, ...]
     ) -> float | Floats | None:
         """Return one number for all, or one an innovation, shape (..., transition, coordinate)."""
-        return self.noise.of_cells(nu, shape)
+        return self.noise.of_coordinates(nu, shape)
 
     def log_density(
         self, residual: Floats, sigma: Floats, measured: Bools, nu: float | Floats | None = None

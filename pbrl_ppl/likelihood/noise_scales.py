@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pbrl_ppl.history import History, unseen
-from pbrl_ppl.likelihood.cells import Cells
+from pbrl_ppl.likelihood.coordinates import Coordinates
 from pbrl_ppl.likelihood.data import least_noise
 from pbrl_ppl.likelihood.problem import Problem
 from pbrl_ppl.scene import Scene
@@ -24,37 +24,41 @@ DRIFT_SHARE = 0.01
 _MEDIAN = np.log(2.0) / -np.log(ACCELERATION_CHANCE)
 
 
-def noise_medians(cells: Cells, scene: Scene, history: History, states: Floats) -> Floats:
+def noise_medians(
+    coordinates: Coordinates, scene: Scene, history: History, states: Floats
+) -> Floats:
     """Return the medians of the noise priors, shape (parameter,), from changes of the states."""
     least = least_noise(scene)
     real = np.isfinite(history.dataset["clock"].to_numpy())
     shown = real & ~unseen(history).any(axis=-1)
     each, seen = (
-        _typical(cells, [np.diff(own[row], axis=0) for own, row in zip(states, rows, strict=True)])
+        _typical(
+            coordinates, [np.diff(own[row], axis=0) for own, row in zip(states, rows, strict=True)]
+        )
         for rows in (real, shown)
     )
     dt = float(history.dataset.attrs["time_step"])
-    sensors = SENSOR_SHARE * seen[list(cells.sensors)]
-    steps = ACCELERATION_SHARE * _MEDIAN * _vectors(each, cells.rates) / dt
-    contacts = CONTACT_SHARE * each[list(cells.contacts)] / dt
-    drifts = DRIFT_SHARE * _MEDIAN * ranges(cells, history, states)
+    sensors = SENSOR_SHARE * seen[list(coordinates.sensors)]
+    steps = ACCELERATION_SHARE * _MEDIAN * _vectors(each, coordinates.rates) / dt
+    contacts = CONTACT_SHARE * each[list(coordinates.contacts)] / dt
+    drifts = DRIFT_SHARE * _MEDIAN * ranges(coordinates, history, states)
     medians = [
-        np.maximum(sensors, least[list(cells.sensors)]),
-        np.maximum(steps, least[list(cells.rates)] / dt),
-        np.maximum(contacts, least[list(cells.contacts)] / dt),
-        np.maximum(drifts, least[list(cells.drifts)]),
+        np.maximum(sensors, least[list(coordinates.sensors)]),
+        np.maximum(steps, least[list(coordinates.rates)] / dt),
+        np.maximum(contacts, least[list(coordinates.contacts)] / dt),
+        np.maximum(drifts, least[list(coordinates.drifts)]),
     ]
     return np.concatenate(medians)
 
 
-def ranges(cells: Cells, history: History, states: Floats) -> Floats:
+def ranges(coordinates: Coordinates, history: History, states: Floats) -> Floats:
     """Return the range of each dimension with correlated errors, shape (drift,).
 
     Of x and y the larger one: a sensor of places is as far off in both.
 
     Parameters
     ----------
-    cells : Cells
+    coordinates : Coordinates
         Says which dimensions those are.
     history : History
         Says which rows there are.
@@ -62,19 +66,19 @@ def ranges(cells: Cells, history: History, states: Floats) -> Floats:
         Shape (trajectory, time, body, 6), SI units.
     """
     real = np.isfinite(history.dataset["clock"].to_numpy())
-    values = states[real].reshape(-1, states.shape[2] * len(STATE))[:, cells.places]
+    values = states[real].reshape(-1, states.shape[2] * len(STATE))[:, coordinates.places]
     extent = np.ptp(values, axis=0)
-    dimension = cells.places % len(STATE)
+    dimension = coordinates.places % len(STATE)
     turns = dimension % VELOCITY == THETA
     place = dimension < VELOCITY
-    return np.array([extent[place & (turns == (d == THETA))].max() for d in cells.drifts])
+    return np.array([extent[place & (turns == (d == THETA))].max() for d in coordinates.drifts])
 
 
-def _typical(cells: Cells, changes: list[Floats]) -> Floats:
+def _typical(coordinates: Coordinates, changes: list[Floats]) -> Floats:
     """Return the root mean square change of each state dimension, shape (6,)."""
     square = np.concatenate([own.reshape(len(own), -1) for own in changes]) ** 2
-    own = square.mean(axis=0)[cells.places]
-    of = cells.places % len(STATE)
+    own = square.mean(axis=0)[coordinates.places]
+    of = coordinates.places % len(STATE)
     return np.array([np.sqrt(own[of == d].mean()) if (of == d).any() else 0.0 for d in range(6)])
 
 
@@ -90,6 +94,6 @@ def bodies_acceleration(problem: Problem) -> Floats:
 
     Of x and y it is that of the vector, whatever the axes' directions (m/s^2); of omega in rad/s^2.
     """
-    cells, segments = problem.trajectory_noise.cells, problem.segments
+    coordinates, segments = problem.trajectory_noise.coordinates, problem.segments
     change = segments.observed[:, 0] - segments.start
-    return _vectors(_typical(cells, [change]), cells.rates) / problem.scene.time_step
+    return _vectors(_typical(coordinates, [change]), coordinates.rates) / problem.scene.time_step

@@ -15,7 +15,7 @@ from typing import ClassVar, final
 
 import numpy as np
 
-from pbrl_ppl.likelihood.cells import Cells, cells_of
+from pbrl_ppl.likelihood.coordinates import Coordinates, observed_coordinates
 from pbrl_ppl.likelihood.data import Observations, least_noise
 from pbrl_ppl.likelihood.likelihood import Likelihood, log_norm, robust
 from pbrl_ppl.likelihood.problem import Problem
@@ -40,22 +40,23 @@ class Starts:
 
     Parameters
     ----------
-    cells : Cells
+    coordinates : Coordinates
         Coordinates of the start states that are inferred.
     slope : ndarray
-        Derivative of the observed states by the start, shape (piece, H, body, state, cell).
+        Derivative of the observed states by the start, shape (piece, H, body, state, coordinate).
     seen : ndarray of bool
         What was measured, shape (piece, H, body, state).
     begin : ndarray
-        Measured minus latent start, shape (piece, cell); NaN where not measured.
+        Measured minus latent start, shape (piece, coordinate); NaN where not measured.
     given : ndarray of bool
         Start coordinates that are given: recorded, of a dimension that is not observed. Shape
-        (piece, cell).
+        (piece, coordinate).
     column : ndarray of int
-        Place among the observed dimensions of each cell, -1 if it is not one; shape (cell,).
+        Place among the observed dimensions of each coordinate, -1 if it is not one; shape
+        (coordinate,).
     """
 
-    cells: Cells
+    coordinates: Coordinates
     slope: Floats
     seen: Bools
     begin: Floats
@@ -89,7 +90,7 @@ class Starts:
         cut, own = horizon * bodies * state, self.column >= 0
         out = np.zeros((pieces, 1 + horizon, bodies, state, *rows.shape[2:]))
         out[:, 1:] = rows[:, :cut].reshape(pieces, horizon, bodies, state, *rows.shape[2:])
-        body = self.cells.places // len(STATE)
+        body = self.coordinates.places // len(STATE)
         out[:, 0, body[own], self.column[own]] = rows[:, cut:][:, own]
         return out
 
@@ -102,19 +103,19 @@ class Starts:
     def basis(self, weight: Floats) -> tuple[Floats, Floats]:
         """Return what start states can take up, and how: orthonormal rows and the way back.
 
-        Shapes (piece, row, direction) and (piece, cell, direction).
+        Shapes (piece, row, direction) and (piece, coordinate, direction).
         """
         unit = weight.max()  # the basis depends on the weights' ratios alone
         u, back = self.memory.recall((weight / unit,), self._basis)
         return u, back / unit
 
     def _basis(self, weight: Floats) -> tuple[Floats, Floats]:
-        pieces, cells = self.begin.shape
+        pieces, coordinates = self.begin.shape
         moved = np.where(self.seen[..., None], self.slope, 0.0) * weight[:, None]
-        moved = moved.reshape(pieces, -1, cells)
+        moved = moved.reshape(pieces, -1, coordinates)
         own = np.isfinite(self.begin) * self._weights(weight)
         own += self.given * _FIRM * np.linalg.norm(moved, axis=1)
-        rows = np.concatenate([moved, own[:, :, None] * np.eye(cells)], axis=1)
+        rows = np.concatenate([moved, own[:, :, None] * np.eye(coordinates)], axis=1)
         scale = np.linalg.norm(rows, axis=1)
         scale = np.where(scale > 0, scale, 1.0)
         rows = rows / scale[:, None]
@@ -124,7 +125,7 @@ class Starts:
         return rows @ v * inverse[:, None], v * inverse[:, None] / scale[:, :, None]
 
     def _weights(self, weight: Floats) -> Floats:
-        """Return the weight of each cell, 0 where it is not observed, shape (cell,)."""
+        """Return the weight of each coordinate, 0 where it is not observed, shape (coordinate,)."""
         return np.where(self.column >= 0, weight[self.column], 0.0)
 
 
@@ -174,7 +175,7 @@ class OutputErrorLikelihood(Likelihood):
     def whitened_nu(
         self, nu: float | Floats | None, shape: tuple[int, ...]
     ) -> float | Floats | None:
-        """Return one number for all; that of a body's cells, shape (..., piece, row)."""
+        """Return one number for all; that of a body's coordinates, shape (..., piece, row)."""
         if not isinstance(nu, np.ndarray) or nu.ndim == 0:
             return nu
         own = np.broadcast_to(nu, shape).reshape(*shape[:-3], -1)
@@ -201,7 +202,7 @@ class OutputErrorLikelihood(Likelihood):
         """Draw measurements with white errors about states from the most probable starts."""
         starts = self.starts
         residual = np.where(starts.seen, linearised - predicted, 0.0)
-        angle = starts.column[starts.cells.places % len(STATE) == THETA]
+        angle = starts.column[starts.coordinates.places % len(STATE) == THETA]
         residual[..., angle[angle >= 0]] = wrapped(residual[..., angle[angle >= 0]])
         weight = 1.0 / (np.asarray(sigma) * np.sqrt(self.tau))
         u, back = starts.basis(weight)
@@ -220,7 +221,7 @@ class OutputErrorLikelihood(Likelihood):
     def unwhitened(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
         """Return projected residuals of the pieces and of their starts, SI units.
 
-        Shapes (piece, H, body, state) and (piece, cell).
+        Shapes (piece, H, body, state) and (piece, coordinate).
         """
         z = self._projected(residual, 1.0 / np.asarray(sigma))
         cut = z.shape[-1] - len(self.starts.column)
@@ -280,14 +281,17 @@ def in_pieces(problem: Problem, length: int, states: Floats) -> Problem:
     """
     data = replace(problem.data, horizon=length, states=states, columns=None)
     problem = problem.on(data)
-    cells, columns = cells_of(problem.scene, data.history), problem.observations.columns
-    dimension = cells.places % len(STATE)
+    coordinates, columns = (
+        observed_coordinates(problem.scene, data.history),
+        problem.observations.columns,
+    )
+    dimension = coordinates.places % len(STATE)
     column = np.array([columns.index(d) if d in columns else -1 for d in dimension])
     seen = problem.observations.measured
-    slope = np.zeros((*seen.shape, len(cells.places)))
-    begin = _begin(problem, cells, column, problem.segments.start)
-    given = (column < 0) & np.isfinite(cells.of(_observed_starts(problem)))
-    starts = Starts(cells, slope, seen, begin, given, column)
+    slope = np.zeros((*seen.shape, len(coordinates.places)))
+    begin = _begin(problem, coordinates, column, problem.segments.start)
+    given = (column < 0) & np.isfinite(coordinates.of(_observed_starts(problem)))
+    starts = Starts(coordinates, slope, seen, begin, given, column)
     tau = (1.0,) * len(columns)
     return replace(
         problem, likelihood=OutputErrorLikelihood(starts=starts, tau=tau, nu=problem.likelihood.nu)
@@ -304,7 +308,7 @@ def linearised_pieces(problem: Problem, start: Floats, slope: Floats, tau: Float
     start : ndarray
         Start states, shape (piece, body, 6), SI units.
     slope : ndarray
-        Derivative of the observed states by them, shape (piece, H, body, state, cell).
+        Derivative of the observed states by them, shape (piece, H, body, state, coordinate).
     tau : ndarray
         Integrated autocorrelation time of each dimension, shape (state,).
     """
@@ -321,7 +325,7 @@ def linearised_about(problem: Problem, start: Floats, slope: Floats) -> Problem:
     Arguments are those of :func:`linearised_pieces`.
     """
     old = output_error(problem).starts
-    begin = _begin(problem, old.cells, old.column, start)
+    begin = _begin(problem, old.coordinates, old.column, start)
     return problem.with_likelihood(starts=replace(old, slope=slope, begin=begin))
 
 
@@ -338,10 +342,10 @@ def output_error(problem: Problem) -> OutputErrorLikelihood:
     raise TypeError("the problem has another likelihood, expected that of simulated pieces")
 
 
-def _begin(problem: Problem, cells: Cells, column: Ints, start: Floats) -> Floats:
-    """Return measured minus latent start states, shape (piece, cell); NaN where not measured."""
-    off = cells.of(_observed_starts(problem)) - cells.of(start)
-    return np.where(column >= 0, cells.wrapped(off), np.nan)
+def _begin(problem: Problem, coordinates: Coordinates, column: Ints, start: Floats) -> Floats:
+    """Return measured minus latent starts (piece, coordinate); NaN where not measured."""
+    off = coordinates.of(_observed_starts(problem)) - coordinates.of(start)
+    return np.where(column >= 0, coordinates.wrapped(off), np.nan)
 
 
 def _observed_starts(problem: Problem) -> Floats:

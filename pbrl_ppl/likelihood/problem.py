@@ -156,7 +156,7 @@ class Problem:
         apart = self.simulator(phi, segments.start, self.inputs)
         off = abs(self.observations.wrapped((states - apart)[..., columns]))
         if isinstance(self.likelihood, TrajectoryLikelihood):  # errors of measurement alone
-            sensors, every = self.likelihood.noise.cells.sensors, sigma
+            sensors, every = self.likelihood.noise.coordinates.sensors, sigma
             stated = dict(self.scene.noise)
             sigma = np.full((len(phi), len(columns)), np.inf)
             for i, d in enumerate(columns):
@@ -236,7 +236,7 @@ class Problem:
 
     def quiet(self, sigma: Floats, share: float) -> Floats:
         """Return sigma with unexplained accelerations of at most a share of their prior median."""
-        steps, sigma = self.trajectory_noise.cells.accelerations, sigma.copy()
+        steps, sigma = self.trajectory_noise.coordinates.accelerations, sigma.copy()
         sigma[steps] = np.minimum(sigma[steps], share * self.noise_prior[0][steps])
         return sigma
 
@@ -312,7 +312,7 @@ class Problem:
     def robust(self, phi: Floats, sigma: Floats, engine: PartedSimulator | None = None) -> Floats:
         """Return residuals whose half squares are the negative log-density up to a constant.
 
-        Shape (..., transition, cell).
+        Shape (..., transition, coordinate).
         """
         return self.likelihood.robust(self.residual(phi, engine), sigma, self.nu(phi))
 

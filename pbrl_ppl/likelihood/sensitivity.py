@@ -17,7 +17,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.likelihood.cells import Cells
+from pbrl_ppl.likelihood.coordinates import Coordinates
 from pbrl_ppl.parameters import Layout, change_from
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Bools, Floats
@@ -38,19 +38,19 @@ class Sensitivity:
         Its hinges hold hung bodies.
     layout : Layout
         Order of phi.
-    cells : Cells
+    coordinates : Coordinates
         Coordinates of the state.
     slope : ndarray
-        Derivative of the next state by the state, shape (transition, cell, cell).
+        Derivative of the next state by the state, shape (transition, coordinate, coordinate).
     phi : ndarray
         Parameters that the states were smoothed with, one set a transition, shape (transition, p).
     before : ndarray
-        Derivative of the state before each transition, shape (transition, cell, p).
+        Derivative of the state before each transition, shape (transition, coordinate, p).
     """
 
     scene: Scene
     layout: Layout
-    cells: Cells
+    coordinates: Coordinates
     slope: Floats
     phi: Floats
     before: Floats
@@ -59,7 +59,7 @@ class Sensitivity:
     def _sets(self) -> list[tuple[Floats, Bools, Floats]]:
         """Parameter sets of phi, the transitions of each, and their derivatives.
 
-        The latter have the shape (transition * cell, p).
+        The latter have the shape (transition * coordinate, p).
         """
         sets, which = np.unique(self.phi, axis=0, return_inverse=True)
         rows = [which.ravel() == i for i in range(len(sets))]
@@ -68,15 +68,15 @@ class Sensitivity:
 
     @cached_property
     def _far(self) -> Floats:
-        """Changes of the cells that count as divergence, shape (cell,)."""
-        return _FAR * self.cells.sizes(self.scene)
+        """Changes of the coordinates that count as divergence, shape (coordinate,)."""
+        return _FAR * self.coordinates.sizes(self.scene)
 
     def at(self, rows: NDArray[np.intp]) -> Sensitivity:
         """Return the sensitivity of these transitions alone."""
         return replace(self, slope=self.slope[rows], phi=self.phi[rows], before=self.before[rows])
 
     def moved(self, phi: Floats) -> Floats:
-        """Return the change of the states with phi, shape (..., transition, cell)."""
+        """Return the change of the states with phi, shape (..., transition, coordinate)."""
         result = np.empty((*phi.shape[:-1], *self.before.shape[:2]))
         for own, rows, by_phi in self._sets:
             change = change_from(self.layout, phi, own) @ by_phi.T
@@ -86,7 +86,7 @@ class Sensitivity:
     def begun(self, moved: Floats, start: Floats) -> Floats:
         """Return moved start states, shape (..., transition, body, 6)."""
         states = np.broadcast_to(start, (*moved.shape[:-2], *start.shape))
-        return self.cells.completed(self.scene, self._added(states, moved))
+        return self.coordinates.completed(self.scene, self._added(states, moved))
 
     def predicted(self, engine: Engine, phi: Floats, start: Floats, inputs: Floats) -> Floats:
         """Return next states from the smoothed starts, shape (..., transition, 1, body, 6).
@@ -111,8 +111,8 @@ class Sensitivity:
         return self._added(states, -back[..., None, :])
 
     def _added(self, states: Floats, change: Floats) -> Floats:
-        """Return states (..., body, 6) with changed cells (..., cell)."""
+        """Return states (..., body, 6) with changed coordinates (..., coordinate)."""
         states = np.array(states, order="C")  # so that what is reshaped is a view of it
         flat = states.reshape(*states.shape[:-2], -1)
-        flat[..., self.cells.places] += change
+        flat[..., self.coordinates.places] += change
         return states

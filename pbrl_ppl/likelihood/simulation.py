@@ -31,7 +31,7 @@ def simulated_trajectories(
         Shape (trajectory, time, body, 6), SI units; NaN where the recording has no measurement, and
         everywhere in a trajectory in which the engine diverged.
     """
-    cells, segments = problem.trajectory_noise.cells, problem.segments
+    coordinates, segments = problem.trajectory_noise.coordinates, problem.segments
     observed = problem.data.history.dataset["observed"].to_numpy()
     states = problem.data.smoothed_states.copy()
     flat = states.reshape(*states.shape[:2], -1)
@@ -43,12 +43,12 @@ def simulated_trajectories(
         ends = problem.one_world(phi, np.where(lost[:, None, None], 0.0, begin), inputs)[:, 0]
         ends[lost] = np.nan
         met = touching(problem.scene, begin, np.nan_to_num(ends))
-        pushes = cells.pushes(sigma, met, rng)
-        flat[own[:, None], step + 1, cells.places] = cells.of(ends) + pushes
-        cells.completed(problem.scene, states[:, step + 1])
-    errors = cells.errors(sigma) * rng.standard_normal((*flat.shape[:2], len(cells.places)))
+        pushes = coordinates.pushes(sigma, met, rng)
+        flat[own[:, None], step + 1, coordinates.places] = coordinates.of(ends) + pushes
+        coordinates.completed(problem.scene, states[:, step + 1])
+    drawn = rng.standard_normal((*flat.shape[:2], len(coordinates.places)))
     measured = states.copy()
-    measured.reshape(flat.shape)[..., cells.places] += errors
+    measured.reshape(flat.shape)[..., coordinates.places] += coordinates.errors(sigma) * drawn
     return np.where(np.isfinite(observed), measured, np.nan)
 
 
@@ -58,7 +58,7 @@ def with_measurements(problem: Problem, observed: Floats) -> Problem:
     Parameters
     ----------
     problem : Problem
-        Of whole trajectories; its noise prior and its cells stay.
+        Of whole trajectories; its noise prior and its coordinates stay.
     observed : ndarray
         Shape (trajectory, time, body, 6), SI units, NaN where missing.
     """
@@ -71,5 +71,5 @@ def with_measurements(problem: Problem, observed: Floats) -> Problem:
     history = History(dataset)
     centre = np.array([prior.centre for prior in problem.layout.priors])
     return along_trajectories(
-        problem.with_data(history=history, states=None), centre, None, noise.cells
+        problem.with_data(history=history, states=None), centre, None, noise.coordinates
     )

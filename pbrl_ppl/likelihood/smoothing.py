@@ -10,7 +10,12 @@ from dataclasses import replace
 import numpy as np
 
 from pbrl_ppl.history import longest_gap, unseen
-from pbrl_ppl.likelihood.cells import Cells, cells_of, check_moves, first_states
+from pbrl_ppl.likelihood.coordinates import (
+    Coordinates,
+    check_moves,
+    first_states,
+    observed_coordinates,
+)
 from pbrl_ppl.likelihood.noise_scales import SPREAD, noise_medians
 from pbrl_ppl.likelihood.problem import Problem
 from pbrl_ppl.likelihood.sensitivity import Sensitivity
@@ -31,7 +36,10 @@ _SHARES = (0.5, 1.0)
 
 
 def along_trajectories(
-    problem: Problem, phi: Floats, sigma: Floats | None = None, cells: Cells | None = None
+    problem: Problem,
+    phi: Floats,
+    sigma: Floats | None = None,
+    coordinates: Coordinates | None = None,
 ) -> Problem:
     """Return the problem with the likelihood of whole trajectories, linearised at smoothed states.
 
@@ -44,7 +52,7 @@ def along_trajectories(
     sigma : ndarray, optional
         Noise parameters to smooth with, shape (parameter,): errors of measuring each state
         dimension, then unexplained accelerations. Without it, a guess from what one step leaves.
-    cells : Cells, optional
+    coordinates : Coordinates, optional
         Coordinates and noise parameters of the training data, where these are others.
 
     Returns
@@ -60,25 +68,25 @@ def along_trajectories(
     history = problem.data.history
     states = first_states(history)
     states = with_predicted_gaps(problem.on(replace(problem.data, horizon=1, states=states)), phi)
-    given = cells is not None
-    if cells is None:
-        cells = cells_of(problem.scene, history)
-        check_moves(cells, problem.scene)
-        medians = tuple(noise_medians(cells, problem.scene, history, states).tolist())
+    given = coordinates is not None
+    if coordinates is None:
+        coordinates = observed_coordinates(problem.scene, history)
+        check_moves(coordinates, problem.scene)
+        medians = tuple(noise_medians(coordinates, problem.scene, history, states).tolist())
         eq_11 = replace(problem.likelihood.of_data(), scalar=False, prior=(medians, SPREAD))
         problem = replace(problem, likelihood=eq_11)
-    data = replace(problem.data, horizon=1, states=states, columns=cells.columns)
+    data = replace(problem.data, horizon=1, states=states, columns=coordinates.columns)
     problem = problem.on(data)
-    begin = _guess(problem, cells, phi)
+    begin = _guess(problem, coordinates, phi)
     sigma = begin if sigma is None else sigma
-    noise = _sloped(problem, cells, phi, begin, _steps(problem, cells, begin))
+    noise = _sloped(problem, coordinates, phi, begin, _steps(problem, coordinates, begin))
     problem = smoothed(problem.along(noise), phi, begin)
     if sigma is not begin:  # the physics alone may diverge from rough states
         for share in _SHARES:
-            problem = smoothed(problem, phi, _between(begin, sigma, share, cells))
+            problem = smoothed(problem, phi, _between(begin, sigma, share, coordinates))
     if not given:  # the noise of measurements adds to the changes of states as measured
-        moved = noise_medians(cells, problem.scene, history, problem.data.smoothed_states)
-        steps = list(cells.accelerations)
+        moved = noise_medians(coordinates, problem.scene, history, problem.data.smoothed_states)
+        steps = list(coordinates.accelerations)
         least = problem.noise_prior[0].copy()
         least[steps] = np.minimum(least[steps], moved[steps])
         problem = problem.with_likelihood(prior=(tuple(least.tolist()), SPREAD))
@@ -98,30 +106,30 @@ def smoothed(problem: Problem, phi: Floats, sigma: Floats) -> Problem:
     Near-zero unexplained accelerations are raised to a small value: with stick and slip, smoothing
     by the physics alone does not converge.
     """
-    steps = list(problem.trajectory_noise.cells.accelerations)
+    steps = list(problem.trajectory_noise.coordinates.accelerations)
     sigma = sigma.copy()
     sigma[steps] = np.maximum(sigma[steps], _LITTLE * problem.noise_prior[0][steps])
     begun: Floats | None = None  # states at which each transition's slope was taken
-    residual = problem.trajectory_noise.cells.of_residual(problem.residual(phi))
+    residual = problem.trajectory_noise.coordinates.of_residual(problem.residual(phi))
     for _ in range(_ROUNDS):
         noise = problem.trajectory_noise
-        cells = noise.cells
+        coordinates = noise.coordinates
         before, after = noise.smoothed(residual, sigma)
         spread = np.sqrt(np.median(np.diagonal(noise.covariance(sigma), axis1=1, axis2=2), axis=0))
-        states = _moved(problem, cells, noise.first, before, after)
+        states = _moved(problem, coordinates, noise.first, before, after)
         if not (np.isfinite(states).all() and np.isfinite(spread).all()):
             break  # diverged: keep the last linearisation
         moved = replace(problem, data=replace(problem.data, states=states))
         moved = replace(moved, data=replace(moved.data, states=with_predicted_gaps(moved, phi)))
-        begin = cells.of(moved.segments.start)
+        begin = coordinates.of(moved.segments.start)
         if begun is None:
-            moved = moved.along(_sloped(moved, cells, phi, sigma, spread))
+            moved = moved.along(_sloped(moved, coordinates, phi, sigma, spread))
             begun = begin
         else:
             far = np.asarray((np.abs(begin - begun) > _STALE * spread).any(axis=1))
-            moved = moved.along(_sloped(moved, cells, phi, sigma, spread, far))
+            moved = moved.along(_sloped(moved, coordinates, phi, sigma, spread, far))
             begun = np.where(far[:, None], begin, begun)
-        residual = cells.of_residual(moved.residual(phi))
+        residual = coordinates.of_residual(moved.residual(phi))
         if not np.isfinite(moved.trajectory_noise.filtered(residual[None], sigma)[0]).all():
             break  # diverged: nothing follows from the new one
         problem = moved
@@ -146,17 +154,17 @@ def with_sensitivity(problem: Problem, phi: Floats, sigma: Floats) -> Problem:
     if not len(phi):
         return problem
     noise, segments = problem.trajectory_noise, problem.segments
-    cells, nothing = noise.cells, np.zeros_like(noise.measured)
+    coordinates, nothing = noise.coordinates, np.zeros_like(noise.measured)
     slopes = problem.rough.simulator.jacobian(phi, segments.start, problem.inputs)[:, 0]
     still = replace(noise, begin=nothing, measured=nothing, sensitivity=None)
     before = np.empty((*nothing.shape, len(phi)))
-    for j, own in enumerate(cells.of(np.moveaxis(slopes, -1, 0))):
+    for j, own in enumerate(coordinates.of(np.moveaxis(slopes, -1, 0))):
         first, after = still.smoothed(-np.nan_to_num(own), sigma)
         before[:, :, j] = np.where(noise.first[:, None], first, np.roll(after, 1, axis=0))
     if not np.isfinite(before).all():
         return problem
     origin = np.tile(phi, (segments.n, 1))
-    follow = Sensitivity(problem.scene, problem.layout, cells, noise.slope, origin, before)
+    follow = Sensitivity(problem.scene, problem.layout, coordinates, noise.slope, origin, before)
     return problem.along(replace(noise, sensitivity=follow))
 
 
@@ -191,52 +199,59 @@ def with_predicted_gaps(problem: Problem, phi: Floats) -> Floats:
     return states
 
 
-def _steps(problem: Problem, cells: Cells, sigma: Floats) -> Floats:
-    """Return the steps of finite differences by the cells, shape (cell,)."""
-    error = cells.errors(sigma)
-    known = {place: error[i] / problem.scene.time_step for i, place in enumerate(cells.places)}
-    below = np.array([known.get(place - VELOCITY, 0.0) for place in cells.places])
-    rate = (cells.places % len(STATE) >= VELOCITY) & (cells.sensor < 0)
+def _steps(problem: Problem, coordinates: Coordinates, sigma: Floats) -> Floats:
+    """Return the steps of finite differences by the coordinates, shape (coordinate,)."""
+    error = coordinates.errors(sigma)
+    known = {
+        place: error[i] / problem.scene.time_step for i, place in enumerate(coordinates.places)
+    }
+    below = np.array([known.get(place - VELOCITY, 0.0) for place in coordinates.places])
+    rate = (coordinates.places % len(STATE) >= VELOCITY) & (coordinates.sensor < 0)
     return np.where(rate, np.maximum(error, below), error)
 
 
-def _between(begin: Floats, end: Floats, share: float, cells: Cells) -> Floats:
+def _between(begin: Floats, end: Floats, share: float, coordinates: Coordinates) -> Floats:
     """Return noise parameters with accelerations between two sets, in the logarithm."""
-    sigma, steps = end.copy(), list(cells.accelerations)
+    sigma, steps = end.copy(), list(coordinates.accelerations)
     larger = np.maximum(begin, end)[steps]
     sigma[steps] = larger ** (1.0 - share) * end[steps] ** share
     return sigma
 
 
-def _guess(problem: Problem, cells: Cells, phi: Floats) -> Floats:
+def _guess(problem: Problem, coordinates: Coordinates, phi: Floats) -> Floats:
     """Return first noise parameters, from residuals of single steps."""
-    residual = cells.of_residual(problem.residual(phi))
+    residual = coordinates.of_residual(problem.residual(phi))
     size = np.sqrt(np.nanmedian(residual**2, axis=0)) / 0.67
     by_dimension = {
-        d: float(np.sqrt(np.mean(size[cells.places % len(STATE) == d] ** 2))) for d in cells.columns
+        d: float(np.sqrt(np.mean(size[coordinates.places % len(STATE) == d] ** 2)))
+        for d in coordinates.columns
     }
     dt = problem.scene.time_step
-    guess = [by_dimension[d] / np.sqrt(2) for d in cells.sensors]
-    guess += [by_dimension[d] / np.sqrt(2) / dt for d in (*cells.rates, *cells.contacts)]
-    guess += [by_dimension[d] / np.sqrt(2) for d in cells.drifts]
+    guess = [by_dimension[d] / np.sqrt(2) for d in coordinates.sensors]
+    guess += [
+        by_dimension[d] / np.sqrt(2) / dt for d in (*coordinates.rates, *coordinates.contacts)
+    ]
+    guess += [by_dimension[d] / np.sqrt(2) for d in coordinates.drifts]
     return np.maximum(guess, problem.noise_prior[0] * 0.01)
 
 
-def _moved(problem: Problem, cells: Cells, first: Bools, before: Floats, after: Floats) -> Floats:
+def _moved(
+    problem: Problem, coordinates: Coordinates, first: Bools, before: Floats, after: Floats
+) -> Floats:
     """Return the states moved by the smoothed deviations."""
     segments = problem.segments
     states = problem.data.smoothed_states.copy()
     flat = states.reshape(*states.shape[:2], -1)
-    at = segments.trajectory[:, None], segments.step[:, None] + 1, cells.places
+    at = segments.trajectory[:, None], segments.step[:, None] + 1, coordinates.places
     flat[at] += after
-    begin = segments.trajectory[first, None], segments.step[first, None], cells.places
+    begin = segments.trajectory[first, None], segments.step[first, None], coordinates.places
     flat[begin] += before[first]
-    return cells.completed(problem.scene, states)
+    return coordinates.completed(problem.scene, states)
 
 
 def _sloped(
     problem: Problem,
-    cells: Cells,
+    coordinates: Coordinates,
     phi: Floats,
     sigma: Floats,
     steps: Floats,
@@ -249,46 +264,48 @@ def _sloped(
     segments = problem.segments
     chosen = np.arange(segments.n) if rows is None else np.flatnonzero(rows)
     if not len(chosen):
-        return linearised(problem, cells, problem.trajectory_noise.slope, sigma)
+        return linearised(problem, coordinates, problem.trajectory_noise.slope, sigma)
     start = segments.start[chosen]
-    d, n = len(cells.places), len(chosen)
+    d, n = len(coordinates.places), len(chosen)
     moved = np.tile(start, (2 * d, 1, 1, 1))
     flat = moved.reshape(2 * d, n, -1)
-    for i, place in enumerate(cells.places):
+    for i, place in enumerate(coordinates.places):
         flat[2 * i, :, place] += steps[i]
         flat[2 * i + 1, :, place] -= steps[i]
-    moved = cells.completed(problem.scene, moved).reshape(2 * d * n, *start.shape[1:])
+    moved = coordinates.completed(problem.scene, moved).reshape(2 * d * n, *start.shape[1:])
     inputs = np.tile(problem.inputs[chosen], (2 * d, 1, 1, 1))
     # a coarse engine's slope agrees with a fine one's
-    ends = cells.of(problem.rough.simulator(phi, moved, inputs)[:, 0]).reshape(d, 2, n, d)
+    ends = coordinates.of(problem.rough.simulator(phi, moved, inputs)[:, 0]).reshape(d, 2, n, d)
     own = ((ends[:, 0] - ends[:, 1]) / (2 * steps[:, None, None])).transpose(1, 2, 0)
     slope = np.nan_to_num(own) if rows is None else problem.trajectory_noise.slope.copy()
     slope[chosen] = np.nan_to_num(own)
-    return linearised(problem, cells, slope, sigma)
+    return linearised(problem, coordinates, slope, sigma)
 
 
-def linearised(problem: Problem, cells: Cells, slope: Floats, sigma: Floats) -> TrajectoryNoise:
+def linearised(
+    problem: Problem, coordinates: Coordinates, slope: Floats, sigma: Floats
+) -> TrajectoryNoise:
     """Return the noise along a problem's trajectories from given slopes.
 
     Parameters
     ----------
     problem : Problem
         Its data hold the states.
-    cells : Cells
+    coordinates : Coordinates
         Coordinates and noise parameters.
     slope : ndarray
-        Derivative of the next state by the state, shape (transition, cell, cell).
+        Derivative of the next state by the state, shape (transition, coordinate, coordinate).
     sigma : ndarray
         Noise parameters at which the states were smoothed, shape (parameter,).
     """
     segments, states = problem.segments, problem.data.smoothed_states
     trajectory, step = segments.trajectory, segments.step
     observed = problem.data.history.dataset["observed"].to_numpy()
-    deviation = cells.wrapped(cells.of(observed) - cells.of(states))
+    deviation = coordinates.wrapped(coordinates.of(observed) - coordinates.of(states))
     end, begin = deviation[trajectory, step + 1], deviation[trajectory, step]
-    far = _FAR * np.ptp(cells.of(states), axis=(0, 1)) + cells.sizes(problem.scene)
+    far = _FAR * np.ptp(coordinates.of(states), axis=(0, 1)) + coordinates.sizes(problem.scene)
     return TrajectoryNoise(
-        cells=cells,
+        coordinates=coordinates,
         slope=np.ascontiguousarray(slope),
         first=step == 0,
         seen=np.isfinite(end),
@@ -296,14 +313,14 @@ def linearised(problem: Problem, cells: Cells, slope: Floats, sigma: Floats) -> 
         begin=np.nan_to_num(begin),
         wide=np.where(np.isfinite(begin), 0.0, far**2),
         sigma=np.asarray(sigma, dtype=float),
-        touching=_touching(problem, cells),
+        touching=_touching(problem, coordinates),
     )
 
 
-def _touching(problem: Problem, cells: Cells) -> Bools:
+def _touching(problem: Problem, coordinates: Coordinates) -> Bools:
     """Return the mask of transitions with contact, shape (transition,)."""
     segments, states = problem.segments, problem.data.smoothed_states
-    if not cells.contacts:
+    if not coordinates.contacts:
         return np.zeros(segments.n, dtype=bool)
     trajectory, step = segments.trajectory, segments.step
     return touching(problem.scene, states[trajectory, step], states[trajectory, step + 1])

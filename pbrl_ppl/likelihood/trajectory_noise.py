@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from pbrl_ppl.likelihood.cells import Cells, step_covariances
+from pbrl_ppl.likelihood.coordinates import Coordinates, step_covariances
 from pbrl_ppl.likelihood.kalman import adjoint, gains, innovations, score, whitened
 from pbrl_ppl.likelihood.sensitivity import Sensitivity
 from pbrl_ppl.physics import Memory
@@ -29,25 +29,25 @@ class TrajectoryNoise:
     where bodies touch: how they part depends on more than any engine knows; and of errors of
     measuring that are correlated from row to row.
 
-    The filter's state is the cells as measured without a row's own error, which is the state plus
-    the correlated errors, followed by those errors: each measurement then is of one coordinate.
+    The filter's state is the coordinates as measured without a row's own error, which is the state
+    plus the correlated errors, followed by those errors: each measurement then is of one of them.
 
     Parameters
     ----------
-    cells : Cells
+    coordinates : Coordinates
         Coordinates of the state.
     slope : ndarray
-        Derivative F of the next state by the state, shape (transition, cell, cell).
+        Derivative F of the next state by the state, shape (transition, coordinate, coordinate).
     first : ndarray of bool
         Whether a transition is its trajectory's first, shape (transition,).
     seen : ndarray of bool
-        Whether a cell was measured at the transition's end, shape (transition, cell).
+        Whether a coordinate was measured at the transition's end, shape (transition, coordinate).
     measured : ndarray
-        Measured minus linearised state at the transition's end, shape (transition, cell).
+        Measured minus linearised state at the transition's end, shape (transition, coordinate).
     begin : ndarray
         The same before the transition, for the first of a trajectory; 0 where not measured.
     wide : ndarray
-        Variance of that where it was not measured, 0 elsewhere, shape (transition, cell).
+        Variance of that where it was not measured, 0 elsewhere, shape (transition, coordinate).
     sigma : ndarray
         Noise parameters at which it was linearised, shape (parameter,).
     touching : ndarray of bool
@@ -61,7 +61,7 @@ class TrajectoryNoise:
         The filter's gains at the last few noise parameters.
     """
 
-    cells: Cells
+    coordinates: Coordinates
     slope: Floats
     first: Bools
     seen: Bools
@@ -76,7 +76,7 @@ class TrajectoryNoise:
     @cached_property
     def _extended(self) -> Extended:
         """The filter's linear model."""
-        return Extended.of(self.cells, self.slope, self.seen)
+        return Extended.of(self.coordinates, self.slope, self.seen)
 
     def _gains(self, sigma: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """Gain, scale and covariance of the filter at noise parameters, and the log of the scale.
@@ -89,17 +89,17 @@ class TrajectoryNoise:
         own = self._extended
         gain, scale, after = gains(
             own.slope, self.first, own.seen, self._begin(sigma),
-            own.padded(self.cells.white(sigma) ** 2), own.steps(sigma), self.kind,
+            own.padded(self.coordinates.white(sigma) ** 2), own.steps(sigma), self.kind,
         )  # fmt: skip
         return gain, scale, after, np.log(scale).sum(axis=1)
 
     def scale(self, sigma: Floats) -> Floats:
-        """Standard deviation of each innovation, shape (transition, cell); 1 where not seen."""
-        return self._gains(sigma)[1][:, : len(self.cells.places)]
+        """Standard deviation of each innovation (transition, coordinate); 1 where not seen."""
+        return self._gains(sigma)[1][:, : len(self.coordinates.places)]
 
     def covariance(self, sigma: Floats) -> Floats:
-        """Covariance of filtered states, shape (transition, cell, cell)."""
-        return self._extended.covariance(self.cells, self._gains(sigma)[2])
+        """Covariance of filtered states, shape (transition, coordinate, coordinate)."""
+        return self._extended.covariance(self.coordinates, self._gains(sigma)[2])
 
     @property
     def last(self) -> Bools:
@@ -124,28 +124,28 @@ class TrajectoryNoise:
         Returns
         -------
         ndarray
-            Shape (..., transition, cell), dimensionless; 0 where nothing was measured.
+            Shape (..., transition, coordinate), dimensionless; 0 where nothing was measured.
         """
         return self.whitened(residual, sigma)[0]
 
     def whitened(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
         """Return whitened innovations with the log of their standard deviations.
 
-        The latter is summed over the cells, shape (..., transition) as that of sigma leads.
+        The latter is summed over the coordinates, shape (..., transition) as that of sigma leads.
         """
-        cells = self.cells.of_residual(residual)
-        lead = cells.shape[:-2]
-        rows = cells.reshape(-1, *cells.shape[-2:])
+        coordinates = self.coordinates.of_residual(residual)
+        lead = coordinates.shape[:-2]
+        rows = coordinates.reshape(-1, *coordinates.shape[-2:])
         if sigma.ndim == 1:
-            return self.filtered(rows, sigma)[0].reshape(cells.shape), self._gains(sigma)[3]
+            return self.filtered(rows, sigma)[0].reshape(coordinates.shape), self._gains(sigma)[3]
         sigmas = np.broadcast_to(sigma, (*lead, sigma.shape[-1])).reshape(-1, sigma.shape[-1])
         white, log_scale = self._whitened(rows, sigmas)
-        return white.reshape(cells.shape), log_scale.reshape(cells.shape[:-1])
+        return white.reshape(coordinates.shape), log_scale.reshape(coordinates.shape[:-1])
 
     def _whitened(self, rows: Floats, sigmas: Floats) -> tuple[Floats, Floats]:
-        """Return the same of residuals (set, transition, cell) that each have their own noise."""
-        own, d = self._extended, len(self.cells.places)
-        sensor = own.padded(self.cells.white(sigmas) ** 2)
+        """Return the same of residuals (set, transition, coordinate) with a noise for each set."""
+        own, d = self._extended, len(self.coordinates.places)
+        sensor = own.padded(self.coordinates.white(sigmas) ** 2)
         variance, step = self._begin(sigmas), own.steps(sigmas)
         begin, measured = own.padded(self.begin), own.padded(self.measured)
 
@@ -167,8 +167,8 @@ class TrajectoryNoise:
     def filtered(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
         """Return whitened innovations and filtered deviations of residuals."""
         white, state = self._filtered(residual, sigma)
-        cells = self.cells
-        return white[..., : len(cells.places)], self._extended.states(cells, state)
+        coordinates = self.coordinates
+        return white[..., : len(coordinates.places)], self._extended.states(coordinates, state)
 
     def _filtered(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
         """Return the same as :meth:`filtered` in the filter's extended state."""
@@ -180,27 +180,29 @@ class TrajectoryNoise:
         )  # fmt: skip
         return white, state
 
-    def of_cells(self, nu: float | Floats | None, shape: tuple[int, ...]) -> float | Floats | None:
+    def of_coordinates(
+        self, nu: float | Floats | None, shape: tuple[int, ...]
+    ) -> float | Floats | None:
         """Return the degrees of freedom of each innovation, from those of residuals."""
         if not isinstance(nu, np.ndarray) or nu.ndim == 0:
             return nu
-        return self.cells.of_residual(np.broadcast_to(nu, shape))
+        return self.coordinates.of_residual(np.broadcast_to(nu, shape))
 
     def log_scale(self, sigma: Floats) -> Floats:
         """Return the summed log standard deviations of innovations, shape (transition,)."""
         return self._gains(sigma)[3]
 
     def smoothed(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
-        """Return smoothed deviations before and after transitions, (transition, cell) each."""
-        own, cells = self._extended, self.cells
+        """Return smoothed deviations (transition, coordinate) before and after transitions."""
+        own, coordinates = self._extended, self.coordinates
         white, filtered = self._filtered(residual[None], sigma)
         before, _, after = self._pulled(white[0], sigma)
         begin = own.padded(self.begin) - self._begin(sigma) * before
         end = filtered[0] - np.einsum("kab,kb->ka", self._gains(sigma)[2], after)
-        return own.states(cells, begin), own.states(cells, end)
+        return own.states(coordinates, begin), own.states(coordinates, end)
 
     def pulled(self, weighted: Floats, sigma: Floats) -> Floats:
-        """Return the derivative of weighted innovations by the predictions, (transition, cell)."""
+        """Return the derivative of weighted innovations by predictions (transition, coordinate)."""
         padded = self._extended.padded(weighted)
         return self._pulled(padded, sigma)[1][:, : weighted.shape[1]]
 
@@ -222,8 +224,8 @@ class TrajectoryNoise:
         sigma : ndarray
             Shape (parameter,).
         """
-        own, cells, d = self._extended, self.cells, len(self.cells.places)
-        white = self._filtered(cells.of_residual(residual)[None], sigma)[0][0]
+        own, coordinates, d = self._extended, self.coordinates, len(self.coordinates.places)
+        white = self._filtered(coordinates.of_residual(residual)[None], sigma)[0][0]
         gain, scale, _, log_scale = self._gains(sigma)
         sensor, step, begin, _ = score(
             own.slope, self.last, own.seen, gain, scale, white, self.kind
@@ -232,9 +234,9 @@ class TrajectoryNoise:
         began = np.where(self.first[:, None], begin, 0.0)
         measured = np.where(self.wide > 0, 0.0, began[:, :d]).sum(axis=0)
         slope = np.zeros(len(sigma))
-        free = cells.sensor >= 0
-        np.add.at(slope, cells.sensor[free], (sensor[:d] + measured)[free])
-        np.add.at(slope, cells.drifted[1], began[:, d:].sum(axis=0))
+        free = coordinates.sensor >= 0
+        np.add.at(slope, coordinates.sensor[free], (sensor[:d] + measured)[free])
+        np.add.at(slope, coordinates.drifted[1], began[:, d:].sum(axis=0))
         steps = np.where(own.always[:, None, None], step.sum(axis=0), step[1])
         np.add.at(slope, own.pushed, np.einsum("ja,jab,jb->j", own.push, steps, own.push))
         norm = -0.5 * np.log(2 * np.pi) * self.seen.sum()
@@ -247,15 +249,15 @@ class TrajectoryNoise:
         Parameters
         ----------
         residual : ndarray
-            Of cells, shape (transition, cell).
+            Of coordinates, shape (transition, coordinate).
         sigma : ndarray
             Shape (parameter,).
 
         Returns
         -------
         end, begin : ndarray
-            At a transition's end, and before the first of a trajectory, shape (transition, cell)
-            each; 0 where nothing was measured.
+            At a transition's end, and before the first of a trajectory, shape (transition,
+            coordinate) each; 0 where nothing was measured.
         """
         own, (gain, scale, *_) = self._extended, self._gains(sigma)
         white = self._filtered(residual[None], sigma)[0][0]
@@ -269,16 +271,16 @@ class TrajectoryNoise:
         Parameters
         ----------
         residual : ndarray
-            Shape (transition, cell).
+            Shape (transition, coordinate).
         sigma : ndarray
             Shape (parameter,).
 
         Returns
         -------
         mean, covariance : ndarray
-            Shapes (transition, cell) and (transition, cell, cell).
+            Shapes (transition, coordinate) and (transition, coordinate, coordinate).
         """
-        own, d, first = self._extended, len(self.cells.places), self.first[:, None]
+        own, d, first = self._extended, len(self.coordinates.places), self.first[:, None]
         after, filtered = self._gains(sigma)[2], self._filtered(residual[None], sigma)[1][0]
         state = np.where(first, own.padded(self.begin), np.roll(filtered, 1, axis=0))
         begin = self._begin(sigma)[:, :, None] * np.eye(own.slope.shape[1])
@@ -286,7 +288,7 @@ class TrajectoryNoise:
         covariance = own.slope @ known @ own.slope.transpose(0, 2, 1) + own.steps(sigma)[self.kind]
         return (
             np.einsum("kab,kb->ka", own.slope, state)[:, :d] - residual,
-            covariance[:, :d, :d] + np.diag(self.cells.white(sigma) ** 2),
+            covariance[:, :d, :d] + np.diag(self.coordinates.white(sigma) ** 2),
         )
 
     def random(
@@ -301,43 +303,45 @@ class TrajectoryNoise:
         sigma : ndarray
             Noise parameters, shape (parameter,).
         """
-        mean, covariance = self.predictive(self.cells.of_residual(linearised - predicted), sigma)
+        mean, covariance = self.predictive(
+            self.coordinates.of_residual(linearised - predicted), sigma
+        )
         factor = np.linalg.cholesky(covariance)
         drawn = mean + np.einsum("kab,kb->ka", factor, rng.standard_normal(mean.shape))
         result = linearised.copy()
-        body, dimension = np.divmod(self.cells.places, 6)
-        result[:, 0, body, np.searchsorted(self.cells.columns, dimension)] += drawn
+        body, dimension = np.divmod(self.coordinates.places, 6)
+        result[:, 0, body, np.searchsorted(self.coordinates.columns, dimension)] += drawn
         return result
 
     def _begin(self, sigma: Floats) -> Floats:
         """Return the variance of the filter's first states at sigma (..., parameter).
 
-        Shape (..., transition, coordinate).
+        Shape (..., transition, extended).
         """
-        sensor = self.cells.white(sigma)[..., None, :] ** 2
+        sensor = self.coordinates.white(sigma)[..., None, :] ** 2
         state = np.where(self.wide > 0, self.wide, sensor)
-        error = sigma[..., None, self.cells.drifted[1]] ** 2
+        error = sigma[..., None, self.coordinates.drifted[1]] ** 2
         error = np.broadcast_to(error, (*state.shape[:-1], error.shape[-1]))
         return np.concatenate([state, error], axis=-1)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Extended:
-    """Linear model of the filter: cells plus their correlated errors, then those errors.
+    """Linear model of the filter: coordinates plus their correlated errors, then those errors.
 
     A correlated error e follows ``e' = rho e + u`` (Harvey, Forecasting, Structural Time Series
     Models and the Kalman Filter, 1989, section 3.2). With ``z = x + e`` and ``x' = F x + w``,
     ``z' = F z + (rho - F) e + w + u``, and each measurement is of one coordinate of z. Without
-    correlated errors it is that of the cells.
+    correlated errors it is that of the coordinates.
 
     Parameters
     ----------
     slope : ndarray
-        Shape (transition, coordinate, coordinate).
+        Shape (transition, extended, extended).
     seen : ndarray of bool
-        Shape (transition, coordinate).
+        Shape (transition, extended).
     push : ndarray
-        What a unit of each noise parameter's acceleration or error adds, shape (push, coordinate).
+        What a unit of each noise parameter's acceleration or error adds, shape (push, extended).
     pushed : ndarray of int
         Which noise parameter each row is of, shape (push,).
     always : ndarray of bool
@@ -351,12 +355,12 @@ class Extended:
     always: Bools
 
     @classmethod
-    def of(cls, cells: Cells, slope: Floats, seen: Bools) -> Extended:
-        """Return the extended model of the cells; arguments as of `TrajectoryNoise`."""
-        at, parameters = cells.drifted
+    def of(cls, coordinates: Coordinates, slope: Floats, seen: Bools) -> Extended:
+        """Return the extended model of the coordinates; arguments as of `TrajectoryNoise`."""
+        at, parameters = coordinates.drifted
         if not len(at):
-            return cls(slope, seen, cells.push, cells.pushed, cells.always)
-        (n, d), k, rho = seen.shape, len(at), cells.memory
+            return cls(slope, seen, coordinates.push, coordinates.pushed, coordinates.always)
+        (n, d), k, rho = seen.shape, len(at), coordinates.memory
         chosen = np.zeros((d, k))
         chosen[at, np.arange(k)] = 1.0
         whole = np.zeros((n, d + k, d + k))
@@ -364,37 +368,37 @@ class Extended:
         whole[:, :d, d:] = rho * chosen - slope @ chosen
         whole[:, d:, d:] = rho * np.eye(k)
         new = np.sqrt(1.0 - rho**2) * np.hstack([chosen.T, np.eye(k)])
-        push = np.vstack([np.pad(cells.push, ((0, 0), (0, k))), new])
+        push = np.vstack([np.pad(coordinates.push, ((0, 0), (0, k))), new])
         return cls(
             whole,
             np.pad(seen, ((0, 0), (0, k))),
             push,
-            np.concatenate([cells.pushed, parameters]),
-            np.concatenate([cells.always, np.ones(k, dtype=bool)]),
+            np.concatenate([coordinates.pushed, parameters]),
+            np.concatenate([coordinates.always, np.ones(k, dtype=bool)]),
         )
 
     def steps(self, sigma: Floats) -> Floats:
         """Return the process noise of a step without and with contact, at sigma (..., parameter).
 
-        Shape (..., 2, coordinate, coordinate).
+        Shape (..., 2, extended, extended).
         """
         return step_covariances(self.push, sigma[..., self.pushed], self.always)
 
     def padded(self, values: Floats) -> Floats:
-        """Return values of cells (..., cell), padded with zeros for the errors."""
+        """Return values of coordinates (..., coordinate), padded with zeros for the errors."""
         more = self.slope.shape[1] - values.shape[-1]
         return np.pad(values, (*[(0, 0)] * (values.ndim - 1), (0, more))) if more else values
 
-    def states(self, cells: Cells, coordinates: Floats) -> Floats:
-        """Return cells without their errors, shape (..., cell)."""
-        at, d = cells.drifted[0], len(cells.places)
+    def states(self, coordinates: Coordinates, extended: Floats) -> Floats:
+        """Return coordinates without their errors, shape (..., coordinate)."""
+        at, d = coordinates.drifted[0], len(coordinates.places)
         if not len(at):
-            return coordinates
-        result = coordinates[..., :d].copy()
-        result[..., at] -= coordinates[..., d:]
+            return extended
+        result = extended[..., :d].copy()
+        result[..., at] -= extended[..., d:]
         return result
 
-    def covariance(self, cells: Cells, whole: Floats) -> Floats:
-        """Return the covariance of cells without errors, shape (transition, cell, cell)."""
-        half = self.states(cells, whole)
-        return self.states(cells, half.swapaxes(-1, -2))
+    def covariance(self, coordinates: Coordinates, whole: Floats) -> Floats:
+        """Return the covariance (transition, coordinate, coordinate) without errors."""
+        half = self.states(coordinates, whole)
+        return self.states(coordinates, half.swapaxes(-1, -2))

@@ -256,7 +256,7 @@ def fit_pieces(
         Derivatives that are not taken anew, of a smaller model nearby.
     """
     priors, layout, exact = problem.layout.priors, problem.layout, problem
-    scale, sizes = layout.scale(phi), output_error(problem).starts.cells.sizes(problem.scene)
+    scale, sizes = layout.scale(phi), output_error(problem).starts.coordinates.sizes(problem.scene)
     phi, start = inside(priors, phi), problem.segments.start
     if known is not None:
         problem = problem.coarse.corrected_to(problem.rough, phi)
@@ -341,20 +341,20 @@ def _linearise(
     known: Linear | None = None,
 ) -> Linear:
     """Return residual and derivatives by central differences, all in one call of the engine."""
-    cells = output_error(problem).starts.cells
+    coordinates = output_error(problem).starts.coordinates
     lower, upper = box(problem.layout.priors)
     ahead, behind = np.minimum(phi + steps[0], upper), np.maximum(phi - steps[0], lower)
     new = np.arange(len(phi)) if known is None else known.unknown
-    p, c = len(new), len(cells.places) if known is None else 0
+    p, c = len(new), len(coordinates.places) if known is None else 0
     points = np.tile(phi, (1 + 2 * p + 2 * c, 1))
     points[1 + np.arange(p), new] = ahead[new]
     points[1 + p + np.arange(p), new] = behind[new]
     starts = np.tile(start, (len(points), 1, 1, 1))
     flat = starts.reshape(len(points), len(start), -1)
-    for i, place in enumerate(cells.places[:c]):
+    for i, place in enumerate(coordinates.places[:c]):
         flat[1 + 2 * p + i, :, place] += steps[1][i]
         flat[1 + 2 * p + c + i, :, place] -= steps[1][i]
-    residual = _residual(problem, points, cells.completed(problem.scene, starts))
+    residual = _residual(problem, points, coordinates.completed(problem.scene, starts))
     width = np.maximum(ahead - behind, 1e-300)[new]
     by_phi = np.moveaxis(residual[1 : 1 + p] - residual[1 + p : 1 + 2 * p], 0, -1) / -width
     if known is not None:
@@ -464,7 +464,7 @@ class _Step:
 
     def moved(self, damping: float) -> tuple[Floats, Floats]:
         """Return phi and start states a damped step on, shapes (p,) and (piece, body, 6)."""
-        phi, cells = self.phi, self.starts.cells
+        phi, coordinates = self.phi, self.starts.coordinates
         if len(phi):
             sd = 1.0 / np.sqrt(np.maximum(np.diag(self.precision), 1e-300))
             scaled = self.precision * np.outer(sd, sd) + damping * np.eye(len(sd))
@@ -474,8 +474,8 @@ class _Step:
         left = self.rows - self.by_phi @ (phi - self.phi)
         change = (self.back @ (np.swapaxes(self.u, 1, 2) @ left[..., None]))[..., 0]
         states = self.start.copy()
-        states.reshape(len(states), -1)[:, cells.places] += change / (1.0 + damping)
-        return phi, cells.completed(self.problem.scene, states)
+        states.reshape(len(states), -1)[:, coordinates.places] += change / (1.0 + damping)
+        return phi, coordinates.completed(self.problem.scene, states)
 
 
 def simulated_states(mode: Mode) -> Floats:

@@ -81,8 +81,8 @@ def trajectory_mode(problem: Problem, phi: Floats, sigma: Floats | None = None) 
     """
     whole = problem.likelihood.filtered
     if sigma is None or not whole:
-        cells = problem.trajectory_noise.cells if whole else None
-        rough = along_trajectories(problem.rough, phi, cells=cells)
+        coordinates = problem.trajectory_noise.coordinates if whole else None
+        rough = along_trajectories(problem.rough, phi, coordinates=coordinates)
         problem = replace(rough, physics=problem.physics)
         sigma = problem.trajectory_noise.sigma
     mode = nearby_mode(problem, phi, sigma)

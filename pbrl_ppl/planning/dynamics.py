@@ -11,7 +11,7 @@ import numpy as np
 
 from pbrl_ppl.effects import Attached, Effect, attach, catalogue, needs_inputs
 from pbrl_ppl.errors import PosteriorError
-from pbrl_ppl.likelihood import Cells, degrees_of_freedom, next_state_random, tail_places
+from pbrl_ppl.likelihood import Coordinates, degrees_of_freedom, next_state_random, tail_places
 from pbrl_ppl.physics import Physics, after_recording
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE, WRENCH, Floats
@@ -122,12 +122,12 @@ class AccelerationNoise:
     ----------
     sigma : ndarray
         Noise parameters, shape (draw, parameter), m/s^2 and rad/s^2 where they are accelerations.
-    cells : Cells
+    coordinates : Coordinates
         Coordinates that they move.
     """
 
     sigma: Floats
-    cells: Cells
+    coordinates: Coordinates
 
     def add(self, states: Floats, rng: np.random.Generator) -> Floats:
         """Return states (draw, n, body, 6) with noise."""
@@ -135,12 +135,14 @@ class AccelerationNoise:
         # without what a contact adds, which is not predicted
         apart = np.zeros(states.shape[:2], dtype=bool)
         flat = out.reshape(*apart.shape, -1)
-        flat[..., self.cells.places] += self.cells.pushes(self.sigma[:, None], apart, rng)
+        flat[..., self.coordinates.places] += self.coordinates.pushes(
+            self.sigma[:, None], apart, rng
+        )
         return out
 
     def single(self, draw: int) -> AccelerationNoise:
         """Return the noise of one draw."""
-        return AccelerationNoise(self.sigma[draw : draw + 1], self.cells)
+        return AccelerationNoise(self.sigma[draw : draw + 1], self.coordinates)
 
 
 #: Noise that a step adds to states, one distribution a posterior draw.

@@ -175,36 +175,36 @@ class Separation:
         predictions' widening by the parameters, and number of parameters that the data inform.
         """
         mode = rival.mode
-        cells = mode.problem.trajectory_noise.cells
+        coordinates = mode.problem.trajectory_noise.coordinates
         seen = mode.problem.trajectory_noise.seen.any(axis=0)
         spread = np.sqrt(np.maximum(np.diag(mode.covariance), 0.0))
         lower, upper = mode.problem.layout.bounds
 
         def steps(phi: Floats, begin: Floats) -> Floats:
-            """Return the cells after an interval, shape (point, transition, cell)."""
+            """Return the coordinates after an interval, shape (point, transition, cell)."""
             dynamics = self._dynamics(rival, phi)
             ends = dynamics.step(begin, paths.wrenches, paths.before)
-            return np.nan_to_num(cells.of(ends))
+            return np.nan_to_num(coordinates.of(ends))
 
         def of_phi(points: Floats) -> Floats:
             return steps(points, np.broadcast_to(paths.begin, (len(points), *paths.begin.shape)))
 
-        residual = cells.wrapped(cells.of(paths.end) - of_phi(mode.phi[None])[0])
+        residual = coordinates.wrapped(coordinates.of(paths.end) - of_phi(mode.phi[None])[0])
         by_phi = differentiate(of_phi, mode.phi, _STEP * spread, lower, upper)
-        c, n = len(cells.places), len(paths.begin)
-        natural = body_sizes(mode.problem.scene).ravel()[list(cells.places)]
-        size = np.maximum(cells.errors(rival.sigma), 1e-6 * natural)
+        c, n = len(coordinates.places), len(paths.begin)
+        natural = body_sizes(mode.problem.scene).ravel()[list(coordinates.places)]
+        size = np.maximum(coordinates.errors(rival.sigma), 1e-6 * natural)
         moved = np.tile(paths.begin, (2 * c, 1, 1, 1))
         flat = moved.reshape(2 * c, n, -1)
-        for i, place in enumerate(cells.places):
+        for i, place in enumerate(coordinates.places):
             flat[i, :, place] += size[i]
             flat[c + i, :, place] -= size[i]
-        moved = cells.completed(mode.problem.scene, moved)
+        moved = coordinates.completed(mode.problem.scene, moved)
         ends = steps(np.tile(mode.phi, (2 * c, 1)), moved)
         slope = np.moveaxis((ends[:c] - ends[c:]) / (2 * size[:, None, None]), 0, -1)
         nothing = np.zeros((n, c))
         noise = TrajectoryNoise(
-            cells=cells,
+            coordinates=coordinates,
             slope=np.ascontiguousarray(slope),
             first=np.arange(n) % paths.intervals == 0,
             seen=np.tile(seen, (n, 1)),

@@ -25,7 +25,7 @@ from .data import linearised_as as linearised_as
 from .data import placed as placed
 from .data import problem_of as problem_of
 from .data import recorded as recorded
-from .data import recorded_cells as recorded_cells
+from .data import recorded_coordinates as recorded_coordinates
 from .data import recording as recording
 from .data import versions as versions
 from .identifiability import Identifiability as Identifiability

@@ -20,10 +20,10 @@ from pbrl_ppl.likelihood import (
     TrajectoryLikelihood,
     TransitionLikelihood,
     along_trajectories,
-    cells_of,
     in_pieces,
     linearised,
     linearised_pieces,
+    observed_coordinates,
     output_error,
     with_sensitivity,
 )
@@ -77,7 +77,7 @@ def record_of(problem: Problem, seed: int, method: str) -> PosteriorRecord:
         nu=problem.likelihood.nu,
         library=problem.library,
         learned_remainder=tables[-1] if tables else None,
-        cells=problem.trajectory_noise.cells if likelihood.filtered else None,
+        cells=problem.trajectory_noise.coordinates if likelihood.filtered else None,
     )
 
 
@@ -149,7 +149,9 @@ def problem_of(
     # linearised at the posterior's best draw
     phi, sigma = vectors(idata, problem.layout, stored.noise_variables)
     best = best_draw(idata)
-    problem = along_trajectories(problem, phi[best], sigma[best], stored.trajectory_noise.cells)
+    problem = along_trajectories(
+        problem, phi[best], sigma[best], stored.trajectory_noise.coordinates
+    )
     return with_sensitivity(problem, phi[best], sigma[best])
 
 
@@ -218,8 +220,8 @@ def recording(problem: Problem) -> xr.Dataset:
     noise = problem.trajectory_noise
     kept["slope"] = (("transition", "cell_after", "cell_before"), noise.slope)
     kept["linearised_at"] = (("noise_parameter",), noise.sigma)
-    if noise.cells.drifts:
-        kept["memory"] = noise.cells.memory
+    if noise.coordinates.drifts:
+        kept["memory"] = noise.coordinates.memory
     if noise.sensitivity is not None:
         kept[_ORIGIN] = (("transition", "parameter"), noise.sensitivity.phi)
         dims = ("transition", "cell_before", "parameter")
@@ -239,13 +241,17 @@ def with_recording(problem: Problem, given: xr.Dataset, data_sha256: str) -> Pro
         start = problem.segments.start
         slope, tau = given[_BY_START].to_numpy(), given[_TAU].to_numpy()
         return linearised_pieces(problem, start, slope, tau).with_likelihood(prior=prior)
-    cells = recorded_cells(problem.scene, given)
-    data = replace(problem.data, history=history, horizon=1, states=states, columns=cells.columns)
+    coordinates = recorded_coordinates(problem.scene, given)
+    data = replace(
+        problem.data, history=history, horizon=1, states=states, columns=coordinates.columns
+    )
     problem, slope = problem.on(data), given["slope"].to_numpy()
-    noise = linearised(problem, cells, slope, given["linearised_at"].to_numpy())
+    noise = linearised(problem, coordinates, slope, given["linearised_at"].to_numpy())
     if _SENSITIVITY in given:
         origin, before = given[_ORIGIN].to_numpy(), given[_SENSITIVITY].to_numpy()
-        follow = Sensitivity(problem.scene, problem.layout, cells, noise.slope, origin, before)
+        follow = Sensitivity(
+            problem.scene, problem.layout, coordinates, noise.slope, origin, before
+        )
         noise = replace(noise, sensitivity=follow)
     return problem.along(noise)
 
@@ -265,10 +271,10 @@ def recorded(scene: Scene, given: xr.Dataset, data_sha256: str = "") -> History:
     return History(dataset)
 
 
-def recorded_cells(scene: Scene, given: xr.Dataset) -> Any:
-    """Return the cells of the history that a posterior's constant data hold."""
-    cells = cells_of(scene, recorded(scene, given))
-    return cells.drifting(float(given["memory"])) if "memory" in given else cells
+def recorded_coordinates(scene: Scene, given: xr.Dataset) -> Any:
+    """Return the coordinates of the history that a posterior's constant data hold."""
+    coordinates = observed_coordinates(scene, recorded(scene, given))
+    return coordinates.drifting(float(given["memory"])) if "memory" in given else coordinates
 
 
 def both_recordings(held: xr.Dataset, new: xr.Dataset) -> xr.Dataset:

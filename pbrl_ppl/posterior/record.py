@@ -12,7 +12,7 @@ import numpy as np
 
 from pbrl_ppl.effects import Attached, Effect, attach, catalogue, learned_remainder
 from pbrl_ppl.errors import PosteriorError
-from pbrl_ppl.likelihood import Cells, noise_labels
+from pbrl_ppl.likelihood import Coordinates, noise_labels
 from pbrl_ppl.parameters import Layout, ParameterLibrary
 from pbrl_ppl.physics import build_layout
 from pbrl_ppl.posterior.store import SCHEMA, check_schema, draws
@@ -83,7 +83,7 @@ class PosteriorRecord:
         Parameter sets of which each body has one.
     learned_remainder : str, optional
         Table of the learned remainder among the effects.
-    cells : Cells, optional
+    cells : Coordinates, optional
         Which noise parameter each coordinate is subject to, where the fit is of whole trajectories.
     mode : StoredMode, optional
         The posterior's mode.
@@ -129,7 +129,7 @@ class PosteriorRecord:
     nu: float | None = None
     library: ParameterLibrary | None = None
     learned_remainder: str | None = None
-    cells: Cells | None = None
+    cells: Coordinates | None = None
     mode: StoredMode | None = None
     linearisation: Mapping[str, Any] | None = None
     configurations: tuple[Mapping[str, Any], ...] | None = None
@@ -255,14 +255,14 @@ def _written(value: Any) -> Any:
         return value.to_json()
     if isinstance(value, StoredMode):
         return json.dumps({name: v for name, v in asdict(value).items() if v is not None})
-    if isinstance(value, Cells):
+    if isinstance(value, Coordinates):
         return json.dumps({name: np.asarray(v).tolist() for name, v in asdict(value).items()})
     if isinstance(value, bool):  # NetCDF has no such attribute
         return int(value)
     return value if isinstance(value, int | float | str) else json.dumps(value)
 
 
-def _cells(text: Any) -> Cells:
+def _cells(text: Any) -> Coordinates:
     held: dict[str, Any] = json.loads(str(text))
     kinds = {"places": np.intp, "sensor": np.intp, "pushed": np.intp, "fixed": float}
     arrays: dict[str, Any] = {
@@ -271,7 +271,7 @@ def _cells(text: Any) -> Cells:
     push = np.array(held.pop("push"), dtype=float).reshape(-1, len(arrays["places"]))
     memory = held.pop("memory")
     tuples: dict[str, Any] = {name: tuple(value) for name, value in held.items()}
-    return Cells(**arrays, push=push, memory=memory, **tuples)
+    return Coordinates(**arrays, push=push, memory=memory, **tuples)
 
 
 def _tuple(text: Any) -> Any:
@@ -283,7 +283,7 @@ def _tuple(text: Any) -> Any:
 _READ: Mapping[str, Callable[[Any], Any]] = {
     "Scene": lambda text: Scene.from_toml(str(text)),
     "ParameterLibrary": lambda text: ParameterLibrary.from_json(str(text)),
-    "Cells": _cells,
+    "Coordinates": _cells,
     "StoredMode": lambda text: StoredMode(**json.loads(str(text))),
     "Mapping": lambda text: json.loads(str(text)),
     "tuple": _tuple,

@@ -107,7 +107,7 @@ def find_evidence(loop: Loop) -> Evidence | None:
     moving = [body.name for body in after.scene.moving]
     body = loop.added[0].body
     index = moving.index(body)
-    places = np.divmod(noise.cells.places, len(STATE))
+    places = np.divmod(noise.coordinates.places, len(STATE))
     seen = set(places[0].tolist())
     states = segments.start[:, index]
     labels = after.data.history.dataset["trajectory"].to_numpy().astype(str)
@@ -275,9 +275,9 @@ def _residual_force(
     problem: Problem, phi: Floats, body: int, dimension: str
 ) -> ResidualForce | None:
     """Return the process noise of a body's velocity over the time step, times its inertia."""
-    cells = problem.trajectory_noise.cells
-    added = cells.of_residual(problem.residual(phi)) / problem.scene.time_step
-    column = {int(place): i for i, place in enumerate(cells.places)}
+    coordinates = problem.trajectory_noise.coordinates
+    added = coordinates.of_residual(problem.residual(phi)) / problem.scene.time_step
+    column = {int(place): i for i, place in enumerate(coordinates.places)}
 
     def acceleration(name: str) -> Floats | None:
         place = body * len(STATE) + STATE.index(name)

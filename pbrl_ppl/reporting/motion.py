@@ -122,7 +122,7 @@ def _predicted(posterior: Any, history: History, effects: Sequence[Effect]) -> d
     """Return the poses that a posterior predicts of whole trajectories, by trajectory."""
     problem = problem_of(posterior, effects)
     phi, sigma = best_vectors(problem, posterior)
-    cells = problem.trajectory_noise.cells
+    cells = problem.trajectory_noise.coordinates
     problem = problem.with_data(history=history, states=None)
     problem = along_trajectories(problem, phi, sigma, cells)
     whole = whole_rollouts(problem, phi, sigma)

@@ -251,8 +251,8 @@ def _weighted(
     data = _with_data(idata, problem)
     changed = replace(record, together=tuple(problem.physics.together))
     if problem.likelihood.filtered:
-        cells = files.recorded_cells(problem.scene, data["constant_data"])
-        changed = replace(changed, cells=cells)
+        coordinates = files.recorded_coordinates(problem.scene, data["constant_data"])
+        changed = replace(changed, cells=coordinates)
     more_noise = [label for label in changed.noise_labels if label not in problem.noise_labels]
     both = from_groups(groups(idata) | data, dict(idata.attrs) | changed.attributes())
     earlier = group(idata, "log_likelihood")["next_state"].transpose("chain", "draw", "transition")

@@ -89,4 +89,4 @@ def test_diverging_forecasts_are_no_gain(diverging) -> None:
     fold = np.zeros(diverging.problem.segments.n, dtype=np.intp)
     left_out = LeftOut(np.zeros(1), diverging.phi[None], diverging.sigma[None])
     squares = forecast_squares(diverging, fold, left_out, 3)
-    assert np.isnan(squares[:, diverging.problem.trajectory_noise.cells.places == 0]).all()
+    assert np.isnan(squares[:, diverging.problem.trajectory_noise.coordinates.places == 0]).all()

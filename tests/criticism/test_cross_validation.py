@@ -58,13 +58,13 @@ def by_quadrature(mode: Mode, fold: np.ndarray) -> np.ndarray:
 def by_refits(mode: Mode, scene: Scene, fold: np.ndarray) -> np.ndarray:
     """The same by a fit without each trajectory, noise and all, and draws of its posterior."""
     rng = np.random.default_rng(5)
-    history, cells = mode.problem.data.history, mode.problem.trajectory_noise.cells
+    history, coordinates = mode.problem.data.history, mode.problem.trajectory_noise.coordinates
     result = []
     for f in range(fold.max() + 1):
         rest = history.select([t for t in range(fold.max() + 1) if t != f])
         fitted = trajectory_mode(Problem.of(Physics.declare(scene), rest), mode.phi)
         held = fitted.problem.with_data(history=history.select([f]), states=None)
-        held = along_trajectories(held, fitted.phi, fitted.sigma, cells)
+        held = along_trajectories(held, fitted.phi, fitted.sigma, coordinates)
         drawn = [
             held.log_density(held.residual(phi), fitted.sigma, phi).sum()
             for phi in fitted.draws(rng, 200)

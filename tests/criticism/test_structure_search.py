@@ -27,5 +27,5 @@ def test_a_disc_is_found_from_a_guess_on_the_other_side_of_the_room(make_history
     found = structure_mode(without, obstacle, np.array([-8.0, 8.0, 0.3]))
     own = [found.problem.layout.labels.index(label) for label in obstacle.labels]
     np.testing.assert_allclose(found.phi[own], disc, atol=0.005)
-    steps = len(found.problem.trajectory_noise.cells.sensors)
+    steps = len(found.problem.trajectory_noise.coordinates.sensors)
     assert np.all(found.sigma[steps:] < 0.05 * without.sigma[steps:])

@@ -51,7 +51,7 @@ def test_a_velocity_recorded_at_the_start_alone_is_given(history) -> None:
     frame.loc[frame["step"] == 0, ["vx", "vy", "omega"]] = 0.0
     problem = fit_pieces(pieces(History.from_dataframe(frame, BALL), 44), np.zeros(0)).problem
     starts = output_error(problem).starts
-    assert starts.given[:, starts.cells.places == 4].all()
+    assert starts.given[:, starts.coordinates.places == 4].all()
     sigma = np.array([0.01])
     z = output_error(problem).whiten(problem.residual(np.zeros(0)), sigma)
     own = history.dataset["observed"].to_numpy()[:, :, 0, 1]

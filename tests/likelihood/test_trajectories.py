@@ -51,9 +51,10 @@ def problem() -> Problem:
 def dense(noise, sigma) -> tuple[np.ndarray, np.ndarray]:
     """Covariance of the first trajectory's measurements after the first, given a flat start."""
     n = int(np.flatnonzero(noise.first)[1])
-    d = len(noise.cells.places)
-    step = (noise.cells.push.T * sigma[noise.cells.pushed] ** 2) @ noise.cells.push
-    r = np.diag(noise.cells.errors(sigma) ** 2)
+    d = len(noise.coordinates.places)
+    push = noise.coordinates.push
+    step = (push.T * sigma[noise.coordinates.pushed] ** 2) @ push
+    r = np.diag(noise.coordinates.errors(sigma) ** 2)
     # residuals e' - F e + w of neighbours share the error e of a measured state
     whole = np.zeros((n * d, n * d))
     for k in range(n):
@@ -70,7 +71,7 @@ def test_whitening_is_that_of_the_whole_covariance(problem) -> None:
     """DESIGN section 7: R + F R F' + Q with itself, -R F' with its successor."""
     noise = problem.trajectory_noise
     covariance, own = dense(noise, NOISE)
-    residual = noise.cells.of_residual(problem.residual(PHI))[own]
+    residual = noise.coordinates.of_residual(problem.residual(PHI))[own]
     begin = np.where(
         noise.first[own][:, None], noise.begin[own], np.roll(noise.measured, 1, 0)[own]
     )
@@ -103,19 +104,19 @@ def test_what_was_not_measured_is_left_out(problem) -> None:
     observed[:, 2, 0, [0, 3]] = np.nan
     dataset["observed"] = dataset["observed"].copy(data=observed)
     gaps = problem.with_data(history=History(dataset), states=None)
-    gaps = along_trajectories(gaps, PHI, NOISE, problem.trajectory_noise.cells)
+    gaps = along_trajectories(gaps, PHI, NOISE, problem.trajectory_noise.coordinates)
     noise, whole = gaps.trajectory_noise, problem.trajectory_noise
     assert (~noise.seen).sum() == 6
     covariance, own = dense(whole, NOISE)
     vague = covariance.copy()
-    d = len(whole.cells.places)
+    d = len(whole.coordinates.places)
     huge = 10.0
     jitter = np.zeros((len(own) * d, 2))
     for j, cell in enumerate((0, 3)):  # measured at the second transition's end
         jitter[d + cell, j] = 1.0
         jitter[2 * d : 3 * d, j] = -whole.slope[2][:, cell]
     vague += huge**2 * jitter @ jitter.T
-    residual = whole.cells.of_residual(problem.residual(PHI))[own]
+    residual = whole.coordinates.of_residual(problem.residual(PHI))[own]
     begin = np.where(
         whole.first[own][:, None], whole.begin[own], np.roll(whole.measured, 1, 0)[own]
     )
@@ -155,8 +156,9 @@ def test_smoothed_states_are_the_likeliest(problem) -> None:
     """No state is moved once the smoother has settled, and the fit of all is a minimum there."""
     settled = smoothed(problem, PHI, NOISE)
     noise = settled.trajectory_noise
-    before, after = noise.smoothed(noise.cells.of_residual(settled.residual(PHI)), NOISE)
-    assert np.abs(np.vstack([before[noise.first], after]) / noise.cells.errors(NOISE)).max() < 0.05
+    before, after = noise.smoothed(noise.coordinates.of_residual(settled.residual(PHI)), NOISE)
+    moved = np.vstack([before[noise.first], after]) / noise.coordinates.errors(NOISE)
+    assert np.abs(moved).max() < 0.05
     # a puck with drag is linear: there is one answer, wherever smoothing began
     moved = replace(problem.data, states=problem.data.states + 1e-3)
     again = smoothed(replace(problem, data=moved), PHI, NOISE)
@@ -236,7 +238,7 @@ def test_the_data_are_in_the_model_s_graph(problem) -> None:
         {model.rvs_to_values[v].name: np.log(point[v.name]) for v in model.free_RVs}
     )
     noise = gappy.trajectory_noise
-    deviation = noise.cells.of_residual(np.nan_to_num(other) - gappy.observations.values)
+    deviation = noise.coordinates.of_residual(np.nan_to_num(other) - gappy.observations.values)
     there = gappy.along(replace(noise, measured=deviation))
     np.testing.assert_allclose(found, there.log_density(there.residual(PHI), NOISE))
     assert abs(found.sum() - gappy.log_density(gappy.residual(PHI), NOISE).sum()) > 0.1
@@ -262,12 +264,12 @@ def test_draws_of_the_model_have_its_covariance(problem) -> None:
     noise = problem.trajectory_noise
     rng = np.random.default_rng(4)
     drawn = np.array([problem.next_states(problem.predict(PHI), NOISE, rng) for _ in range(4000)])
-    mean, covariance = noise.predictive(noise.cells.of_residual(problem.residual(PHI)), NOISE)
-    cells = drawn[:, :, 0, 0] - problem.observations.values[:, 0, 0]
+    mean, covariance = noise.predictive(noise.coordinates.of_residual(problem.residual(PHI)), NOISE)
+    coordinates = drawn[:, :, 0, 0] - problem.observations.values[:, 0, 0]
     sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     # 72 means and 72 variances of 4000 draws: 5 standard errors, chance of a false alarm 1e-4
-    assert (np.abs(cells.mean(axis=0) - mean) < 5 * sd / np.sqrt(4000)).all()
-    ratio = cells.var(axis=0) / sd**2
+    assert (np.abs(coordinates.mean(axis=0) - mean) < 5 * sd / np.sqrt(4000)).all()
+    ratio = coordinates.var(axis=0) / sd**2
     assert (np.abs(ratio - 1) < 5 * np.sqrt(2 / 4000)).all()
 
 
@@ -280,7 +282,7 @@ def test_simulated_trajectories_have_both_noises(problem) -> None:
         made = smoothed(made, PHI, NOISE)
         white.append(made.whitened(PHI, NOISE).reshape(3, 4, 6))
     z = np.array(white)
-    # 2880 cells: sd of the mean square 0.026, of a correlation over 2160 pairs 0.022; 4 of each
+    # 2880 numbers: sd of the mean square 0.026, of a correlation over 2160 pairs 0.022; 4 of each
     assert abs((z**2).mean() - 1) < 0.105
     assert abs((z[:, :, 1:] * z[:, :, :-1]).mean()) < 0.086
 
@@ -311,11 +313,11 @@ def test_a_stated_noise_is_not_inferred(problem, stated) -> None:
     free = [name for name in truth if name not in stated]
     assert list(known.noise_variables.get("sigma", ())) == free
     sigma = np.array([*(truth[name] for name in free), *NOISE[6:]])
-    np.testing.assert_array_equal(known.trajectory_noise.cells.errors(sigma), NOISE[:6])
+    np.testing.assert_array_equal(known.trajectory_noise.coordinates.errors(sigma), NOISE[:6])
     # linearised where all are inferred, the density is the same
-    same = known.trajectory_noise.cells
+    same = known.trajectory_noise.coordinates
     states = problem
-    noise = replace(states.trajectory_noise, cells=same)
+    noise = replace(states.trajectory_noise, coordinates=same)
     there = states.along(noise)
     residual = problem.residual(PHI)
     np.testing.assert_allclose(

@@ -54,8 +54,8 @@ def test_restitution_is_recovered(problem) -> None:
 
 def test_its_path_has_no_noise(problem) -> None:
     whole = along_trajectories(problem, np.array([R]))
-    cells = whole.trajectory_noise.cells
-    assert (cells.places // 6 == 1).all()  # the block's
+    coordinates = whole.trajectory_noise.coordinates
+    assert (coordinates.places // 6 == 1).all()  # the block's
     own = whole.data.history.dataset["start"].to_numpy()[:, :, 0, :3]
     np.testing.assert_array_equal(whole.data.states[:, :, 0, :3], own)
     density = whole.log_density(whole.residual(np.array([R])), whole.trajectory_noise.sigma)

@@ -168,8 +168,8 @@ def _density(data: np.ndarray, mean: np.ndarray, cov: np.ndarray) -> float:
 def _noise(judge: Separation, steps: int) -> np.ndarray:
     """Covariance of what is measured of a free body: errors of the start and of steps run on."""
     one = judge.rivals[0]
-    cells = one.mode.problem.trajectory_noise.cells
-    errors, step = np.diag(cells.errors(one.sigma) ** 2), cells.steps(one.sigma)[0]
+    coordinates = one.mode.problem.trajectory_noise.coordinates
+    errors, step = np.diag(coordinates.errors(one.sigma) ** 2), coordinates.steps(one.sigma)[0]
     flow = np.eye(6)
     flow[:3, 3:] = judge.scene.time_step * np.eye(3)
     state, cov = errors, np.zeros((steps, 6, steps, 6))

@@ -11,7 +11,7 @@ import xarray as xr
 from scipy import stats
 
 from pbrl_ppl.errors import OutputError, PosteriorError
-from pbrl_ppl.likelihood import Cells
+from pbrl_ppl.likelihood import Coordinates
 from pbrl_ppl.parameters import ParameterLibrary
 from pbrl_ppl.posterior import PosteriorRecord, scene_of
 from pbrl_ppl.posterior import store as posterior
@@ -279,7 +279,7 @@ def test_no_scene() -> None:
         scene_of(from_groups(datasets(), {}))
 
 
-CELLS = Cells(
+CELLS = Coordinates(
     places=np.array([0, 5]),
     columns=(0, 5),
     sensor=np.array([0, -1]),
@@ -319,8 +319,8 @@ def test_a_record_is_the_same_from_its_file(tmp_path, given) -> None:
     assert found.attributes() == attrs
     for field in dataclasses.fields(PosteriorRecord):
         value, read = getattr(whole, field.name), getattr(found, field.name)
-        if isinstance(value, Cells):
-            for each in dataclasses.fields(Cells):
+        if isinstance(value, Coordinates):
+            for each in dataclasses.fields(Coordinates):
                 np.testing.assert_array_equal(getattr(read, each.name), getattr(value, each.name))
         else:
             assert read == value, field.name

@@ -143,7 +143,7 @@ def test_pymc_s_predictions_are_of_the_filter(model, half) -> None:
         prior = pm.sample_prior_predictive(draws=3, random_seed=1)
     drawn = group(drawn, "posterior_predictive")["next_state"].to_numpy()[0]
     noise, problem = model.problem.trajectory_noise, model.problem
-    mean, covariance = noise.predictive(noise.cells.of_residual(problem.residual(phi)), sigma)
+    mean, covariance = noise.predictive(noise.coordinates.of_residual(problem.residual(phi)), sigma)
     off = (drawn - problem.observations.values)[:, :, 0, 0]
     sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     assert (np.abs(off.mean(axis=0) - mean) < 5 * sd / np.sqrt(2000)).all()

@@ -23,22 +23,23 @@ DRIFT = "correlated_error"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Cells:
+class Coordinates:
     """Unknown coordinates of the bodies' states, with the noise parameters of each.
 
     Parameters
     ----------
     places : ndarray of int
-        Where an array of shape (body * 6,) holds them, shape (cell,).
+        Where an array of shape (body * 6,) holds them, shape (coordinate,).
     columns : tuple of int
         State dimensions that occur.
     sensor : ndarray of int
-        Place of the noise parameter that is a cell's measurement noise; -1 where ``fixed`` is it.
+        Place of the noise parameter of each coordinate's measurement noise; -1 where ``fixed`` is
+        it.
     fixed : ndarray
-        Standard deviation of measuring a cell where it is no parameter, shape (cell,).
+        Standard deviation of measuring a coordinate where it is no parameter, shape (coordinate,).
     push : ndarray
-        Change of the cells in a step by a unit unexplained acceleration, one row a body and
-        velocity, shape (push, cell).
+        Change of the coordinates in a step by a unit unexplained acceleration, one row a body and
+        velocity, shape (push, coordinate).
     pushed : ndarray of int
         Place of the noise parameter that scales each row, shape (push,).
     sensors, rates, contacts, drifts : tuple of int
@@ -82,17 +83,17 @@ class Cells:
         first = len(self.sensors) + len(self.rates) + len(self.contacts)
         return range(first, first + len(self.drifts))
 
-    def drifting(self, memory: float) -> Cells:
+    def drifting(self, memory: float) -> Coordinates:
         """Return the same with correlated measurement noise of positions."""
         return replace(self, drifts=tuple(d for d in self.sensors if d <= THETA), memory=memory)
 
     @cached_property
     def drifted(self) -> tuple[Ints, Ints]:
-        """Cells with correlated measurement noise, and the place of its noise parameter."""
+        """Coordinates with correlated measurement noise, and the place of its noise parameter."""
         dimension = self.places % len(STATE)
-        cells = np.flatnonzero(np.isin(dimension, self.drifts) & (self.sensor >= 0))
-        order = np.searchsorted(self.drifts, dimension[cells])
-        return cells, self.drift_parameters.start + order
+        coordinates = np.flatnonzero(np.isin(dimension, self.drifts) & (self.sensor >= 0))
+        order = np.searchsorted(self.drifts, dimension[coordinates])
+        return coordinates, self.drift_parameters.start + order
 
     @cached_property
     def always(self) -> Bools:
@@ -102,12 +103,12 @@ class Cells:
     def steps(self, sigma: Floats) -> Floats:
         """Return the process noise of a step without and with contact.
 
-        Shape (2, cell, cell).
+        Shape (2, coordinate, coordinate).
         """
         return step_covariances(self.push, sigma[self.pushed], self.always)
 
     def pushes(self, sigma: Floats, touching: Bools, rng: np.random.Generator) -> Floats:
-        """Draw process noise of the cells, shape (*touching.shape, cell).
+        """Draw process noise of the coordinates, shape (*touching.shape, coordinate).
 
         The leading axes of ``sigma``, shape (..., parameter), go with those.
         """
@@ -115,22 +116,22 @@ class Cells:
         return np.where(self.always | touching[..., None], drawn, 0.0) @ self.push
 
     def sizes(self, scene: Scene) -> Floats:
-        """Return typical sizes of the cells, shape (cell,); see :func:`state_sizes`."""
+        """Return typical sizes of the coordinates, shape (coordinate,); see :func:`state_sizes`."""
         return state_sizes(scene)[self.places % len(STATE)]
 
     def white(self, sigma: Floats) -> Floats:
-        """Return the uncorrelated measurement noise of each cell, shape (..., cell)."""
+        """Return the uncorrelated measurement noise of each coordinate, shape (..., coordinate)."""
         return np.where(self.sensor >= 0, sigma[..., self.sensor], self.fixed)
 
     def errors(self, sigma: Floats) -> Floats:
-        """Return the measurement noise of each cell, correlated and not, shape (cell,)."""
+        """Return the whole measurement noise of each coordinate, shape (coordinate,)."""
         square = self.white(sigma) ** 2
-        cells, parameters = self.drifted
-        square[cells] += sigma[parameters] ** 2
+        coordinates, parameters = self.drifted
+        square[coordinates] += sigma[parameters] ** 2
         return np.sqrt(square)
 
     def of(self, values: Floats) -> Floats:
-        """Return the cells of values (..., body, 6), shape (..., cell)."""
+        """Return the coordinates of values (..., body, 6), shape (..., coordinate)."""
         return np.asarray(values.reshape(*values.shape[:-2], -1)[..., self.places])
 
     def completed(self, scene: Scene, states: Floats) -> Floats:
@@ -147,18 +148,18 @@ class Cells:
         return states
 
     def wrapped(self, difference: Floats) -> Floats:
-        """Return differences of cells, shape (..., cell), angles wrapped to (-pi, pi]."""
+        """Return differences (..., coordinate) with angles wrapped to (-pi, pi]."""
         angle = self.places % 6 == THETA
         return np.where(angle, wrapped(difference), difference)
 
     def of_residual(self, residual: Floats) -> Floats:
-        """Return the cells of a residual (..., transition, 1, body, state)."""
+        """Return the coordinates of a residual (..., transition, 1, body, state)."""
         body, place = self.in_residual
         return np.ascontiguousarray(residual[..., 0, body, place])
 
     @cached_property
     def in_residual(self) -> tuple[Ints, Ints]:
-        """Body and place among the columns of each cell."""
+        """Body and place among the columns of each coordinate."""
         body, dimension = np.divmod(self.places, 6)
         return body, np.searchsorted(self.columns, dimension)
 
@@ -185,7 +186,7 @@ def step_covariances(push: Floats, size: Floats, always: Bools) -> Floats:
     return np.asarray((push.T * both[..., None, :]) @ push)
 
 
-def check_moves(cells: Cells, scene: Scene) -> None:
+def check_moves(coordinates: Coordinates, scene: Scene) -> None:
     """Refuse a recording in which nothing moves.
 
     Raises
@@ -193,7 +194,7 @@ def check_moves(cells: Cells, scene: Scene) -> None:
     HistoryError
         If no number that was measured ever changes.
     """
-    if not cells.sensors and not cells.rates:
+    if not coordinates.sensors and not coordinates.rates:
         names = ", ".join(body.name for body in scene.dynamic)
         raise HistoryError(
             f"history: nothing moves: every number that was measured of {names} stays exactly the"
@@ -205,7 +206,7 @@ def check_moves(cells: Cells, scene: Scene) -> None:
 _EXACT = 1e-6
 
 
-def cells_of(scene: Scene, history: History) -> Cells:
+def observed_coordinates(scene: Scene, history: History) -> Coordinates:
     """Return the unknown coordinates of a scene's bodies with the noise of a recording."""
     observed = history.dataset["observed"].to_numpy()
     # what was measured of first states alone is given with them
@@ -249,7 +250,7 @@ def cells_of(scene: Scene, history: History) -> Cells:
                 if kind:  # a blow falls at any moment of the interval
                     push.append(place / np.sqrt(12))
                 pushed += [len(sensors) + kind * len(rates) + j] * (1 + kind)
-    return Cells(
+    return Coordinates(
         places,
         tuple(int(d) for d in np.unique(dimension)),
         sensor,
