@@ -30,6 +30,7 @@ def calibrate(
         Path,
         typer.Option("-o", "--output", metavar="DIR", help="Folder for results; goes on there."),
     ],
+    reading: options.SceneReading,
     likelihood: Annotated[
         str,
         typer.Option(
@@ -48,27 +49,20 @@ def calibrate(
             min=0.0, help="Correlation of neighbouring rows' errors, with --likelihood simulation."
         ),
     ] = 0.0,
-    noise: options.Noise = None,
     replications: Annotated[int, typer.Option(min=2, help="Simulated histories.")] = 200,
     seed: options.Seed = 1,
     jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     draws: Annotated[int, typer.Option(min=100, help="Posterior draws of each chain.")] = 1500,
-    estimate_velocities: options.Velocities = False,
-    columns: options.Columns = None,
-    units: options.Units = None,
-    time_step: options.TimeStep = None,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Simulate from the prior, fit, and test whether the true values' ranks are uniform."""
-    reading = options.Reading(columns, units, estimate_velocities, resample=time_step is not None)
     with interruptible(f"finished replications are in {output}; the same command goes on"):
         if trajectories is not None:  # older spellings
             likelihood = "trajectories" if trajectories else "transitions"
         check_can_make(output)
-        declared, (design,) = options.load(
-            scene, [history], reading, time_step=time_step, noise=noise
-        )
+        declared, (design,) = reading.read(scene, [history])
+        declared, own = reading.with_effects(declared)
         import pbrl_ppl.reporting as report
         from pbrl_ppl.files import write_atomically
         from pbrl_ppl.sampling import calibration
@@ -76,8 +70,9 @@ def calibrate(
         with _pool(jobs) as executor:
             try:
                 result = calibration.calibrate(
-                    declared, design, likelihood=likelihood, colour=colour, seed=seed, draws=draws,
-                    replications=replications, folder=output, executor=executor, progress=not quiet,
+                    declared, design, effects=own, likelihood=likelihood, colour=colour, seed=seed,
+                    draws=draws, replications=replications, folder=output, executor=executor,
+                    progress=not quiet,
                 )  # fmt: skip
             except PbrlError:
                 raise

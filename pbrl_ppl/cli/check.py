@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -11,11 +12,11 @@ from rich.table import Table
 from pbrl_ppl.cli import options
 from pbrl_ppl.cli.commands import command
 from pbrl_ppl.cli.terminal import interruptible, print_json, print_table, stages
-from pbrl_ppl.physics import Physics
 from pbrl_ppl.state import STATE
 
 if TYPE_CHECKING:
     from pbrl_ppl.criticism import Attribution, Candidate, Law
+    from pbrl_ppl.effects import Effect
     from pbrl_ppl.history import History
     from pbrl_ppl.scene import Scene
 
@@ -24,11 +25,7 @@ if TYPE_CHECKING:
 def check(
     scene: options.SceneFile,
     history: options.HistoryFile,
-    estimate_velocities: options.Velocities = False,
-    columns: options.Columns = None,
-    units: options.Units = None,
-    time_step: options.TimeStep = None,
-    trim: options.Trim = False,
+    reading: options.SceneReading,
     prior: Annotated[
         bool, typer.Option(help="Whether to compare the data with draws from the prior.")
     ] = True,
@@ -41,16 +38,16 @@ def check(
 
     Warns where a velocity and the changes of its position differ by the factor of a unit.
     """
-    reading = options.Reading(columns, units, estimate_velocities, trim, time_step is not None)
     with interruptible(), stages(quiet) as progress:
-        declared, (loaded,) = options.load(scene, [history], reading, time_step=time_step)
+        declared, (loaded,) = reading.read(scene, [history])
+        catalogue = reading.catalogue()
         from pbrl_ppl.history import (
             mass_contradictions,
             unit_mismatches,
             unused_velocities,
             with_units,
         )
-        from pbrl_ppl.physics import check_history
+        from pbrl_ppl.physics import Physics, check_history
 
         check_history(declared, loaded, loaded.segments(1))
         contents, missing = _contents(declared, loaded), _missing(loaded)
@@ -65,17 +62,18 @@ def check(
         for sentence in (*(velocity.sentence for velocity in unused), *masses):
             console.print(sentence, soft_wrap=True)
         sized = with_units(declared, loaded)
-        priors = _default_priors(sized)
+        priors = _default_priors(sized, catalogue)
         console.print(_priors_table(priors))
         checked = None
         if prior:
             progress("comparing with draws from the prior")
             from pbrl_ppl.criticism import prior_predictive_check, telling_horizon
+            from pbrl_ppl.effects import attach
             from pbrl_ppl.likelihood import Problem
             from pbrl_ppl.model import build_model
 
             horizon = telling_horizon(loaded)
-            physics = Physics.declare(sized)
+            physics = Physics(sized, attach(sized, (), catalogue))
             model = build_model(Problem.of(physics, loaded, horizon=horizon))
             checked = prior_predictive_check(model, draws=draws, seed=seed)
             for sentence in checked.summary:
@@ -137,13 +135,13 @@ def _missing_table(missing: dict[str, dict[str, int]], rows: int) -> Table:
     return table
 
 
-def _default_priors(scene: Scene) -> dict[str, dict[str, str]]:
+def _default_priors(scene: Scene, catalogue: Sequence[Effect]) -> dict[str, dict[str, str]]:
     """Return the priors of effects that depend on the recording's units, by body and variable."""
-    from pbrl_ppl.effects import candidates, catalogue
+    from pbrl_ppl.effects import candidates
 
     sized = {(effect.name, p.name) for effect in catalogue for p in effect.parameters if p.scale}
     priors: dict[str, dict[str, str]] = {body.name: {} for body in scene.dynamic}
-    for attached in candidates(scene, ()):
+    for attached in candidates(scene, (), catalogue):
         effect = attached.effect
         for parameter in effect.parameters:
             if (effect.name, parameter.name) in sized:
@@ -167,14 +165,8 @@ def _priors_table(priors: dict[str, dict[str, str]]) -> Table:
 def criticise(
     scene: options.SceneFile,
     history: options.HistoryFile,
-    noise: options.Noise = None,
-    substeps: options.Substeps = None,
+    reading: options.SceneReading,
     seed: options.Seed = 1,
-    estimate_velocities: options.Velocities = False,
-    columns: options.Columns = None,
-    units: options.Units = None,
-    time_step: options.TimeStep = None,
-    trim: options.Trim = False,
     simulate: Annotated[
         bool,
         typer.Option(
@@ -191,21 +183,23 @@ def criticise(
     whether that effect helps on data that it has not seen. With --simulate, effects are refitted
     one by one and in pairs, and named if they take at least a fifth off the simulation error.
     """
-    reading = options.Reading(columns, units, estimate_velocities, trim, time_step is not None)
     with interruptible(), stages(quiet) as progress:
         progress("reading the scene and the history")
-        declared, (loaded,) = options.load(
-            scene, [history], reading, time_step=time_step, noise=noise, substeps=substeps
-        )
+        declared, (loaded,) = reading.read(scene, [history])
+        catalogue = reading.catalogue()
         progress("loading the model")
         from pbrl_ppl import criticism
         from pbrl_ppl.physics import check_history
 
         if simulate:
-            simulated = criticism.attribute(declared, loaded, seed=seed, progress=progress)
+            simulated = criticism.attribute(
+                declared, loaded, catalogue=catalogue, seed=seed, progress=progress
+            )
         else:
             check_history(declared, loaded, loaded.segments(1))
-            found = criticism.criticise(declared, loaded, seed=seed, progress=progress)
+            found = criticism.criticise(
+                declared, loaded, catalogue=catalogue, seed=seed, progress=progress
+            )
     if simulate:
         _print_laws(simulated, as_json)
         return

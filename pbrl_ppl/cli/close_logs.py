@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated, Any
 
+import cloudpickle
 import typer
 
 from pbrl_ppl.cli import options
@@ -31,18 +34,13 @@ def close_logs(
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the results.")
     ],
+    reading: options.SceneReading,
     seed: options.Seed = 1,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Run finished logs again.")
     ] = False,
-    substeps: options.Substeps = None,
     draws: Draws = None,
     method: Sampler = Method.IMPORTANCE,
-    noise: options.Noise = None,
-    estimate_velocities: options.Velocities = False,
-    columns: options.Columns = None,
-    units: options.Units = None,
-    time_step: options.TimeStep = None,
     jobs: Annotated[int, typer.Option(min=1, help="Logs at a time.")] = 1,
     scheduler: Annotated[
         str | None,
@@ -61,6 +59,8 @@ def close_logs(
         progress("reading the manifest")
         import pbrl_ppl.reporting as report
 
+        settings = reading.settings()
+        catalogue = reading.catalogue() if reading.effect_file else None
         logs = report.read_manifest(manifest)  # its errors come before a cluster is sought
         with _executor(jobs, scheduler) as executor:
             loops = report.close_loop_many(
@@ -71,14 +71,14 @@ def close_logs(
                 source=report.Source(command=options.command_line(context)),
                 again=overwrite,
                 seed=seed,
-                substeps=substeps,
                 draws=draws,
                 method=method.value,
-                noise=options.noise_of(noise),
-                columns=options.columns_of(columns),
-                units=options.units_of(units),
-                time_step=time_step,
-                estimate_velocities=estimate_velocities,
+                catalogue=catalogue,
+                **reading.scene_settings(),
+                columns=settings["columns"],
+                units=settings["units"],
+                estimate_velocities=settings["estimate_velocities"],
+                trim=settings["trim"],
             )
     effects = loops.effects().drop_duplicates(["name", "effect", "body"])
     found = [
@@ -139,16 +139,22 @@ class OneProcessEach(ThreadPoolExecutor):
     """
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Schedule a call that can be pickled."""
+        """Schedule a call."""
         return super().submit(_in_a_process, fn, *args, **kwargs)
 
 
 def _in_a_process(fn: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+    # the laws of an effect file are functions of no module that another process could import
+    call = cloudpickle.dumps(partial(fn, *args, **kwargs))
     for again in (True, False):
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
             try:
-                return pool.submit(fn, *args, **kwargs).result()
+                return pool.submit(_called, call).result()
             except BrokenProcessPool:
                 if not again:
                     raise
     return None
+
+
+def _called(call: bytes) -> Any:
+    return pickle.loads(call)()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pbrl_ppl.cli import effect_files, options
+from pbrl_ppl.cli import options
 from pbrl_ppl.cli.commands import command
 from pbrl_ppl.cli.terminal import (
     INTERRUPTED,
@@ -61,6 +61,7 @@ def close_loop(
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the results.")
     ],
+    reading: options.SceneReading,
     test: Annotated[
         Path | None,
         typer.Option(
@@ -72,16 +73,8 @@ def close_loop(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Write to a folder that is not empty.")
     ] = False,
-    substeps: options.Substeps = None,
     draws: Draws = None,
     method: Sampler = Method.IMPORTANCE,
-    effect_file: effect_files.EffectFiles = None,
-    noise: options.Noise = None,
-    estimate_velocities: options.Velocities = False,
-    columns: options.Columns = None,
-    units: options.Units = None,
-    time_step: options.TimeStep = None,
-    trim: options.Trim = False,
     learn_remainder: Annotated[
         bool,
         typer.Option(
@@ -97,15 +90,12 @@ def close_loop(
 
     Exits with 3 if the chains have not converged: then there is no verdict.
     """
-    reading = options.Reading(columns, units, estimate_velocities, trim, time_step is not None)
     with interruptible(), stages(quiet) as progress:
         check_can_make(output)  # before the long work, which would be lost
         progress("reading the scene and the histories")
         paths = [train] if test is None else [train, test]
-        declared, histories = options.load(
-            scene, paths, reading, time_step=time_step, noise=noise, substeps=substeps
-        )
-        catalogue = {"catalogue": effect_files.with_catalogue(effect_file)} if effect_file else {}
+        declared, histories = reading.read(scene, paths)
+        catalogue = reading.catalogue()
         progress("loading the sampler")
         import pbrl_ppl.reporting as report
         from pbrl_ppl import criticism
@@ -114,7 +104,8 @@ def close_loop(
         if learn_remainder:
             criticism.check_scikit_learn()
         loop, stopped = _finished(
-            declared, histories, progress, seed=seed, draws=draws, method=method.value, **catalogue,
+            declared, histories, progress, seed=seed, draws=draws, method=method.value,
+            catalogue=catalogue,
         )  # fmt: skip
         progress("writing the report")
         source = report.Source(

@@ -47,6 +47,7 @@ def demo(
         cart / "scene.toml",
         cart / "recorded" / "train.csv",
         output,
+        options.SceneReading(),
         cart / "recorded" / "test.csv",
         method=method,
         seed=seed,

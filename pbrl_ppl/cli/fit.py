@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pbrl_ppl.cli import effect_files, options
+from pbrl_ppl.cli import options
 from pbrl_ppl.cli.commands import command
 from pbrl_ppl.cli.terminal import (
     INTERRUPTED,
@@ -36,6 +36,7 @@ def fit(
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="FILE", help="The posterior file (.nc).")
     ],
+    reading: options.SceneReading,
     likelihood: Annotated[
         str,
         typer.Option(
@@ -60,9 +61,6 @@ def fit(
         float | None,
         typer.Option(min=0.1, help="Degrees of freedom of Student-t noise; else Gaussian."),
     ] = None,
-    effect_file: effect_files.EffectFiles = None,
-    noise: options.Noise = None,
-    substeps: options.Substeps = None,
     method: Annotated[
         str,
         typer.Option(
@@ -82,11 +80,6 @@ def fit(
         typer.Option(metavar="FILE", help="Go on with this posterior: its chains, or more draws."),
     ] = None,
     seed: options.Seed = 1,
-    estimate_velocities: options.Velocities = False,
-    columns: options.Columns = None,
-    units: options.Units = None,
-    time_step: options.TimeStep = None,
-    trim: options.Trim = False,
     overwrite: options.Overwrite = False,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
@@ -96,7 +89,6 @@ def fit(
     Exits with 3 if chains have not converged or draws are too few, and with 130 if it was
     interrupted; the draws of chains so far are kept.
     """
-    reading = options.Reading(columns, units, estimate_velocities, trim, time_step is not None)
     with interruptible(), stages(quiet) as progress:
         check_file(output, (".nc",), overwrite)
         if trajectories is not None:  # older spellings
@@ -106,10 +98,8 @@ def fit(
                 "--horizon and --scalar-sigma are of single transitions: --likelihood transitions"
             )
         progress("reading the scene and the history")
-        declared, (loaded,) = options.load(
-            scene, [history], reading, time_step=time_step, noise=noise, substeps=substeps
-        )
-        declared, own = effect_files.added_effects(declared, effect_files.own_effects(effect_file))
+        declared, (loaded,) = reading.read(scene, [history])
+        declared, own = reading.with_effects(declared)
         progress("loading the sampler")
         from pbrl_ppl import sampling
         from pbrl_ppl.physics import check_history
@@ -201,13 +191,8 @@ def update(
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="FILE", help="The new posterior file.")
     ],
-    effect_file: effect_files.EffectFiles = None,
+    reading: options.PosteriorReading,
     seed: options.Seed = 1,
-    estimate_velocities: options.Velocities = False,
-    columns: options.Columns = None,
-    units: options.Units = None,
-    resample: options.Resample = False,
-    trim: options.Trim = False,
     overwrite: options.Overwrite = False,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
@@ -216,16 +201,14 @@ def update(
 
     Exits with 3 if the new posterior has not converged.
     """
-    reading = options.Reading(columns, units, estimate_velocities, trim, resample)
     with interruptible(), stages(quiet) as progress:
         check_file(output, (".nc",), overwrite)
-        catalogue = effect_files.with_catalogue(effect_file)
+        catalogue = reading.catalogue()
         progress("reading the posterior and the history")
         from pbrl_ppl.posterior import load_posterior, save_posterior, scene_of
 
         idata = load_posterior(posterior)
-        scene = scene_of(idata)
-        new = reading.trimmed(reading.history(history, scene), scene, history)
+        new = reading.recording(history, scene_of(idata))
         progress("updating")
         from pbrl_ppl.sampling import updating
 

@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import shlex
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, TypedDict, TypeVar
 
 import typer
 
+from pbrl_ppl.cli import effect_files
 from pbrl_ppl.errors import GoalError
 
 if TYPE_CHECKING:
+    from pbrl_ppl.effects import Attached, Effect
     from pbrl_ppl.history import History
     from pbrl_ppl.scene import Scene
 
 T = TypeVar("T")
-
-#: Trajectory ends that one warning names, at most.
-_MOST_ENDS = 4
 
 SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.toml).")]
 HistoryFile = Annotated[
@@ -33,30 +31,12 @@ Seed = Annotated[int, typer.Option(min=0, help="Same seed, same answer.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object, and nothing else.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what exists.")]
-Substeps = Annotated[
-    int | None, typer.Option(min=1, help="Engine steps per interval, in place of the scene's.")
-]
 Noise = Annotated[
     list[str] | None,
     typer.Option(
         "--noise",
         metavar="NAME=SD",
         help="Known measurement noise of a state dimension (x=0.002, in m; repeat for others).",
-    ),
-]
-Velocities = Annotated[
-    bool,
-    typer.Option(
-        "--estimate-velocities",
-        help="Start predictions from velocities estimated from positions, if none were measured.",
-    ),
-]
-Trim = Annotated[
-    bool,
-    typer.Option(
-        "--trim",
-        help="Leave out rows at a trajectory's ends that belong to no model: a body still held, an"
-        " abrupt stop.",
     ),
 ]
 Columns = Annotated[
@@ -73,22 +53,6 @@ Units = Annotated[
         metavar="NAME=UNIT,...", help="What columns are measured in, if not SI (x=mm,theta=deg)."
     ),
 ]
-TimeStep = Annotated[
-    float | None,
-    typer.Option(
-        min=1e-9,
-        metavar="SECONDS",
-        help="In place of the scene's time_step; uneven samples are interpolated to it.",
-    ),
-]
-Resample = Annotated[
-    bool,
-    typer.Option(
-        "--resample",
-        help="Interpolate uneven samples to the scene's time step. There is no --time-step as in"
-        " other commands, which sets another: a posterior holds for one time step.",
-    ),
-]
 Starts = Annotated[
     list[str] | None,
     typer.Option(
@@ -96,6 +60,127 @@ Starts = Annotated[
         help="Where a body starts (m, rad), at rest or with ,VX,VY,OMEGA; once a body.",
     ),
 ]
+
+
+class ReadingSettings(TypedDict):
+    """Arguments of `history.read_recording`."""
+
+    columns: dict[str, str | float]
+    units: dict[str, str]
+    estimate_velocities: bool
+    trim: bool
+    resample: bool
+
+
+class SceneSettings(TypedDict):
+    """Arguments of `history.read_scene`."""
+
+    noise: dict[str, float]
+    substeps: int | None
+    time_step: float | None
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Options of each command that reads a recording.
+
+    Each is in place of what the scene file's ``[recording]`` says.
+    """
+
+    columns: Columns = None
+    units: Units = None
+    estimate_velocities: Annotated[
+        bool,
+        typer.Option(
+            "--estimate-velocities",
+            help="Start predictions from velocities estimated from positions, if none were"
+            " measured.",
+        ),
+    ] = False
+    trim: Annotated[
+        bool,
+        typer.Option(
+            "--trim",
+            help="Leave out rows at a trajectory's ends that belong to no model: a body still held,"
+            " an abrupt stop.",
+        ),
+    ] = False
+    effect_file: effect_files.EffectFiles = None
+
+    def __post_init__(self) -> None:
+        self.settings()  # bad usage is reported before any file is read
+
+    def settings(self, resample: bool = False) -> ReadingSettings:
+        """Return what the options say of a recording."""
+        return {
+            "columns": columns_of(self.columns),
+            "units": units_of(self.units),
+            "estimate_velocities": self.estimate_velocities,
+            "trim": self.trim,
+            "resample": resample,
+        }
+
+    def catalogue(self) -> tuple[Effect, ...]:
+        """Return the catalogue and after it the effects of effect files."""
+        return effect_files.with_catalogue(self.effect_file)
+
+    def with_effects(self, scene: Scene) -> tuple[Scene, tuple[Effect | Attached, ...]]:
+        """Return a scene and the effects of effect files on its bodies."""
+        return effect_files.added_effects(scene, effect_files.own_effects(self.effect_file))
+
+
+@dataclass(frozen=True)
+class PosteriorReading(Reading):
+    """Options of a command that reads a recording with the scene of a posterior."""
+
+    resample: Annotated[
+        bool,
+        typer.Option(
+            "--resample",
+            help="Interpolate uneven samples to the scene's time step. There is no --time-step as"
+            " in other commands, which sets another: a posterior holds for one time step.",
+        ),
+    ] = False
+
+    def recording(self, path: Path, scene: Scene) -> History:
+        """Return the history of a file."""
+        from pbrl_ppl.history import read_recording
+
+        return read_recording(path, scene, **self.settings(self.resample))
+
+
+@dataclass(frozen=True)
+class SceneReading(Reading):
+    """Options of a command that reads a scene file and recordings."""
+
+    noise: Noise = None
+    substeps: Annotated[
+        int | None, typer.Option(min=1, help="Engine steps per interval, in place of the scene's.")
+    ] = None
+    time_step: Annotated[
+        float | None,
+        typer.Option(
+            min=1e-9,
+            metavar="SECONDS",
+            help="In place of the scene's time_step; uneven samples are interpolated to it.",
+        ),
+    ] = None
+
+    def scene_settings(self) -> SceneSettings:
+        """Return what the options say of a scene."""
+        return {
+            "noise": noise_of(self.noise),
+            "substeps": self.substeps,
+            "time_step": self.time_step,
+        }
+
+    def read(self, scene: Path, histories: Sequence[Path]) -> tuple[Scene, list[History]]:
+        """Return the scene and its histories."""
+        from pbrl_ppl.history import read_recording, read_scene
+
+        declared = read_scene(scene, **self.scene_settings())
+        settings = self.settings(self.time_step is not None)
+        return declared, [read_recording(path, declared, **settings) for path in histories]
 
 
 def command_line(context: typer.Context) -> str:
@@ -116,19 +201,19 @@ def command_line(context: typer.Context) -> str:
     return shlex.join([*words, *options])
 
 
-def named_numbers(given: list[str] | None, option: str, example: str) -> dict[str, float]:
-    """Return numbers by name from options such as ``x=0.002``."""
-    return dict(_pairs(given, option, example, float))
-
-
 def noise_of(given: list[str] | None) -> dict[str, float]:
     """Return standard deviations by state dimension from ``--noise``."""
-    return named_numbers(given, "--noise", "x=0.002")
+    return dict(pairs(given, "--noise", "x=0.002", float))
 
 
 def columns_of(given: list[str] | None) -> dict[str, str | float]:
     """Return column names, or numbers, from options such as ``x=pos_x,force_x=0``."""
-    return dict(_pairs(given, "--columns", "x=pos_x", _number_or_name))
+    return dict(pairs(given, "--columns", "x=pos_x", _number_or_name))
+
+
+def units_of(given: list[str] | None) -> dict[str, str]:
+    """Return units from options such as ``x=mm,theta=deg``."""
+    return dict(pairs(given, "--units", "x=mm", str))
 
 
 def _number_or_name(text: str) -> str | float:
@@ -139,26 +224,21 @@ def _number_or_name(text: str) -> str | float:
     return int(number) if number.is_integer() else number
 
 
-def units_of(given: list[str] | None) -> dict[str, str]:
-    """Return units from options such as ``x=mm,theta=deg``."""
-    return dict(_pairs(given, "--units", "x=mm", str))
-
-
-def _pairs(
+def pairs(
     given: list[str] | None, option: str, example: str, kind: Callable[[str], T]
 ) -> list[tuple[str, T]]:
     """Return names and values from ``NAME=VALUE,...``."""
-    pairs = []
+    found = []
     for item in ",".join(given).split(",") if given else ():
         name, _, value = (part.strip() for part in item.partition("="))
         try:
             if not (name and value):
                 raise ValueError
-            pairs.append((name, kind(value)))
+            found.append((name, kind(value)))
         except ValueError:
             message = f"{item!r} is not NAME=VALUE, such as {example}"
             raise typer.BadParameter(message, param_hint=option) from None
-    return pairs
+    return found
 
 
 def pose(text: str, bodies: Sequence[str], option: str) -> tuple[str, list[float | None]]:
@@ -191,95 +271,3 @@ def starts_of(given: list[str] | None, bodies: Sequence[str]) -> dict[str, list[
         if len(starts[name]) < len(values):
             raise GoalError(f"--start {text}: a start has no free coordinates; give a number for -")
     return starts
-
-
-@dataclass(frozen=True)
-class Reading:
-    """Settings for reading histories: the values of ``--columns``, ``--units`` and others.
-
-    Parameters
-    ----------
-    columns, units : list of str, optional
-        As typed.
-    estimate_velocities : bool
-        Whether velocities may be estimated from positions.
-    trim : bool, optional
-        Whether rows at a trajectory's ends that belong to no model are left out, or only warned of;
-        None does not look for them.
-    resample : bool
-        Whether uneven samples are interpolated to the time step.
-    """
-
-    columns: list[str] | None = None
-    units: list[str] | None = None
-    estimate_velocities: bool = False
-    trim: bool | None = None
-    resample: bool = False
-
-    def __post_init__(self) -> None:
-        columns_of(self.columns)  # bad usage is reported before any file is read
-        units_of(self.units)
-
-    def history(self, path: Path, scene: Scene) -> History:
-        """Read one history of a scene."""
-        from pbrl_ppl.history import History
-
-        return History.load(
-            path,
-            scene,
-            estimate_velocities=self.estimate_velocities,
-            columns=columns_of(self.columns),
-            units=units_of(self.units),
-            resample=self.resample,
-        )
-
-    def trimmed(self, history: History, scene: Scene, path: Path) -> History:
-        """Return the history without strange rows at trajectory ends, or warn of them."""
-        if self.trim is None:
-            return history
-        trim = self.trim or (scene.recording is not None and scene.recording.trim)
-        from pbrl_ppl.history import strange_ends, trimmed
-
-        ends = strange_ends(history, scene)
-        if not ends:
-            return history
-        named = "; ".join(str(end) for end in ends[:_MOST_ENDS])
-        more = f"; and {len(ends) - _MOST_ENDS} more" if len(ends) > _MOST_ENDS else ""
-        cure = "no command or contact explains it: --trim leaves the rows out"
-        cure = "left out" if trim else cure
-        warnings.warn(f"history {path}: {named}{more}: {cure}", stacklevel=2)
-        return trimmed(history, ends) if trim else history
-
-
-def load(
-    scene: Path,
-    histories: Sequence[Path],
-    reading: Reading,
-    *,
-    time_step: float | None = None,
-    noise: list[str] | None = None,
-    substeps: int | None = None,
-) -> tuple[Scene, list[History]]:
-    """Read a scene, change it as options say, and read its histories.
-
-    Warns where velocities and changes of positions differ by the factor of a unit.
-    """
-    from pbrl_ppl.scene import Scene
-
-    declared = Scene.load(scene)  # its errors come before pandas is loaded
-    if time_step is not None:
-        declared = declared.replace(time_step=time_step)
-    from pbrl_ppl.history import unit_mismatches
-
-    loaded = [reading.history(path, declared) for path in histories]
-    for path, history in zip(histories, loaded, strict=True):
-        for sentence in unit_mismatches(history):
-            warnings.warn(f"history {path}: {sentence}", stacklevel=2)
-    loaded = [
-        reading.trimmed(history, declared, path)
-        for path, history in zip(histories, loaded, strict=True)
-    ]
-    declared = declared.replace(noise=dict(declared.noise) | noise_of(noise))
-    if substeps is not None:
-        declared = declared.replace(substeps=substeps)
-    return declared, loaded

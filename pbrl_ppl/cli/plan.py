@@ -172,6 +172,7 @@ def suggest(
         int | None, typer.Option(min=1, help="Intervals for which a wrench within bounds is held.")
     ] = None,
     draws: Annotated[int, typer.Option(min=1, help="Posterior draws of each effect's model.")] = 16,
+    effect_file: effect_files.EffectFiles = None,
     seed: options.Seed = 1,
     overwrite: options.Overwrite = False,
     as_json: options.AsJson = False,
@@ -184,6 +185,7 @@ def suggest(
         if bounds and actions is not None:
             raise GoalError("suggest: --bounds and --actions both say what is allowed; drop one")
         check_file(output, (".csv",), overwrite)
+        catalogue = effect_files.with_catalogue(effect_file)
         progress("reading the posterior")
         from pbrl_ppl.criticism import kept_groups
         from pbrl_ppl.planning import ActionSet, suggest_actions
@@ -205,7 +207,8 @@ def suggest(
         allowed = _bounds(bounds, bodies) if bounds else None
         result = suggest_actions(
             idata, starts, allowed if actions is None else ActionSet.load(actions),
-            effects=effect, steps=steps, hold=hold, draws=draws, seed=seed, progress=progress,
+            effects=effect, steps=steps, hold=hold, draws=draws, seed=seed, catalogue=catalogue,
+            progress=progress,
         )  # fmt: skip
         result.to_csv(output)
     print_result(

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import typer
@@ -16,9 +16,10 @@ from pbrl_ppl.errors import HistoryError, ParameterError, PosteriorError, Simula
 from pbrl_ppl.state import STATE, Floats
 
 if TYPE_CHECKING:
+    from pbrl_ppl.effects import Effect
     from pbrl_ppl.history import History
     from pbrl_ppl.parameters import Layout
-    from pbrl_ppl.scene import Scene
+    from pbrl_ppl.physics import Physics
 
 
 @command("simulate", 11, "pbrl-ppl simulate cart.nc plan.csv -o predicted.csv --draws 20")
@@ -32,6 +33,7 @@ def simulate(
         Path,
         typer.Option("-o", "--output", metavar="FILE", help="The history (.csv, .parquet, .nc)."),
     ],
+    reading: options.PosteriorReading,
     given: Annotated[
         list[str] | None,
         typer.Option(
@@ -46,10 +48,6 @@ def simulate(
     ] = None,
     noise: options.Noise = None,
     seed: options.Seed = 1,
-    estimate_velocities: options.Velocities = False,
-    columns: options.Columns = None,
-    units: options.Units = None,
-    resample: options.Resample = False,
     overwrite: options.Overwrite = False,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
@@ -59,17 +57,18 @@ def simulate(
     Each trajectory is followed from its first complete state to its end. With --noise, measurement
     noise is added; without, the states are the engine's.
     """
-    reading = options.Reading(columns, units, estimate_velocities, resample=resample)
     with interruptible(), stages(quiet) as progress:
         check_file(output, (".csv", ".parquet", ".nc"), overwrite)
-        values = options.named_numbers(given, "--set", "mass=8")
+        values = dict(options.pairs(given, "--set", "mass=8", float))
         errors = options.noise_of(noise)
         progress("reading the parameters and the history")
-        scene, layout, phi, substeps = _parameters(source, values, draws, seed)
+        catalogue = reading.catalogue()
+        physics, phi = _parameters(source, values, draws, seed, catalogue)
+        scene = physics.scene
         scene.replace(noise=errors)  # raises where the noise is invalid
-        recorded = reading.history(history, scene)
+        recorded = reading.recording(history, scene)
         progress("simulating")
-        simulated = _simulated(scene, phi, substeps, recorded)
+        simulated = _simulated(physics, phi, recorded)
         result = _history(recorded, simulated, errors, seed, labelled=draws is not None)
         result.save(output)
     print_result(
@@ -78,37 +77,41 @@ def simulate(
             "history": output,
             "trajectories": result.n_trajectories,
             "transitions": result.n_transitions,
-            "parameters": dict(zip(layout.labels, phi.T, strict=True)),
+            "parameters": dict(zip(physics.layout.labels, phi.T, strict=True)),
         },
         [f"history: {output} ({result.n_trajectories} trajectories)"],
     )
 
 
 def _parameters(
-    source: Path, values: Mapping[str, float], draws: int | None, seed: int
-) -> tuple[Scene, Layout, Floats, int]:
-    """Return the scene, and parameter vectors, shape (draw, p), from a posterior or options."""
+    source: Path,
+    values: Mapping[str, float],
+    draws: int | None,
+    seed: int,
+    catalogue: Sequence[Effect],
+) -> tuple[Physics, Floats]:
+    """Return the physics, and parameter vectors, shape (draw, p), from a posterior or options."""
+    from pbrl_ppl.effects import attach
+    from pbrl_ppl.physics import Physics
+
     if source.suffix == ".nc":
         from pbrl_ppl.planning import Dynamics
         from pbrl_ppl.posterior import load_posterior
 
         idata = load_posterior(source)
-        dynamics = Dynamics.of(idata, draws, seed=seed)
-        scene, layout, phi = dynamics.scene, dynamics.layout, dynamics.phi.copy()
-        substeps = int(idata.attrs["substeps"])
+        dynamics = Dynamics.of(idata, draws, seed=seed, effects=catalogue)
+        scene, substeps = dynamics.scene, int(idata.attrs["substeps"])
     elif draws is not None:
         raise PosteriorError(f"--draws: {source} is no posterior file (.nc), and has no draws")
     else:
         from pbrl_ppl.scene import Scene
 
-        scene = Scene.load(source)
-        from pbrl_ppl.effects import attach
-        from pbrl_ppl.physics import build_layout
-
-        layout, substeps = build_layout(scene, attach(scene)), scene.substeps
-        phi = np.full((1, layout.size), np.nan)
-    _set(layout, phi, values)
-    return scene, layout, phi, substeps
+        scene, dynamics = Scene.load(source), None
+        substeps = scene.substeps
+    physics = Physics(scene, attach(scene, (), catalogue), substeps, threads=2)
+    phi = dynamics.phi.copy() if dynamics else np.full((1, physics.layout.size), np.nan)
+    _set(physics.layout, phi, values)
+    return physics, phi
 
 
 def _set(layout: Layout, phi: Floats, values: Mapping[str, float]) -> None:
@@ -133,10 +136,9 @@ def _bare(label: str) -> str:
     return label.partition("[")[0]
 
 
-def _simulated(scene: Scene, phi: Floats, substeps: int, recorded: History) -> list[Any]:
+def _simulated(physics: Physics, phi: Floats, recorded: History) -> list[Floats]:
     """Return simulated states, shape (trajectory, time, body, 6), for each draw."""
-    from pbrl_ppl.effects import attach
-    from pbrl_ppl.physics import Physics, check_history
+    from pbrl_ppl.physics import check_history
 
     # one segment a trajectory, up to its end
     segments = recorded.segments(int(recorded.dataset["n_rows"].max()) - 1)
@@ -147,8 +149,7 @@ def _simulated(scene: Scene, phi: Floats, substeps: int, recorded: History) -> l
             f"history: trajectory {label} has no complete state to start from; measure one, drop it"
             " or pass estimate_velocities=True"
         )
-    check_history(scene, recorded, segments)
-    physics = Physics(scene, attach(scene), substeps=substeps, threads=2)
+    check_history(physics.scene, recorded, segments)
     predicted = physics.predict(phi, segments.start, segments.inputs)
     follows = recorded.dataset["kinematic"].to_numpy()
     n_rows = recorded.dataset["n_rows"].to_numpy()
@@ -173,7 +174,7 @@ def _simulated(scene: Scene, phi: Floats, substeps: int, recorded: History) -> l
 
 
 def _history(
-    recorded: History, states: list[Any], errors: Mapping[str, float], seed: int, labelled: bool
+    recorded: History, states: list[Floats], errors: Mapping[str, float], seed: int, labelled: bool
 ) -> History:
     """Return a history of simulated states with measurement noise; labels may name the draw."""
     import xarray as xr

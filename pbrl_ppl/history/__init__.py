@@ -26,5 +26,7 @@ from .kinematics import hung_bodies as hung_bodies
 from .kinematics import lever as lever
 from .layout import is_history as is_history
 from .proposal import propose as propose
+from .reading import read_recording as read_recording
+from .reading import read_scene as read_scene
 from .units import mass_contradictions as mass_contradictions
 from .units import with_units as with_units

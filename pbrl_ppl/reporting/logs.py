@@ -25,9 +25,9 @@ from pbrl_ppl.effects import Effect
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import ManifestError, PbrlError
 from pbrl_ppl.files import write_text
-from pbrl_ppl.history import History
+from pbrl_ppl.history import read_recording, read_scene
 from pbrl_ppl.reporting.report import render
-from pbrl_ppl.scene import Scene, nearest
+from pbrl_ppl.scene import nearest
 
 _NEEDED, _OPTIONAL = ("name", "scene", "train"), ("test", "kind")
 #: A log's name is the name of its folder, on every system, and of no file beside it.
@@ -152,7 +152,7 @@ class Settings:
         Of the loop; the whole catalogue without one.
     noise : mapping of str to float
         Known errors of measuring, by state dimension.
-    estimate_velocities, columns, units : optional
+    estimate_velocities, columns, units, trim : optional
         How histories are read.
     time_step : float, optional
         In place of the scene's (s); uneven samples are then interpolated to it.
@@ -168,6 +168,7 @@ class Settings:
     columns: Mapping[str, str | float] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
     time_step: float | None = None
+    trim: bool = False
 
     def to_dict(self) -> dict[str, Any]:
         """Return the settings as JSON values."""
@@ -194,15 +195,13 @@ class LoopWithPage:
 
 def close_log(log: Log, settings: Settings) -> LoopWithPage:
     """Read a log's files and close the loop."""
-    scene = Scene.load(log.scene)
-    scene = scene.replace(
-        noise=dict(scene.noise) | dict(settings.noise),
-        time_step=scene.time_step if settings.time_step is None else settings.time_step,
-        substeps=scene.substeps if settings.substeps is None else settings.substeps,
+    scene = read_scene(
+        log.scene, noise=settings.noise, substeps=settings.substeps, time_step=settings.time_step
     )
     read = partial(
-        History.load, scene=scene, estimate_velocities=settings.estimate_velocities,
-        columns=settings.columns, units=settings.units, resample=settings.time_step is not None,
+        read_recording, scene=scene, estimate_velocities=settings.estimate_velocities,
+        columns=settings.columns, units=settings.units, trim=settings.trim,
+        resample=settings.time_step is not None,
     )  # fmt: skip
     train, test = read(log.train), None if log.test is None else read(log.test)
     catalogue = full_catalogue if settings.catalogue is None else settings.catalogue

@@ -95,6 +95,7 @@ def close_loop_many(
     columns: Mapping[str, str | float] | None = None,
     units: Mapping[str, str] | None = None,
     time_step: float | None = None,
+    trim: bool = False,
     again: bool = False,
     run: Run = close_log,
     progress: Callable[[str], None] | None = None,
@@ -121,8 +122,8 @@ def close_loop_many(
         As of :func:`pbrl_ppl.close_loop`; each log is what that gives with this seed.
     noise : mapping of str to float, optional
         Known errors of measuring, ``{"x": 0.002}``; they replace those of the scenes.
-    estimate_velocities, columns, units : optional
-        As of :meth:`History.load`.
+    estimate_velocities, columns, units, trim : optional
+        As of :meth:`History.load`, and of the scene's ``[recording]``.
     time_step : float, optional
         In place of the scenes' (s); uneven samples are interpolated to it.
     again : bool
@@ -164,6 +165,7 @@ def close_loop_many(
     settings = Settings(
         seed, substeps, draws, method, None if catalogue is None else tuple(catalogue),
         dict(noise or {}), estimate_velocities, dict(columns or {}), dict(units or {}), time_step,
+        trim,
     )  # fmt: skip
     tell = progress or (lambda _: None)
     inputs = {log.name: inputs_sha256(log, settings) for log in logs}

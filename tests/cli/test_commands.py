@@ -110,6 +110,20 @@ def test_options_are_alike() -> None:
     } == drawing
 
 
+def test_commands_read_recordings_alike() -> None:
+    """By the same options, all of them, in place of what the scene says."""
+    group = typer.main.get_command(app).commands
+    options = {
+        name: {option for parameter in group[name].params for option in parameter.opts}
+        for name in NAMES
+    }
+    reading = {"--columns", "--units", "--estimate-velocities", "--trim", "--effect-file"}
+    for name in ("check", "criticise", "fit", "close-loop", "close-logs", "calibrate"):
+        assert reading | {"--noise", "--substeps", "--time-step"} <= options[name], name
+    for name in ("update", "simulate"):
+        assert reading | {"--resample"} <= options[name], name
+
+
 def test_exit_codes_are_documented() -> None:
     readme = (ROOT / "README.md").read_text()
     page = (ROOT / "analysis" / "docs" / "pages" / "explanation" / "reliability.md").read_text()

@@ -38,6 +38,7 @@ def test_the_demo_takes_the_files_of_the_package(
         return made_up()
 
     monkeypatch.setattr(criticism, "close_loop", close_loop)
+    monkeypatch.setattr("pbrl_ppl.reporting.render", lambda *args, **options: "a page")
     monkeypatch.chdir(tmp_path)
     assert main(["demo", "-o", "here", "--method", "metropolis", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["report"] == str(Path("here", "report.html"))

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 import pbrl_ppl as pp
-from pbrl_ppl import criticism
+from pbrl_ppl import criticism, planning, posterior, reporting
 from pbrl_ppl.cli import main
+from pbrl_ppl.cli.close_logs import OneProcessEach
 from pbrl_ppl.cli.effect_files import added_effects, own_effects
 from pbrl_ppl.posterior import load_posterior, scene_of
 from tests.helpers.histories import simulated_history
@@ -91,7 +92,52 @@ def test_close_loop_adds_own_effects_to_the_catalogue(files, monkeypatch) -> Non
     assert tuple(known) == pp.catalogue and tether.name == "tether"
     given.clear()
     assert main(run) == 2
-    assert "catalogue" not in given
+    assert given["catalogue"] == pp.catalogue
+
+
+def test_commands_look_effects_up_in_the_file(files, monkeypatch, capsys) -> None:
+    given = {}
+
+    def take(*args, **settings):
+        given.update(settings)
+        raise pp.errors.FitError("enough")
+
+    for module, name in (
+        (criticism, "criticise"),
+        (criticism, "attribute"),
+        (planning, "suggest_actions"),
+        (reporting, "close_loop_many"),
+    ):
+        monkeypatch.setattr(module, name, take)
+    monkeypatch.setattr(posterior, "load_posterior", lambda path: None)
+    monkeypatch.setattr(posterior, "scene_of", lambda idata: pp.Scene.load("scene.toml"))
+    Path("logs.csv").write_text("name,scene,train\na,scene.toml,train.csv\n")
+    names = ["--effect", "tether", "--effect", "spring"]
+    for command in (
+        ["criticise", "scene.toml", "train.csv"],
+        ["criticise", "scene.toml", "train.csv", "--simulate"],
+        ["suggest", "puck.nc", "-o", "next.csv", *names],
+        ["close-logs", "logs.csv", "-o", "out"],
+    ):
+        given.clear()
+        assert "enough" in refused(capsys, *command, "--effect-file", "laws.py")
+        assert [each.name for each in given["catalogue"]][-1] == "tether"
+    # a scene that declares it by name
+    Path("tied.toml").write_text(SCENE + 'effects = ["tether"]\n')
+    known = ["--set", "mass=2", "--set", "tether_stiffness=3"]
+    for command in (["check", "--no-prior"], ["simulate", "-o", "made.csv", *known]):
+        argv = [command[0], "tied.toml", "train.csv", *command[1:], "--quiet"]
+        assert main([*argv, "--effect-file", "laws.py"]) == 0
+    made, measured = (pp.History.load(f"{name}.csv", pp.Scene.load("scene.toml")) for name in
+                      ("made", "train"))  # fmt: skip
+    off = (made.dataset["observed"] - measured.dataset["observed"]).sel(state=["x", "y"])
+    assert float(abs(off).max()) < 0.05
+
+
+def test_a_law_of_an_effect_file_goes_to_another_process(files) -> None:
+    (tether,) = own_effects([Path("laws.py")])
+    with OneProcessEach(1) as executor:
+        assert executor.submit(getattr, tether, "name").result() == "tether"
 
 
 def test_an_own_effect_that_the_scene_declares_acts_there_alone(files) -> None:

@@ -87,7 +87,6 @@ def test_many(logs: list[Settings], capsys: pytest.CaptureFixture[str]) -> None:
         ("scene.toml", 'unknown column "a scene"'),
         ("scene.toml red.csv", "unexpected extra argument"),
         ("", "Missing argument 'MANIFEST'"),
-        ("logs.csv --trim", "No such option: --trim"),
         ("logs.csv --columns x", "is not NAME=VALUE, such as x=pos_x"),
         ("logs.csv --units x=", "is not NAME=VALUE, such as x=mm"),
         ("logs.csv --scheduler tcp://127.0.0.1:9", "no Dask scheduler answers there"),

@@ -52,10 +52,3 @@ def test_check_warns_of_a_held_body_and_trim_leaves_the_rows_out(
     said = capsys.readouterr()
     assert "left out" in said.err
     assert any(f"{n} ({n - 43} to 43 in a trajectory)" in said.out for n in (79, 80))
-
-
-@pytest.mark.usefixtures("files")
-@pytest.mark.parametrize("command", ["close-loop", "fit", "check", "criticise", "update"])
-def test_commands_have_it(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([command, "--help"]) == 0
-    assert "--trim" in capsys.readouterr().out
