@@ -23,13 +23,13 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
+from episodes import EpisodeError, World, run_episodes
 from experiments import curve, of_episodes, origin, save, summary, to_end
 
 import pbrl_ppl as pp
-from pbrl_ppl.errors import EpisodeError
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models" / "shopping_cart"))
-from task import TASK, TRUTH, world
+from task import SPREAD, TASK, TRUTH
 
 SIGMAS = {"a": 0.0, "b": 0.25}
 OUT = Path("out") / "shopping_cart"
@@ -55,6 +55,15 @@ def agent(name: str, seed: int) -> pp.Agent:
 AGENTS = {name: partial(agent, name) for name in NAMES}
 
 
+def world(sigma: float, box2d: bool) -> World:
+    """Return the true cart, with noise in m, rad, m/s and rad/s."""
+    if box2d:
+        from episodes.box2d_world import Box2DWorld
+
+        return Box2DWorld(TASK, TRUTH, sigma=sigma, spread=SPREAD)
+    return World(TASK, TRUTH, sigma=sigma, spread=SPREAD)
+
+
 def run() -> None:
     """Run what is missing, print the table, draw."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -76,8 +85,8 @@ def run() -> None:
     figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), sharey=True, layout="constrained")
     command = f"04_shopping_cart.py --episodes {episodes} --steps {steps}"
     for (panel, sigma), axis in zip(SIGMAS.items(), axes, strict=True):
-        done = pp.run_episodes(
-            AGENTS, world(sigma, box2d=options.box2d), range(1, episodes + 1),
+        done = run_episodes(
+            AGENTS, world(sigma, options.box2d), range(1, episodes + 1),
             out / f"sigma_{sigma:g}", steps=steps, workers=options.workers,
             progress=partial(print, flush=True),
         )  # fmt: skip

@@ -31,14 +31,21 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import xarray as xr
+from episodes import (
+    Episode,
+    EpisodeError,
+    World,
+    processes,
+    processors,
+    run_episode,
+    run_episodes,
+)
 from experiments import curve, of_episodes, origin, save, share, summary, to_end
 
 import pbrl_ppl as pp
-from pbrl_ppl.agents.processes import processes, processors
-from pbrl_ppl.errors import EpisodeError
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
-from apartment.task import TASK, TRUTH, library, world
+from apartment.task import TASK, TRUTH, library
 
 OUT = Path("out") / "apartment"
 #: Actions of an exploring episode, and of one in which an agent acts.
@@ -101,6 +108,15 @@ def agent(name: str, seed: int, **options: object) -> pp.Agent:
     return pp.OOLWRAgent(TASK, learner={"relations": (contacts,)}, seed=seed, **options)
 
 
+def world(sigma: float, box2d: bool) -> World:
+    """Return the true apartment, with noise in m, rad, m/s and rad/s."""
+    if box2d:
+        from episodes.box2d_world import Box2DWorld
+
+        return Box2DWorld(TASK, TRUTH, sigma=sigma, step=0.0025)
+    return World(TASK, TRUTH, sigma=sigma)
+
+
 def explored(count: int, seed: int, sigma: float, box2d: bool) -> list[tuple[np.ndarray, ...]]:
     """Return a given number of observed transitions."""
     found: list[tuple[np.ndarray, ...]] = []
@@ -108,8 +124,8 @@ def explored(count: int, seed: int, sigma: float, box2d: bool) -> list[tuple[np.
     while len(found) < count:
         # seeds that no other run has
         own = 1000 * seed + part
-        data = pp.run_episode(
-            Explorer(TASK, seed=own), world(sigma, box2d=box2d), steps=LENGTH, seed=own
+        data = run_episode(
+            Explorer(TASK, seed=own), world(sigma, box2d), steps=LENGTH, seed=own
         ).dataset
         found += zip(
             data["states"].to_numpy()[:-1], data["action"].to_numpy(),
@@ -163,7 +179,7 @@ def described() -> dict[str, str]:
 
 def played(wrenches: np.ndarray, box2d: bool) -> tuple[bool, float]:
     """Execute a plan in the true world; return whether it succeeds, and the last reward (m)."""
-    true = world(box2d=box2d)
+    true = world(0.0, box2d)
     state = true.reset(0)
     for wanted in wrenches:
         # a body's heading is not quite what the plan predicted, and with it the wrench
@@ -231,18 +247,18 @@ def plans(options: argparse.Namespace, counts: dict[str, tuple[int, ...]]) -> xr
     )
 
 
-def acting(options: argparse.Namespace, steps: int) -> dict[str, list[pp.Episode]]:
+def acting(options: argparse.Namespace, steps: int) -> dict[str, list[Episode]]:
     """Run the episodes that are missing; return all of them by agent."""
     search = {**SEARCH, "nodes": ACTING_NODES}
-    return pp.run_episodes(
+    return run_episodes(
         {name: partial(agent, name, **search) for name in ACTING if name in options.only},
-        world(options.sigma, box2d=options.box2d), range(1, options.seeds + 1),
+        world(options.sigma, options.box2d), range(1, options.seeds + 1),
         options.out / f"acting_{options.sigma:g}", steps=steps, workers=options.workers,
         progress=partial(print, flush=True),
     )  # fmt: skip
 
 
-def draw(data: xr.Dataset, done: dict[str, list[pp.Episode]], steps: int, path: Path) -> None:
+def draw(data: xr.Dataset, done: dict[str, list[Episode]], steps: int, path: Path) -> None:
     """Draw the share of valid plans against observations, and rewards against steps."""
     figure, axes = plt.subplots(1, 2, figsize=(11, 3.6), layout="constrained")
     colours = {name: f"C{i}" for i, name in enumerate(NAMES)}

@@ -27,10 +27,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import xarray as xr
+from episodes import EpisodeError, World, run_episodes
 from experiments import curve, of_episodes, origin, save, summary, to_end
 
 import pbrl_ppl as pp
-from pbrl_ppl.errors import EpisodeError
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models" / "shopping_cart"))
 from task import SPREAD, TASK, TRUTH
@@ -67,12 +67,12 @@ class Hidden:
         return out
 
 
-def world(name: str, sigma: float, box2d: bool = False) -> pp.World:
+def world(name: str, sigma: float, box2d: bool = False) -> World:
     """Return the cart's world with an effect and noisy observations."""
     sizes = WORLDS[name]
     if not box2d:
-        return pp.World(TASK, TRUTH | sizes, (EFFECTS[name],), sigma=sigma, spread=SPREAD)
-    from pbrl_ppl.agents.box2d_world import Box2DWorld
+        return World(TASK, TRUTH | sizes, (EFFECTS[name],), sigma=sigma, spread=SPREAD)
+    from episodes.box2d_world import Box2DWorld
 
     hidden = Hidden(*sizes.values()) if len(sizes) == 1 else Hidden(force=tuple(sizes.values()))
     return Box2DWorld(TASK, TRUTH, sigma=sigma, spread=SPREAD, acting=hidden)
@@ -113,7 +113,7 @@ def run() -> None:
     found = []
     for name, axis in zip(WORLDS, axes, strict=True):
         agents = {kind: partial(agent, kind, name) for kind in AGENTS}
-        done = pp.run_episodes(
+        done = run_episodes(
             agents, world(name, options.sigma, options.box2d), range(1, episodes + 1), out / name,
             steps=steps, workers=options.workers, progress=partial(print, flush=True),
         )  # fmt: skip

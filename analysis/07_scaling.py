@@ -24,12 +24,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import xarray as xr
+from episodes import EpisodeError, processes, processors
 from experiments import origin, save, to_end
 from matplotlib.axes import Axes
 
 import pbrl_ppl as pp
-from pbrl_ppl.agents.processes import processes, processors
-from pbrl_ppl.errors import EpisodeError
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.physics import Physics, Simulator, build_layout
 from pbrl_ppl.scene import Body, Scene, Shape, Wall

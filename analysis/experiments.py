@@ -11,11 +11,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import xarray as xr
+from episodes import Episode, EpisodeError
 from matplotlib.axes import Axes
 from scipy import stats
 
-import pbrl_ppl as pp
-from pbrl_ppl.errors import EpisodeError
 from pbrl_ppl.files import write_atomically
 
 
@@ -57,7 +56,7 @@ def origin(command: str) -> dict[str, str]:
 
 
 def of_episodes(
-    done: Mapping[str, list[pp.Episode]], steps: int, variables: tuple[str, ...]
+    done: Mapping[str, list[Episode]], steps: int, variables: tuple[str, ...]
 ) -> xr.Dataset:
     """Return rewards and some variables of all episodes, NaN by step after the goal is reached."""
     agents = []
@@ -76,13 +75,13 @@ def of_episodes(
     return xr.concat(agents, pd.Index(list(done), name="agent"), join="outer").drop_encoding()
 
 
-def added(episode: pp.Episode) -> str:
+def added(episode: Episode) -> str:
     """Return the effects that an agent had added at the end, and after how many transitions."""
     found = [f"{each['effect']} after {each['transitions']}" for each in episode.added]
     return ", ".join(found) or "nothing"
 
 
-def summary(name: str, episodes: list[pp.Episode], steps: int) -> dict[str, object]:
+def summary(name: str, episodes: list[Episode], steps: int) -> dict[str, object]:
     """Return a row of the table of an experiment's agents."""
     rewards = np.array([episode.rewards(steps) for episode in episodes])
     reached = [episode.steps for episode in episodes if episode.reached]

@@ -2,18 +2,13 @@
 
 from .agents import Acted as Acted
 from .agents import Agent as Agent
-from .agents import Episode as Episode
 from .agents import LibraryAgent as LibraryAgent
 from .agents import LWRAgent as LWRAgent
 from .agents import OOLWRAgent as OOLWRAgent
-from .agents import Outcome as Outcome
 from .agents import PBRLAgent as PBRLAgent
 from .agents import Task as Task
 from .agents import TrueModelAgent as TrueModelAgent
-from .agents import World as World
 from .agents import act as act
-from .agents import run_episode as run_episode
-from .agents import run_episodes as run_episodes
 from .criticism import Attribution as Attribution
 from .criticism import Criteria as Criteria
 from .criticism import Loop as Loop

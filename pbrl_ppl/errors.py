@@ -81,9 +81,5 @@ class GoalError(PbrlError, ValueError):
     """An invalid goal, start or set of actions."""
 
 
-class EpisodeError(PbrlError, ValueError):
-    """A world, an agent or an episode file that does not fit its task."""
-
-
 class ManifestError(PbrlError, ValueError):
     """A manifest of logs that cannot be read, or that names one of them twice."""

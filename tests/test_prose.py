@@ -206,13 +206,13 @@ def test_bags_and_models_of_robots(tmp_path, monkeypatch) -> None:
 
 @pytest.mark.long
 def test_blocks_run_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """At small size: Gaussian approximations, short searches and a short episode."""
+    """At small size: Gaussian approximations, and short searches."""
     shutil.copytree(MODELS, tmp_path / "models")
     shutil.copy(CART / "scene.toml", tmp_path / "cart.toml")  # as `pbrl-ppl new --from` does
     shutil.copy(CART / "recorded" / "train.csv", tmp_path)
     exported(tmp_path)
     monkeypatch.chdir(tmp_path)
-    whole, loop, plan, episode = pp.fit, pp.close_loop, pp.plan, pp.run_episode
+    whole, loop, plan = pp.fit, pp.close_loop, pp.plan
 
     def fit(model: Any, **options: Any) -> Any:
         small = {} if model.problem.library is not None else {"method": "laplace"}
@@ -221,13 +221,10 @@ def test_blocks_run_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     def planned(model: Any, *given: Any, draws: int | None = None, **options: Any) -> Any:
         return plan(model, *given, draws=draws and 2, nodes=2000, **options)
 
-    def episodes(*given: Any, steps: int, **options: Any) -> Any:
-        return episode(*given, steps=2, **options)
-
     monkeypatch.setattr(pp, "fit", fit)
     monkeypatch.setattr(pp, "close_loop", partial(loop, method="laplace", draws=100))
     monkeypatch.setattr(pp, "plan", planned)
-    monkeypatch.setattr(pp, "run_episode", episodes)
+    monkeypatch.setattr(pp, "PBRLAgent", partial(pp.PBRLAgent, nodes=2000))
     names: dict[str, Any] = {"__name__": "__main__"}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # too few draws
@@ -235,6 +232,6 @@ def test_blocks_run_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
             warnings.simplefilter("ignore", kind)
         for block in BLOCKS:
             exec(compile(block, block, "exec"), names)
-    assert Path("report.html").exists() and Path("episode.nc").exists()
+    assert Path("report.html").exists() and Path("learned.nc").exists()
     assert pp.joint_probabilities(names["found"])["joint1"]["none"] > 0.9
     assert names["loop"].added[0].effect == "angular_drag"

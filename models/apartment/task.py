@@ -58,12 +58,3 @@ LIBRARY_FILE = FOLDER / "library.json"
 def library() -> pp.ParameterLibrary:
     """The categorical prior: any body may be as any piece of furniture that was tried before."""
     return pp.ParameterLibrary.from_json(LIBRARY_FILE.read_text(encoding="utf-8"))
-
-
-def world(sigma: float = 0.0, *, box2d: bool = False) -> pp.World:
-    """The true apartment, in the package's engine or in Box2D."""
-    if box2d:
-        from pbrl_ppl.agents.box2d_world import Box2DWorld
-
-        return Box2DWorld(TASK, TRUTH, sigma=sigma, step=0.0025)
-    return pp.World(TASK, TRUTH, sigma=sigma)

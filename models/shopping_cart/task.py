@@ -21,15 +21,3 @@ TRUTH = {
 
 #: How far a start may be from the scene's (m, m, rad): episodes differ by it.
 SPREAD = 0.2
-
-
-def world(sigma: float = 0.0, *, box2d: bool = False) -> pp.World:
-    """The true cart, in the package's engine or in Box2D; the paper's noise is 0 or 0.25.
-
-    In m, rad, m/s and rad/s.
-    """
-    if box2d:
-        from pbrl_ppl.agents.box2d_world import Box2DWorld
-
-        return Box2DWorld(TASK, TRUTH, sigma=sigma, spread=SPREAD)
-    return pp.World(TASK, TRUTH, sigma=sigma, spread=SPREAD)

@@ -1,18 +1,91 @@
-"""Agents that plan with a transition model, and the paper's baselines."""
+"""Task of an agent, agents that plan with a transition model, and the paper's baselines."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, ClassVar, final
 
 import numpy as np
 
 from pbrl_ppl.agents.revision import Revision
-from pbrl_ppl.agents.world import Task
+from pbrl_ppl.errors import GoalError
 from pbrl_ppl.oomdp import LWR, OOLWR
-from pbrl_ppl.planning import Dynamics, TransitionModel, plan, rollout
+from pbrl_ppl.planning import (
+    ActionSet,
+    Dynamics,
+    Goal,
+    TransitionModel,
+    plan,
+    rollout,
+    start_state,
+)
+from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import THETA, Floats, wrapped
+
+
+@dataclass(frozen=True)
+class Task:
+    """Scene, goal and actions of an agent; the dynamics are unknown to it.
+
+    Attributes
+    ----------
+    scene : Scene
+        Known geometry. Its bodies start at rest at their ``pose``.
+    goal : Goal
+        An episode ends when it is reached.
+    actions : ActionSet
+        One is held over each sampling interval: one duration, the scene's ``time_step``.
+
+    Raises
+    ------
+    GoalError
+        If the goal or the actions do not fit the scene, an action is longer than an interval, or a
+        body has no pose.
+
+    Examples
+    --------
+    >>> from pbrl_ppl.scene import Body, Scene, Shape
+    >>> scene = Scene(time_step=0.2, bodies=(Body("puck", Shape.circle(0.2), pose=(0, 0, 0)),))
+    >>> pushes = ActionSet.box("puck", forces=(-4.0, 0.0, 4.0))
+    >>> task = Task(scene, Goal.of({"puck": (2.0, 0.0, None)}), pushes)
+    >>> task.reward(task.start)
+    -2.0
+    """
+
+    scene: Scene
+    goal: Goal
+    actions: ActionSet
+
+    def __post_init__(self) -> None:
+        self.goal.check(self.scene)
+        self.actions.check(self.scene)
+        if self.actions.intervals(self.scene) != (1,):
+            raise GoalError(
+                f"task: actions last {self.actions.durations} s, expected one sampling interval of"
+                f" {self.scene.time_step:g} s; an agent chooses an action for each"
+            )
+        start_state(self.scene, {})
+
+    @property
+    def start(self) -> Floats:
+        """Return the state at which an episode begins, shape (body, 6), SI units."""
+        return start_state(self.scene, {})
+
+    def reward(self, state: Floats) -> float:
+        """Return minus the L2 distance of the bodies from their goal (m), as in section 5."""
+        return -float(self.goal.distance(self.scene, state))
+
+    def reached(self, state: Floats) -> bool:
+        """Return whether a state (body, 6) is within the goal's tolerances."""
+        return bool(self.goal.shortfall(self.scene, state) <= 1.0)
+
+    def wrenches(self, state: Floats) -> Floats:
+        """Return all actions in a state (body, 6), shape (action, body, 3), world frame, N, N m."""
+        count = len(self.actions.actions)
+        heading = np.repeat(state[None, :, 2], count, axis=0)
+        return self.actions.wrenches(self.scene, np.arange(count), heading)
 
 
 class Agent(ABC):

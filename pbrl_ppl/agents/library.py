@@ -8,9 +8,8 @@ from typing import Any, ClassVar, final
 import numpy as np
 import pandas as pd
 
-from pbrl_ppl.agents.agent import PhysicsAgent, prediction_errors
+from pbrl_ppl.agents.agent import PhysicsAgent, Task, prediction_errors
 from pbrl_ppl.agents.pbrl import NEGLIGIBLE
-from pbrl_ppl.agents.world import Task
 from pbrl_ppl.errors import ConvergenceWarning, FitError
 from pbrl_ppl.history import from_segments
 from pbrl_ppl.likelihood import Problem, TransitionLikelihood

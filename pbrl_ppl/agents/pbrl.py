@@ -10,9 +10,8 @@ from typing import Any, ClassVar, final
 
 import numpy as np
 
-from pbrl_ppl.agents.agent import PhysicsAgent, prediction_errors
+from pbrl_ppl.agents.agent import PhysicsAgent, Task, prediction_errors
 from pbrl_ppl.agents.revision import select_effects
-from pbrl_ppl.agents.world import Task
 from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import BoundWarning, FitError, UninformedWarning

@@ -4,16 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from episodes import World, run_episode
 
-from pbrl_ppl.agents import (
-    LWRAgent,
-    OOLWRAgent,
-    PBRLAgent,
-    Task,
-    TrueModelAgent,
-    World,
-    run_episode,
-)
+from pbrl_ppl.agents import LWRAgent, OOLWRAgent, PBRLAgent, Task, TrueModelAgent
 from pbrl_ppl.errors import FitError, GoalError
 from pbrl_ppl.planning import ActionSet, Goal
 from tests.helpers.tasks import CART, CART_TRUTH, PUCK, PUCK_TRUTH, puck_world

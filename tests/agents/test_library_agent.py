@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from episodes import World, run_episode
 
-from pbrl_ppl.agents import LibraryAgent, Task, World, run_episode
+from pbrl_ppl.agents import LibraryAgent, Task
 from pbrl_ppl.errors import FitError, ParameterError
 from pbrl_ppl.parameters import ParameterLibrary
 from pbrl_ppl.planning import ActionSet, Dynamics, Goal

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from episodes import World
 
-from pbrl_ppl.agents import PBRLAgent, Revision, World
+from pbrl_ppl.agents import PBRLAgent, Revision
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.errors import EffectError
 from tests.helpers.tasks import CART, CART_TRUTH

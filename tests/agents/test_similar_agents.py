@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from episodes import EpisodeError, World
 
-from pbrl_ppl.agents import PBRLAgent, TrueModelAgent, World
-from pbrl_ppl.errors import EpisodeError
+from pbrl_ppl.agents import PBRLAgent, TrueModelAgent
 from pbrl_ppl.planning import Dynamics
 from pbrl_ppl.scene import body_sizes
 from tests.helpers.similar_plan import RIGS, Similar

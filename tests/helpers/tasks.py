@@ -1,6 +1,8 @@
 """Small tasks for agents: a cart without walls, and a puck behind a wall."""
 
-from pbrl_ppl.agents import Task, World
+from episodes import World
+
+from pbrl_ppl.agents import Task
 from pbrl_ppl.planning import ActionSet, Goal
 from pbrl_ppl.scene import Body, Scene, Shape, Wall
 

@@ -154,7 +154,7 @@ def test_an_undeclared_effect_is_the_same_in_another_engine(script, name) -> Non
     for action in module.TASK.wrenches(state)[[0, 8]]:
         one, other = (world.step(action).state for world in (ours, its))
         assert abs(one - other).max() < 0.002  # an interval moves it by centimetres
-        without = module.pp.World(module.TASK, module.TRUTH)._play(state, action)
+        without = module.World(module.TASK, module.TRUTH)._play(state, action)
         assert abs(one - without).max() > 0.02
         ours._state = its._state = state
     assert "Hidden(" in its.description

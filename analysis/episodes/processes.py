@@ -10,7 +10,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import active_children, get_context
 
-from pbrl_ppl.errors import EpisodeError
+from episodes.world import EpisodeError
 
 
 @contextmanager

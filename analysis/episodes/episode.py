@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from pbrl_ppl.errors import EpisodeError
+from episodes.world import EpisodeError
 from pbrl_ppl.files import write_atomically
 from pbrl_ppl.history import History, from_segments
 from pbrl_ppl.scene import Scene

@@ -1,16 +1,17 @@
 """Worlds as Gymnasium environments."""
 
+import os
 import runpy
 import subprocess
 import sys
 
 import numpy as np
 import pytest
+from episodes import EpisodeError, World, run_episode
+from episodes.environment import Environment
 from gymnasium.utils.env_checker import check_env
 
-from pbrl_ppl.agents import TrueModelAgent, run_episode
-from pbrl_ppl.agents.environment import Environment
-from pbrl_ppl.errors import EpisodeError
+from pbrl_ppl.agents import TrueModelAgent
 from tests.helpers.places import ROOT
 from tests.helpers.tasks import PUCK, PUCK_TRUTH, puck_world
 
@@ -26,7 +27,7 @@ def test_gymnasium_accepts_it(sigma) -> None:
 @pytest.mark.parametrize("model", ["shopping_cart", "apartment"])
 def test_gymnasium_accepts_the_papers_worlds(model) -> None:
     task = runpy.run_path(str(ROOT / "models" / model / "task.py"))
-    environment = Environment(task["world"](0.25), steps=20)
+    environment = Environment(World(task["TASK"], task["TRUTH"], sigma=0.25), steps=20)
     check_env(environment, skip_render_check=True)
     assert environment.observation_space.shape == (len(task["SCENE"].moving), 6)
 
@@ -87,8 +88,13 @@ def test_bad_requests() -> None:
     ("module", "missing"), [("environment", "gymnasium"), ("box2d_world", "Box2D")]
 )
 def test_what_is_not_installed_is_named(module, missing) -> None:
-    code = f"import sys; sys.modules[{missing!r}] = None; import pbrl_ppl.agents.{module}"
+    code = f"import sys; sys.modules[{missing!r}] = None; import episodes.{module}"
     ran = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False
+        [sys.executable, "-c", code],
+        cwd=ROOT / "analysis",
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
     )
-    assert "EpisodeError" in ran.stderr and "pip install 'pbrl_ppl[agents]'" in ran.stderr
+    assert "EpisodeError" in ran.stderr and "pip install 'pbrl_ppl[paper]'" in ran.stderr

@@ -12,20 +12,19 @@ from multiprocessing import active_children
 
 import numpy as np
 import pytest
-
-from pbrl_ppl.agents import (
-    Agent,
+from episodes import (
     Episode,
+    EpisodeError,
     Outcome,
-    Revision,
-    TrueModelAgent,
     World,
+    processes,
     run_episode,
     run_episodes,
 )
-from pbrl_ppl.agents.processes import processes
+
+from pbrl_ppl.agents import Agent, Revision, TrueModelAgent
 from pbrl_ppl.effects import catalogue
-from pbrl_ppl.errors import EpisodeError, UninformedWarning
+from pbrl_ppl.errors import UninformedWarning
 from pbrl_ppl.history import from_segments
 from pbrl_ppl.posterior import group, load_posterior
 from pbrl_ppl.sampling import fit, physics_model
@@ -131,8 +130,8 @@ def test_processes_by_default(tmp_path, monkeypatch) -> None:
         asked.append(workers)
         yield Here()
 
-    monkeypatch.setattr("pbrl_ppl.agents.experiment.processes", started)
-    monkeypatch.setattr("pbrl_ppl.agents.experiment.processors", lambda: 4)
+    monkeypatch.setattr("episodes.runs.processes", started)
+    monkeypatch.setattr("episodes.runs.processors", lambda: 4)
     run = partial(run_episodes, {"true": known}, puck_world(), folder=tmp_path, steps=1)
     for seeds in (range(1), range(3), range(9)):
         assert [each.seed for each in run(seeds=seeds)["true"]] == list(seeds)

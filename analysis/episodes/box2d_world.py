@@ -10,8 +10,8 @@ from typing import Any, final
 
 import numpy as np
 
-from pbrl_ppl.agents.world import Task, World
-from pbrl_ppl.errors import EpisodeError
+from episodes.world import EpisodeError, World
+from pbrl_ppl.agents import Task
 from pbrl_ppl.physics import scenery
 from pbrl_ppl.scene import WORLD
 from pbrl_ppl.state import Floats
@@ -22,7 +22,7 @@ try:
         import Box2D
 except ImportError as error:  # an optional dependency
     raise EpisodeError(
-        f"Box2D world: {error}; install Box2D: pip install 'pbrl_ppl[agents]'"
+        f"Box2D world: {error}; install Box2D: pip install 'pbrl_ppl[paper]'"
     ) from None
 
 

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from episodes import EpisodeError, World, run_episode
+from episodes.box2d_world import Box2DWorld
+from episodes.environment import Environment
 
-from pbrl_ppl.agents import PBRLAgent, Task, World, run_episode
-from pbrl_ppl.agents.box2d_world import Box2DWorld
-from pbrl_ppl.agents.environment import Environment
-from pbrl_ppl.errors import EpisodeError
+from pbrl_ppl.agents import PBRLAgent, Task
 from pbrl_ppl.planning import ActionSet, Goal
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.tasks import CART, CART_TRUTH, PUCK, PUCK_TRUTH

@@ -6,8 +6,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from pbrl_ppl.agents.experiment import AnyWorld, check_state
-from pbrl_ppl.errors import EpisodeError
+from episodes.world import AnyWorld, EpisodeError, check_state
 from pbrl_ppl.state import STATE, Floats
 
 try:
@@ -15,7 +14,7 @@ try:
     from gymnasium import spaces
 except ImportError as error:  # an optional dependency
     raise EpisodeError(
-        f"environment: {error}; install Gymnasium: pip install 'pbrl_ppl[agents]'"
+        f"environment: {error}; install Gymnasium: pip install 'pbrl_ppl[paper]'"
     ) from None
 
 
@@ -51,7 +50,8 @@ class Environment(gymnasium.Env[Floats, np.int64]):
 
     Examples
     --------
-    >>> from pbrl_ppl.agents import Task, World
+    >>> from episodes import World
+    >>> from pbrl_ppl.agents import Task
     >>> from pbrl_ppl.planning import ActionSet, Goal
     >>> from pbrl_ppl.scene import Body, Scene, Shape
     >>> scene = Scene(time_step=0.2, bodies=(Body("puck", Shape.circle(0.2), pose=(0, 0, 0)),))
@@ -84,7 +84,7 @@ class Environment(gymnasium.Env[Floats, np.int64]):
         Parameters
         ----------
         seed : int, optional
-            Seed of the world, as for :func:`pbrl_ppl.run_episode`; drawn from the environment's
+            Seed of the world, as for :func:`episodes.run_episode`; drawn from the environment's
             generator by default.
         options : dict, optional
             Ignored.

@@ -1,108 +1,25 @@
-"""Task of an agent, and the world to act in: true dynamics, reward, collisions and noise."""
+"""World to act in: true dynamics, reward, collisions and noise; and checks of other worlds."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from pbrl_ppl.errors import EpisodeError, GoalError
+from pbrl_ppl.agents import Task
+from pbrl_ppl.effects import Attached, Effect
+from pbrl_ppl.errors import PbrlError
 from pbrl_ppl.physics import touching
-from pbrl_ppl.planning import ActionSet, Dynamics, Goal, start_state
-from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import Floats
-
-#: Largest difference of an action from one of the set, for rounding, as a share of the largest
-#: force and the largest torque.
-_ROUNDING = 1e-9
+from pbrl_ppl.planning import Dynamics, start_state
+from pbrl_ppl.state import STATE, Floats
 
 
-@dataclass(frozen=True)
-class Task:
-    """Scene, goal and actions of an agent; the dynamics are unknown to it.
-
-    Attributes
-    ----------
-    scene : Scene
-        Known geometry. Its bodies start at rest at their ``pose``.
-    goal : Goal
-        An episode ends when it is reached.
-    actions : ActionSet
-        One is held over each sampling interval: one duration, the scene's ``time_step``.
-
-    Raises
-    ------
-    GoalError
-        If the goal or the actions do not fit the scene, an action is longer than an interval, or a
-        body has no pose.
-
-    Examples
-    --------
-    >>> from pbrl_ppl.scene import Body, Scene, Shape
-    >>> scene = Scene(time_step=0.2, bodies=(Body("puck", Shape.circle(0.2), pose=(0, 0, 0)),))
-    >>> pushes = ActionSet.box("puck", forces=(-4.0, 0.0, 4.0))
-    >>> task = Task(scene, Goal.of({"puck": (2.0, 0.0, None)}), pushes)
-    >>> task.reward(task.start)
-    -2.0
-    """
-
-    scene: Scene
-    goal: Goal
-    actions: ActionSet
-
-    def __post_init__(self) -> None:
-        self.goal.check(self.scene)
-        self.actions.check(self.scene)
-        if self.actions.intervals(self.scene) != (1,):
-            raise GoalError(
-                f"task: actions last {self.actions.durations} s, expected one sampling interval of"
-                f" {self.scene.time_step:g} s; an agent chooses an action for each"
-            )
-        start_state(self.scene, {})
-
-    @property
-    def start(self) -> Floats:
-        """Return the state at which an episode begins, shape (body, 6), SI units."""
-        return start_state(self.scene, {})
-
-    def reward(self, state: Floats) -> float:
-        """Return minus the L2 distance of the bodies from their goal (m), as in section 5."""
-        return -float(self.goal.distance(self.scene, state))
-
-    def reached(self, state: Floats) -> bool:
-        """Return whether a state (body, 6) is within the goal's tolerances."""
-        return bool(self.goal.shortfall(self.scene, state) <= 1.0)
-
-    def wrenches(self, state: Floats) -> Floats:
-        """Return all actions in a state (body, 6), shape (action, body, 3), world frame, N, N m."""
-        count = len(self.actions.actions)
-        heading = np.repeat(state[None, :, 2], count, axis=0)
-        return self.actions.wrenches(self.scene, np.arange(count), heading)
-
-    def check_action(self, state: Floats, action: Floats) -> None:
-        """Check that an action is one of the set in this state.
-
-        Raises
-        ------
-        EpisodeError
-            If it is not.
-        """
-        every = self.wrenches(state)
-        if action.shape != every.shape[1:]:
-            raise EpisodeError(
-                f"action: its shape is {action.shape}, expected {every.shape[1:]}: force_x, force_y"
-                f" and torque on {', '.join(body.name for body in self.scene.moving)}"
-            )
-        force, torque = abs(every[..., :2]).max(), abs(every[..., 2]).max()
-        allowed = _ROUNDING * np.array([force, force, torque])
-        if not (abs(every - action) <= allowed).all(axis=(1, 2)).any():
-            raise EpisodeError(
-                f"action: {action.tolist()} (N, N, N m; world frame) is none of the task's"
-                f" {len(every)} actions; choose one of Task.wrenches(state)"
-            )
+class EpisodeError(PbrlError, ValueError):
+    """A world, an agent or an episode file that does not fit its task."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,6 +45,25 @@ class Outcome:
     reward: float
     bumped: bool
     reached: bool
+
+
+class AnyWorld(Protocol):
+    """Interface of a world; :class:`World` is one.
+
+    A string ``description`` is optional; an episode file is not reused in a world with another one.
+    """
+
+    sigma: float | tuple[float, ...]
+
+    @property
+    def task(self) -> Task:
+        """Return scene, goal and actions."""
+
+    def reset(self, seed: int) -> Floats:
+        """Go back to the start and return the state, shape (body, 6), SI units."""
+
+    def step(self, action: Floats) -> Outcome:
+        """Hold an action, shape (body, 3), over one sampling interval."""
 
 
 class World:
@@ -179,7 +115,7 @@ class World:
         self,
         task: Task,
         parameters: Mapping[str, object],
-        effects: Any = (),
+        effects: Iterable[Effect | Attached] = (),
         *,
         sigma: float | Sequence[float] = 0.0,
         spread: float | Sequence[float] = 0.0,
@@ -233,7 +169,7 @@ class World:
             If it is not one of the task's actions.
         """
         action = np.asarray(action, dtype=float)
-        self.task.check_action(self._state, action)
+        check_action(self.task, self._state, action)
         begin = self._state
         state = self._play(begin, action)
         self._state, self._last = state, action
@@ -260,3 +196,55 @@ def _sizes(name: str, given: float | Sequence[float], count: int) -> float | tup
             f"world: {name} is {given}, expected a finite number from 0 up, or {count} of them"
         )
     return tuple(values.tolist()) if values.ndim else float(values)
+
+
+def check_action(task: Task, state: Floats, action: Floats, rounding: float = 1e-9) -> None:
+    """Check that an action is one of a task's in a state, up to rounding errors.
+
+    Parameters
+    ----------
+    task : Task
+        Has the actions.
+    state, action : ndarray
+        Shapes (body, 6) and (body, 3), SI units.
+    rounding : float
+        Largest difference, as a share of the largest force and the largest torque.
+
+    Raises
+    ------
+    EpisodeError
+        If it is not.
+    """
+    wrenches = task.wrenches(state)
+    if action.shape != wrenches.shape[1:]:
+        raise EpisodeError(
+            f"action: its shape is {action.shape}, expected {wrenches.shape[1:]}: force_x, force_y"
+            f" and torque on {', '.join(body.name for body in task.scene.moving)}"
+        )
+    force, torque = abs(wrenches[..., :2]).max(), abs(wrenches[..., 2]).max()
+    allowed = rounding * np.array([force, force, torque])
+    if not (abs(wrenches - action) <= allowed).all(axis=(1, 2)).any():
+        raise EpisodeError(
+            f"action: {action.tolist()} (N, N, N m; world frame) is none of the task's"
+            f" {len(wrenches)} actions; choose one of Task.wrenches(state)"
+        )
+
+
+def check_state(task: Task, given: ArrayLike, method: str) -> Floats:
+    """Return a state that a world's method returned, shape (body, 6), after a check.
+
+    Raises
+    ------
+    EpisodeError
+        If it has another shape, or is not finite.
+    """
+    state, expected = np.asarray(given, dtype=float), (len(task.scene.moving), len(STATE))
+    if state.shape != expected or not np.isfinite(state).all():
+        found = f"states of shape {state.shape}"
+        if state.shape == expected:
+            found = "a state that is not finite"
+        raise EpisodeError(
+            f"world: {method} returned {found}, expected finite ones of shape {expected}:"
+            f" {', '.join(STATE)} of {', '.join(body.name for body in task.scene.moving)}"
+        )
+    return state

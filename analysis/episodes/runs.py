@@ -10,40 +10,19 @@ from concurrent.futures import Executor
 from contextlib import AbstractContextManager, closing, nullcontext
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
-from pbrl_ppl.agents.agent import Agent
-from pbrl_ppl.agents.episode import VARIABLES, Episode
-from pbrl_ppl.agents.processes import processes, processors
-from pbrl_ppl.agents.world import Outcome, Task
+from episodes.episode import VARIABLES, Episode
+from episodes.processes import processes, processors
+from episodes.world import AnyWorld, EpisodeError, check_action, check_state
+from pbrl_ppl.agents import Agent
 from pbrl_ppl.background import as_ended
-from pbrl_ppl.errors import EpisodeError
 from pbrl_ppl.posterior import save_posterior
-from pbrl_ppl.state import STATE, Floats
 
 #: Makes an agent from a seed.
 MakeAgent = Callable[[int], Agent]
-
-
-class AnyWorld(Protocol):
-    """Interface of a world; :class:`World` is one.
-
-    A string ``description`` is optional; an episode file is not reused in a world with another one.
-    """
-
-    sigma: float | tuple[float, ...]
-
-    @property
-    def task(self) -> Task:
-        """Return scene, goal and actions."""
-
-    def reset(self, seed: int) -> Floats:
-        """Go back to the start and return the state, shape (body, 6), SI units."""
-
-    def step(self, action: Floats) -> Outcome:
-        """Hold an action, shape (body, 3), over one sampling interval."""
 
 
 def run_episode(
@@ -84,7 +63,7 @@ def run_episode(
     --------
     ::
 
-        episode = pp.run_episode(pp.PBRLAgent(task, seed=1), world, seed=1)
+        episode = run_episode(pp.PBRLAgent(task, seed=1), world, seed=1)
         episode.steps, episode.bumps
         idata = pp.fit(pp.physics_model(task.scene, episode.history()))
     """
@@ -101,7 +80,7 @@ def run_episode(
     while not reached and len(rows["action"]) < steps:
         begin = time.monotonic()
         action = np.asarray(agent.act(state), dtype=float)
-        task.check_action(state, action)
+        check_action(task, state, action)
         chosen = time.monotonic() - begin
         outcome = world.step(action)
         after = check_state(task, outcome.state, "step")
@@ -196,11 +175,11 @@ def run_episodes(
             return pp.PBRLAgent(task, seed=seed)
 
         if __name__ == "__main__":
-            done = pp.run_episodes({"pbrl": learner}, world, range(10), "out/cart")
+            done = run_episodes({"pbrl": learner}, world, range(10), "out/cart")
             # with dask.distributed, whose workers write into the same folder
             with Client("tcp://host:8786") as client:
                 executor = client.get_executor(pure=False)
-                pp.run_episodes({"pbrl": learner}, world, range(20), "out/cart", executor=executor)
+                run_episodes({"pbrl": learner}, world, range(20), "out/cart", executor=executor)
     """
     if workers is not None and workers < 1:
         raise EpisodeError(f"episodes: workers is {workers}, expected at least 1")
@@ -289,23 +268,3 @@ def _stored(path: Path, world: AnyWorld, steps: int, seed: int) -> Episode:
 def _description(world: AnyWorld) -> str:
     """Return a world's description for an episode's file; empty if it has none."""
     return str(getattr(world, "description", ""))
-
-
-def check_state(task: Task, given: Any, method: str) -> Floats:
-    """Return a state that a world's method returned, shape (body, 6), after a check.
-
-    Raises
-    ------
-    EpisodeError
-        If it has another shape, or is not finite.
-    """
-    state, expected = np.asarray(given, dtype=float), (len(task.scene.moving), len(STATE))
-    if state.shape != expected or not np.isfinite(state).all():
-        found = f"states of shape {state.shape}"
-        if state.shape == expected:
-            found = "a state that is not finite"
-        raise EpisodeError(
-            f"world: {method} returned {found}, expected finite ones of shape {expected}:"
-            f" {', '.join(STATE)} of {', '.join(body.name for body in task.scene.moving)}"
-        )
-    return state
