@@ -70,12 +70,11 @@ def check(
             from pbrl_ppl.criticism import prior_predictive_check, telling_horizon
             from pbrl_ppl.effects import attach
             from pbrl_ppl.likelihood import Problem
-            from pbrl_ppl.model import build_model
 
             horizon = telling_horizon(loaded)
             physics = Physics(sized, attach(sized, (), catalogue))
-            model = build_model(Problem.of(physics, loaded, horizon=horizon))
-            checked = prior_predictive_check(model, draws=draws, seed=seed)
+            problem = Problem.of(physics, loaded, horizon=horizon)
+            checked = prior_predictive_check(problem, draws=draws, seed=seed)
             for sentence in checked.summary:
                 console.print(f"prior: {sentence}", soft_wrap=True)
     if as_json:

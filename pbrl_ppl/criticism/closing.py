@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -55,8 +54,9 @@ from pbrl_ppl.history import History, with_units, without_measurements
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.physics import Physics, try_effect
-from pbrl_ppl.posterior import MAX_PARETO_K, PARETO_K, compare, identify, interval, versions
+from pbrl_ppl.posterior import MAX_PARETO_K, PARETO_K, Fit, compare, identify, interval, versions
 from pbrl_ppl.posterior import draws as posterior_draws
+from pbrl_ppl.sampling import sample
 from pbrl_ppl.scene import Scene
 
 #: Draws of each chain, then those where that is not enough; those of other methods; least tuning.
@@ -178,11 +178,11 @@ class _Task:
 
 @dataclass(frozen=True, eq=False)
 class _Model:
-    """A fitted model: mode, unexplained acceleration, posterior, and held-out trajectories."""
+    """A fitted model: mode, unexplained acceleration, draws, and held-out trajectories."""
 
     mode: Mode
     excess: UnexplainedAcceleration
-    posterior: Any
+    fit: Fit
     held_out: HeldOut
 
 
@@ -269,10 +269,10 @@ def _closed(task: _Task, train: History, test: History, recorded: History) -> Lo
 
     def sampled(task: _Task) -> Loop:
         say(Stage.SAMPLE)
-        posteriors = _posteriors(task, [declared, revised] if steps else [declared])
-        first = last = _Model(revised, after, posteriors[-1], held_out)
+        fits = _fits(task, [declared, revised] if steps else [declared])
+        first = last = _Model(revised, after, fits[-1], held_out)
         if revised is not declared:
-            first = _Model(declared, before, posteriors[0], HeldOut.of(declared, test))
+            first = _Model(declared, before, fits[0], HeldOut.of(declared, test))
         say(Stage.COMPARE)
         return replace(
             _put_together(task, train, first, last, steps, misfit, longest),
@@ -338,14 +338,11 @@ def _prior_test(
     held: Mapping[str, float] | None = None,
 ) -> ResidualTest:
     """Test whether the prior, with some parameters held, could have made the data."""
-    from pbrl_ppl.model import build_model  # PyMC takes seconds to load
-
     horizon = telling_horizon(train, task.criteria.prior)
     problem = Problem.of(Physics(task.scene, effects, threads=2), train, horizon=horizon)
     checked = prior_predictive_check(
-        build_model(problem), draws=PRIOR_DRAWS, seed=task.seed, held=held,
-        criteria=task.criteria.prior,
-    )  # fmt: skip
+        problem, draws=PRIOR_DRAWS, seed=task.seed, held=held, criteria=task.criteria.prior
+    )
     share = float(checked.dataset["share_beyond"].max())
     sentence, *more = checked.summary
     if more:
@@ -353,13 +350,13 @@ def _prior_test(
     return ResidualTest(PRIOR, float("nan"), share, not checked.sentences, sentence)
 
 
-def _posteriors(task: _Task, modes: list[Mode]) -> list[Any]:
+def _fits(task: _Task, modes: list[Mode]) -> list[Fit]:
     """Sample the models of modes, the first beside the others; issue their warnings, each once.
 
     What the data do not inform is said, and in the report: no conclusion depends on it.
     """
-    with background(partial(_posterior, task, modes[0])) as first:
-        others = [_posterior(task, mode) for mode in modes[1:]]
+    with background(partial(_fit, task, modes[0])) as first:
+        others = [_fit(task, mode) for mode in modes[1:]]
         results = [first(), *others]
     issued = {str(message): message for _, caught, _ in results for message in caught}
     uninformed = [text for text, each in issued.items() if isinstance(each, UninformedWarning)]
@@ -372,26 +369,22 @@ def _posteriors(task: _Task, modes: list[Mode]) -> list[Any]:
     return [fitted for fitted, *_ in results]
 
 
-def _posterior(task: _Task, mode: Mode) -> tuple[Any, list[Warning], list[str]]:
+def _fit(task: _Task, mode: Mode) -> tuple[Fit, list[Warning], list[str]]:
     """Sample a mode's model, with more draws if they do not suffice.
 
-    Returns the posterior, its warnings, and what to tell the user.
+    Returns the fit, its warnings, and what to tell the user.
     """
-    from pbrl_ppl.model import build_model  # PyMC takes seconds to load
-    from pbrl_ppl.sampling import fit
-
     # one thread a chain: more would wait for each other
     mode = replace(mode, problem=mode.problem.with_physics(threads=1))
-    model, method, said = build_model(mode.problem), task.method, []
+    method, said = task.method, []
     for n in DRAWS.get(method, CHAIN_DRAWS) if task.draws is None else (task.draws,):
         tune = max(LEAST_TUNE, 5 * n // 8)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            fitted = fit(
-                model, method=method, seed=task.seed, draws=n, tune=tune, start=mode, cores=1,
-                progress=False,
-            )  # fmt: skip
-        if "interrupted" in fitted.attrs:  # half a posterior gives no verdict
+            fitted = sample(
+                mode.problem, method=method, seed=task.seed, draws=n, tune=tune, start=mode, cores=1
+            )
+        if "interrupted" in fitted.posterior.attrs:  # half a posterior gives no verdict
             raise KeyboardInterrupt
         if _converged(fitted, task.criteria):
             break
@@ -402,10 +395,11 @@ def _posterior(task: _Task, mode: Mode) -> tuple[Any, list[Warning], list[str]]:
     return fitted, [message for message in kept if isinstance(message, Warning)], said
 
 
-def _converged(posterior: Any, criteria: Criteria) -> bool:
+def _converged(fit: Fit, criteria: Criteria) -> bool:
     """Return whether draws are good enough for a verdict; warnings begin earlier."""
-    r_hat, ess = posterior.attrs.get("max_rhat", np.inf), posterior.attrs.get("min_ess", 0.0)
-    weights = posterior.attrs.get(PARETO_K, 0.0) <= MAX_PARETO_K
+    attributes = fit.posterior.attrs
+    r_hat, ess = attributes.get("max_rhat", np.inf), attributes.get("min_ess", 0.0)
+    weights = attributes.get(PARETO_K, 0.0) <= MAX_PARETO_K
     return bool(weights and r_hat <= criteria.worst_rhat and ess >= criteria.least_ess)
 
 
@@ -422,10 +416,10 @@ def _put_together(
     scene, held_out, criteria = task.scene, revised.held_out, task.criteria
     test = held_out.problem.data.history
     unit = measurement_noise(revised.mode, revised.excess)
-    before = declared.held_out.errors(held_out, declared.posterior, rollout, task.seed, unit)
+    before = declared.held_out.errors(held_out, declared.fit, rollout, task.seed, unit)
     after = before
     if revised is not declared:
-        after = held_out.errors(held_out, revised.posterior, rollout, task.seed, unit)
+        after = held_out.errors(held_out, revised.fit, rollout, task.seed, unit)
     verdict = EFFECTS_ADDED if steps else ADEQUATE
     unexplained = misfit.unexplained
     # added effects that leave an acceleration unexplained are at best near the right ones
@@ -433,10 +427,10 @@ def _put_together(
         verdict = UNEXPLAINED
     if steps and after.normalised_rmse > (1.0 + criteria.negligible) * before.normalised_rmse:
         verdict, unexplained = UNEXPLAINED, unexplained or _worse(before, after)
-    if not all(_converged(model.posterior, criteria) for model in (declared, revised)):
+    if not all(_converged(model.fit, criteria) for model in (declared, revised)):
         verdict = NOT_CONVERGED
     added = tuple(_added(step, revised) for step in steps)
-    keep_groups(revised.posterior, added)
+    keep_groups(revised.fit.posterior, added)
     first, last = declared.excess, revised.excess
     noise = noise_alone(revised.mode, last)
     return Loop(
@@ -451,8 +445,8 @@ def _put_together(
         before=before,
         after=after,
         noise_floor=held_out.noise_floor(noise, rollout),
-        posterior_before=declared.posterior,
-        posterior_after=revised.posterior,
+        declared=declared.fit,
+        revised=revised.fit,
         residuals_before=declared.held_out.residuals(held_out),
         residuals_after=held_out.residuals(held_out),
         rollout=example_rollout(declared.held_out, held_out),
@@ -478,8 +472,8 @@ def _put_together(
         ),
         correlations=misfit.correlations,
         growth=misfit.growth,
-        identifiability=identify(revised.posterior, mode=revised.mode),
-        loo=compare(declared.posterior, revised.posterior),
+        identifiability=identify(revised.fit.posterior, mode=revised.mode),
+        loo=compare(declared.fit.posterior, revised.fit.posterior),
     )
 
 
@@ -500,7 +494,7 @@ def _added(step: Step, revised: _Model) -> Added:
     named = {
         named_beside(each, step.signature.attached) for each in revised.mode.problem.physics.effects
     }  # an effect that was added as well is told from it
-    drawn = posterior_draws(revised.posterior)
+    drawn = posterior_draws(revised.fit.posterior)
     bodies = [
         attached.body
         for attached in revised.mode.problem.physics.effects

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.special import logsumexp
@@ -15,7 +14,7 @@ from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History, longest_gap
 from pbrl_ppl.likelihood import Problem, along_trajectories, observed_coordinates
 from pbrl_ppl.modes import Mode
-from pbrl_ppl.posterior import parameter_draws
+from pbrl_ppl.posterior import Fit
 from pbrl_ppl.scene import Scene, motion_time, state_sizes
 from pbrl_ppl.state import STATE, STATE_UNITS, Floats
 
@@ -90,17 +89,15 @@ class HeldOut:
             if seen[:, dimension == d].any()
         }
 
-    def errors(
-        self, unit: HeldOut, posterior: Any, rollout: int, seed: int, noise: Floats
-    ) -> Errors:
+    def errors(self, unit: HeldOut, fit: Fit, rollout: int, seed: int, noise: Floats) -> Errors:
         """Return the model's errors.
 
         Parameters
         ----------
         unit : HeldOut
             The model with which innovations are filtered.
-        posterior : InferenceData or DataTree
-            Posterior of this model.
+        fit : Fit
+            This model with its posterior.
         rollout : int
             Intervals of the forecasts.
         seed : int
@@ -112,7 +109,7 @@ class HeldOut:
         mode, own = self.mode, unit.problem.trajectory_noise
         seen = own.seen
         whitened = self.whitened(unit) * own.scale(unit.mode.sigma) / own.scale(noise)
-        phi, sigma = parameter_draws(mode.problem, posterior)
+        phi, sigma = fit.draws
         rng = np.random.default_rng(seed)
         chosen = rng.choice(len(phi), min(_DRAWS, len(phi)), replace=False)
         phi, sigma = phi[chosen], sigma[chosen]

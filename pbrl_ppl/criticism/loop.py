@@ -29,7 +29,7 @@ from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import FitError, OutputError
 from pbrl_ppl.files import json_values
 from pbrl_ppl.history import History, UnusedVelocity
-from pbrl_ppl.posterior import Comparison, Identifiability, save_posterior
+from pbrl_ppl.posterior import Comparison, Fit, Identifiability, save_posterior
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats
 
@@ -61,8 +61,8 @@ class Loop:
         Structure that no effect in the catalogue explains.
     before, after, noise_floor : Errors
         Held-out errors of the declared model, of the revised one, and of the noise alone.
-    posterior_before, posterior_after : InferenceData or DataTree
-        Posteriors of both models; the same object twice if nothing was added.
+    declared, revised : Fit
+        Both models with their posteriors; the same object twice if nothing was added.
     residuals_before, residuals_after : dict of str to ndarray
         Held-out residuals in units of noise per state dimension, 1-d arrays.
     rollout : Rollout
@@ -108,8 +108,8 @@ class Loop:
     before: Errors
     after: Errors
     noise_floor: Errors
-    posterior_before: Any
-    posterior_after: Any
+    declared: Fit
+    revised: Fit
     residuals_before: Mapping[str, Floats]
     residuals_after: Mapping[str, Floats]
     rollout: Rollout
@@ -132,6 +132,16 @@ class Loop:
     def __repr__(self) -> str:
         added = [f"{one.effect} on {one.body}" for one in self.added]
         return f"Loop(verdict={self.verdict!r}, added={added})"
+
+    @property
+    def posterior_before(self) -> Any:
+        """Posterior of the declared model, an InferenceData or a DataTree."""
+        return self.declared.posterior
+
+    @property
+    def posterior_after(self) -> Any:
+        """Posterior of the revised model; that of the declared one if nothing was added."""
+        return self.revised.posterior
 
     @property
     def remainder_words(self) -> str:
@@ -184,7 +194,7 @@ class Loop:
         if not body:
             raise FitError(f"remainder: no body stands out; give body=, one of {bodies}")
         return learn_remainder(
-            self.posterior_after, body, catalogue=self.catalogue, seed=seed,
+            self.revised, body, catalogue=self.catalogue, seed=seed,
             criteria=self.criteria, progress=progress,
         )  # fmt: skip
 

@@ -20,7 +20,7 @@ from pbrl_ppl.history import (
     measurement_noise,
     unused_velocities,
 )
-from pbrl_ppl.likelihood import Problem
+from pbrl_ppl.likelihood import Problem, draw_prior
 from pbrl_ppl.posterior import HDI_PROB
 from pbrl_ppl.state import POSE, STATE, STATE_UNITS, THETA, Bools, Floats, Ints, wrapped
 
@@ -121,8 +121,8 @@ def prior_predictive_check(
 
     Parameters
     ----------
-    model : pymc.Model
-        As made by :func:`pbrl_ppl.physics_model`.
+    model : pymc.Model or Problem
+        As made by :func:`pbrl_ppl.physics_model`, or the problem that it is of.
     draws : int
         Draws from the prior, at least 50; measurements beyond all of them count against the prior.
     seed : int
@@ -152,7 +152,7 @@ def prior_predictive_check(
         check.dataset["share_inside"]
         check.sentences  # ('omega of cart changes by up to 12 rad/s in 0.1 s; under ...',)
     """
-    problem = getattr(model, "problem", None)
+    problem = getattr(model, "problem", model)
     if not isinstance(problem, Problem):
         raise FitError("prior check: this pm.Model was not made by physics_model; make it so")
     if draws < criteria.least_draws:
@@ -173,11 +173,7 @@ def prior_predictive_check(
     for velocity in unused:
         if (d := STATE.index(velocity.state)) in columns:
             measured[:, history.bodies.index(velocity.body), columns.index(d)] = np.nan
-    names = [block.name for block in problem.layout.blocks]
-    from pbrl_ppl.model import prior_predictive_draws  # PyMC takes seconds to load
-
-    drawn = prior_predictive_draws(model, names, draws, int(rng.integers(2**31)))
-    phi = problem.layout.to_vectors(drawn, draws)
+    phi = draw_prior(problem, rng, draws)
     for label, value in (held or {}).items():
         phi[:, problem.layout.labels.index(label)] = value
     ends = np.concatenate(

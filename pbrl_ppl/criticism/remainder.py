@@ -23,8 +23,9 @@ from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import ACCELERATION
 from pbrl_ppl.modes import Mode, trajectory_mode
+from pbrl_ppl.posterior import Fit, group
 from pbrl_ppl.posterior import draws as posterior_draws
-from pbrl_ppl.posterior import group
+from pbrl_ppl.sampling import sample
 from pbrl_ppl.scene import state_sizes
 from pbrl_ppl.state import STATE, Floats
 
@@ -81,7 +82,7 @@ def learn_remainder(
 
     Parameters
     ----------
-    posterior : InferenceData or DataTree
+    posterior : InferenceData, DataTree or Fit
         A posterior of whole trajectories.
     body : str
         The body that lacks a force.
@@ -112,7 +113,7 @@ def learn_remainder(
     check_scikit_learn()
     say = progress or (lambda stage: None)
     with threadpool_limits(1, "blas"):
-        mode = posterior_mode(posterior, tuple(catalogue))
+        mode = posterior_mode(Fit.of(posterior, catalogue))
         present = [attached.effect.name for attached in mode.problem.physics.effects]
         if LEARNED_REMAINDER in present:
             raise FitError("posterior: it has a learned remainder already; take one without")
@@ -128,11 +129,9 @@ def learn_remainder(
                 f"nothing to learn: a force on {body} that follows its velocity does not help on"
                 " trajectories that were left out"
             )
-        from pbrl_ppl.model import build_model  # PyMC takes seconds to load
-        from pbrl_ppl.sampling import fit
-
-        model = build_model(refitted.problem.with_physics(threads=1))
-        return fit(model, method="laplace", seed=seed, draws=draws, start=refitted, progress=False)
+        problem = refitted.problem.with_physics(threads=1)
+        fit = sample(problem, method="laplace", seed=seed, draws=draws, start=refitted)
+        return fit.posterior
 
 
 def remainder_in_words(before: Any, after: Any) -> str:

@@ -17,7 +17,7 @@ from pbrl_ppl.criticism.selection import refitted
 from pbrl_ppl.effects import Attached, Effect, Noise
 from pbrl_ppl.errors import EffectError, PosteriorError
 from pbrl_ppl.modes import Mode, trajectory_mode
-from pbrl_ppl.posterior import best_draw, parameter_draws, problem_of
+from pbrl_ppl.posterior import Fit
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats
 
@@ -111,23 +111,21 @@ def named_effects(
     return found
 
 
-def posterior_mode(posterior: Any, catalogue: Iterable[Effect]) -> Mode:
-    """Return the mode of a posterior's model, found from its draw of the highest density.
+def posterior_mode(fit: Fit) -> Mode:
+    """Return the mode of a fitted model, found from its draw of the highest density.
 
     Raises
     ------
     PosteriorError
         If the posterior is of single transitions.
     """
-    problem = problem_of(posterior, catalogue).with_physics(threads=2)
+    problem = fit.problem.with_physics(threads=2)
     if problem.likelihood.independent:
         raise PosteriorError(
             "posterior: it is of single transitions, which do not separate measurement noise from"
             " process noise; take after.nc of close_loop, or fit with trajectories=True"
         )
-    phi, sigma = parameter_draws(problem, posterior)
-    best = best_draw(posterior)
-    return trajectory_mode(problem, phi[best], sigma[best])
+    return trajectory_mode(problem, *fit.best)
 
 
 def fit_rivals(
@@ -155,9 +153,10 @@ def fit_rivals(
     PosteriorError
         If the posterior is of single transitions, or holds fewer draws.
     """
-    declared = posterior_mode(posterior, catalogue)
+    fit = Fit.of(posterior, catalogue)
+    declared = posterior_mode(fit)
     problem = declared.problem
-    phi, sigma = parameter_draws(problem, posterior)
+    phi, sigma = fit.draws
     if not 1 <= draws <= len(phi):
         raise PosteriorError(f"posterior: {draws} draws were asked for, expected 1 to {len(phi)}")
     rng = np.random.default_rng(seed)

@@ -92,6 +92,19 @@ def log_prior(problem: Problem, phi: Floats, sigma: Floats, choice: Ints | None 
     return np.asarray(of_noise + table[np.arange(len(names)), choice].sum(axis=-1))
 
 
+def draw_prior(problem: Problem, rng: np.random.Generator, n: int) -> Floats:
+    """Draw parameters from the declared prior, shape (n, p), in SI units."""
+    layout, library = problem.layout, problem.library
+    if library is None:
+        return layout.prior_draws(rng, n)
+    table = library.table(layout, problem.scene)
+    names = list(problem.scene.owners)
+    chosen = {name: rng.choice(len(library.names), n, p=library.prior(name)) for name in names}
+    owners = [owner for block in layout.blocks for owner in block.owners]
+    columns = [row[chosen[owner]] for row, owner in zip(table, owners, strict=True)]
+    return np.stack(columns, axis=1)
+
+
 def log_posterior(
     problem: Problem,
     phi: Floats,

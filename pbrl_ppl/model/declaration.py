@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -13,19 +13,18 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.likelihood import (
     ACCELERATION,
-    CONTACT,
+    ACTION_DIMS,
     DRIFT,
+    NEXT_STATE_DIMS,
+    START_DIMS,
     Problem,
+    coordinates,
+    variable_dims,
 )
 from pbrl_ppl.model.op import LogLikelihoodOp, SimulatorOp
 from pbrl_ppl.model.table1 import random_variable
 from pbrl_ppl.parameters import Block, Layout, ParameterLibrary
-from pbrl_ppl.state import INPUT, STATE, Floats
-
-#: Dimensions of the noise variables along trajectories.
-_NOISE_DIMS = {
-    "sigma": "sensor", ACCELERATION: "velocity", CONTACT: "velocity", DRIFT: "position",
-}  # fmt: skip
+from pbrl_ppl.state import Floats
 
 
 class PhysicsModel(pm.Model):  # type: ignore[misc]  # untyped
@@ -40,7 +39,7 @@ class PhysicsModel(pm.Model):  # type: ignore[misc]  # untyped
     """
 
     def __init__(self, problem: Problem, mode: Any = None) -> None:
-        super().__init__(coords=_coords(problem))
+        super().__init__(coords=coordinates(problem))
         self.problem, self.mode = problem, mode
 
 
@@ -50,20 +49,20 @@ def build_model(problem: Problem, mode: Any = None) -> PhysicsModel:
     ``mode`` is that of :class:`PhysicsModel`.
     """
     observations, segments, physics = problem.observations, problem.segments, problem.physics
-    sensitivity = problem.likelihood.sensitivity
+    sensitivity, dims = problem.likelihood.sensitivity, variable_dims(problem)
     model = PhysicsModel(problem, mode)
     with model:
-        start = pm.Data("start", segments.start, dims=("transition", "body", "full_state"))
-        actions = pm.Data("actions", problem.inputs, dims=("transition", "step", "body", "wrench"))
+        start = pm.Data("start", segments.start, dims=START_DIMS)
+        actions = pm.Data("actions", problem.inputs, dims=ACTION_DIMS)
         # Table 1
         table1: dict[str, Any] = {}
         if problem.library is not None:
-            table1 = _chosen(problem, problem.library)
+            table1 = _chosen(problem, problem.library, dims)
         else:
             for block in physics.layout.blocks:
                 index = _index(block, physics.layout, table1)
                 table1[block.name] = random_variable(
-                    block.name, block.priors, _dim(problem, block), block.conditional, index
+                    block.name, block.priors, dims[block.name], block.conditional, index
                 )
         phi = pt.concatenate(list(table1.values())) if table1 else pt.zeros(0)
         # P(sigma)
@@ -87,7 +86,7 @@ def build_model(problem: Problem, mode: Any = None) -> PhysicsModel:
             random=partial(_random, problem),
             signature="(n,h,k,d),(n,h,k,d),(m),(p)->(n,h,k,d)",
             observed=np.nan_to_num(problem.measured),
-            dims=("transition", "step", "body", "state"),
+            dims=NEXT_STATE_DIMS,
         )
     return model
 
@@ -121,17 +120,19 @@ def prior_predictive_draws(
     return dict(zip(names, drawn, strict=True))
 
 
-def _chosen(problem: Problem, library: ParameterLibrary) -> dict[str, Any]:
+def _chosen(
+    problem: Problem, library: ParameterLibrary, dims: Mapping[str, tuple[str, ...]]
+) -> dict[str, Any]:
     """Declare the parameter set of each body or class, and the parameters that follow from it."""
     names = tuple(problem.scene.owners)
     table = library.table(problem.layout, problem.scene)
     p = np.stack([library.prior(name) for name in names])
-    index = pm.Categorical("library_index", p=p, dims=_owner_dim(problem, names, "library"))
+    index = pm.Categorical("library_index", p=p, dims=dims["library_index"])
     result = {}
     for block, place in problem.layout.slices():
         own = index[[names.index(owner) for owner in block.owners]]
         value = pt.as_tensor(table[place])[np.arange(len(block.owners)), own]
-        result[block.name] = pm.Deterministic(block.name, value, dims=_dim(problem, block))
+        result[block.name] = pm.Deterministic(block.name, value, dims=dims[block.name])
     return result
 
 
@@ -145,7 +146,7 @@ def _noise(problem: Problem) -> Any:
         return pm.LogNormal("sigma", mu=np.log(median), sigma=spread, dims="state")
     parts, mu = [pt.zeros(0)], np.log(median)
     for name, own in problem.noise_variables.items():
-        centre, dims = mu[: len(own)], _NOISE_DIMS[name]
+        centre, dims = mu[: len(own)], variable_dims(problem)[name]
         if name in (ACCELERATION, DRIFT):
             variable = pm.Exponential(name, scale=np.exp(centre) / np.log(2.0), dims=dims)
         else:
@@ -177,42 +178,3 @@ def _random(
     """Draw measurements about the predictions of one world."""
     linearised = np.nan_to_num(problem.observations.values)
     return problem.likelihood.random(whole, linearised, sigma, rng, problem.nu(phi))
-
-
-def _coords(problem: Problem) -> dict[str, Any]:
-    """Return the coordinates of the model's dimensions by name."""
-    segments = problem.segments
-    coords: dict[str, Any] = {
-        "body": [body.name for body in problem.scene.moving],
-        "full_state": list(STATE),
-        "state": list(problem.observations.names),
-        **_noise_coords(problem),
-        "wrench": list(INPUT[: problem.inputs.shape[-1]]),
-        "transition": np.arange(segments.n),
-        "step": np.arange(1, problem.data.horizon + 1),
-    }
-    owners = tuple(problem.scene.owners)
-    coords.setdefault(_owner_dim(problem, owners, ""), list(owners))
-    for block in problem.layout.blocks:
-        coords.setdefault(_dim(problem, block), list(block.owners))
-    return coords
-
-
-def _noise_coords(problem: Problem) -> dict[str, Any]:
-    if not problem.likelihood.filtered:
-        return {}
-    return {_NOISE_DIMS[name]: list(own) for name, own in problem.noise_variables.items()}
-
-
-def _dim(problem: Problem, block: Block) -> str:
-    """Return the dimension of a parameter: joints, or the bodies or classes that have it."""
-    if block.of == "joint":
-        return "joint" if not block.name.startswith("i_") else "free_joint"
-    return _owner_dim(problem, block.owners, block.effect or block.name)
-
-
-def _owner_dim(problem: Problem, owners: tuple[str, ...], name: str) -> str:
-    """Return ``body`` for all moving bodies, ``owner`` for all owners, or a name of its own."""
-    if set(owners) == {body.name for body in problem.scene.moving}:
-        return "body"
-    return "owner" if owners == tuple(problem.scene.owners) else f"{name}_body"

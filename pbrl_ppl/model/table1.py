@@ -19,7 +19,7 @@ _SHARP, _LEVEL = 500.0, 1e-12
 def random_variable(
     name: str,
     priors: tuple[Prior, ...],
-    dims: str,
+    dims: str | tuple[str, ...],
     conditional: tuple[tuple[Prior, ...], ...] = (),
     index: Any = None,
 ) -> Any:
@@ -31,7 +31,7 @@ def random_variable(
         The variable's name.
     priors : tuple of Prior
         Same family, one a body or joint.
-    dims : str
+    dims : str or tuple of str
         The model's dimension over those bodies or joints.
     conditional : tuple of tuple of Prior
         For each owner its prior if its index is 0, 1, ...; see `Block`.
@@ -65,7 +65,7 @@ def random_variable(
     return pm.Categorical(name, p=p, dims=dims)
 
 
-def _von_mises(name: str, mu: Floats, kappa: Floats, dims: str) -> Any:
+def _von_mises(name: str, mu: Floats, kappa: Floats, dims: str | tuple[str, ...]) -> Any:
     """Declare PyMC's von Mises, or an equal density that does not overflow if it is sharp."""
     kappa = np.maximum(kappa, _LEVEL)
     if kappa.max() <= _SHARP:

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from pbrl_ppl.errors import ParameterError
-from pbrl_ppl.parameters.priors import Prior
+from pbrl_ppl.parameters.priors import Prior, prior_draws
 from pbrl_ppl.state import Bools, Floats
 
 #: Table 1's names for one body, in the order of Eq. 8, with units.
@@ -142,6 +142,15 @@ class Layout:
                 held = phi[..., index] == number
                 result[held, place] = prior.log_density(phi[held, place])
         return result
+
+    def prior_draws(self, rng: np.random.Generator, n: int) -> Floats:
+        """Return draws from the prior, shape (n, p); an anchor's prior depends on its index."""
+        phi = prior_draws(self.priors, rng, n)
+        for place, index, conditional in self._conditional():
+            for number, prior in enumerate(conditional):
+                here = phi[:, index] == number
+                phi[here, place] = prior.sample(rng, int(here.sum()))
+        return phi
 
     def _conditional(self) -> Iterator[tuple[int, int, tuple[Prior, ...]]]:
         """Yield the places of each anchor of unknown bodies and of its index, and its priors."""

@@ -287,7 +287,8 @@ class Prior:
 
 def prior_draws(priors: Sequence[Prior], rng: np.random.Generator, n: int) -> Floats:
     """Return independent draws from each prior, shape (n, p)."""
-    return np.stack([prior.sample(rng, n) for prior in priors], axis=1)
+    columns = [prior.sample(rng, n) for prior in priors]
+    return np.stack(columns, axis=1) if columns else np.zeros((n, 0))
 
 
 def prior_residual(priors: Sequence[Prior], phi: Floats) -> Floats:

@@ -28,6 +28,7 @@ from .data import recorded as recorded
 from .data import recorded_coordinates as recorded_coordinates
 from .data import recording as recording
 from .data import versions as versions
+from .fit import Fit as Fit
 from .identifiability import Identifiability as Identifiability
 from .identifiability import identify as identify
 from .identifiability import uninformed as uninformed

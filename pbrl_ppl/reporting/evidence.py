@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.criticism import QUANTITIES, Loop, recorded_quantities
 from pbrl_ppl.likelihood import Problem
-from pbrl_ppl.posterior import problem_of
-from pbrl_ppl.reporting.motion import best_vectors
+from pbrl_ppl.posterior import Fit
 from pbrl_ppl.reporting.style import acceleration_unit
 from pbrl_ppl.reporting.words import depends_on_records
 from pbrl_ppl.state import STATE, Bools, Floats, Ints
@@ -99,10 +98,8 @@ def find_evidence(loop: Loop) -> Evidence | None:
     """
     if not loop.added or not recorded(loop.posterior_before, loop.posterior_after):
         return None
-    after = problem_of(loop.posterior_after, loop.catalogue)
-    before = problem_of(loop.posterior_before, loop.catalogue)
-    nats = _log_density(after, loop.posterior_after)
-    nats = nats - _log_density(before, loop.posterior_before)
+    after = loop.revised.problem
+    nats = _log_density(loop.revised) - _log_density(loop.declared)
     noise, segments = after.trajectory_noise, after.segments
     moving = [body.name for body in after.scene.moving]
     body = loop.added[0].body
@@ -134,9 +131,9 @@ def recorded(*posteriors: Any) -> bool:
     )
 
 
-def _log_density(problem: Problem, posterior: Any) -> Floats:
+def _log_density(fit: Fit) -> Floats:
     """Return the log-likelihood of each measured number given those before it."""
-    phi, sigma = best_vectors(problem, posterior)
+    problem, (phi, sigma) = fit.problem, fit.best
     noise = problem.trajectory_noise
     cells = -0.5 * problem.robust(phi, sigma) ** 2 - np.log(noise.scale(sigma))
     whole = problem.log_density(problem.residual(phi), sigma, phi)
@@ -252,8 +249,7 @@ def find_laws(loop: Loop, most: int = 3) -> list[Law]:
         return []
     if not recorded(loop.posterior_after):
         return []
-    problem = problem_of(loop.posterior_after, loop.catalogue)
-    phi, _ = best_vectors(problem, loop.posterior_after)
+    problem, phi = loop.revised.problem, loop.revised.best[0]
     body = [moving.name for moving in problem.scene.moving].index(remains.body)
     residual = _residual_force(problem, phi, body, remains.dimension)
     if residual is None:

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from pbrl_ppl.criticism import Loop, diverged_after, whole_rollouts
-from pbrl_ppl.effects import Effect
 from pbrl_ppl.history import History
-from pbrl_ppl.likelihood import Problem, along_trajectories
-from pbrl_ppl.posterior import best_draw, parameter_draws, problem_of
+from pbrl_ppl.likelihood import along_trajectories
+from pbrl_ppl.posterior import Fit
 from pbrl_ppl.reporting.words import number
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats, wrapped
@@ -44,13 +43,6 @@ class Motion:
     after: Floats
 
 
-def best_vectors(problem: Problem, posterior: Any) -> tuple[Floats, Floats]:
-    """Return the draw of highest likelihood: phi, shape (p,), and the noise parameters."""
-    best = best_draw(posterior)
-    phi, sigma = parameter_draws(problem, posterior)
-    return phi[best], sigma[best]
-
-
 def held_out_motions(loop: Loop) -> list[Motion]:
     """Return predictions of held-out trajectories, those worst predicted by the old model first.
 
@@ -60,9 +52,9 @@ def held_out_motions(loop: Loop) -> list[Motion]:
     """
     if loop.held_out is None:
         return []
-    before = after = _predicted(loop.posterior_before, loop.held_out, loop.catalogue)
-    if loop.posterior_after is not loop.posterior_before:
-        after = _predicted(loop.posterior_after, loop.held_out, loop.catalogue)
+    before = after = _predicted(loop.declared, loop.held_out)
+    if loop.revised is not loop.declared:
+        after = _predicted(loop.revised, loop.held_out)
     dataset = loop.held_out.dataset
     known = dataset["start"].to_numpy()[..., :3]
     labels = [str(label) for label in dataset["trajectory"].to_numpy()]
@@ -118,12 +110,11 @@ def divergence_in_words(motions: Sequence[Motion]) -> str:
     return f"{text[:1].upper()}{text[1:]}." if text else ""
 
 
-def _predicted(posterior: Any, history: History, effects: Sequence[Effect]) -> dict[int, Floats]:
-    """Return the poses that a posterior predicts of whole trajectories, by trajectory."""
-    problem = problem_of(posterior, effects)
-    phi, sigma = best_vectors(problem, posterior)
-    cells = problem.trajectory_noise.coordinates
-    problem = problem.with_data(history=history, states=None)
+def _predicted(fit: Fit, history: History) -> dict[int, Floats]:
+    """Return the poses that a fitted model predicts of whole trajectories, by trajectory."""
+    phi, sigma = fit.best
+    cells = fit.problem.trajectory_noise.coordinates
+    problem = fit.problem.with_data(history=history, states=None)
     problem = along_trajectories(problem, phi, sigma, cells)
     whole = whole_rollouts(problem, phi, sigma)
     return {trajectory: states[..., :3] for trajectory, states in whole.items()}

@@ -4,6 +4,7 @@ from .calibration import calibrate as calibrate
 from .declaration import physics_model as physics_model
 from .fitting import DEFAULT as DEFAULT
 from .fitting import fit as fit
+from .fitting import sample as sample
 from .pooling import Pooled as Pooled
 from .pooling import pool as pool
 from .ranks import Calibration as Calibration

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
-
-import pymc as pm
+from typing import TYPE_CHECKING, Any
 
 from pbrl_ppl.effects import LEARNED_REMAINDER, Attached, Effect, catalogue
 from pbrl_ppl.history import History, with_units
@@ -15,7 +13,6 @@ from pbrl_ppl.likelihood import (
     TransitionLikelihood,
     declared_problem,
 )
-from pbrl_ppl.model import build_model
 from pbrl_ppl.modes import (
     Mode,
     find_simulation_mode,
@@ -28,6 +25,9 @@ from pbrl_ppl.parameters import ParameterLibrary
 from pbrl_ppl.physics import Physics, try_effect
 from pbrl_ppl.posterior import linearised_as
 from pbrl_ppl.scene import Scene
+
+if TYPE_CHECKING:
+    import pymc as pm
 
 
 def physics_model(
@@ -162,6 +162,8 @@ def physics_model(
             mode = following(trajectory_mode(problem, around.phi))
             mode = simulation_mode(mode) if simulated else mode
         problem = mode.problem
+    from pbrl_ppl.model import build_model  # PyMC takes seconds to load
+
     model = build_model(problem, mode)
     if mode is not None:  # chains of pm.sample begin there
         for name, value in problem.named(mode.phi, mode.sigma).items():

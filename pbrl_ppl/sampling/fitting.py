@@ -6,15 +6,13 @@ import os
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pymc as pm
 import xarray as xr
 
 from pbrl_ppl.errors import FitError, MeetingWarning
 from pbrl_ppl.likelihood import Problem
-from pbrl_ppl.model import build_model
 from pbrl_ppl.modes import (
     Mode,
     find_mode,
@@ -26,6 +24,7 @@ from pbrl_ppl.modes import (
 from pbrl_ppl.posterior import (
     PARETO_K,
     SIZE,
+    Fit,
     Point,
     PosteriorRecord,
     complete,
@@ -41,6 +40,9 @@ from pbrl_ppl.sampling.methods import METHODS, OVER_LIBRARY, Job, Method
 from pbrl_ppl.sampling.mixture import mix, most_frequent, most_probable, summed
 from pbrl_ppl.state import Floats
 from pbrl_ppl.threads import one_blas_thread
+
+if TYPE_CHECKING:
+    import pymc as pm
 
 #: Searches for the mode, by the likelihood's name.
 _SEARCHES: Mapping[str, Callable[..., Mode]] = {
@@ -154,13 +156,56 @@ def fit(
     UninformedWarning
         If the data say nothing about a parameter.
     """
-    problem = _checked_problem(model, method, start, resume)
+    problem = getattr(model, "problem", None)
+    if not isinstance(problem, Problem):
+        raise FitError("fit: this pm.Model was not made by physics_model; use pm.sample for others")
+    return sample(
+        problem, method=method, seed=seed, draws=draws, tune=tune, chains=chains, thin=thin,
+        cores=cores, start=start, resume=resume, progress=progress, declared=model,
+    ).posterior  # fmt: skip
+
+
+def sample(
+    problem: Problem,
+    *,
+    method: str = DEFAULT,
+    seed: int = 0,
+    draws: int | None = None,
+    tune: int | None = None,
+    chains: int | None = None,
+    thin: int | None = None,
+    cores: int | None = None,
+    start: Mode | None = None,
+    resume: Any = None,
+    progress: bool = False,
+    declared: pm.Model | None = None,
+) -> Fit:
+    """Sample the posterior of a problem; see :func:`pbrl_ppl.fit`, which takes its pm.Model.
+
+    Parameters
+    ----------
+    problem : Problem
+        What is fitted. Of whole trajectories it is linearised at the mode.
+    method, seed, draws, tune, chains, thin, cores, start, resume, progress
+        As of :func:`pbrl_ppl.fit`.
+    declared : pymc.Model, optional
+        Its pm.Model, which PyMC's samplers take if the problem stays as it is; they make one
+        otherwise.
+
+    Returns
+    -------
+    Fit
+        The problem that was sampled, and the posterior.
+    """
+    _check(problem, method, start, resume)
     library = problem.library
+    if start is None and declared is not None:
+        start = declared.mode  # that the problem is linearised at
     # with one set there is no choice to walk over
     walks = library is not None and method in OVER_LIBRARY and len(library.names) > 1
     chosen = OVER_LIBRARY[method] if walks else METHODS[method]
     job = Job(
-        model=_as_in(model, resume),
+        problem=_as_in(problem, resume),
         mode=None,
         resume=resume,
         seed=seed,
@@ -170,6 +215,7 @@ def fit(
         thin=chosen.thin if thin is None else thin,
         cores=os.cpu_count() or 1 if cores is None else cores,
         progress=progress,
+        declared=declared,
     )
     while True:
         job, trace, point = _drawn(job, chosen, start, walks)
@@ -177,15 +223,15 @@ def fit(
         sizes = group(trace, "posterior").sizes
         all_chains = job.chains if resume is None else group(resume, "posterior").sizes["chain"]
         cut = sizes["draw"] < job.draws or sizes["chain"] < all_chains
-        joined = None if cut else _joined_of_draws(job.problem, trace)
-        if joined is None:
+        joined = job.problem if cut else _joined_of_draws(job.problem, trace)
+        if joined is job.problem:
             break
-        job, start, resume = replace(job, model=joined, resume=None), None, None
+        job, start, resume = replace(job, problem=joined, resume=None), None, None
     if resume is not None:
         if sizes["chain"] < all_chains:
             raise KeyboardInterrupt  # some chains have nothing new, and resume= has all of them
         trace = _appended(resume, trace)
-    return complete(
+    posterior = complete(
         job.problem,
         trace,
         seed=seed,
@@ -193,24 +239,25 @@ def fit(
         asked=(job.draws, all_chains) if cut else None,
         mode=point,
     )
+    return Fit(job.problem, posterior)
 
 
 def _drawn(job: Job, chosen: Method, start: Mode | None, walks: bool) -> tuple[Job, Any, Point]:
-    """Return the job on the model that was sampled, its draws, and its mode."""
+    """Return the job on the problem that was sampled, its draws, and its mode."""
     problem = job.problem
     if walks:
         trace = _run(chosen, job)
         return job, trace, most_frequent(problem, trace)
     if problem.library is not None:
-        return job, *summed(job.model, job.draws, job.chains, job.seed)
+        return job, *summed(problem, job.draws, job.chains, job.seed)
     if problem.layout.discrete.any():
         found = weigh(problem, seed=job.seed, progress=job.progress)
 
-        def sample(model: pm.Model, mode: Mode) -> Any:
-            return _run(chosen, replace(job, model=model, mode=mode))
+        def of_configuration(mode: Mode) -> Any:
+            return _run(chosen, replace(job, problem=mode.problem, mode=mode))
 
         trace = mix(
-            job.model, problem, found, sample, draws=job.draws, chains=job.chains, seed=job.seed
+            problem, found, of_configuration, draws=job.draws, chains=job.chains, seed=job.seed
         )
         return job, trace, most_probable(problem, found)
     if job.resume is not None:
@@ -220,36 +267,32 @@ def _drawn(job: Job, chosen: Method, start: Mode | None, walks: bool) -> tuple[J
 
 
 def _at_mode(job: Job, start: Mode | None) -> Job:
-    """Return the job with a mode, in whose model bodies that meet at it are in one part."""
+    """Return the job with a mode, in whose problem bodies that meet at it are in one part."""
     while True:
-        model, held = job.model, job.model.mode
-        mode = start or held or _SEARCHES[job.problem.likelihood.name](job.problem, seed=job.seed)
-        if mode is not held and not mode.problem.likelihood.independent:
+        problem = job.problem
+        mode = start or _SEARCHES[problem.likelihood.name](problem, seed=job.seed)
+        if mode.problem is not problem and not mode.problem.likelihood.independent:
             if start is not None and start.problem.likelihood.filtered:
                 mode = following(start)
-            model = build_model(mode.problem)  # linearised at the mode
-        problem = model.problem
-        joined = _joined_model(problem, mode.phi[None], mode.sigma[None])
-        if joined is None:
-            return replace(job, model=model, mode=replace(mode, problem=problem))
-        job, start = replace(job, model=joined), None
+            problem = mode.problem  # linearised at the mode
+        joined = _joined(problem, mode.phi[None], mode.sigma[None])
+        if joined is problem:
+            return replace(job, problem=problem, mode=replace(mode, problem=problem))
+        job, start = replace(job, problem=joined), None
 
 
 @one_blas_thread
 def _run(chosen: Method, job: Job) -> Any:
     """Return draws by a method, without what its processes warn of."""
-    with job.model, warnings.catch_warnings():
+    with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*fork.*", category=DeprecationWarning)
         # draws from the prior, of which SMC needs some, are not compiled on the newer stack
         warnings.filterwarnings("ignore", message="Numba will use object mode")
         return chosen.run(job)
 
 
-def _checked_problem(model: pm.Model, method: str, start: Any, resume: Any) -> Problem:
-    """Return the problem of a model; refuse arguments of `fit` that do not go with it."""
-    problem = getattr(model, "problem", None)
-    if not isinstance(problem, Problem):
-        raise FitError("fit: this pm.Model was not made by physics_model; use pm.sample for others")
+def _check(problem: Problem, method: str, start: Any, resume: Any) -> None:
+    """Refuse arguments of `fit` that do not go with a problem."""
     if method not in METHODS:
         raise FitError(f"fit: method is {method!r}, expected one of {', '.join(METHODS)}")
     if start is not None and resume is not None:
@@ -284,14 +327,13 @@ def _checked_problem(model: pm.Model, method: str, start: Any, resume: Any) -> P
                 f" go on from one choice of bodies to all of them; leave {given} out and raise"
                 " draws="
             )
-    return problem
 
 
-def _joined_model(problem: Problem, phi: Floats, sigma: Floats) -> pm.Model | None:
-    """Return a model whose bodies that meet at draws (n, p) and (n, state) are in one part.
+def _joined(problem: Problem, phi: Floats, sigma: Floats) -> Problem:
+    """Return the problem with bodies that meet at draws (n, p) and (n, state) in one part.
 
-    The likelihood simulates bodies apart that were apart in the data. None if they do not meet
-    under these parameters either.
+    The likelihood simulates bodies apart that were apart in the data. The problem itself if they do
+    not meet under these parameters either.
 
     Warns
     -----
@@ -300,7 +342,7 @@ def _joined_model(problem: Problem, phi: Floats, sigma: Floats) -> pm.Model | No
     """
     joined = problem.joined(phi, sigma)
     if joined is problem:
-        return None
+        return problem
     warnings.warn(
         f"fit: {', '.join(joined.physics.together)} meet under the parameters that were found, and"
         " were thought apart by where they are in the data; all is fitted again with them in one"
@@ -308,26 +350,24 @@ def _joined_model(problem: Problem, phi: Floats, sigma: Floats) -> pm.Model | No
         MeetingWarning,
         stacklevel=3,
     )
-    return build_model(joined)
+    return joined
 
 
-def _joined_of_draws(problem: Problem, trace: Any) -> pm.Model | None:
-    """Return the model of `_joined_model` at some of a trace's draws."""
+def _joined_of_draws(problem: Problem, trace: Any) -> Problem:
+    """Return the problem of `_joined` at some of a trace's draws."""
     phi, sigma = parameter_draws(problem, trace)
     rows = np.linspace(0, len(phi) - 1, min(_CHECKED_DRAWS, len(phi))).astype(int)
-    return _joined_model(problem, phi[rows], sigma[rows])
+    return _joined(problem, phi[rows], sigma[rows])
 
 
-def _as_in(model: pm.Model, idata: Any) -> pm.Model:
-    """Return the model with the parts and the linearisation that a posterior was sampled with."""
+def _as_in(problem: Problem, idata: Any) -> Problem:
+    """Return the problem with the parts and the linearisation that a posterior was sampled with."""
     if idata is None:
-        return model
-    problem = model.problem
+        return problem
     known = PosteriorRecord.of(idata).together
     if not set(known) <= set(problem.physics.together):
         problem = problem.with_physics(together=known)
-    problem = linearised_as(problem, idata)
-    return model if problem is model.problem else build_model(problem)
+    return linearised_as(problem, idata)
 
 
 def _appended(earlier: Any, trace: Any) -> Any:

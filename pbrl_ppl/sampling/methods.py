@@ -4,20 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pymc as pm
 import xarray as xr
 from rich.console import Console
 from rich.progress import track
 
 from pbrl_ppl.errors import FitError
-from pbrl_ppl.likelihood import Problem
+from pbrl_ppl.likelihood import (
+    ACTION_DIMS,
+    NEXT_STATE_DIMS,
+    START_DIMS,
+    Problem,
+    coordinates,
+    variable_dims,
+)
 from pbrl_ppl.modes import Mode, Space
 from pbrl_ppl.parameters import gathered
 from pbrl_ppl.posterior import (
-    CELLS,
     LIKELIHOOD,
     PARETO_K,
     SIZE,
@@ -30,6 +36,9 @@ from pbrl_ppl.sampling.ensemble import Ensemble, Posterior, Reference
 from pbrl_ppl.sampling.importance import draw_pool, resample, stream
 from pbrl_ppl.sampling.starts import dispersed, last_draws, prior_starts
 from pbrl_ppl.state import Floats
+
+if TYPE_CHECKING:
+    import pymc as pm
 
 #: Weighted proposals a draw.
 _PROPOSALS = 1.4
@@ -66,17 +75,19 @@ class Job:
 
     Parameters
     ----------
-    model : pymc.Model
-        As made by ``physics_model``.
+    problem : Problem
+        What is sampled.
     mode : Mode, optional
         Where draws begin, unless they go on from a posterior or walk over a library.
     resume : InferenceData or DataTree, optional
         Posterior to go on from.
     seed, draws, tune, chains, thin, cores, progress
         As of :func:`pbrl_ppl.fit`, with defaults filled in.
+    declared : pymc.Model, optional
+        Of the problem, or of one that it was made from.
     """
 
-    model: pm.Model
+    problem: Problem
     mode: Mode | None
     resume: Any
     seed: int
@@ -86,11 +97,16 @@ class Job:
     thin: int
     cores: int
     progress: bool
+    declared: pm.Model | None = None
 
-    @property
-    def problem(self) -> Problem:
-        """The model's problem."""
-        return self.model.problem  # type: ignore[no-any-return]
+    @cached_property
+    def model(self) -> pm.Model:
+        """The problem's pm.Model, which PyMC's samplers need."""
+        if self.declared is not None and self.declared.problem is self.problem:
+            return self.declared
+        from pbrl_ppl.model import build_model  # PyMC takes seconds to load
+
+        return build_model(self.problem)
 
     def starts(self) -> list[dict[str, Any]]:
         """Return starts of PyMC's chains, and of the stream of random numbers."""
@@ -127,6 +143,8 @@ class Job:
 
     def sample(self, step: Any, steps_a_draw: int = 1) -> Any:
         """Run ``pm.sample`` from the starts, without its checks of convergence."""
+        import pymc as pm
+
         starts = self.starts()
         try:
             trace = pm.sample(
@@ -141,6 +159,7 @@ class Job:
                 quiet=not self.progress,
                 compute_convergence_checks=False,
                 discard_tuned_samples=True,
+                model=self.model,
             )
         except ValueError as error:
             if "Not enough samples" in str(error):  # PyMC's answer to an early interrupt
@@ -163,7 +182,7 @@ def _importance(job: Job) -> Any:
     chosen, k, size = resample(pool.log_weight, n, np.random.default_rng([*seed, 1]))
     phi, sigma = pool.phi[chosen], pool.sigma[chosen]
     values = job.problem.named(phi.reshape(*shape, -1), sigma.reshape(*shape, -1))
-    trace = as_trace(job.model, values, {"log_weight": pool.log_weight[chosen].reshape(shape)})
+    trace = as_trace(job.problem, values, {"log_weight": pool.log_weight[chosen].reshape(shape)})
     trace.attrs |= {
         PARETO_K: k, SIZE: pool.kept * size, LIKELIHOOD: pool.log_likelihood[chosen],
         "proposals": pool.cheaper, "rungs": pool.rungs, "acceptance": pool.accepted,
@@ -217,7 +236,7 @@ def _metropolis(job: Job) -> Any:
 
     values = job.problem.named(chained(phi), chained(sigma))
     accept = np.repeat(np.array(rates)[:, None], chains * walkers, axis=1)
-    return as_trace(job.model, values, {"accept": chained(accept[..., None])[..., 0]})
+    return as_trace(job.problem, values, {"accept": chained(accept[..., None])[..., 0]})
 
 
 def _paper(job: Job) -> Any:
@@ -225,11 +244,13 @@ def _paper(job: Job) -> Any:
 
     The set of a library that each body has is proposed uniformly, body by body.
     """
+    import pymc as pm
+
     discrete = job.model.discrete_value_vars
     steps = [
         pm.CategoricalGibbsMetropolis([variable], model=job.model)
         if job.model.rvs_to_values[variable] in discrete
-        else pm.Metropolis([variable])
+        else pm.Metropolis([variable], model=job.model)
         for variable in job.model.free_RVs
     ]
     return job.sample(steps, job.thin)
@@ -237,16 +258,22 @@ def _paper(job: Job) -> Any:
 
 def _demetropolisz(job: Job) -> Any:
     """Run differential evolution from each chain's past (ter Braak and Vrugt, 2008)."""
-    return job.sample(pm.DEMetropolisZ(job.model.free_RVs), job.thin)
+    import pymc as pm
+
+    return job.sample(pm.DEMetropolisZ(job.model.free_RVs, model=job.model), job.thin)
 
 
 def _nuts(job: Job) -> Any:
     """Run NUTS on the finite-difference gradient: where nothing slides to a stop or collides."""
-    return job.sample(pm.NUTS(job.model.free_RVs), job.thin)
+    import pymc as pm
+
+    return job.sample(pm.NUTS(job.model.free_RVs, model=job.model), job.thin)
 
 
 def _smc(job: Job) -> Any:
     """Run sequential Monte Carlo from the prior: for several modes and few parameters."""
+    import pymc as pm
+
     return pm.sample_smc(
         draws=job.draws,
         chains=job.chains,
@@ -254,6 +281,7 @@ def _smc(job: Job) -> Any:
         random_seed=job.seed,
         progressbar=job.progress,
         compute_convergence_checks=False,
+        model=job.model,
     )
 
 
@@ -262,7 +290,7 @@ def _map(job: Job) -> Any:
     mode = job.at_mode
     values = mode.problem.named(mode.phi, mode.sigma)
     draws = {name: np.asarray(value)[None, None] for name, value in values.items()}
-    return as_trace(job.model, draws, {"lp": np.array([[mode.log_posterior]])})
+    return as_trace(job.problem, draws, {"lp": np.array([[mode.log_posterior]])})
 
 
 def _laplace(job: Job) -> Any:
@@ -274,53 +302,52 @@ def _laplace(job: Job) -> Any:
     noise = rng.standard_normal((len(phi), len(centre))) @ np.linalg.cholesky(covariance).T
     sigma = np.exp(centre + noise)
     values = mode.problem.named(phi.reshape(*shape, -1), sigma.reshape(*shape, -1))
-    return as_trace(job.model, values, {"accept": np.ones(shape)})
+    return as_trace(job.problem, values, {"accept": np.ones(shape)})
 
 
-def as_trace(model: pm.Model, draws: Mapping[str, Any], stats: Mapping[str, Any]) -> Any:
+def as_trace(problem: Problem, draws: Mapping[str, Any], stats: Mapping[str, Any]) -> Any:
     """Return a trace in PyMC's form, of draws made without PyMC.
 
     Parameters
     ----------
-    model : pymc.Model
-        As made by ``physics_model``; has the dimensions of each variable.
+    problem : Problem
+        Has the dimensions of each variable.
     draws : mapping of str to ndarray
         By the variables' names, shape (chain, draw, ...).
     stats : mapping of str to ndarray
         The sampler's statistics of each draw, shape (chain, draw).
     """
-    problem, posterior = model.problem, posterior_dataset(model, draws)
+    posterior = posterior_dataset(problem, draws)
     per_draw = {name: (("chain", "draw"), value) for name, value in stats.items()}
     given = {
-        "start": (("transition", "body", "full_state"), problem.segments.start),
-        "actions": (("transition", "step", "body", "wrench"), problem.inputs),
+        "start": (START_DIMS, problem.segments.start),
+        "actions": (ACTION_DIMS, problem.inputs),
     }
-    observed = {"next_state": (CELLS, problem.observations.values)}
+    observed = {"next_state": (NEXT_STATE_DIMS, problem.observations.values)}
     return from_groups(
         {
             "posterior": posterior,
             "sample_stats": xr.Dataset(per_draw, {d: posterior[d] for d in ("chain", "draw")}),
-            "observed_data": labelled(model, observed),
-            "constant_data": labelled(model, given),
+            "observed_data": labelled(problem, observed),
+            "constant_data": labelled(problem, given),
         },
         {},
     )
 
 
-def posterior_dataset(model: pm.Model, values: Mapping[str, Floats]) -> xr.Dataset:
-    """Return draws, shape (chain, draw, ...), with the model's dimensions and coordinates."""
-    data = {
-        name: (("chain", "draw", *(model.named_vars_to_dims.get(name) or ())), value)
-        for name, value in values.items()
-    }
+def posterior_dataset(problem: Problem, values: Mapping[str, Floats]) -> xr.Dataset:
+    """Return draws, shape (chain, draw, ...), with the problem's dimensions and coordinates."""
+    dims = variable_dims(problem)
+    data = {name: (("chain", "draw", *dims[name]), value) for name, value in values.items()}
     chains, draws = next(iter(values.values())).shape[:2]
-    return labelled(model, data).assign_coords(chain=np.arange(chains), draw=np.arange(draws))
+    return labelled(problem, data).assign_coords(chain=np.arange(chains), draw=np.arange(draws))
 
 
-def labelled(model: pm.Model, variables: Mapping[str, Any]) -> xr.Dataset:
-    """Return variables (dims, values) with the model's coordinates of their dimensions."""
-    used = {dim for dims, _ in variables.values() for dim in dims if dim in model.coords}
-    return xr.Dataset(variables, {dim: list(model.coords[dim]) for dim in used})
+def labelled(problem: Problem, variables: Mapping[str, Any]) -> xr.Dataset:
+    """Return variables (dims, values) with the coordinates of their dimensions."""
+    coords = coordinates(problem)
+    used = {dim for dims, _ in variables.values() for dim in dims if dim in coords}
+    return xr.Dataset(variables, {dim: coords[dim] for dim in used})
 
 
 #: The samplers by name. The paper's schedule is that of Table 2 for the cart: 30 chains of 20,000

@@ -6,12 +6,10 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import pymc as pm
 import xarray as xr
 
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import Problem
-from pbrl_ppl.model import build_model
 from pbrl_ppl.modes import (
     ATTRIBUTE,
     Mode,
@@ -32,10 +30,9 @@ NEGLIGIBLE = 1e-3
 
 
 def mix(
-    model: pm.Model,
     problem: Problem,
     found: Sequence[Weighed],
-    sample: Callable[[pm.Model, Mode], Any],
+    sample: Callable[[Mode], Any],
     *,
     draws: int,
     chains: int,
@@ -50,14 +47,12 @@ def mix(
 
     Parameters
     ----------
-    model : pymc.Model
-        Of ``problem``.
     problem : Problem
         Of a scene with joints of unknown bodies.
     found : sequence of Weighed
         Configurations with their probabilities.
     sample : callable
-        ``sample(model, mode) -> trace`` of a configuration's model.
+        ``sample(mode) -> trace`` of a configuration.
     draws, chains : int
         Draws a chain, and chains.
     seed : int
@@ -74,8 +69,7 @@ def mix(
     wanted = np.flatnonzero(allocate(probability, chains * draws))
     traces = {}
     for i in wanted[np.argsort(-probability[wanted])]:
-        mode = found[i].mode
-        traces[i] = sample(build_model(mode.problem), mode)
+        traces[i] = sample(found[i].mode)
         done = group(traces[i], "posterior").sizes
         if done["chain"] < chains or (done["draw"] < draws and len(traces) < len(wanted)):
             raise KeyboardInterrupt  # PyMC ended quietly, and some have no draws at all
@@ -86,7 +80,7 @@ def mix(
     values = _values(problem, found, traces, label, rng)
     rest = groups(next(iter(traces.values())))
     data = {
-        "posterior": posterior_dataset(model, values),
+        "posterior": posterior_dataset(problem, values),
         "sample_stats": _stats(traces, label),
         "observed_data": rest["observed_data"],
         "constant_data": rest["constant_data"],
@@ -220,21 +214,20 @@ def _stats(traces: Mapping[int, Any], label: Ints) -> xr.Dataset:
     return xr.Dataset(mixed, first.coords)
 
 
-def summed(model: pm.Model, draws: int, chains: int, seed: int) -> tuple[Any, Point]:
+def summed(problem: Problem, draws: int, chains: int, seed: int) -> tuple[Any, Point]:
     """Return draws by summing over the choices, and the most probable choice.
 
     Parameters
     ----------
-    model : pymc.Model
-        Model with a library.
+    problem : Problem
+        Of a model with a library.
     draws, chains, seed : int
         As for :func:`pbrl_ppl.fit`.
     """
-    problem = model.problem
     phi, sigma, index, accepted, best = choose_from_library(problem, draws, chains, seed)
     values: dict[str, Any] = problem.layout.to_dict(phi)
     values |= {"library_index": index, "sigma": sigma[..., 0] if problem.scalar_sigma else sigma}
-    return as_trace(model, values, {"accept": accepted}), _point(problem, best)
+    return as_trace(problem, values, {"accept": accepted}), _point(problem, best)
 
 
 def most_frequent(problem: Problem, trace: Any) -> Point:

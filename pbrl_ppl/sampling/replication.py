@@ -25,10 +25,9 @@ from pbrl_ppl.likelihood import (
     simulated_trajectories,
     with_measurements,
 )
-from pbrl_ppl.model import build_model, prior_predictive_draws
 from pbrl_ppl.parameters import fold_wheels
 from pbrl_ppl.posterior import convergence, from_groups, group, parameter_draws, problem_of
-from pbrl_ppl.sampling.fitting import fit
+from pbrl_ppl.sampling.fitting import sample
 from pbrl_ppl.sampling.ranks import MOST_DRAWS, rank
 from pbrl_ppl.state import STATE, Floats
 
@@ -95,6 +94,8 @@ def draw_truths(design: Problem, n: int, seed: int, colour: float = 0.0) -> tupl
     FitError
         If too few draws can be simulated.
     """
+    from pbrl_ppl.model import build_model, prior_predictive_draws  # PyMC takes seconds to load
+
     model = build_model(design)
     whole = not design.likelihood.independent
     names = [*(block.name for block in design.layout.blocks), *design.noise_variables]
@@ -227,14 +228,13 @@ def replicate(design: Problem, truth: Truth, seed: int, settings: Mapping[str, A
     """
     # bodies that met in the simulation are simulated in one world
     problem = simulated(design, truth.values).joined(truth.phi[None], truth.sigma[None])
-    model = build_model(problem)
     settings = {"cores": 1, **settings}
     for again in range(_AGAIN + 1):
         with warnings.catch_warnings():
             # convergence is in the result; the other warnings are about simulated data
             for kind in _KNOWN:
                 warnings.simplefilter("ignore", kind)
-            idata = fit(model, seed=seed, progress=False, **settings)
+            idata = sample(problem, seed=seed, **settings).posterior
         if "interrupted" in idata.attrs:
             raise KeyboardInterrupt
         sizes = group(idata, "posterior").sizes

@@ -15,7 +15,7 @@ from pbrl_ppl.criticism import learn_remainder
 from pbrl_ppl.criticism.results import Unexplained
 from pbrl_ppl.effects import LEARNED_REMAINDER
 from pbrl_ppl.errors import FitError
-from pbrl_ppl.posterior import group, scene_of
+from pbrl_ppl.posterior import Fit, group, scene_of
 from pbrl_ppl.reporting import render_posterior
 from tests.helpers.free_puck import BOX, MASS, box2d
 from tests.helpers.made_up import made_up
@@ -39,9 +39,10 @@ def posterior_of(frame):
 def unexplained(posterior) -> pp.Loop:
     """A loop that found no name for what is missing, without the search."""
     left = Unexplained("puck", "vx", "speed", 0.5, 0.001, "vx of puck depends on its speed")
+    fitted = Fit.of(posterior)
     return replace(
         made_up("unexplained"), scene=BOX, candidates=(), unexplained=left,
-        posterior_before=posterior, posterior_after=posterior,
+        declared=fitted, revised=fitted,
     )  # fmt: skip
 
 

@@ -20,6 +20,7 @@ from pbrl_ppl.criticism.results import (
     Rollout,
     Unexplained,
 )
+from pbrl_ppl.posterior import Fit
 from pbrl_ppl.scene import Body, Scene, Shape
 from pbrl_ppl.state import STATE, STATE_UNITS
 
@@ -149,7 +150,7 @@ def made_up(verdict: str = "effects-added", stuck: bool = False) -> Loop:
     remains = Unexplained(
         "cart", "omega", "omega", 0.34, 0.002, "its omega is off in a way that depends on omega"
     )
-    posterior = made_up_posterior(stuck)
+    fit = Fit(None, made_up_posterior(stuck))  # a problem is not made up
     before = made_up_errors(2.4 if verdict != "adequate" else 1.01)
     return Loop(
         scene=scene,
@@ -161,8 +162,8 @@ def made_up(verdict: str = "effects-added", stuck: bool = False) -> Loop:
         before=before,
         after=made_up_errors(1.02) if found else before,
         noise_floor=made_up_errors(1.0),
-        posterior_before=posterior,
-        posterior_after=posterior,
+        declared=fit,
+        revised=fit,
         residuals_before=noise if verdict == "adequate" else grown,
         residuals_after=noise if found else grown,
         rollout=Rollout(

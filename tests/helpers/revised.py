@@ -10,6 +10,7 @@ from pbrl_ppl.criticism.loop import Loop
 from pbrl_ppl.criticism.results import Added, Estimate, Unexplained
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.history import History
+from pbrl_ppl.posterior import Fit
 from pbrl_ppl.posterior.store import from_groups, groups
 from pbrl_ppl.sampling import fit, physics_model
 from tests.helpers.free_puck import DISC, Disc
@@ -33,7 +34,9 @@ def revised() -> Loop:
     train, test = recordings()
     drag = [effect for effect in catalogue if effect.name == "linear_drag"]
     models = (physics_model(DISC, train, e, trajectories=True) for e in ((), drag))
-    before, after = (fit(m, method="laplace", seed=1, draws=100, progress=False) for m in models)
+    before, after = (
+        Fit(m.problem, fit(m, method="laplace", seed=1, draws=100, progress=False)) for m in models
+    )
     size = Estimate(DRAG, 0.01, (DRAG - 0.02, DRAG + 0.02), "kg/s")
     added = Added("linear_drag", "puck", "a drag", 99.0, 1e-9, {"coefficient": size}, (), 9.0, 1.0)
     found = made_up()
@@ -42,8 +45,8 @@ def revised() -> Loop:
         scene=DISC,
         candidates=tuple(replace(one, body="puck") for one in found.candidates),
         added=(added,),
-        posterior_before=before,
-        posterior_after=after,
+        declared=before,
+        revised=after,
         held_out=test,
     )
 
@@ -51,15 +54,15 @@ def revised() -> Loop:
 def unexplained() -> Loop:
     """The same where no effect has a name."""
     left = Unexplained("puck", "vx", "velocity x", 0.5, 0.001, "vx of puck depends on velocity x")
-    before = revised().posterior_before
+    before = revised().declared
     found = made_up("unexplained")
     return replace(
         found,
         scene=DISC,
         candidates=tuple(replace(one, body="puck") for one in found.candidates),
         unexplained=left,
-        posterior_before=before,
-        posterior_after=before,
+        declared=before,
+        revised=before,
         held_out=revised().held_out,
     )
 
@@ -80,8 +83,9 @@ def diverging() -> Loop:
     )
     return replace(
         found,
-        posterior_after=from_groups(
-            datasets | {"posterior": pushed}, dict(found.posterior_after.attrs)
+        revised=Fit(
+            found.revised.problem,
+            from_groups(datasets | {"posterior": pushed}, dict(found.posterior_after.attrs)),
         ),
         after=replace(found.after, rollout_rmse=far),
         rollout=replace(rollout, after=lost),

@@ -352,13 +352,13 @@ def weighed(model: pm.Model) -> list[Weighed]:
     return found
 
 
-def numbered(model: pm.Model, mode: Mode, chains: int = 2, n: int = 5000):
+def numbered(mode: Mode, chains: int = 2, n: int = 5000):
     """A trace whose noise says where each draw was: its chain and number."""
     place = np.arange(chains)[:, None] * n + np.arange(n)
     named = mode.problem.named(mode.phi, mode.sigma)
     values = {k: np.broadcast_to(v, (chains, n, *v.shape)).copy() for k, v in named.items()}
     values["sigma"] = np.repeat(place[..., None], 6, axis=-1).astype(float)
-    posterior = mixture.posterior_dataset(model, values)
+    posterior = mixture.posterior_dataset(mode.problem, values)
     of = posterior[["chain", "draw"]]
     stats_of = of.assign(lp=(("chain", "draw"), place * 1.0), odd=("steps", np.zeros(3)))
     data = {"posterior": posterior, "sample_stats": stats_of}
@@ -367,7 +367,7 @@ def numbered(model: pm.Model, mode: Mode, chains: int = 2, n: int = 5000):
 
 def mixed(rod: pm.Model, seed: int = 1):
     found = weighed(rod)
-    return mixture.mix(rod, rod.problem, found, numbered, draws=5000, chains=2, seed=seed)
+    return mixture.mix(rod.problem, found, numbered, draws=5000, chains=2, seed=seed)
 
 
 def test_draws_are_shared_out_by_weight(rod) -> None:
@@ -424,11 +424,11 @@ def test_probabilities_are_finer_than_the_draws(rod) -> None:
 def test_an_interrupt_with_others_to_come_ends_the_fit(rod) -> None:
     """PyMC ends quietly with the draws so far; what has none cannot be mixed in."""
 
-    def interrupted(own, mode):
-        return numbered(own, mode, n=100)
+    def interrupted(mode):
+        return numbered(mode, n=100)
 
     with pytest.raises(KeyboardInterrupt):
-        mixture.mix(rod, rod.problem, weighed(rod), interrupted, draws=5000, chains=2, seed=1)
+        mixture.mix(rod.problem, weighed(rod), interrupted, draws=5000, chains=2, seed=1)
 
 
 @pytest.mark.parametrize(

@@ -166,14 +166,14 @@ def test_draws_have_each_order_s_share() -> None:
         weight = probability.get(each.pairs[0][1], 0.0)
         found.append(Weighed(each, mode, Evidence(0.0), weight))
 
-    def constant(model, mode):
+    def constant(mode):
         named = mode.problem.named(mode.phi, mode.sigma)
         values = {k: np.broadcast_to(v, (2, 5000, *v.shape)).copy() for k, v in named.items()}
-        posterior = mixture.posterior_dataset(model, values)
+        posterior = mixture.posterior_dataset(mode.problem, values)
         rest = dict.fromkeys(("sample_stats", "observed_data", "constant_data"), posterior)
         return from_groups({"posterior": posterior, **rest}, {})
 
-    trace = mixture.mix(model, model.problem, found, constant, draws=5000, chains=2, seed=1)
+    trace = mixture.mix(model.problem, found, constant, draws=5000, chains=2, seed=1)
     named = {k: v[:, 0] for k, v in draws(trace).items()}
     joined = named["i_a"] != named["i_b"]
     assert joined.sum() == 6000

@@ -9,7 +9,7 @@ import pytest
 from pbrl_ppl.criticism.dependence import FEATURES, PRODUCTS
 from pbrl_ppl.criticism.results import Unexplained, diverged_after
 from pbrl_ppl.history import History
-from pbrl_ppl.posterior import compare
+from pbrl_ppl.posterior import Fit, compare
 from pbrl_ppl.reporting.effect_plots import plot_evidence, plot_laws
 from pbrl_ppl.reporting.evidence import bin_means, find_evidence, find_laws
 from pbrl_ppl.reporting.motion import animation, distance, divergence_in_words, held_out_motions
@@ -152,13 +152,10 @@ def test_motions_start_from_velocities_fitted_to_the_first_rows() -> None:
     states = disc.frame(rng)
     coarse = states.assign(x=states["x"] + rng.normal(0.0, 0.02, len(states)))
     history = History.from_dataframe(coarse.drop(columns=["vx", "vy", "omega"]), DISC)
-    fitted = fit(
-        physics_model(DISC, history, (), trajectories=True),
-        method="laplace", seed=1, draws=20, progress=False,
-    )  # fmt: skip
-    findings = replace(
-        unexplained(), posterior_before=fitted, posterior_after=fitted, held_out=history
-    )
+    model = physics_model(DISC, history, (), trajectories=True)
+    fitted = fit(model, method="laplace", seed=1, draws=20, progress=False)
+    both = Fit(model.problem, fitted)
+    findings = replace(unexplained(), declared=both, revised=both, held_out=history)
     truth = states.groupby("trajectory")["x"].last().to_numpy()
     off = [
         float(motion.before[-1, 0, 0] - truth[int(motion.name)])

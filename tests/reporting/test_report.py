@@ -16,6 +16,7 @@ from pbrl_ppl.criticism.results import Errors
 from pbrl_ppl.errors import OutputError
 from pbrl_ppl.history import UnusedVelocity
 from pbrl_ppl.parameters import BODY_PARAMETERS
+from pbrl_ppl.posterior import Fit
 from pbrl_ppl.posterior.cross_validation import Comparison, LeaveOneOut
 from pbrl_ppl.posterior.identifiability import Direction, Identifiability, Width
 from pbrl_ppl.reporting import page as page_module
@@ -337,7 +338,7 @@ def test_summary_has_the_same_columns_everywhere() -> None:
 @pytest.mark.usefixtures("undrawn")
 def test_a_parameter_that_never_moved() -> None:
     constant = idata({"mass": np.ones((4, 500, 1))}, {"mass": ["body"]})
-    findings = replace(made_up("adequate"), posterior_after=constant)
+    findings = replace(made_up("adequate"), revised=Fit(None, constant))
     assert "mass[cart]: R-hat –" in Page(render(findings)).text
 
 

@@ -283,7 +283,7 @@ def test_an_early_interrupt_leaves_nothing(model, mode, monkeypatch):
     def nothing(**options):
         raise ValueError("Not enough samples to build a trace.")
 
-    monkeypatch.setattr("pbrl_ppl.sampling.fitting.pm.sample", nothing)
+    monkeypatch.setattr(pm, "sample", nothing)
     with pytest.raises(KeyboardInterrupt):
         fit(model, method="demetropolisz", draws=10, tune=10, start=mode, progress=False)
 
@@ -343,14 +343,14 @@ def test_chains_that_an_interrupt_left_out_are_missed(model, mode, monkeypatch):
             **(given | {"chains": chains, "initvals": given["initvals"][:chains]})
         )
 
-    monkeypatch.setattr("pbrl_ppl.sampling.fitting.pm.sample", fewer(2))
+    monkeypatch.setattr(pm, "sample", fewer(2))
     with (
         pytest.warns(ConvergenceWarning, match="have not converged"),
         pytest.warns(ConvergenceWarning, match="after 30 of 30 draws in 2 of 3 chains"),
     ):
         cut = fit(model, seed=4, start=mode, **options)
     assert cut.attrs["interrupted"] == 1
-    monkeypatch.setattr("pbrl_ppl.sampling.fitting.pm.sample", fewer(1))
+    monkeypatch.setattr(pm, "sample", fewer(1))
     with pytest.raises(KeyboardInterrupt):  # the earlier draws are where they were
         fit(model, seed=4, resume=cut, **options)
 
