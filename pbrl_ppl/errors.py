@@ -1,5 +1,19 @@
 """Exceptions and warnings: each message says what is wrong, where, and the cure."""
 
+import inspect
+import warnings
+from pathlib import Path
+
+_PACKAGE = str(Path(__file__).parent)
+
+
+def warn(message: str | Warning, category: type[Warning] | None = None) -> None:
+    """Issue a warning that points at the first caller outside the package."""
+    frame, level = inspect.currentframe(), 1
+    while frame is not None and frame.f_code.co_filename.startswith(_PACKAGE):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, category, stacklevel=level)
+
 
 class PbrlError(Exception):
     """Base of every error that a user can cause and cure."""

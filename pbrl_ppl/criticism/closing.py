@@ -49,7 +49,13 @@ from pbrl_ppl.criticism.unexplained import (
 )
 from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.effects import catalogue as full_catalogue
-from pbrl_ppl.errors import ConvergenceWarning, HistoryError, PriorWarning, UninformedWarning
+from pbrl_ppl.errors import (
+    ConvergenceWarning,
+    HistoryError,
+    PriorWarning,
+    UninformedWarning,
+    warn,
+)
 from pbrl_ppl.history import History, with_units, without_measurements
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import Mode
@@ -221,7 +227,7 @@ def _closed(task: _Task, train: History, test: History, recorded: History) -> Lo
         if not prior.passed:  # before the long fit: units may be wrong
             hint = "the declared prior does not explain this recording"
             hint = f"{hint}, unless a missing effect is why"
-            warnings.warn(f"{hint}: {prior.sentence}", PriorWarning, stacklevel=3)
+            warn(f"{hint}: {prior.sentence}", PriorWarning)
         say(Stage.FIT)
         declared = declared_mode(scene, train, effects, seed, task.substeps, say, criteria)
         compiled()
@@ -365,7 +371,7 @@ def _fits(task: _Task, modes: list[Mode]) -> list[Fit]:
         task.say(sentence)
     for text, message in issued.items():
         if text not in uninformed:
-            warnings.warn(message, stacklevel=3)
+            warn(message)
     return [fitted for fitted, *_ in results]
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -16,6 +15,7 @@ from pbrl_ppl.errors import (
     ConvergenceWarning,
     LinearisationWarning,
     UninformedWarning,
+    warn,
 )
 from pbrl_ppl.likelihood import (
     ACCELERATION,
@@ -324,7 +324,7 @@ def checked(problem: Problem, idata: Any, asked: tuple[int, int] | None = None) 
     found = list(_warnings(problem, idata, asked))
     idata.attrs["warnings"] = json.dumps([message for _, message in found])
     for kind, message in found:
-        warnings.warn(message, kind, stacklevel=4)
+        warn(message, kind)
     return idata
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from pbrl_ppl.errors import FitError, MeetingWarning
+from pbrl_ppl.errors import FitError, MeetingWarning, warn
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import (
     Mode,
@@ -271,9 +271,10 @@ def _at_mode(job: Job, start: Mode | None) -> Job:
     while True:
         problem = job.problem
         mode = start or _SEARCHES[problem.likelihood.name](problem, seed=job.seed)
-        if mode.problem is not problem and not mode.problem.likelihood.independent:
-            if start is not None and start.problem.likelihood.filtered:
-                mode = following(start)
+        if not mode.problem.likelihood.independent:
+            filtered = mode.problem.likelihood.filtered
+            if filtered and mode.problem.trajectory_noise.sensitivity is None:
+                mode = following(mode)
             problem = mode.problem  # linearised at the mode
         joined = _joined(problem, mode.phi[None], mode.sigma[None])
         if joined is problem:
@@ -343,12 +344,11 @@ def _joined(problem: Problem, phi: Floats, sigma: Floats) -> Problem:
     joined = problem.joined(phi, sigma)
     if joined is problem:
         return problem
-    warnings.warn(
+    warn(
         f"fit: {', '.join(joined.physics.together)} meet under the parameters that were found, and"
         " were thought apart by where they are in the data; all is fitted again with them in one"
         " world",
         MeetingWarning,
-        stacklevel=3,
     )
     return joined
 
