@@ -32,7 +32,7 @@ from .log_posterior import noise_prior_slope as noise_prior_slope
 from .names import ACTION_DIMS as ACTION_DIMS
 from .names import NEXT_STATE_DIMS as NEXT_STATE_DIMS
 from .names import START_DIMS as START_DIMS
-from .names import coordinates as coordinates
+from .names import variable_coords as variable_coords
 from .names import variable_dims as variable_dims
 from .noise_scales import bodies_acceleration as bodies_acceleration
 from .noise_scales import noise_medians as noise_medians

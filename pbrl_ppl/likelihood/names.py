@@ -34,7 +34,7 @@ def variable_dims(problem: Problem) -> dict[str, tuple[str, ...]]:
     return dims
 
 
-def coordinates(problem: Problem) -> dict[str, list[Any]]:
+def variable_coords(problem: Problem) -> dict[str, list[Any]]:
     """Return the labels of each dimension by name."""
     coords: dict[str, list[Any]] = {
         "body": [body.name for body in problem.scene.moving],

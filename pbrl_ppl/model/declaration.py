@@ -18,7 +18,7 @@ from pbrl_ppl.likelihood import (
     NEXT_STATE_DIMS,
     START_DIMS,
     Problem,
-    coordinates,
+    variable_coords,
     variable_dims,
 )
 from pbrl_ppl.model.op import LogLikelihoodOp, SimulatorOp
@@ -39,7 +39,7 @@ class PhysicsModel(pm.Model):  # type: ignore[misc]  # untyped
     """
 
     def __init__(self, problem: Problem, mode: Any = None) -> None:
-        super().__init__(coords=coordinates(problem))
+        super().__init__(coords=variable_coords(problem))
         self.problem, self.mode = problem, mode
 
 

@@ -18,7 +18,7 @@ from pbrl_ppl.likelihood import (
     NEXT_STATE_DIMS,
     START_DIMS,
     Problem,
-    coordinates,
+    variable_coords,
     variable_dims,
 )
 from pbrl_ppl.modes import Mode, Space
@@ -345,7 +345,7 @@ def posterior_dataset(problem: Problem, values: Mapping[str, Floats]) -> xr.Data
 
 def labelled(problem: Problem, variables: Mapping[str, Any]) -> xr.Dataset:
     """Return variables (dims, values) with the coordinates of their dimensions."""
-    coords = coordinates(problem)
+    coords = variable_coords(problem)
     used = {dim for dims, _ in variables.values() for dim in dims if dim in coords}
     return xr.Dataset(variables, {dim: coords[dim] for dim in used})
 
