@@ -26,7 +26,7 @@ from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import ManifestError, PbrlError
 from pbrl_ppl.files import write_text
 from pbrl_ppl.history import read_recording, read_scene
-from pbrl_ppl.reporting.report import render
+from pbrl_ppl.reporting.loop_report import render
 from pbrl_ppl.scene import nearest
 
 _NEEDED, _OPTIONAL = ("name", "scene", "train"), ("test", "kind")

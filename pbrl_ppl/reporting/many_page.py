@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import pandas as pd
 from markupsafe import Markup
 
 from pbrl_ppl.criticism import NOT_CONVERGED
-from pbrl_ppl.reporting.page import Cell, Source, Table, render_page
+from pbrl_ppl.reporting.page import Cell, Section, Source, Table, render_page
 from pbrl_ppl.reporting.words import chance, joined, number, plain, quantity
 from pbrl_ppl.sampling import Pooled
 
@@ -20,8 +22,6 @@ _COLUMNS = ("name", "kind", "status", "verdict", "effects", "error_before", "err
             "seconds", "warnings", "message", "report")  # fmt: skip
 _ESTIMATE = ("name", "kind", "effect", "body", "parameter", "mean", "sd", "low", "high", "unit",
              "p_value")  # fmt: skip
-#: Effects side by side in one table: with more, it would not fit beside the names of the logs.
-_SIDE_BY_SIDE = 4
 
 
 def summary_table(rows: Iterable[Row]) -> pd.DataFrame:
@@ -58,7 +58,7 @@ def in_words(rows: Iterable[Row]) -> str:
 
 
 def page(
-    rows: tuple[Row, ...],
+    rows: Sequence[Row],
     pooled: Mapping[str, Pooled],
     not_pooled: Mapping[str, str],
     source: Source,
@@ -68,25 +68,107 @@ def page(
     for row in rows:
         for each in row.get("effects", ()):
             found.setdefault((each["effect"], each["body"]), []).append(row["name"])
-    pairs = list(found)
-    tables = -(-len(pairs) // _SIDE_BY_SIDE)
+    warnings = {row["name"]: row["warnings"] for row in rows if row.get("warnings")}
+    sections = [
+        Logs(rows),
+        found and Effects(rows, list(found)),
+        (pooled or not_pooled) and Kinds(pooled, not_pooled),
+        warnings and Warnings(warnings),
+        LogsSource(source),
+    ]
     return render_page(
-        "many.html.jinja",
-        {},
-        count=len(rows),
-        headline=_verdict(in_words(rows)),
-        found={_title(*pair): names for pair, names in found.items()},
-        failed=[row["name"] for row in rows if row["status"] == "failed"],
-        logs=_logs(rows),
-        effects=[
-            _effects(rows, pairs[i * len(pairs) // tables : (i + 1) * len(pairs) // tables])
-            for i in range(tables)
-        ],
-        kinds={kind: (each.names, _pooled(each, kind)) for kind, each in pooled.items()},
-        not_pooled=not_pooled,
-        warnings={row["name"]: row["warnings"] for row in rows if row.get("warnings")},
-        source=source,
+        f"{len(rows)} logs",
+        LogsHeader(rows, found),
+        [section for section in sections if isinstance(section, Section)],
     )
+
+
+@dataclass(frozen=True, eq=False)
+class LogsHeader(Section):
+    """Header: how many logs have which verdict, which effects were found, what failed."""
+
+    rows: Sequence[Row]
+    found: Mapping[tuple[str, str], Sequence[str]]
+
+    template = "logs_header"
+
+    def context(self) -> Mapping[str, object]:
+        return {
+            "count": len(self.rows),
+            "headline": _verdict(in_words(self.rows)),
+            "found": {_title(*pair): names for pair, names in self.found.items()},
+            "failed": [row["name"] for row in self.rows if row["status"] == "failed"],
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Logs(Section):
+    """Verdict, effects and errors of each log."""
+
+    rows: Sequence[Row]
+
+    template = "logs"
+    title = "Logs"
+    link = title
+
+    def context(self) -> Mapping[str, object]:
+        return {"logs": _logs(self.rows)}
+
+
+@dataclass(frozen=True, eq=False)
+class Effects(Section):
+    """Size of each effect in each log, or its detection limit."""
+
+    rows: Sequence[Row]
+    pairs: Sequence[tuple[str, str]]
+
+    template = "effects"
+    title = "Which effects were found where"
+    link = "Effects"
+
+    def context(self) -> Mapping[str, object]:
+        # more than four effects side by side would not fit beside the names of the logs
+        count, tables = len(self.pairs), -(-len(self.pairs) // 4)
+        parts = pairwise(i * count // tables for i in range(tables + 1))
+        return {"effects": [_effects(self.rows, self.pairs[i:j]) for i, j in parts]}
+
+
+@dataclass(frozen=True, eq=False)
+class Kinds(Section):
+    """Hyper-parameters that robots of one kind share."""
+
+    pooled: Mapping[str, Pooled]
+    not_pooled: Mapping[str, str]
+
+    template = "kinds"
+    title = "Kinds of robots"
+    link = title
+
+    def context(self) -> Mapping[str, object]:
+        kinds = {kind: (each.names, _pooled(each, kind)) for kind, each in self.pooled.items()}
+        return vars(self) | {"kinds": kinds}
+
+
+@dataclass(frozen=True, eq=False)
+class Warnings(Section):
+    """Warnings of the logs."""
+
+    warnings: Mapping[str, Sequence[str]]
+
+    template = "warnings"
+    title = "Warnings"
+    link = title
+
+
+@dataclass(frozen=True, eq=False)
+class LogsSource(Section):
+    """The command that makes the page again, and the files beside it."""
+
+    source: Source
+
+    template = "logs_source"
+    title = "Where this came from"
+    link = "Source"
 
 
 def _logs(rows: Iterable[Row]) -> Table:
@@ -110,7 +192,7 @@ def _logs(rows: Iterable[Row]) -> Table:
     return Table("All logs", heads, cells, (1, 2), marks)
 
 
-def _effects(rows: Iterable[Row], pairs: list[tuple[str, str]]) -> Table:
+def _effects(rows: Iterable[Row], pairs: Sequence[tuple[str, str]]) -> Table:
     """Tabulate the effects, one row a finished log, one column an effect."""
     cells: list[list[Cell]] = [
         [_link(row), *(_cell(row, *pair) for pair in pairs)]

@@ -1,33 +1,24 @@
-"""Self-contained pages of HTML: their template, tables and pictures."""
+"""Self-contained pages of HTML: their sections, tables and pictures."""
 
 from __future__ import annotations
 
 import base64
-import json
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import Any
 
 import jinja2
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from pbrl_ppl.background import background
+from pbrl_ppl.reporting import words
 from pbrl_ppl.reporting.style import NARROW, WIDE, png
-from pbrl_ppl.reporting.words import (
-    change,
-    digits_of,
-    joined,
-    number,
-    p_equals,
-    percent,
-    plain,
-    quantity,
-)
 
 #: Text of a cell of a table, or text and a small note beside it.
 Cell = str | tuple[str, str]
+#: Draws a picture at a width (inches).
+Draw = Callable[[float], Figure]
 
 
 @dataclass(frozen=True)
@@ -83,41 +74,83 @@ class Table:
         return result
 
 
-def render_page(
-    template: str, pictures: Mapping[str, Callable[[float], Figure]], **values: Any
-) -> str:
-    """Render a template; pictures are drawn twice, for a page and for a telephone.
+class Section:
+    """A section of a page: its data, the template that shows them, and its pictures.
+
+    A new section is a dataclass of its data, a template in ``templates/``, and an entry in a page's
+    list of sections. Templates can use the functions of ``words.py`` as filters.
+
+    Attributes
+    ----------
+    template : str
+        Name of the template, without ``.html.jinja``; also the anchor that others link to.
+    title : str
+        Heading; none if empty.
+    link : str
+        Entry in the page's table of contents; none if empty.
+    """
+
+    template: str
+    title: str = ""
+    link: str = ""
+
+    def context(self) -> Mapping[str, object]:
+        """Return the values that the template shows, by name: the section's data, or more."""
+        return vars(self)
+
+    def pictures(self) -> Mapping[str, Draw]:
+        """Return the pictures that the template shows, as ``picture.name``."""
+        return {}
+
+
+def render_page(title: str, header: Section, sections: Sequence[Section]) -> str:
+    """Return a page of HTML; pictures are drawn twice, for a page and for a telephone.
 
     Parameters
     ----------
-    template : str
-        Its name in this folder.
-    pictures : dict of str to callable
-        Draws a picture at a width (inches).
-    **values : object
-        Values that the template shows.
+    title : str
+        Title of the window.
+    header : Section
+        What stands above the table of contents.
+    sections : sequence of Section
+        What stands below it, in this order.
     """
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("pbrl_ppl", "reporting"),
+        loader=jinja2.PackageLoader("pbrl_ppl.reporting"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    for words in (number, percent, p_equals, plain, joined, change, quantity):
-        environment.filters[words.__name__] = words
-    environment.filters["data"] = _data
-    names = list(pictures)
+    for name, function in inspect.getmembers(words, inspect.isfunction):
+        environment.filters.setdefault(name, function)
+    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
+    parts = [header, *sections]
+    contexts = [part.context() for part in parts]
+    draws = [part.pictures() for part in parts]
+    drawn = iter(_drawn([draw for each in draws for draw in each.values()]))
+    shown = [
+        Markup(
+            environment.get_template(f"{part.template}.html.jinja").render(
+                context, picture={name: next(drawn) for name in each}
+            )
+        )
+        for part, context, each in zip(parts, contexts, draws, strict=True)
+    ]
+    return environment.get_template("page.html.jinja").render(
+        title=title, header=shown[0], sections=list(zip(sections, shown[1:], strict=True))
+    )
 
-    def drawn(chosen: list[str]) -> dict[str, dict[str, str]]:
-        return {name: _picture(pictures[name]) for name in chosen}
 
-    with background(partial(drawn, names[1::2])) as others:
-        picture = drawn(names[::2]) | others()
-    return environment.get_template(template).render(picture=picture, digits_of=digits_of, **values)
+def _drawn(draws: Sequence[Draw]) -> list[Mapping[str, str]]:
+    """Return pictures in both widths, drawn by two processes."""
+    with background(lambda: [_picture(draw) for draw in draws[1::2]]) as others:
+        pictures = {2 * i: _picture(draw) for i, draw in enumerate(draws[::2])}
+        pictures |= {2 * i + 1: picture for i, picture in enumerate(others())}
+    return [pictures[i] for i in range(len(draws))]
 
 
-def _picture(draw: Callable[[float], Figure]) -> dict[str, str]:
+def _picture(draw: Draw) -> Mapping[str, str]:
     """Return a picture in both widths."""
     return {"wide": _address(draw(WIDE)), "narrow": _address(draw(NARROW))}
 
@@ -125,11 +158,3 @@ def _picture(draw: Callable[[float], Figure]) -> dict[str, str]:
 def _address(figure: Figure) -> str:
     """Return a picture as a data URL."""
     return "data:image/png;base64," + base64.b64encode(png(figure)).decode("ascii")
-
-
-def _data(value: Any) -> Markup:
-    """Return JSON for a script element, escaped so that no text can end it."""
-    text = json.dumps(value, separators=(",", ":"), allow_nan=False)
-    for sign in "<>&":
-        text = text.replace(sign, f"\\u{ord(sign):04x}")
-    return Markup(text)

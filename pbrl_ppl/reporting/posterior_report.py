@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping
-from functools import partial
-from typing import Any
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any, TypeVar
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.effects import catalogue as full_catalogue
@@ -24,7 +24,7 @@ from pbrl_ppl.posterior import (
     scene_of,
 )
 from pbrl_ppl.reporting.loop_tables import loo_table
-from pbrl_ppl.reporting.page import Source, Table, render_page
+from pbrl_ppl.reporting.page import Draw, Section, Source, Table, render_page
 from pbrl_ppl.reporting.posterior_plots import (
     MOST_PRIORS,
     Coverage,
@@ -35,13 +35,19 @@ from pbrl_ppl.reporting.posterior_plots import (
     plot_pareto,
     plot_predictions,
     plot_prior,
-    plot_rank,
-    plot_trace,
 )
-from pbrl_ppl.reporting.posterior_tables import parameter_section
-from pbrl_ppl.reporting.scene_plots import plot_recording
+from pbrl_ppl.reporting.posterior_sections import (
+    Informed,
+    Parameters,
+    Recording,
+    Sampler,
+    Words,
+    recorded_poses,
+)
 from pbrl_ppl.reporting.words import plain
 from pbrl_ppl.state import Floats
+
+T = TypeVar("T")
 
 #: Fewest draws for diagnostics of chains, densities and cross-validation.
 LEAST_DRAWS = 100
@@ -79,77 +85,185 @@ def render_posterior(
         Path("cart.html").write_text(page, encoding="utf-8")
     """
     effects = tuple(effects)
-    scene = scene_of(posterior)
     sizes = group(posterior, "posterior").sizes
     if sizes["chain"] * sizes["draw"] < LEAST_DRAWS:
         raise PosteriorError(
             f"posterior: it has {sizes['chain'] * sizes['draw']} draws, a report needs at least"
             f" {LEAST_DRAWS}; fit with a method that draws, and more draws"
         )
-    pairs, draws = most_dependent(posterior), scalars(posterior)
-    moving = [str(name) for name, values in draws.items() if float(values.max() - values.min()) > 0]
-    priors = (moving or list(map(str, draws)))[:MOST_PRIORS]
-    missing: dict[str, str] = {}
-    known = _or_why(lambda: identify(posterior, effects=effects), "identifiability", missing)
-    section = parameter_section(posterior, effects, known)
-    covered = _or_why(lambda: coverage(posterior), "predictions", missing)
-    k = _or_why(lambda: pareto_k(posterior), "loo", missing)
-    compared = None if k is None else compare(posterior, posterior)
-    pictures: dict[str, Callable[[float], Figure]] = {
-        "prior": partial(plot_prior, posterior, priors),
-        "trace": partial(plot_trace, posterior, section["shown"]),
-        "rank": partial(plot_rank, posterior, section["shown"]),
-    }
-    if pairs:
-        pictures["pairs"] = partial(plot_pairs, posterior, pairs)
-    if covered:
-        pictures["predictions"] = partial(plot_predictions, posterior)
-    if k is not None:
-        pictures["pareto"] = partial(plot_pareto, *k)
+    scene, parameters = scene_of(posterior), Parameters(posterior, effects)
+    known, why_unknown = _or_why(lambda: identify(posterior, effects=effects))
+    covered, why_uncovered = _or_why(lambda: coverage(posterior))
+    k, why_no_k = _or_why(lambda: pareto_k(posterior))
+    predictions = Predictions(posterior, covered or {}, why_uncovered)
     poses = recorded_poses(posterior)
-    if poses is not None and np.isfinite(poses[..., :2]).any():
-        pictures["scene"] = partial(plot_recording, scene, poses, None)
+    drawn = poses is not None and np.isfinite(poses[..., :2]).any()
+    sections = [
+        AllParameters(parameters),
+        Recording(scene, poses) if poses is not None and drawn else None,
+        Informed(parameters, known, why_unknown, "What the data say", "What the data say", True),
+        Sampler(parameters, "Did the sampler work?", True),
+        predictions,
+        LeaveOneOut(posterior, k, why_no_k),
+        Words(parameters),
+        Origin(posterior, source or Source(command="render_posterior(pp.load_posterior(...))")),
+    ]
     return render_page(
-        "posterior.html.jinja",
-        pictures,
-        bodies=[body.name for body in scene.moving],
-        headline=_headline(posterior, known),
-        sentences=() if known is None else known.sentences,
-        predicts=_predicts(covered, missing),
-        warnings=_warned(posterior, known is not None),
-        about=_about(posterior),
-        has_prior="prior" in groups(posterior),
-        shown_priors=priors,
-        pairs=pairs,
-        covered=covered and _coverage_table(covered),
-        loo=compared and loo_table(compared, ["Value"]),
-        missing=missing,
-        source=source or Source(command="render_posterior(pp.load_posterior(...))"),
-        refit=_refit(posterior),
-        origin=_origin(posterior),
-        scene_toml=scene.to_toml(),
-        **section,
+        f"posterior of {', '.join(body.name for body in scene.moving)}",
+        PosteriorHeader(parameters, known, predictions),
+        [section for section in sections if section is not None],
     )
 
 
-def recorded_poses(posterior: Any) -> Floats | None:
-    """Return the recorded poses that a posterior holds, shape (trajectory, time, body, 3)."""
-    if "scene" not in posterior.attrs:
-        return None
-    given = group(posterior, "constant_data")
-    if "recorded_start" in given:
-        return np.asarray(given["recorded_start"].to_numpy()[..., :3])
-    # single transitions: the start of each, in order
-    return np.asarray(given["start"].to_numpy()[None, ..., :3])
-
-
-def _or_why(compute: Callable[[], Any], name: str, missing: dict[str, str]) -> Any:
-    """Return the result of a computation; if it fails, None, and note the reason for the page."""
+def _or_why(compute: Callable[[], T]) -> tuple[T | None, str]:
+    """Return the result of a computation; if it fails, None and the reason for the page."""
     try:
-        return compute()
+        return compute(), ""
     except PbrlError as error:
-        missing[name] = f"Not available: {error}"
-        return None
+        return None, f"Not available: {error}"
+
+
+@dataclass(frozen=True, eq=False)
+class AllParameters(Section):
+    """Table of all parameters, with their priors and pairs."""
+
+    parameters: Parameters
+
+    template = "parameters"
+    title = "Parameters"
+    link = title
+
+    @cached_property
+    def pairs(self) -> list[str]:
+        """The parameters that depend most on each other."""
+        return most_dependent(self.parameters.posterior)
+
+    @cached_property
+    def priors(self) -> list[str]:
+        """The parameters that are drawn over their prior: those that move, if any does."""
+        draws = scalars(self.parameters.posterior)
+        moving = [str(name) for name, v in draws.items() if float(v.max() - v.min()) > 0]
+        return (moving or list(map(str, draws)))[:MOST_PRIORS]
+
+    def context(self) -> Mapping[str, object]:
+        return {
+            "parameters": self.parameters.table(),
+            "has_prior": "prior" in groups(self.parameters.posterior),
+            "shown_priors": self.priors,
+            "count": len(self.parameters.summary),
+            "pairs": self.pairs,
+        }
+
+    def pictures(self) -> Mapping[str, Draw]:
+        posterior = self.parameters.posterior
+        pairs = {"pairs": partial(plot_pairs, posterior, self.pairs)} if self.pairs else {}
+        return {"prior": partial(plot_prior, posterior, self.priors)} | pairs
+
+
+@dataclass(frozen=True, eq=False)
+class Predictions(Section):
+    """Coverage of leave-one-out predictions."""
+
+    posterior: Any
+    covered: Mapping[str, Coverage]
+    why_not: str
+
+    template = "predictions"
+    title = "Posterior predictions"
+    link = "Predictions"
+
+    def sentence(self) -> str:
+        """Return the coverage in a sentence, or why there is none."""
+        if not self.covered:
+            return self.why_not or "It holds no predictions."
+        inside = [each.wide for each in self.covered.values()]
+        return (
+            f"Intervals that should hold 94 % of measurements hold {100 * min(inside):.0f} to"
+            f" {100 * max(inside):.0f} % of them, in {len(inside)} state dimensions, each"
+            " transition predicted without itself."
+        )
+
+    def context(self) -> Mapping[str, object]:
+        rows = [
+            (name, f"{100 * each.half:.1f} %", f"{100 * each.wide:.1f} %", str(each.measurements))
+            for name, each in self.covered.items()
+        ]
+        table = Table(
+            "Measurements inside leave-one-out predictions",
+            ("State dimension", "In the central 50 %", "In the central 94 %", "Measurements"),
+            rows,
+        )
+        return {"covered": table if rows else None, "why_not": self.why_not}
+
+    def pictures(self) -> Mapping[str, Draw]:
+        return {"predictions": partial(plot_predictions, self.posterior)} if self.covered else {}
+
+
+@dataclass(frozen=True, eq=False)
+class LeaveOneOut(Section):
+    """Leave-one-out cross-validation, with its Pareto k."""
+
+    posterior: Any
+    k: tuple[Floats, float, str] | None
+    why_not: str
+
+    template = "loo"
+    title = "Leave-one-out cross-validation"
+    link = "LOO"
+
+    def context(self) -> Mapping[str, object]:
+        compared = None if self.k is None else compare(self.posterior, self.posterior)
+        return vars(self) | {"loo": compared and loo_table(compared, ["Value"])}
+
+    def pictures(self) -> Mapping[str, Draw]:
+        return {} if self.k is None else {"pareto": partial(plot_pareto, *self.k)}
+
+
+@dataclass(frozen=True, eq=False)
+class Origin(Section):
+    """Commands that make the page and the posterior again; seed, data, versions, scene."""
+
+    posterior: Any
+    source: Source
+
+    template = "origin"
+    title = "Where this came from"
+    link = "Source"
+
+    def context(self) -> Mapping[str, object]:
+        attrs = self.posterior.attrs
+        names = ("seed", "data_sha256", "method", "substeps", "horizon", "updates")
+        versions = json.loads(str(attrs.get("versions", "{}")))
+        return {
+            "source": self.source,
+            "refit": _refit(self.posterior),
+            "origin": {name: str(attrs[name]) for name in names if name in attrs}
+            | {"versions": ", ".join(f"{name} {number}" for name, number in versions.items())},
+            "scene_toml": scene_of(self.posterior).to_toml(),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class PosteriorHeader(Section):
+    """Header: what the data inform, whether the sampler worked, whether the model predicts."""
+
+    parameters: Parameters
+    known: Identifiability | None
+    predictions: Predictions
+
+    template = "posterior"
+
+    def context(self) -> Mapping[str, object]:
+        posterior = self.parameters.posterior
+        return {
+            "failed": len(self.parameters.failed),
+            "headline": _headline(posterior, self.known),
+            "diagnosis": self.parameters.diagnosis(),
+            "sentences": self.known.sentences if self.known else (),
+            "predicts": self.predictions.sentence(),
+            "warnings": _warned(posterior, self.known is not None),
+            "about": _about(posterior),
+        }
 
 
 def _headline(posterior: Any, informed_by: Identifiability | None) -> str:
@@ -168,18 +282,6 @@ def _headline(posterior: Any, informed_by: Identifiability | None) -> str:
     if kept:
         text += f"; {kept} {'keep their' if kept > 1 else 'keeps its'} prior"
     return f"{text}."
-
-
-def _predicts(covered: Mapping[str, Coverage] | None, missing: dict[str, str]) -> str:
-    if not covered:
-        return missing.get("predictions", "It holds no predictions.")
-    inside = [each.wide for each in covered.values()]
-    low, high = min(inside), max(inside)
-    return (
-        f"Intervals that should hold 94 % of measurements hold {100 * low:.0f} to"
-        f" {100 * high:.0f} % of them, in {len(covered)} state dimensions, each transition"
-        " predicted without itself."
-    )
 
 
 def _warned(posterior: Any, identified: bool) -> list[str]:
@@ -205,17 +307,6 @@ def _about(posterior: Any) -> str:
     return (
         f"{transitions} transitions; likelihood of {likelihood}; sampler"
         f" {attrs.get('method', 'unknown')}, {sizes['chain']} chains of {sizes['draw']} draws."
-    )
-
-
-def _coverage_table(covered: Mapping[str, Coverage]) -> Table:
-    return Table(
-        "Measurements inside leave-one-out predictions",
-        ("State dimension", "In the central 50 %", "In the central 94 %", "Measurements"),
-        [
-            (name, f"{100 * each.half:.1f} %", f"{100 * each.wide:.1f} %", str(each.measurements))
-            for name, each in covered.items()
-        ],
     )
 
 
@@ -246,12 +337,3 @@ def _refit(posterior: Any) -> str:
     if "updates" in attrs:
         lines.append("# and updates since, which attrs['updates'] lists")
     return "\n".join(lines)
-
-
-def _origin(posterior: Any) -> dict[str, str]:
-    """Return the attributes on a posterior's origin: seed, data, method, versions."""
-    attrs = posterior.attrs
-    names = ("seed", "data_sha256", "method", "substeps", "horizon", "updates")
-    origin = {name: str(attrs[name]) for name in names if name in attrs}
-    versions = json.loads(str(attrs.get("versions", "{}")))
-    return origin | {"versions": ", ".join(f"{name} {number}" for name, number in versions.items())}

@@ -11,8 +11,7 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from pbrl_ppl.reporting import render_posterior
-from pbrl_ppl.reporting.report import render
+from pbrl_ppl.reporting import render, render_posterior
 from pbrl_ppl.reporting.words import number
 from tests.helpers.fleet import many_page
 from tests.helpers.html import Page, stands_alone

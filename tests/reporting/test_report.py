@@ -14,17 +14,17 @@ from pbrl_ppl.criticism import loop as loop_module
 from pbrl_ppl.criticism.loop import FILES
 from pbrl_ppl.criticism.results import Errors
 from pbrl_ppl.errors import OutputError
-from pbrl_ppl.history import UnusedVelocity
+from pbrl_ppl.history import History, UnusedVelocity
 from pbrl_ppl.parameters import BODY_PARAMETERS
 from pbrl_ppl.posterior import Fit
 from pbrl_ppl.posterior.cross_validation import Comparison, LeaveOneOut
 from pbrl_ppl.posterior.identifiability import Direction, Identifiability, Width
 from pbrl_ppl.reporting import page as page_module
+from pbrl_ppl.reporting import render
 from pbrl_ppl.reporting.error_plots import plot_rollout, unwrap
 from pbrl_ppl.reporting.page import Source
 from pbrl_ppl.reporting.posterior_plots import MOST_PARAMETERS, most_interesting, summary
-from pbrl_ppl.reporting.posterior_tables import PARAMETERS
-from pbrl_ppl.reporting.report import render
+from pbrl_ppl.reporting.posterior_sections import PARAMETERS
 from pbrl_ppl.reporting.words import number, rejected_in_words, remains_in_words, verdict_in_words
 from tests.helpers.html import Page, stands_alone
 from tests.helpers.made_up import DRAG, idata, made_up, made_up_posterior
@@ -242,8 +242,18 @@ def test_names_from_files_are_escaped() -> None:
     remains = replace(findings.unexplained, body="<script>alert(1)</script>", sentence="a<b>&")
     html = render(replace(findings, unexplained=remains))
     assert Page(html).tags.count("script") == 1  # it opens details in print
-    assert "<" not in page_module._data({"name": "</script><script>alert(1)"})
     assert "A<b>&" in Page(html).text
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning")
+def test_names_of_trajectories_cannot_end_the_script_of_the_motions() -> None:
+    dataset = unexplained().held_out.dataset
+    names = [f"</script><script>alert({i})" for i in range(dataset.sizes["trajectory"])]
+    loop = replace(unexplained(), held_out=History(dataset.assign_coords(trajectory=names)))
+    page = Page(render(loop))
+    assert page.tags.count("script") == 2
+    assert {motion["name"] for motion in page.motion["motions"]} <= set(names)
 
 
 @pytest.mark.usefixtures("undrawn")
