@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import warnings
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,7 +15,7 @@ from scipy.special import logsumexp
 
 from pbrl_ppl import posterior as files
 from pbrl_ppl.effects import Effect, catalogue
-from pbrl_ppl.errors import RefitWarning
+from pbrl_ppl.errors import RefitWarning, warn
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import (
     OutputErrorLikelihood,
@@ -26,11 +24,10 @@ from pbrl_ppl.likelihood import (
     declared_problem,
     single_transitions,
 )
-from pbrl_ppl.model import build_model
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.posterior import PosteriorRecord, from_groups, group, groups, parameter_draws
 from pbrl_ppl.sampling.ensemble import systematic
-from pbrl_ppl.sampling.fitting import fit
+from pbrl_ppl.sampling.fitting import sample
 from pbrl_ppl.sampling.update_checks import (
     as_recorded,
     check_engine,
@@ -126,20 +123,14 @@ def update(
         new = _weighted(idata, record, history, effects)
         entry |= {"transitions": new.likelihood.shape[1], "share": new.share}
         entry["pareto_k"] = new.k if np.isfinite(new.k) else None
-        with _relayed():
-            result = _reweighted(idata, record, new, seed)
+        result = _reweighted(idata, record, new, seed)
         if result is not None:
             return _entered(result, record, history, entry | {"did": "reweighted"})
         why, whole = new.why_not, new.problem
         advice = f"; {judgement(new.earlier, new.likelihood)}"
         places = new.data["observed_data"].coords
-    warnings.warn(
-        f"update: {why} are fitted anew, which takes as long as a fit{advice}",
-        RefitWarning,
-        stacklevel=2,
-    )
-    with _relayed():
-        result = fit(build_model(whole), seed=seed, progress=progress, **options)
+    warn(f"update: {why} are fitted anew, which takes as long as a fit{advice}", RefitWarning)
+    result = sample(whole, seed=seed, progress=progress, **options).posterior
     if places is not None:
         result = files.placed(result, places)
     return _entered(result, record, history, entry)
@@ -171,16 +162,6 @@ def _simulated(
     both = History.from_dataframe(pd.concat([rows, new]), record.scene)
     problem = declared_problem(physics, both, kind=OutputErrorLikelihood.name)
     return problem.with_likelihood(prior=record.sigma_prior)
-
-
-@contextmanager
-def _relayed() -> Iterator[None]:
-    """Issue the warnings of the block again, as the caller's of the function that holds it."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        yield
-    for warning in caught:
-        warnings.warn(warning.message, stacklevel=4)
 
 
 @dataclass(frozen=True, eq=False)

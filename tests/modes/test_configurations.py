@@ -514,14 +514,14 @@ def test_an_update_fits_anew_rather_than_move_an_index(fitted, monkeypatch) -> N
     more = simulated_history(
         truth, {}, seed=9, trajectories=1, intervals=2, noise=NOISE, poses=LINED, substeps=20
     )
-    monkeypatch.setattr(updating, "_MOVE", 1.1)  # no weights are good enough
+    monkeypatch.setattr("pbrl_ppl.posterior.MIN_ESS", np.inf)  # no weights are good enough
     asked = []
 
-    def refit(model, **options):
-        asked.append(model.problem.layout.discrete.any())
+    def refit(problem, **options):
+        asked.append(problem.layout.discrete.any())
         raise InterruptedError
 
-    monkeypatch.setattr(updating, "fit", refit)
+    monkeypatch.setattr(updating, "sample", refit)
     with warnings.catch_warnings(), pytest.raises(InterruptedError):
         warnings.simplefilter("ignore", RefitWarning)
         updating.update(fitted, more)

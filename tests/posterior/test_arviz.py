@@ -14,7 +14,7 @@ from pbrl_ppl.parameters import wheels
 from pbrl_ppl.posterior import by_number, from_groups, group, groups, loo_pit, predicted_rows
 from pbrl_ppl.posterior.completion import predictive_rows, prior_groups
 from pbrl_ppl.posterior.store import DATATREE, load_posterior, save_posterior
-from pbrl_ppl.sampling import fit, physics_model, update
+from pbrl_ppl.sampling import fit, physics_model, sample, update
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
 from tests.helpers.stacks import SCENE, fitted, history
@@ -189,8 +189,8 @@ def test_a_selection_of_trajectories_keeps_their_numbers() -> None:
 def test_an_update_numbers_trajectories_on(idata, way, monkeypatch) -> None:
     monkeypatch.setattr("pbrl_ppl.posterior.MIN_ESS", 0 if way == "reweighted" else np.inf)
     monkeypatch.setattr("pbrl_ppl.posterior.MAX_PARETO_K", np.inf)
-    quick = partial(fit, method="laplace")
-    monkeypatch.setattr("pbrl_ppl.sampling.updating.fit", quick)
+    quick = partial(sample, method="laplace")
+    monkeypatch.setattr("pbrl_ppl.sampling.updating.sample", quick)
     new = update(idata, history(2, trajectories=1), seed=1)
     new = update(new, history(3, trajectories=1), seed=1)
     assert [each["did"] for each in json.loads(new.attrs["updates"])] == [way, way]

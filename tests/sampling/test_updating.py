@@ -265,7 +265,7 @@ def test_a_refit_says_whether_the_bodies_may_be_the_same(mass, says, monkeypatch
     def long_work(*args, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("pbrl_ppl.sampling.updating.fit", long_work)
+    monkeypatch.setattr("pbrl_ppl.sampling.updating.sample", long_work)
     with pytest.warns(RefitWarning, match=says) as caught, pytest.raises(KeyboardInterrupt):
         update(start, more, seed=3, progress=False)
     assert ("look whether" in str(caught[0].message)) == (mass != 2.0)
@@ -417,7 +417,7 @@ def test_few_draws_are_refitted(parts, first, monkeypatch) -> None:
         key: data.isel(draw=slice(20)) if key in ("posterior", "log_likelihood") else data
         for key, data in groups(first).items()
     }
-    monkeypatch.setattr("pbrl_ppl.sampling.updating.fit", long_work)
+    monkeypatch.setattr("pbrl_ppl.sampling.updating.sample", long_work)
     says = "fewer than 400 effective draws are left of 40"
     with pytest.warns(RefitWarning, match=says), pytest.raises(KeyboardInterrupt):
         update(from_groups(few, first.attrs), parts[2].select([0]))
