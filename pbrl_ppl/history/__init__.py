@@ -18,7 +18,6 @@ from .history import Segments as Segments
 from .history import check_start as check_start
 from .history import from_segments as from_segments
 from .history import longest_gap as longest_gap
-from .history import segment_rows as segment_rows
 from .history import unseen as unseen
 from .kinematics import estimate_rates as estimate_rates
 from .kinematics import fill_hinges as fill_hinges

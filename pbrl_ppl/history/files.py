@@ -1,12 +1,11 @@
 """Files of histories: CSV, Parquet and NetCDF to a table, and back, written atomically."""
 
 import io
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 import xarray as xr
 
@@ -14,7 +13,7 @@ from pbrl_ppl.errors import HistoryError, OutputError
 from pbrl_ppl.files import write_atomically
 from pbrl_ppl.history import bags
 from pbrl_ppl.scene import SEPARATORS, Recording
-from pbrl_ppl.state import STATE, WRENCH, Floats
+from pbrl_ppl.state import STATE, WRENCH
 
 COLUMNS = ("trajectory", "step", "time", "body", *STATE, *WRENCH)
 SUFFIXES = (".csv", ".parquet", ".nc")
@@ -173,46 +172,22 @@ def _read_netcdf(path: Path) -> pd.DataFrame:
 
 
 def to_table(dataset: xr.Dataset) -> pd.DataFrame:
-    """Return one row for each (trajectory, step, body) of a history's dataset."""
-    names = ("trajectory", "clock", "body", "observed", "action", "state", "wrench")
-    return as_table(*(dataset[name].to_numpy() for name in names))
+    """Return one row for each (trajectory, step, body) of a history's dataset.
 
-
-def as_table(
-    labels: npt.NDArray[Any],
-    clock: Floats,
-    bodies: npt.NDArray[Any],
-    state: Floats,
-    action: Floats,
-    states: Iterable[str] = STATE,
-    wrenches: Iterable[str] = WRENCH,
-) -> pd.DataFrame:
-    """Return one row for each (trajectory, step, body) of arrays.
-
-    Parameters
-    ----------
-    labels : ndarray
-        Of the trajectories, shape (trajectory,).
-    clock : ndarray
-        Times (s), shape (trajectory, step); steps without a time are left out.
-    bodies : ndarray
-        Names, shape (body,).
-    state, action : ndarray
-        Shape (trajectory, step, body, 6) and (trajectory, step, body, 3), SI units.
-    states, wrenches : iterable of str
-        Names along the last axes.
+    Steps without a time are left out.
     """
+    clock, bodies = dataset["clock"].to_numpy(), dataset["body"].to_numpy()
     trajectory, step = np.nonzero(~np.isnan(clock))
     k = len(bodies)
     columns = {
-        "trajectory": np.repeat(labels[trajectory], k),
+        "trajectory": np.repeat(dataset["trajectory"].to_numpy()[trajectory], k),
         "step": np.repeat(step, k),
         "time": np.repeat(clock[trajectory, step], k),
         "body": np.tile(bodies.astype(object), len(step)),
     }
-    for names, values in ((states, state), (wrenches, action)):
-        rows = values[trajectory, step].reshape(len(step) * k, -1)
-        columns |= zip(map(str, names), rows.T, strict=True)
+    for names, values in (("state", "observed"), ("wrench", "action")):
+        rows = dataset[values].to_numpy()[trajectory, step].reshape(len(step) * k, -1)
+        columns |= zip(map(str, dataset[names].to_numpy()), rows.T, strict=True)
     return pd.DataFrame(columns)
 
 

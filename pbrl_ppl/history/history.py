@@ -9,15 +9,17 @@ from pathlib import Path
 from typing import Unpack
 
 import numpy as np
+import numpy.typing as npt
 import pandas as pd
 import xarray as xr
 
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history.conversion import Reading, as_history
-from pbrl_ppl.history.files import as_table, read_table, to_table, write_dataset
+from pbrl_ppl.history.files import read_table, to_table, write_dataset
 from pbrl_ppl.history.kinematics import complete_start, kinematic_bodies, path_velocities
 from pbrl_ppl.history.layout import layout_of
-from pbrl_ppl.history.rows import arrays
+from pbrl_ppl.history.resampling import resampled
+from pbrl_ppl.history.rows import Rows, padded, rows_of_arrays, rows_of_table
 from pbrl_ppl.scene import Recording, Scene
 from pbrl_ppl.state import STATE, STATE_UNITS, WRENCH, WRENCH_UNITS, Bools, Floats, Ints
 
@@ -68,7 +70,7 @@ class History:
     Parameters
     ----------
     dataset : xarray.Dataset
-        As built by `load` and `from_dataframe`, with the variables
+        As built by `load`, `of_arrays` and `from_dataframe`, with the variables
 
         - ``observed`` (trajectory, time, body, state): the measured state; NaN where missing
           (m, m, rad, m/s, m/s, rad/s);
@@ -155,21 +157,85 @@ class History:
         if not isinstance(frame, pd.DataFrame):
             raise HistoryError(f"{source}: got {type(frame).__name__}, expected a pandas.DataFrame")
         layout = layout_of(frame, layout)
-        frame = as_history(frame, scene, source, layout, **reading)
-        table = arrays(frame, scene, source)
-        start, assumed = complete_start(table.state, scene)
+        rows = rows_of_table(as_history(frame, scene, source, layout, **reading), scene, source)
+        if reading.get("resample") or (layout is not None and layout.resample):
+            rows = resampled(rows, scene, source)
         estimated = layout is not None and layout.velocities == "estimate"
-        if estimate_velocities or estimated:  # of positions that were measured, or that hinges give
+        return cls._of_rows(rows, scene, estimate_velocities=estimate_velocities or estimated)
+
+    @classmethod
+    def of_arrays(
+        cls,
+        states: npt.ArrayLike,
+        scene: Scene,
+        actions: npt.ArrayLike | None = None,
+        times: npt.ArrayLike | None = None,
+        *,
+        labels: Sequence[int | str] | None = None,
+        estimate_velocities: bool = False,
+        resample: bool = False,
+    ) -> History:
+        """Build a history from arrays, as a simulator or a driver's script has them.
+
+        Parameters
+        ----------
+        states : array
+            Measured states, shape (trajectory, time, body, 6), bodies in the order of
+            ``scene.moving``; m, m, rad, m/s, m/s, rad/s; NaN where nothing was measured.
+        scene : Scene
+            The bodies, hinges and time step that are expected.
+        actions : array, optional
+            Wrenches from each row to the next, shape (trajectory, time, body, 3) or one row less;
+            N, N, N m. Without them, nothing pushes.
+        times : array, optional
+            Shape (time,) or (trajectory, time); s; NaN after the end of a trajectory that is
+            shorter than others. By default a row each ``time_step`` of the scene.
+        labels : sequence of int or str, optional
+            Of the trajectories; 0, 1, ... by default.
+        estimate_velocities : bool
+            As of `load`.
+        resample : bool
+            Whether uneven ``times`` are interpolated every ``time_step`` of the scene.
+
+        Raises
+        ------
+        HistoryError
+            If a shape, a time or a number is wrong; the message says where and what to do.
+
+        Examples
+        --------
+        A puck that slides at 1 m/s, in three trajectories of twenty rows:
+
+        >>> from pbrl_ppl.scene import Body, Scene, Shape
+        >>> scene = Scene(time_step=0.1, bodies=(Body("puck", Shape.circle(0.1)),))
+        >>> states = np.zeros((3, 20, 1, 6))
+        >>> states[..., 0] = 0.1 * np.arange(20)[:, None]
+        >>> states[..., 3] = 1.0
+        >>> history = History.of_arrays(states, scene)
+        >>> history.n_trajectories, history.n_transitions
+        (3, 57)
+        """
+        rows = rows_of_arrays(states, scene, actions, times, labels)
+        if resample:
+            rows = resampled(rows, scene, "history")
+        return cls._of_rows(rows, scene, estimate_velocities=estimate_velocities)
+
+    @classmethod
+    def _of_rows(cls, rows: Rows, scene: Scene, *, estimate_velocities: bool) -> History:
+        """Return the history of rows at the scene's time step, after checks of all of them."""
+        table = padded(rows, scene)
+        start, assumed = complete_start(table.state, scene)
+        if estimate_velocities:  # of positions that were measured, or that hinges give
             assumed[:, 3:] &= assumed[:, :3]
         n, k = len(table.n_rows), len(scene.moving)
-        rows = ("trajectory", "time", "body")
+        dims = ("trajectory", "time", "body")
         states, wrenches = ({"units": ", ".join(each)} for each in (STATE_UNITS, WRENCH_UNITS))
         before = np.zeros((n, k, len(WRENCH)))
         dataset = xr.Dataset(
             {
-                "observed": ((*rows, "state"), table.state, states),
-                "action": ((*rows, "wrench"), table.action, wrenches),
-                "start": ((*rows, "state"), start, states),
+                "observed": ((*dims, "state"), table.state, states),
+                "action": ((*dims, "wrench"), table.action, wrenches),
+                "start": ((*dims, "state"), start, states),
                 "assumed": (("body", "state"), assumed),
                 "clock": (("trajectory", "time"), table.clock, {"units": "s"}),
                 "n_rows": ("trajectory", table.n_rows),
@@ -468,13 +534,28 @@ def _cut(complete: Bools, intervals: Ints, horizon: int) -> tuple[Ints, Ints]:
 
 
 def from_segments(scene: Scene, start: Floats, actions: Floats, observed: Floats) -> History:
-    """Return a history of segments; arguments as of :func:`segment_rows`.
+    """Return a history with one trajectory a segment, each from its start state.
 
-    Actions of shape (n, H, body, 9) are inputs as in :data:`pbrl_ppl.state.INPUT`: they also hold
-    the wrench of the interval before, and times.
+    Parameters
+    ----------
+    scene : Scene
+        Names the bodies and the time step.
+    start : ndarray
+        Complete start states, shape (n, body, 6), SI units.
+    actions : ndarray
+        Wrenches, shape (n, H, body, 3); of a kinematic body its velocities. Inputs as in
+        :data:`pbrl_ppl.state.INPUT`, shape (n, H, body, 9), also hold the wrench of the interval
+        before, and times.
+    observed : ndarray
+        Next states, shape (n, H, body, 6), NaN where missing.
     """
-    wrench = actions[..., : len(WRENCH)]
-    history = History.from_dataframe(segment_rows(scene, start, wrench, observed), scene)
+    states = np.concatenate([start[:, None], observed], axis=1)
+    wrench = actions[..., : len(WRENCH)].copy()
+    follows = kinematic_bodies(scene)
+    path = scene.time_step * np.cumsum(wrench[:, :, follows], axis=1)
+    states[:, 1:, follows, :3] = start[:, None, follows, :3] + path
+    wrench[:, :, follows] = np.nan
+    history = History.of_arrays(states, scene, wrench)
     if actions.shape[-1] == len(WRENCH):
         return history
     number, begin, end = np.moveaxis(actions[:, :, 0, 6:], -1, 0)
@@ -486,29 +567,3 @@ def from_segments(scene: Scene, start: Floats, actions: Floats, observed: Floats
             clock=data["clock"].copy(data=np.concatenate([begin, end[:, -1:]], axis=1)),
         )
     )
-
-
-def segment_rows(scene: Scene, start: Floats, actions: Floats, observed: Floats) -> pd.DataFrame:
-    """Return a history's rows with one trajectory a segment, each from its start state.
-
-    Parameters
-    ----------
-    scene : Scene
-        Names the bodies and the time step.
-    start : ndarray
-        Complete start states, shape (n, body, 6), SI units.
-    actions : ndarray
-        Wrenches, shape (n, H, body, 3); of a kinematic body its velocities.
-    observed : ndarray
-        Next states, shape (n, H, body, 6), NaN where missing.
-    """
-    n, h, k = actions.shape[:3]
-    states = np.concatenate([start[:, None], observed], axis=1)
-    wrenches = np.concatenate([actions, np.full((n, 1, k, len(WRENCH)), np.nan)], axis=1)
-    follows = kinematic_bodies(scene)
-    path = scene.time_step * np.cumsum(actions[:, :, follows], axis=1)
-    states[:, 1:, follows, :3] = start[:, None, follows, :3] + path
-    wrenches[:, :, follows] = np.nan
-    clock = np.broadcast_to(scene.time_step * np.arange(h + 1), (n, h + 1))
-    names = np.array([body.name for body in scene.moving])
-    return as_table(np.arange(n), clock, names, states, wrenches)

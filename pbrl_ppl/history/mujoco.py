@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 
 from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.history.files import as_table
 from pbrl_ppl.history.history import History
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE, WRENCH, Floats
@@ -150,12 +149,8 @@ def from_mujoco(
         raise HistoryError(f"{rows} rows are less than a step of {every} rows and its end")
     # the mean keeps the impulse where the command changes within a step
     mean = action[:, : kept * every].reshape(n, kept, every, k, len(WRENCH)).mean(axis=2)
-    mean = np.concatenate([mean, np.full((n, 1, k, len(WRENCH)), np.nan)], axis=1)
-    clock = np.broadcast_to(np.arange(kept + 1) * scene.time_step, (n, kept + 1))
-    state = state[:, : kept * every + 1 : every]
-    table = as_table(np.arange(n), clock, np.array(list(joints)), state, mean)
-    return History.from_dataframe(
-        table, scene, estimate_velocities=estimate_velocities, source="MuJoCo rollout"
+    return History.of_arrays(
+        state[:, : kept * every + 1 : every], scene, mean, estimate_velocities=estimate_velocities
     )
 
 

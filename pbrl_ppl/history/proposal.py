@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from pbrl_ppl.history.conversion import LONGEST
 from pbrl_ppl.history.layout import peaks, velocity_changes
+from pbrl_ppl.history.resampling import LONGEST
 from pbrl_ppl.history.rows import TIME_TOLERANCE
 from pbrl_ppl.scene import Recording
 from pbrl_ppl.state import WRENCH, Bools, Floats, Ints

@@ -1,10 +1,11 @@
-"""Rows of a history's table: checks of names, cells and times, and conversion to arrays."""
+"""Rows of a history, from a table or from arrays: checks, and conversion to padded arrays."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pandas as pd
 
 from pbrl_ppl.errors import HistoryError
@@ -17,29 +18,111 @@ from pbrl_ppl.state import STATE, WRENCH, Bools, Floats, Ints
 TIME_TOLERANCE = 0.01
 #: Largest absolute value of a state or wrench, in SI units.
 _LARGEST = 1e18
-_INTEGER = re.compile(r"(-?(?:0|[1-9]\d{0,17}))(?:\.0*)?")
+
+#: Labels of trajectories.
+Labels = list[int | str]
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Columns of a table without its blank rows; ``line`` is each row's number in the file."""
+    """Rows of a history, one for each (trajectory, step, body), in any order.
 
-    line: Ints
-    labels: list[Any]
+    Attributes
+    ----------
+    labels : list of int or str
+        Of the trajectories.
+    trajectory, body : ndarray of int
+        Position among the labels, and among the scene's moving bodies, shape (row,).
+    step : ndarray of int or None
+        Steps that are counted in the recording, shape (row,).
+    time, state, action : ndarray
+        Shape (row,), (row, 6) and (row, 3), SI units; NaN where a state or wrench is missing.
+    line : ndarray of int or None
+        Number of the row in its table; None of arrays.
+    """
+
+    labels: Labels
     trajectory: Ints
     body: Ints
     step: Ints | None
     time: Floats
     state: Floats
     action: Floats
+    line: Ints | None = None
 
     def error(self, row: int, message: str) -> HistoryError:
-        """Return an error that names the row of the file."""
-        return HistoryError(f"history row {self.line[row]}: {message}")
+        """Return an error that names the row of the table, or its time."""
+        at = f"at {self.time[row]:.6g} s" if self.line is None else f"row {self.line[row]}"
+        return HistoryError(f"history {at}: {message}")
 
     def trajectory_of(self, row: int) -> str:
         """Return the name of a row's trajectory, for messages."""
         return f"trajectory {self.labels[self.trajectory[row]]}"
+
+
+def rows_of_arrays(
+    states: npt.ArrayLike,
+    scene: Scene,
+    actions: npt.ArrayLike | None = None,
+    times: npt.ArrayLike | None = None,
+    labels: Sequence[int | str] | None = None,
+) -> Rows:
+    """Return the rows of arrays; arguments and errors as of :meth:`History.of_arrays`."""
+    state = np.array(states, dtype=np.float64)
+    k = len(scene.moving)
+    if state.ndim != 4 or state.shape[2:] != (k, len(STATE)):
+        raise HistoryError(
+            f"history: states have shape {state.shape}, expected (trajectory, time, {k},"
+            f" {len(STATE)}): {', '.join(STATE)} of {', '.join(b.name for b in scene.moving)}; add"
+            " the axes that are missing (states[None] for one trajectory, states[:, :, None] for"
+            " one body), NaN where nothing was measured"
+        )
+    n, length = state.shape[:2]
+    action = np.zeros((n, length, k, len(WRENCH)))
+    if actions is not None:
+        given = np.array(actions, dtype=np.float64)
+        whole, intervals = action.shape, (n, length - 1, *action.shape[2:])
+        if given.shape not in (whole, intervals):
+            raise HistoryError(
+                f"history: actions have shape {given.shape}, expected {whole}, as the states have,"
+                f" or {intervals}: {', '.join(WRENCH)} from each row to the next"
+            )
+        action[:, : given.shape[1]] = given
+    clock = scene.time_step * np.arange(length) if times is None else np.asarray(times, np.float64)
+    if clock.shape not in ((length,), (n, length)):
+        raise HistoryError(
+            f"history: times have shape {clock.shape}, expected {(n, length)} or {(length,)}: one"
+            " for each row of a trajectory (s), NaN after its end"
+        )
+    names = list(range(n) if labels is None else labels)
+    if len({*map(str, names)}) != n:
+        raise HistoryError(
+            f"history: labels are {names}, expected {n} different ones, one for each trajectory"
+        )
+    trajectory, step = np.nonzero(~np.isnan(np.broadcast_to(clock, (n, length))))
+    rows = Rows(
+        names,
+        np.repeat(trajectory, k),
+        np.tile(np.arange(k), len(step)),
+        np.repeat(step, k),
+        np.repeat(np.broadcast_to(clock, (n, length))[trajectory, step], k),
+        state[trajectory, step].reshape(-1, len(STATE)),
+        action[trajectory, step].reshape(-1, len(WRENCH)),
+    )
+    if empty := {*range(n)} - {*trajectory.tolist()}:
+        raise HistoryError(
+            f"history: trajectory {names[min(empty)]} has no times; expected at least 2; drop it"
+        )
+    for values, columns in ((rows.state, STATE), (rows.action, WRENCH)):
+        for row, column in np.argwhere(np.abs(values) > _LARGEST):
+            body = scene.moving[rows.body[row]].name
+            raise rows.error(
+                row,
+                f'{columns[column]} of body "{body}" is {values[row, column]} in'
+                f" {rows.trajectory_of(row)}; expected a finite number of at most {_LARGEST:g}; NaN"
+                " if it was not measured",
+            )
+    return rows
 
 
 def with_clean_names(frame: pd.DataFrame, source: str) -> pd.DataFrame:
@@ -59,7 +142,7 @@ def with_clean_names(frame: pd.DataFrame, source: str) -> pd.DataFrame:
     return frame
 
 
-def read_rows(frame: pd.DataFrame, scene: Scene, source: str) -> Rows:
+def rows_of_table(frame: pd.DataFrame, scene: Scene, source: str) -> Rows:
     """Return a table's rows after a check of the columns' names and of each cell.
 
     Raises
@@ -108,10 +191,10 @@ def read_rows(frame: pd.DataFrame, scene: Scene, source: str) -> Rows:
         )
     whole = None if step is None else step.astype(np.int64)
     state, action = (np.stack([number[name] for name in names], 1) for names in (STATE, WRENCH))
-    return Rows(line, labels, trajectory, body, whole, number["time"], state, action)
+    return Rows(labels, trajectory, body, whole, number["time"], state, action, line)
 
 
-def _trajectories(column: pd.Series, line: Ints) -> tuple[list[Any], Ints]:
+def _trajectories(column: pd.Series, line: Ints) -> tuple[Labels, Ints]:
     """Return the labels in order of appearance (integers where all are) and each row's code."""
     text = [str(cell).strip() for cell in column.astype(object).where(column.notna(), "")]
     if "" in text:
@@ -119,8 +202,10 @@ def _trajectories(column: pd.Series, line: Ints) -> tuple[list[Any], Ints]:
             f"history row {line[text.index('')]}: trajectory is empty; expected a number or a name;"
             " fill it in"
         )
-    whole = [_INTEGER.fullmatch(label) for label in text]
-    labels: list[Any] = [int(match[1]) for match in whole if match] if all(whole) else text
+    whole = [re.fullmatch(r"(-?(?:0|[1-9]\d{0,17}))(?:\.0*)?", label) for label in text]
+    labels: Labels = [*text]
+    if all(whole):
+        labels = [int(match[1]) for match in whole if match]
     codes, unique = pd.factorize(np.array(labels, dtype=object))
     return unique.tolist(), codes.astype(np.int64)
 
@@ -174,31 +259,28 @@ def _numbers(column: pd.Series, line: Ints, where: list[str]) -> Floats:
 class Arrays:
     """A history as padded arrays: n trajectories, at most T steps, k bodies."""
 
-    labels: list[Any]
+    labels: Labels
     n_rows: Ints
     clock: Floats
     state: Floats
     action: Floats
 
 
-def arrays(frame: pd.DataFrame, scene: Scene, source: str) -> Arrays:
-    """Return a table's rows as checked arrays.
+def padded(rows: Rows, scene: Scene) -> Arrays:
+    """Return rows as checked arrays.
 
     Parameters
     ----------
-    frame : pandas.DataFrame
-        One row for each (trajectory, step, body).
+    rows : Rows
+        One for each (trajectory, step, body).
     scene : Scene
         The bodies and the time step that are expected.
-    source : str
-        Name of the table in messages about the whole of it.
 
     Raises
     ------
     HistoryError
         At the first row that breaks a rule.
     """
-    rows = read_rows(frame, scene, source)
     # Trajectories may alternate in the file; inside each one, the file's order counts.
     order = np.argsort(rows.trajectory, kind="stable")
     first, position = _steps(rows, order, scene)
@@ -232,34 +314,55 @@ def _steps(rows: Rows, order: Ints, scene: Scene) -> tuple[Bools, Ints]:
         first = ~inside | (jump != 0)
     group = np.cumsum(first) - 1
     again = pd.Series(group * len(scene.moving) + rows.body[order]).duplicated().to_numpy()
-    # In the order of the cures: rows out of order or twice look like gaps further on.
-    rules = {
-        "time goes back by {back:.6g} s in {where}; sort the rows or drop the duplicate": inside
-        & (change < np.where(first, 0.0, -tolerance)),
-        'a second row of body "{body}" at {moment} in {where}; expected one; drop the'
-        " duplicate": again,
-        "step goes back from {before} to {step} in {where}; sort the rows": inside & (jump < 0),
-        "step skips from {before} to {step} in {where}; expected {next}; record every step, or give"
-        " the rows after the gap a trajectory of their own": inside & (jump > 1),
-        "step {step} has two times, {change:.6g} s apart, in {where}; expected one; give every body"
-        " the same time at a step": inside & ~first & (change > tolerance),
-        "{change:.6g} s since the step before in {where}; expected {dt:.6g} s, the scene's"
-        " time_step, within 1 %; correct time_step, or have the history resampled (resample=True,"
-        " --time-step)": inside & first & (np.abs(change - dt) > tolerance),
-    }
-    for message, broken in rules.items():
-        if not broken.any():
-            continue
+
+    def first_of(broken: Bools) -> int:
+        """Return the first of these places in the file; -1 if there is none."""
         places = np.flatnonzero(broken)
-        place = int(places[np.argmin(order[places])])
+        return int(places[np.argmin(order[places])]) if len(places) else -1
+
+    def error(place: int, message: str, cure: str) -> HistoryError:
         row = int(order[place])
-        step = 0 if rows.step is None else int(rows.step[row])
-        before = step - int(jump[place])
-        words = {"where": rows.trajectory_of(row), "body": scene.moving[rows.body[row]].name}
-        words["moment"] = f"time {time[place]:.6g} s" if rows.step is None else f"step {step}"
-        numbers = {"change": change[place], "back": -change[place], "dt": dt}
-        steps = {"step": step, "before": before, "next": before + 1}
-        raise rows.error(row, message.format(**words, **numbers, **steps))
+        return rows.error(row, f"{message} in {rows.trajectory_of(row)}; {cure}")
+
+    def counted(place: int) -> tuple[int, int]:
+        """Return a step as counted in the recording, and the one before."""
+        step = 0 if rows.step is None else int(rows.step[order[place]])
+        return step, step - int(jump[place])
+
+    # In the order of the cures: rows out of order or twice look like gaps further on.
+    back = change < np.where(first, 0.0, -tolerance)
+    if (i := first_of(inside & back)) >= 0:
+        goes_back = f"time goes back by {-change[i]:.6g} s"
+        raise error(i, goes_back, "sort the rows or drop the duplicate")
+    if (i := first_of(again)) >= 0:
+        body = scene.moving[rows.body[order[i]]].name
+        moment = f"time {time[i]:.6g} s" if rows.step is None else f"step {counted(i)[0]}"
+        second = f'a second row of body "{body}" at {moment}'
+        raise error(i, second, "expected one; drop the duplicate")
+    if (i := first_of(inside & (jump < 0))) >= 0:
+        step, before = counted(i)
+        raise error(i, f"step goes back from {before} to {step}", "sort the rows")
+    if (i := first_of(inside & (jump > 1))) >= 0:
+        step, before = counted(i)
+        raise error(
+            i,
+            f"step skips from {before} to {step}",
+            f"expected {before + 1}; record every step, or give the rows after the gap a trajectory"
+            " of their own",
+        )
+    if (i := first_of(inside & ~first & (change > tolerance))) >= 0:
+        raise error(
+            i,
+            f"step {counted(i)[0]} has two times, {change[i]:.6g} s apart,",
+            "expected one; give every body the same time at a step",
+        )
+    if (i := first_of(inside & first & (np.abs(change - dt) > tolerance))) >= 0:
+        raise error(
+            i,
+            f"{change[i]:.6g} s since the step before",
+            f"expected {dt:.6g} s, the scene's time_step, within 1 %; correct time_step, or have"
+            " the history resampled (resample=True, --time-step)",
+        )
     position = np.empty(len(order), dtype=np.int64)
     position[order] = group - np.maximum.accumulate(np.where(inside, 0, group))
     return first, position
@@ -287,14 +390,9 @@ def _check_complete(rows: Rows, scene: Scene, position: Ints, n_rows: Ints) -> N
             " cells for what was not measured",
         )
     kinematic = kinematic_bodies(scene)[rows.body]
-    before_last = position < n_rows[rows.trajectory] - 1
-    needed = (
-        (
-            rows.action,
-            before_last & ~kinematic,
-            WRENCH,
-            "on every row but the last; write 0 where nothing pushed",
-        ),
+    pushed = (position < n_rows[rows.trajectory] - 1) & ~kinematic
+    for values, required, columns, cure in (
+        (rows.action, pushed, WRENCH, "on every row but the last; write 0 where nothing pushed"),
         (
             rows.state[:, :3],
             kinematic,
@@ -302,8 +400,7 @@ def _check_complete(rows: Rows, scene: Scene, position: Ints, n_rows: Ints) -> N
             "on every row: the body is kinematic and follows its path; fill it in (theta of a round"
             " body may be 0 throughout)",
         ),
-    )
-    for values, required, columns, cure in needed:
+    ):
         for row, column in np.argwhere(np.isnan(values) & required[:, None]):
             raise rows.error(
                 row,

@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.errors import EffectError, GoalError
 from pbrl_ppl.files import write_atomically
-from pbrl_ppl.history import segment_rows
+from pbrl_ppl.history import from_segments
 from pbrl_ppl.likelihood import TrajectoryNoise
 from pbrl_ppl.parameters import differentiate
 from pbrl_ppl.physics import touching
@@ -308,7 +308,7 @@ class Suggestion:
         """Return the experiment as rows of a history without measurements after the start."""
         wrenches = self.wrenches.to_numpy()[None]
         nothing = np.full((1, wrenches.shape[1], *self.start.shape), np.nan)
-        return segment_rows(self.scene, self.start[None], wrenches, nothing)
+        return from_segments(self.scene, self.start[None], wrenches, nothing).to_dataframe()
 
     def to_csv(self, path: str | Path) -> None:
         """Write the experiment as a CSV file that a robot's script can play, whole or not at all.

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.errors import GoalError
 from pbrl_ppl.files import write_atomically
-from pbrl_ppl.history import segment_rows
+from pbrl_ppl.history import from_segments
 from pbrl_ppl.physics import check_placement, overlap
 from pbrl_ppl.planning.actions import ActionSet
 from pbrl_ppl.planning.astar import astar
@@ -86,7 +86,8 @@ class Plan:
             Columns as of :meth:`History.to_dataframe`; state cells after the start are missing.
         """
         nothing = np.full((1, len(self.wrenches), *self.start.shape), np.nan)
-        return segment_rows(self.scene, self.start[None], self.wrenches[None], nothing)
+        planned = from_segments(self.scene, self.start[None], self.wrenches[None], nothing)
+        return planned.to_dataframe()
 
     def save(self, path: str | Path) -> None:
         """Write the plan as a CSV file, whole or not at all.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.history import History, from_segments, segment_rows
+from pbrl_ppl.history import History, from_segments
 from tests.helpers.pushes import SCENE, WRENCH, pushed, rows
 
 pytestmark = pytest.mark.one_stack
@@ -64,11 +64,12 @@ def test_it_must_be_recorded() -> None:
 def test_segments_make_the_same_history_again() -> None:
     segments = pushed()[1].segments(5)
     given = segments.start, segments.actions, segments.observed
-    again = from_segments(SCENE, *given).segments(5)
+    same = from_segments(SCENE, *given)
+    again = same.segments(5)
     for name in ("start", "actions", "observed"):
         np.testing.assert_allclose(getattr(again, name), getattr(segments, name), atol=1e-12)
     # a path is no wrench: nobody is to read it as newtons
-    table = segment_rows(SCENE, *given)
+    table = same.to_dataframe()
     assert table.loc[table["body"] == "finger", WRENCH].isna().all(axis=None)
 
 
