@@ -57,6 +57,7 @@ def test_uneven_times_are_resampled_if_asked() -> None:
     """Uniform motion is interpolated exactly; a trajectory may end before the others."""
     given, times = states(), np.tile(0.8 * DT * np.arange(12), (3, 1))
     given[..., :3] *= 0.8
+    given[..., 3:] = np.nan
     times[1, 8:] = np.nan
     with pytest.raises(HistoryError, match=r"history at 0.08 s: 0.08 s since .* expected 0.1 s"):
         History.of_arrays(given, PUCKS, times=times)
@@ -64,7 +65,7 @@ def test_uneven_times_are_resampled_if_asked() -> None:
         history = History.of_arrays(given, PUCKS, times=times, resample=True)
     assert history.dataset["n_rows"].to_numpy().tolist() == [9, 6, 9]
     expected = states(rows=9)
-    expected[1, 6:] = np.nan
+    expected[1, 6:], expected[..., 3:] = np.nan, np.nan
     np.testing.assert_allclose(history.dataset["observed"], expected, atol=1e-9)
 
 
@@ -78,7 +79,7 @@ def test_uneven_times_are_resampled_if_asked() -> None:
         ({"times": -DT * np.arange(12)}, "time goes back by 0.1 s in trajectory 0"),
         ({"times": np.full((3, 12), np.nan)}, "trajectory 0 has no times"),
         ({"labels": ["a", "a", "b"]}, "expected 3 different ones"),
-        ({"states": states() * np.inf}, "expected a finite number"),
+        ({"states": np.full((3, 12, 2, 6), np.inf)}, "expected a finite number"),
         ({"states": states(rows=1)}, "trajectory 0 has 1 step; expected at least 2"),
     ],
 )
