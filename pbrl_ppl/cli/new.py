@@ -6,33 +6,28 @@ import shlex
 import shutil
 import sys
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import jinja2
 import numpy as np
 import typer
 
 from pbrl_ppl.cli import options
 from pbrl_ppl.cli.commands import command
-from pbrl_ppl.cli.scene_text import (
-    HINGE,
-    SHAPES,
-    body_texts,
-    hinge,
-    outline,
-    outlines,
-    scene_text,
-    wall,
-)
 from pbrl_ppl.cli.terminal import check_file, interruptible, print_json
 from pbrl_ppl.errors import HistoryError, OutputError, RecordingWarning, SceneError
 from pbrl_ppl.files import write_text
-from pbrl_ppl.scene import Body, Recording, Scene, Shape, nearest
+from pbrl_ppl.scene import WORLD, Body, Joint, Recording, Scene, Shape, nearest
+from pbrl_ppl.scene import toml as scene_toml
 
 if TYPE_CHECKING:
     import pandas as pd
+
+#: How ``--body`` and a question's answer write an outline.
+SHAPES = "box:0.9x0.55, circle:0.1 or polygon:0,2/-1,-1/1,-1, in m"
 
 
 @dataclass(frozen=True)
@@ -51,12 +46,15 @@ class Recorded:
         How it is laid out; None where it is a history's.
     said : list of str
         What was seen in it.
+    angles : tuple of str
+        Bodies of which angles alone were measured, which must be hinged.
     """
 
     names: tuple[str, ...]
     time_step: float
     layout: Recording | None
     said: list[str]
+    angles: tuple[str, ...]
 
 
 def recorded(
@@ -65,7 +63,6 @@ def recorded(
     given: Sequence[str] = (),
     *,
     time_step: float | None = None,
-    walls: bool = False,
 ) -> Recorded:
     """Read bodies, time step and layout from a recording.
 
@@ -79,8 +76,6 @@ def recorded(
         Names of bodies from options, for a recording that names none.
     time_step : float, optional
         Time between rows (s), for a recording without times.
-    walls : bool
-        Whether walls are declared.
 
     Raises
     ------
@@ -126,8 +121,16 @@ def recorded(
             " correct them, or give --time-step; times since the row before are a column duration"
         )
     step = float(f"{step:.6g}")
-    found, said = propose(table, layout, step, walls=walls)
-    return Recorded(tuple(names), step, None if plain and not said else found, said)
+    found, said = propose(table, layout, step)
+    measured = table.reindex(columns=["x", "y", "theta"]).notna().groupby(table["body"]).any()
+    angles = measured["theta"] & ~measured["x"] & ~measured["y"]
+    hung = tuple(name for name in names if angles.get(name, False))
+    if hung:
+        said.append(
+            f"only the angle of {' and '.join(hung)} was measured: hung by the upper end; correct"
+            " the places of [[joint]]"
+        )
+    return Recorded(tuple(names), step, None if plain and not said else found, said, hung)
 
 
 def _names(frame: pd.DataFrame, columns: Mapping[str, str | float]) -> list[str]:
@@ -155,39 +158,10 @@ def new(
         list[str] | None,
         typer.Option("--body", metavar="NAME=SHAPE", help=f"A body and its outline: {SHAPES}."),
     ] = None,
-    wheels: Annotated[
-        list[str] | None,
-        typer.Option("--wheel", metavar="NAME", help="A body that has a wheel or sticky feet."),
-    ] = None,
-    kinematic: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME", help="A body that follows its recorded path: a finger."),
-    ] = None,
-    known: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME.PARAMETER=VALUE", help="What is given: arm.mass=0.148 (SI)."),
-    ] = None,
-    declare: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME=EFFECT,...", help="Effects that it has: arm=inertia_scale."),
-    ] = None,
-    hinges: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--hinge",
-            metavar="NAME@X,Y[=NAME@X,Y]",
-            help=f"Bodies that a hinge joins, at points in their frames (m): {HINGE}.",
-        ),
-    ] = None,
-    walls: Annotated[
-        list[str] | None,
-        typer.Option("--wall", metavar="X,Y/X,Y", help="An edge between two points (m)."),
-    ] = None,
     side: Annotated[
         bool | None,
         typer.Option("--side/--top", help="Seen from the side (gravity acts in y), or from above."),
     ] = None,
-    gravity: Annotated[float, typer.Option(min=0.0, help="Size of gravity (m/s^2).")] = 9.81,
     time_step: Annotated[
         float | None, typer.Option(min=0.0, help="Time between rows of the history (s).")
     ] = None,
@@ -215,24 +189,21 @@ def new(
 ) -> None:
     """Write a commented scene, from options or from a few questions; or copy a model.
 
-    Asks at a terminal for what the options leave open. All options of bodies, hinges and walls can
-    be repeated. Models to copy: apartment, namo, pendulum and
+    Asks at a terminal for what the options leave open. Joints, walls, wheels and what is known of a
+    body are in the scene as examples to uncomment. Models to copy: apartment, namo, pendulum and
     shopping_cart; recordings that a model has go beside the scene.
     """
-    described = (
-        bodies, wheels, kinematic, known, declare, hinges, walls, time_step, history, columns, units
-    )  # fmt: skip
     with interruptible():
         check_file(scene, (".toml",), overwrite)
-        names, measures = options.columns_of(columns), options.units_of(units)
         layout = Recording(
-            columns=tuple(names.items()),
-            units=tuple(measures.items()),
+            columns=tuple(options.columns_of(columns).items()),
+            units=tuple(options.units_of(units).items()),
             topics=tuple(_topics(topics).items()),
         )
+        described = (bodies, time_step, history, columns, units)
         if model is not None and (side is not None or any(described)):
             raise SceneError("--from copies a model as it is: leave the other options, or --from")
-        if history is None and (names or measures):
+        if history is None and (columns or units):
             raise SceneError("--columns and --units say how a recording is read: add --history")
         found: Recorded | None = None
         try:
@@ -241,23 +212,12 @@ def new(
             else:
                 shapes = outlines(bodies or [])
                 if history is not None:
-                    found = recorded(
-                        history, layout, [*shapes], time_step=time_step, walls=bool(walls)
-                    )
-                answers = _asked(shapes, wheels, kinematic, side, time_step, history, found)
-                texts = body_texts(
-                    answers.shapes, answers.names, wheels=answers.wheels,
-                    kinematic=kinematic or [], known=known or [], effects=declare or [],
-                )  # fmt: skip
-                text = scene_text(
-                    texts, side=answers.side, time_step=answers.time_step,
-                    hinges=[hinge(each, answers.names) for each in hinges or []],
-                    walls=[wall(each) for each in walls or []],
-                    gravity=gravity, recording=found.layout if found else None,
-                    said=found.said if found else (),
-                )  # fmt: skip
+                    found = recorded(history, layout, [*shapes], time_step=time_step)
+                answers = _asked(shapes, side, time_step, history, found)
+                text = scene_text(answers, found)
+                Scene.from_toml(text)  # written whole and valid, or not at all
+                write_text(scene, text)
                 written = [scene]
-                _write(scene, text)
         except typer.Abort:  # Ctrl-C at a question
             raise KeyboardInterrupt from None
     if as_json:
@@ -267,6 +227,8 @@ def new(
             typer.echo(f"wrote {path}")
         for sentence in found.said if found else ():
             typer.echo(f"{history}: {sentence}")
+        if model is None:
+            typer.echo(f"joints, walls, wheels, known masses: uncomment them in {scene}")
         log = history or (written[-1] if len(written) > 1 else None)
         command = ["pbrl-ppl", "check", str(scene), str(log or "history.csv")]
         begin = "next" if log else "next, with your recording"
@@ -316,37 +278,24 @@ def _copied(model: str, scene: Path, overwrite: bool) -> list[Path]:
     return list(copies)
 
 
-def _write(path: Path, text: str) -> None:
-    """Write a scene whole or not at all, if it is valid."""
-    from pbrl_ppl.effects import attach
-
-    attach(Scene.from_toml(text))  # whether declared effects exist too
-    write_text(path, text)
-
-
 @dataclass(frozen=True)
-class _Answers:
+class Answers:
     """Scene settings from options, recording and answers."""
 
-    names: Sequence[str]
-    shapes: Mapping[str, str]
-    wheels: Sequence[str]
+    shapes: Mapping[str, Shape]
     side: bool
     time_step: float
 
 
 def _asked(
-    given: Mapping[str, str],
-    wheels: list[str] | None,
-    kinematic: list[str] | None,
+    given: Mapping[str, Shape],
     side: bool | None,
     time_step: float | None,
     history: Path | None,
     found: Recorded | None,
-) -> _Answers:
+) -> Answers:
     """Return scene settings from options, a recording and answers to questions."""
-    shapes = dict(given)
-    names = list(shapes)
+    names, shapes = [*given], dict(given)
     if found is not None:
         names = list(found.names)
         time_step = found.time_step if time_step is None else time_step
@@ -355,26 +304,86 @@ def _asked(
                 raise SceneError(
                     f"--body: {history} has no rows of {name!r}, only of {', '.join(names)}"
                 )
-    asking = not names or any(name not in shapes for name in names) or time_step is None
-    if asking and not sys.stdin.isatty():
-        lacking = [f"--body {name}={SHAPES}" for name in names or ["NAME"] if name not in shapes]
-        lacking += ["--time-step"] if time_step is None else []
+    lacking = [f"--body {name}={SHAPES}" for name in names or ["NAME"] if name not in shapes]
+    lacking += ["--time-step"] if time_step is None else []
+    if lacking and not sys.stdin.isatty():
         raise SceneError(f"new: there is no terminal to ask at; give {', '.join(lacking)}")
-    if asking and side is None:
+    if lacking and side is None:
         side = typer.prompt("Seen from the top or the side?", default="top") == "side"
     if not names:
         names = [typer.prompt("What is the body that moves called?", default="cart")]
-    rolling = list(wheels or [])
     for name in names:
         while name not in shapes:
             answer = typer.prompt(f"Outline of {name} ({SHAPES})")
             try:
-                shapes |= dict([outline(f"{name}={answer}")])
+                shapes |= outlines([f"{name}={answer}"])
             except SceneError as error:
                 typer.echo(str(error), err=True)
-        free = not side and name not in (kinematic or [])
-        if asking and wheels is None and free and typer.confirm(f"Has {name} a wheel?"):
-            rolling.append(name)
     if time_step is None:
         time_step = typer.prompt("Time between two rows of the recording (s)", type=float)
-    return _Answers(names, shapes, rolling, bool(side), time_step)
+    return Answers({name: shapes[name] for name in names}, bool(side), time_step)
+
+
+def scene_text(answers: Answers, found: Recorded | None = None) -> str:
+    """Return a commented scene as TOML.
+
+    Bodies of which angles alone were measured hang in a chain, each by its upper end.
+
+    Examples
+    --------
+    >>> text = scene_text(Answers(outlines(["cart=box:0.9x0.55"]), side=False, time_step=0.1))
+    >>> Scene.from_toml(text).moving[0].shape
+    Shape(kind='box', size=(0.9, 0.55), radius=None, vertices=None)
+    """
+    joints: list[Joint] = []
+    above, end = WORLD, (0.0, 0.0)
+    for name in found.angles if found else ():
+        *_, low, high = answers.shapes[name].bounds
+        joints.append(Joint("hinge", (name, above), (0.0, high), end))
+        above, end = name, (0.0, low)
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("pbrl_ppl", "cli"), undefined=jinja2.StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
+    )  # fmt: skip
+    return environment.get_template("scene.toml.jinja").render(
+        shapes={name: vars(shape) for name, shape in answers.shapes.items()},
+        side=answers.side, time_step=answers.time_step, joints=joints,
+        recording=found and found.layout, said=found.said if found else (),
+        entry=lambda key, value: scene_toml.write([("", {key: value})]).strip(),
+    )  # fmt: skip
+
+
+def outlines(given: Iterable[str]) -> dict[str, Shape]:
+    """Return shapes by name from ``NAME=box:LENGTHxWIDTH`` and the like.
+
+    Examples
+    --------
+    >>> outlines(["arm=box:0.03x0.2"])["arm"].size
+    (0.03, 0.2)
+    """
+    shapes: dict[str, Shape] = {}
+    for text in given:
+        name, _, outline = text.rpartition("=")
+        kind, _, rest = outline.partition(":")
+        if name in shapes:
+            raise SceneError(f"--body: {name!r} is given twice; leave one out")
+        try:
+            if not name:
+                raise ValueError
+            if kind == "box":
+                width, height = map(float, rest.split("x"))
+                shapes[name] = Shape.box(width, height)
+            elif kind == "circle":
+                shapes[name] = Shape.circle(float(rest))
+            else:
+                corners = [tuple(map(float, corner.split(","))) for corner in rest.split("/")]
+                if kind != "polygon" or {len(corner) for corner in corners} != {2}:
+                    raise ValueError
+                shapes[name] = Shape.polygon((corner[0], corner[1]) for corner in corners)
+        except SceneError:  # of a shape's numbers
+            raise
+        except ValueError:
+            raise SceneError(
+                f"--body: {text!r} is not NAME=SHAPE with a shape such as {SHAPES}"
+            ) from None
+    return shapes

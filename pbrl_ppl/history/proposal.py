@@ -22,7 +22,7 @@ _FEW, _LEAST_ROWS, _MOST_ROWS = 4, 30, 200
 
 
 def propose(
-    frame: pd.DataFrame, layout: Recording, time_step: float, *, walls: bool
+    frame: pd.DataFrame, layout: Recording, time_step: float
 ) -> tuple[Recording, list[str]]:
     """Return a layout with what a recording's rows show, and a sentence on each.
 
@@ -34,8 +34,6 @@ def propose(
         What is known; its entries are kept.
     time_step : float
         Median time between rows (s).
-    walls : bool
-        Whether walls are declared, which explain jumps of the velocity.
     """
     said = []
     times = pd.to_numeric(frame["time"], errors="coerce").to_numpy(float)
@@ -60,7 +58,7 @@ def propose(
         cut["gaps"] = float(f"{LONGEST * time_step:.6g}")
         said.append(f"nothing was seen for up to {longest:.3g} s: cut at gaps")
     pushed = frame[[name for name in WRENCH if name in frame]].apply(pd.to_numeric, errors="coerce")
-    if places and not walls and not pushed.fillna(0.0).to_numpy().any():
+    if places and not pushed.fillna(0.0).to_numpy().any():
         least = _jump([(times[rows], states[rows]) for rows in groups])
         if least:
             cut["jumps"] = least

@@ -21,7 +21,6 @@ from pbrl_ppl import criticism, sampling
 from pbrl_ppl.cli import main
 from pbrl_ppl.cli.app import _options_of, app
 from pbrl_ppl.cli.commands import commands
-from pbrl_ppl.cli.scene_text import _HEAD
 from pbrl_ppl.cli.terminal import warnings_in_a_line
 from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, FitError
 from pbrl_ppl.history import History
@@ -264,13 +263,13 @@ def test_new_says_what_it_needs(capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.mark.usefixtures("puck")
 def test_new_asks(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    answers = iter(["top", "box", "box:0.4x0.2", 0.02])
+    answers = iter(["side", "box", "box:0.4", "box:0.4x0.2", 0.02])
     monkeypatch.setattr("sys.stdin.isatty", lambda: True)
     monkeypatch.setattr(typer, "prompt", lambda *args, **options: next(answers))
-    monkeypatch.setattr(typer, "confirm", lambda *args: True)
     assert main(["new", "a.toml", "--quiet"]) == 0
-    (body,) = Scene.load("a.toml").moving
-    assert (body.name, body.wheel) == ("box", True)
+    scene = Scene.load("a.toml")
+    assert scene.moving[0].shape.size == (0.4, 0.2)
+    assert (scene.moving[0].name, scene.gravity[1], scene.time_step) == ("box", -9.81, 0.02)
     monkeypatch.setattr(
         typer, "prompt", lambda *args, **options: (_ for _ in ()).throw(typer.Abort)
     )
@@ -281,11 +280,12 @@ def test_new_asks(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 def test_table_1_is_told_as_it_is() -> None:
     """In the docs and in new scenes."""
     priors = table1(Body("cart", Shape.box(1.0, 0.6)))
+    new_scene = (ROOT / "pbrl_ppl" / "cli" / "scene.toml.jinja").read_text()
     page = (ROOT / "analysis" / "docs" / "pages" / "reference" / "formats.md").read_text()
     for name in ("mass", "r", "mu_c"):
         own = priors[name]
         row = next(line for line in page.splitlines() if line.startswith(f"| `{name}`"))
-        line = next(each for each in _HEAD.splitlines() if each.startswith(f"#   {name} "))
+        line = next(each for each in new_scene.splitlines() if each.startswith(f"#   {name} "))
         for text in (row, line):
             assert f"mu = {own.mu}" in text and f"sigma = {own.sigma}" in text
         assert ("logarithm" in row.lower()) == (own.family == "log_normal")

@@ -50,6 +50,7 @@ def named(folder: str) -> tuple[str, set[str]]:
 def test_angles_between_blanks_in_one_take() -> None:
     raw_logs.angles(Path("pole.txt"))
     assert run(f"new --history pole.txt --columns time=0,theta=1 {raw_logs.POLE}") == 0
+    raw_logs.weighed(Path("scene.toml"), 0.2)
     scene = Scene.load("scene.toml")
     assert scene.time_step == 0.05 and dict(scene.recording.cut) == {"every": 1.7}
     assert run("check scene.toml pole.txt -q") == 0
@@ -66,6 +67,7 @@ def test_an_encoder_with_a_computed_velocity(capsys: pytest.CaptureFixture[str])
     raw_logs.encoder(Path("encoder.csv"))
     columns = "--columns time=t,theta=angle,omega=speed"
     assert run(f"new --history encoder.csv {columns} {raw_logs.POLE}") == 0
+    raw_logs.weighed(Path("scene.toml"), 0.2)
     capsys.readouterr()
     assert run("check scene.toml encoder.csv -q") == 0
     assert "omega of pole was computed from theta" in capsys.readouterr().out

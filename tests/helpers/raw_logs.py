@@ -6,10 +6,17 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 #: A uniform pole of 0.6 m (g / (2/3 length) is what swings), its damping and friction over inertia.
-POLE = "--side --body pole=box:0.02x0.6 --hinge pole@0,0.3 --known pole.mass=0.2"
+POLE = "--side --body pole=box:0.02x0.6"
 LENGTH, DAMPING, FRICTION = 0.6, 0.25, 0.6
 #: Drag over mass of the puck (1/s), and noise of the camera (m).
 DRAG, NOISE = 0.25, 0.001
+
+
+def weighed(scene: Path, mass: float) -> None:
+    """Declare the mass of a new scene's body: uncomment the line that has it as an example."""
+    text = scene.read_text()
+    assert "# known = { mass = 6.0 }" in text
+    scene.write_text(text.replace("# known = { mass = 6.0 }", f"known = {{ mass = {mass} }}"))
 
 
 def swing(seconds: float, dt: float, *, angle: float = 2.3) -> tuple[np.ndarray, np.ndarray]:
