@@ -33,6 +33,7 @@ from .results import ONE_TRAJECTORY as ONE_TRAJECTORY
 from .results import Added as Added
 from .results import Candidate as Candidate
 from .results import Errors as Errors
+from .results import Stage as Stage
 from .results import Unexplained as Unexplained
 from .results import diverged_after as diverged_after
 from .rivals import Rival as Rival
@@ -44,4 +45,3 @@ from .score import inseparable as inseparable
 from .score import rank_candidates as rank_candidates
 from .score import twins as twins
 from .simulated import Law as Law
-from .stages import Stage as Stage

@@ -5,19 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from threadpoolctl import threadpool_limits
-
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.ranking import checked_mode
-from pbrl_ppl.criticism.results import ONE_TRAJECTORY
+from pbrl_ppl.criticism.results import ONE_TRAJECTORY, Stage
 from pbrl_ppl.criticism.simulated import Law, SimulatedSearch
-from pbrl_ppl.criticism.stages import Stage
 from pbrl_ppl.effects import Attached, Effect, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import output_error
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.scene import Scene
+from pbrl_ppl.threads import one_blas_thread
 
 
 @dataclass(frozen=True)
@@ -57,6 +55,7 @@ class Attribution:
         return said
 
 
+@one_blas_thread
 def attribute(
     scene: Scene,
     history: History,
@@ -112,15 +111,13 @@ def attribute(
         [law.effect for law in found.laws]  # ['linear_drag', 'sliding_friction']
     """
     say, catalogue = progress or (lambda stage: None), tuple(catalogue)
-    # matrices are small: threads of linear algebra only get in each other's way
-    with threadpool_limits(1, "blas"):
-        mode = checked_mode(scene, history, catalogue, seed, substeps, criteria, say)
-        say(Stage.SIMULATE)
+    mode = checked_mode(scene, history, catalogue, seed, substeps, criteria, say)
+    say(Stage.SIMULATE)
 
-        def missing(now: Mode) -> tuple[Attached, ...]:
-            return candidates(mode.problem.scene, now.problem.physics.effects, catalogue)
+    def missing(now: Mode) -> tuple[Attached, ...]:
+        return candidates(mode.problem.scene, now.problem.physics.effects, catalogue)
 
-        found = SimulatedSearch(missing, criteria, say)(mode)
+    found = SimulatedSearch(missing, criteria, say)(mode)
     before, after = found.declared, found.after
     problem = after.problem
     names, likelihood = problem.observations.names, output_error(problem)

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from pbrl_ppl.background import background
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
@@ -34,13 +33,13 @@ from pbrl_ppl.criticism.results import (
     Estimate,
     Numerical,
     ResidualTest,
+    Stage,
     Unexplained,
 )
 from pbrl_ppl.criticism.rivals import keep_groups
 from pbrl_ppl.criticism.score import Signature, named_beside
 from pbrl_ppl.criticism.selection import Selection, Step
 from pbrl_ppl.criticism.simulated import Simulated, SimulatedSearch
-from pbrl_ppl.criticism.stages import Stage
 from pbrl_ppl.criticism.unexplained import (
     UnexplainedAcceleration,
     measurement_noise,
@@ -64,14 +63,15 @@ from pbrl_ppl.posterior import MAX_PARETO_K, PARETO_K, Fit, compare, identify, i
 from pbrl_ppl.posterior import draws as posterior_draws
 from pbrl_ppl.sampling import sample
 from pbrl_ppl.scene import Scene
+from pbrl_ppl.threads import one_blas_thread
 
-#: Draws of each chain, then those where that is not enough; those of other methods; least tuning.
-CHAIN_DRAWS, LEAST_TUNE = (300, 1000), 100
-DRAWS = {"importance": (180, 600), "laplace": (125,)}
-#: Draws from the prior, some of which must reach the measurements.
-PRIOR_DRAWS = 100
+#: Draws of each chain by method, then those where that is not enough.
+_DRAWS = {"importance": (180, 600), "laplace": (125,)}
+#: The same of all other methods.
+_CHAIN_DRAWS = (300, 1000)
 
 
+@one_blas_thread
 def close_loop(
     scene: Scene,
     train: History,
@@ -149,9 +149,7 @@ def close_loop(
     else:  # an effect from some trajectory on still acts in a later test
         after = float(train.dataset["number"].max()) + 1.0
         numbered = test.numbered(after) if scene.test_is_later else test
-    # matrices are small: threads of linear algebra only get in each other's way
-    with threadpool_limits(1, "blas"):
-        return _closed(task, train, numbered, test)
+    return _closed(task, train, numbered, test)
 
 
 class LoopInterrupted(KeyboardInterrupt):
@@ -347,7 +345,7 @@ def _prior_test(
     horizon = telling_horizon(train, task.criteria.prior)
     problem = Problem.of(Physics(task.scene, effects, threads=2), train, horizon=horizon)
     checked = prior_predictive_check(
-        problem, draws=PRIOR_DRAWS, seed=task.seed, held=held, criteria=task.criteria.prior
+        problem, draws=100, seed=task.seed, held=held, criteria=task.criteria.prior
     )
     share = float(checked.dataset["share_beyond"].max())
     sentence, *more = checked.summary
@@ -383,8 +381,8 @@ def _fit(task: _Task, mode: Mode) -> tuple[Fit, list[Warning], list[str]]:
     # one thread a chain: more would wait for each other
     mode = replace(mode, problem=mode.problem.with_physics(threads=1))
     method, said = task.method, []
-    for n in DRAWS.get(method, CHAIN_DRAWS) if task.draws is None else (task.draws,):
-        tune = max(LEAST_TUNE, 5 * n // 8)
+    for n in _DRAWS.get(method, _CHAIN_DRAWS) if task.draws is None else (task.draws,):
+        tune = max(100, 5 * n // 8)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             fitted = sample(

@@ -15,12 +15,6 @@ from pbrl_ppl.modes import Mode, profile_sigma
 from pbrl_ppl.parameters import box, differentiate, inside, prior_residual, prior_slopes
 from pbrl_ppl.state import Bools, Floats, Ints
 
-#: A step that a bound shortens by more than this (standard deviations) is stopped by it.
-_ROUNDING = 1e-6
-#: Steps of derivatives are a posterior standard deviation where that is less than this share of the
-#: prior's; those by whitened residuals are short.
-_INFORMED, _NEAR = 0.7, 1e-4
-
 
 @dataclass(frozen=True, eq=False)
 class LeftOut:
@@ -228,29 +222,31 @@ def _linearised(
     slopes = _residual_slopes(mode, scale)
     nothing = np.zeros_like(noise.begin)
     still = replace(noise, begin=nothing, measured=nothing)
+    step = 1e-4  # of a whitened residual
 
     def without(own: Bools) -> tuple[Floats, Floats, Floats]:
         hidden = replace(noise, seen=noise.seen & ~own[:, None], sigma=mode.sigma)
         sigma = profile_sigma(problem.along(hidden), residual, phi)
         z = noise.whiten(residual, sigma)
         white = still.filtered(slopes, sigma)[0]
-        weight = (robust(z + _NEAR, nu) - robust(z - _NEAR, nu)) / (2 * _NEAR)
+        weight = (robust(z + step, nu) - robust(z - step, nu)) / (2 * step)
         return sigma, robust(z, nu), np.moveaxis(white * weight, 0, -1)
 
     return without
 
 
-def _residual_slopes(mode: Mode, scale: Floats) -> Floats:
+def _residual_slopes(mode: Mode, scale: Floats, informed_share: float = 0.7) -> Floats:
     """Return the derivative of residuals by parameters in units of ``scale``.
 
-    Shape (p, transition, cell).
+    Shape (p, transition, coordinate). Steps are a posterior standard deviation where that is less
+    than ``informed_share`` of the prior's.
     """
     problem, priors = mode.problem, mode.problem.layout.priors
     coordinates = problem.trajectory_noise.coordinates
     if not priors:
         return np.zeros((0, problem.segments.n, len(coordinates.places)))
     lower, upper = box(priors)
-    informed = scale * np.abs(prior_slopes(priors, mode.phi)) < _INFORMED
+    informed = scale * np.abs(prior_slopes(priors, mode.phi)) < informed_share
 
     def residual(points: Floats) -> Floats:
         return np.nan_to_num(coordinates.of_residual(problem.residual(points)))
@@ -274,7 +270,7 @@ def _to_top(mode: Mode, precision: Floats, gradient: Floats, scale: Floats) -> t
         wanted[free] -= np.linalg.solve(precision[free][:, free], slope)
         top = inside(mode.problem.layout.priors, mode.phi + scale * wanted)
         move = (top - mode.phi) / scale
-        stopped = free & (np.abs(move - wanted) > _ROUNDING)
+        stopped = free & (np.abs(move - wanted) > 1e-6)  # by a bound, and not by rounding
         if not stopped.any():
             break
         free &= ~stopped

@@ -17,12 +17,8 @@ from pbrl_ppl.state import STATE, Floats, Ints
 
 #: Name of the test.
 DEPENDENCE = "dependence on state, command and time"
-#: Permutations a body: the smallest p-value is a fifth of the significance.
-_PERMUTATIONS = 500
-_FOLDS = 5
+#: Ridge of the regression, over the kernel's variance of each term.
 _RIDGE = 1.0
-#: Transitions of the test, at most: more take long and change nothing.
-_MOST = 1500
 #: Recorded quantities that a residual may depend on, with their units.
 FEATURES = {
     "position x": "m",
@@ -67,7 +63,12 @@ QUANTITIES = FEATURES | {name: f"{FEATURES[a]} {FEATURES[b]}" for name, (a, b) i
 
 
 def find_dependence(
-    mode: Mode, criteria: Criteria, *, seed: int = 0
+    mode: Mode,
+    criteria: Criteria,
+    *,
+    seed: int = 0,
+    permutations_a_body: int = 500,
+    most_transitions: int = 1500,
 ) -> tuple[ResidualTest, Unexplained | None]:
     """Test whether the innovations of a fitted model depend on state, action or time.
 
@@ -83,6 +84,10 @@ def find_dependence(
         Thresholds of significant and of negligible.
     seed : int
         Seed of the permutations and the folds.
+    permutations_a_body : int
+        By default the smallest p-value is a fifth of the significance.
+    most_transitions : int
+        Transitions of the test, at most: more take long and change nothing.
 
     Returns
     -------
@@ -97,8 +102,8 @@ def find_dependence(
     if n < limits.least_transitions:
         return ResidualTest.untested(DEPENDENCE, "too few transitions"), None
     tests = len(problem.scene.dynamic)
-    permutations = _PERMUTATIONS * tests - 1
-    chosen = np.sort(rng.permutation(n)[:_MOST])
+    permutations = permutations_a_body * tests - 1
+    chosen = np.sort(rng.permutation(n)[:most_transitions])
     places = mode.problem.trajectory_noise.coordinates.places
     innovations = mode.whitened_residual[chosen]
     groups = folds(mode, criteria)[chosen]
@@ -187,11 +192,13 @@ def _summed(features: Floats) -> Floats:
     return kernel
 
 
-def _cross_validated(kernel: Floats, groups: Ints, rng: np.random.Generator) -> Floats:
+def _cross_validated(
+    kernel: Floats, groups: Ints, rng: np.random.Generator, folds: int = 5
+) -> Floats:
     """Return the matrix that predicts each transition from those of other groups."""
     smoother = np.zeros_like(kernel)
     names = rng.permutation(np.unique(groups))
-    for held in np.array_split(names, min(_FOLDS, len(names))):
+    for held in np.array_split(names, min(folds, len(names))):
         out = np.isin(groups, held)
         inner = kernel[np.ix_(~out, ~out)] + _RIDGE * np.eye(int((~out).sum()))
         smoother[np.ix_(out, ~out)] = np.linalg.solve(inner, kernel[np.ix_(~out, out)]).T

@@ -18,17 +18,13 @@ from pbrl_ppl.posterior import Fit
 from pbrl_ppl.scene import Scene, motion_time, state_sizes
 from pbrl_ppl.state import STATE, STATE_UNITS, Floats
 
-#: Length of the forecasts in the error table, in motion times, if trajectories are as long.
-ROLLOUT_TIMES = 4.0
-_DRAWS = 100
 
-
-def rollout_horizon(history: History, scene: Scene) -> int:
+def rollout_horizon(history: History, scene: Scene, motion_times: float = 4.0) -> int:
     """Return the intervals of a recording's forecasts: some motion times, or a whole trajectory.
 
     More where bodies are seen less often.
     """
-    intervals = math.ceil(ROLLOUT_TIMES * motion_time(scene) / scene.time_step)
+    intervals = math.ceil(motion_times * motion_time(scene) / scene.time_step)
     return longest_rollout(history, max(longest_gap(history), intervals))
 
 
@@ -89,7 +85,15 @@ class HeldOut:
             if seen[:, dimension == d].any()
         }
 
-    def errors(self, unit: HeldOut, fit: Fit, rollout: int, seed: int, noise: Floats) -> Errors:
+    def errors(
+        self,
+        unit: HeldOut,
+        fit: Fit,
+        rollout: int,
+        seed: int,
+        noise: Floats,
+        most_draws: int = 100,
+    ) -> Errors:
         """Return the model's errors.
 
         Parameters
@@ -105,13 +109,15 @@ class HeldOut:
         noise : ndarray
             Noise parameters of ``unit`` without any unexplained acceleration, shape (parameter,):
             the unit of the normalised error.
+        most_draws : int
+            Posterior draws of the predictive density, at most.
         """
         mode, own = self.mode, unit.problem.trajectory_noise
         seen = own.seen
         whitened = self.whitened(unit) * own.scale(unit.mode.sigma) / own.scale(noise)
         phi, sigma = fit.draws
         rng = np.random.default_rng(seed)
-        chosen = rng.choice(len(phi), min(_DRAWS, len(phi)), replace=False)
+        chosen = rng.choice(len(phi), min(most_draws, len(phi)), replace=False)
         phi, sigma = phi[chosen], sigma[chosen]
         residual = self.problem.residual(phi, self.problem.one_world)
         density = self.problem.log_density(residual, sigma, phi)

@@ -24,8 +24,6 @@ HELD_OUT = "held-out forecasts"
 NOTHING_RECORDED = "nothing that was recorded"
 #: Shares of the bodies' acceleration from here on are of bodies that hardly accelerate.
 LARGEST_SHARE = 0.995
-#: Lengths of forecasts that a picture shows, at most.
-_LENGTHS = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,13 +179,16 @@ def held_out_forecasts(mode: Mode, sigma: Floats, horizon: int, criteria: Criter
 
 
 def _forecasts(
-    mode: Mode, sigma: Floats, horizon: int, criteria: Criteria
+    mode: Mode, sigma: Floats, horizon: int, criteria: Criteria, most_lengths: int = 6
 ) -> tuple[ResidualTest, Growth]:
-    """Return the test of forecasts' errors against those of noise and a negligible acceleration."""
+    """Return the test of forecasts' errors against those of noise and a negligible acceleration.
+
+    A picture shows their growth over at most ``most_lengths`` lengths.
+    """
     noise = mode.problem.trajectory_noise
     lengths = np.diff(np.append(np.flatnonzero(noise.first), len(noise.first)))
     longest = min(horizon, int(lengths.max()))
-    steps = np.unique(np.geomspace(1, longest, min(longest, _LENGTHS)).round().astype(int))
+    steps = np.unique(np.geomspace(1, longest, min(longest, most_lengths)).round().astype(int))
     every = [forecast(mode.problem, mode.phi, sigma, int(n)) for n in steps]
     allowed = criteria.negligible * bodies_acceleration(mode.problem)
     last = forecast(mode.problem, mode.phi, sigma, longest, allowed=allowed)

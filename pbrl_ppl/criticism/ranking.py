@@ -5,14 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from threadpoolctl import threadpool_limits
-
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.recordings import checked_histories
 from pbrl_ppl.criticism.refinement import with_enough_substeps
-from pbrl_ppl.criticism.results import Candidate
+from pbrl_ppl.criticism.results import Candidate, Stage
 from pbrl_ppl.criticism.score import rank_candidates
-from pbrl_ppl.criticism.stages import Stage
 from pbrl_ppl.criticism.unexplained import unexplained_acceleration
 from pbrl_ppl.effects import Attached, Effect, attach, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
@@ -21,6 +18,7 @@ from pbrl_ppl.likelihood import Problem, single_transitions
 from pbrl_ppl.modes import Mode, find_mode, trajectory_mode
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Scene
+from pbrl_ppl.threads import one_blas_thread
 
 
 @dataclass(frozen=True)
@@ -45,6 +43,7 @@ class Ranking:
     substeps: int
 
 
+@one_blas_thread
 def criticise(
     scene: Scene,
     history: History,
@@ -91,13 +90,11 @@ def criticise(
     """
     say = progress or (lambda stage: None)
     catalogue = tuple(catalogue)
-    # matrices are small: threads of linear algebra only get in each other's way
-    with threadpool_limits(1, "blas"):
-        mode = checked_mode(scene, history, catalogue, seed, substeps, criteria, say)
-        scene, effects = mode.problem.scene, mode.problem.physics.effects
-        say(Stage.SCORE)
-        ranked = rank_candidates(mode, candidates(scene, effects, catalogue), criteria)
-        excess = unexplained_acceleration(mode, criteria)
+    mode = checked_mode(scene, history, catalogue, seed, substeps, criteria, say)
+    scene, effects = mode.problem.scene, mode.problem.physics.effects
+    say(Stage.SCORE)
+    ranked = rank_candidates(mode, candidates(scene, effects, catalogue), criteria)
+    excess = unexplained_acceleration(mode, criteria)
     return Ranking(
         tuple(signature.candidate for signature in ranked),
         dict(zip(mode.problem.layout.labels, mode.phi.tolist(), strict=True)),

@@ -1,4 +1,4 @@
-"""Refinement of a fitted mode: enough engine substeps, and correlated measurement errors."""
+"""Refits of a mode: with other effects, substeps or noise, or a structure that bodies hit."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
+from scipy.optimize import minimize
 
 from pbrl_ppl.criticism.correlation import correlation_tests
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
@@ -15,9 +16,6 @@ from pbrl_ppl.likelihood import Problem, noise_medians, ranges
 from pbrl_ppl.modes import Mode, nearby_mode, profile_sigma, trajectory_evidence, trajectory_mode
 from pbrl_ppl.parameters import inside
 from pbrl_ppl.state import Floats
-
-#: Correlations from row to row that are tried: errors that last two, five and twenty rows.
-_MEMORIES = (0.5, 0.8, 0.95)
 
 
 def with_effects(
@@ -40,7 +38,7 @@ def with_effects(
     layout = problem.layout
     phi = layout.from_layout(mode.problem.layout, mode.phi)
     for attached, sizes in (values or {}).items():
-        phi[[layout.labels.index(label) for label in attached.labels]] = sizes
+        phi[layout.places(attached.labels)] = sizes
     return problem, inside(layout.priors, phi)
 
 
@@ -104,7 +102,12 @@ def shift(mode: Mode, substeps: int | None = None) -> float:
     return float(np.sqrt(np.nanmean(change**2, axis=0).max()))
 
 
-def with_correlated_errors(mode: Mode, criteria: Criteria = DEFAULT) -> Mode | None:
+def with_correlated_errors(
+    mode: Mode,
+    criteria: Criteria = DEFAULT,
+    *,
+    memories: tuple[float, ...] = (0.5, 0.8, 0.95),
+) -> Mode | None:
     """Return a mode with correlated measurement errors, if those explain the data better.
 
     A tracker's errors last from frame to frame, which an unexplained acceleration fits as well.
@@ -117,6 +120,8 @@ def with_correlated_errors(mode: Mode, criteria: Criteria = DEFAULT) -> Mode | N
         Fitted to whole trajectories, without correlated errors.
     criteria : Criteria
         How much evidence is needed, and what is negligible.
+    memories : tuple of float
+        Correlations from row to row that are tried: errors that last two, five and twenty rows.
 
     Returns
     -------
@@ -131,7 +136,7 @@ def with_correlated_errors(mode: Mode, criteria: Criteria = DEFAULT) -> Mode | N
             return None
     residual = mode.problem.residual(mode.phi)
     tried = []
-    for memory in _MEMORIES:
+    for memory in memories:
         problem = _with_correlation(mode, memory)
         sigma = profile_sigma(problem, residual, mode.phi)
         density = problem.log_density(residual, sigma, mode.phi).sum()
@@ -170,3 +175,131 @@ def _with_correlation(mode: Mode, memory: float) -> Problem:
     sigma = np.concatenate([mode.sigma, mode.sigma[: len(medians)]])
     prior = (*problem.noise_prior[0].tolist(), *medians.tolist()), problem.noise_prior[1]
     return problem.along(replace(noise, coordinates=coordinates, sigma=sigma), prior=prior)
+
+
+def structure_mode(
+    mode: Mode,
+    candidate: Attached,
+    estimate: Floats,
+    *,
+    least_substeps: int = 40,
+    noise_share: float = 0.3,
+    most_places: int = 4,
+    rounds: int = 3,
+    least_gain: float = 2.0,
+) -> Mode:
+    """Fit a model with a structure that bodies collide with.
+
+    Derivatives across a collision mislead an optimiser, and the noise that fits without the
+    structure hides which collisions a place explains. So guesses of the place are improved first,
+    by Nelder and Mead's simplex under Student's loss with little noise; the best are fitted with
+    all parameters, place and fit in turn.
+
+    Parameters
+    ----------
+    mode : Mode
+        Of the model that lacks the structure, fitted to whole trajectories.
+    candidate : Attached
+        The effect; its scan makes the guesses.
+    estimate : ndarray
+        A further guess, shape (q,).
+    least_substeps : int
+        A body stops within a step of where it touches: with fewer steps places come out far off.
+    noise_share : float
+        Process noise as a share of its prior's median: more than the engine's error at contact.
+    most_places : int
+        Places from which the other parameters and the noise are fitted.
+    rounds : int
+        Further rounds of place and fit, at most.
+    least_gain : float
+        A round that gains less (nats) is the last.
+
+    Returns
+    -------
+    Mode
+        With at least ``least_substeps`` an interval.
+    """
+    physics = mode.problem.physics
+    substeps = max(least_substeps, physics.substeps)
+    # where bodies touch, extrapolation gains nothing
+    problem = mode.problem.with_physics(
+        effects=(*physics.effects, candidate), substeps=least_substeps, extrapolate=False
+    )
+    layout = problem.layout
+    phi = layout.from_layout(mode.problem.layout, mode.phi)
+    own = layout.places(candidate.labels)
+    guesses = estimate[None]
+    if candidate.effect.scan is not None:
+        body = problem.scene.body(candidate.body)
+        points = candidate.effect.scan(problem.scene, problem.data.history, body)
+        guesses = np.vstack([guesses, points[np.isfinite(points).all(axis=1)]])
+
+    def fitted(problem: Problem, phi: Floats, place: Floats, sigma: Floats) -> Mode:
+        start = phi.copy()
+        start[own] = place
+        return trajectory_mode(problem, inside(layout.priors, start), sigma)
+
+    places = _places(problem, phi, problem.quiet(mode.sigma, noise_share), own, guesses)
+    fits = [fitted(problem, phi, place, mode.sigma) for place in places[:most_places]]
+    best = max(fits, key=lambda found: found.log_posterior)
+    for _ in range(rounds):
+        quiet = best.problem.quiet(best.sigma, noise_share)
+        place, *_ = _places(best.problem, best.phi, quiet, own, best.phi[own][None])
+        again = fitted(best.problem, best.phi, place, best.sigma)
+        if again.log_posterior < best.log_posterior + least_gain:
+            break
+        best = again
+    exact = best.problem.with_physics(substeps=substeps, extrapolate=physics.extrapolate)
+    return nearby_mode(exact, best.phi, best.sigma)
+
+
+def _places(
+    problem: Problem,
+    phi: Floats,
+    sigma: Floats,
+    own: list[int],
+    guesses: Floats,
+    *,
+    nu: float = 4.0,
+    most_guesses: int = 6,
+    most_runs: int = 200,
+    first_side: float = 0.05,
+    last_side: float = 4e-3,
+    least_difference: float = 1.0,
+) -> list[Floats]:
+    """Improve guesses of some parameters, the others held; return distinct ones, best first.
+
+    ``nu`` are the degrees of freedom of the loss, under which a transition that a guess does not
+    explain pulls little. ``most_guesses`` are improved, by ``most_runs`` of the engine each. The
+    first simplex has sides of ``first_side`` of the prior's scale, the last ``last_side`` of those.
+    Places whose losses differ by less than ``least_difference`` are the same.
+    """
+    lower, upper = (bound[own] for bound in problem.layout.bounds)
+
+    def loss(values: Floats) -> float:
+        if np.any(values <= lower) or np.any(values >= upper):
+            return np.inf
+        here = phi.copy()
+        here[own] = values
+        whitened = np.nan_to_num(problem.whitened(here, sigma)).reshape(problem.segments.n, -1)
+        square = (whitened**2).sum(axis=1)
+        return float(0.5 * (nu + whitened.shape[1]) * np.log1p(square / nu).sum())
+
+    losses = [loss(guess) for guess in guesses]
+    side = first_side * min(problem.layout.priors[place].scale for place in own)
+    found: list[tuple[float, Floats]] = []
+    for i in np.argsort(losses)[:most_guesses]:
+        best = minimize(
+            lambda values: loss(side * values),
+            guesses[i] / side,
+            method="Nelder-Mead",
+            options={
+                "maxfev": most_runs,
+                "initial_simplex": guesses[i] / side + np.eye(len(own) + 1, len(own), -1),
+                "xatol": last_side,
+                "fatol": 0.1,
+            },
+        )
+        if all(abs(best.fun - value) > least_difference for value, _ in found):
+            found.append((float(best.fun), side * best.x))
+    return [place for _, place in sorted(found, key=lambda entry: entry[0])]

@@ -10,13 +10,12 @@ from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
-from threadpoolctl import threadpool_limits
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.cross_validation import gain
 from pbrl_ppl.criticism.refinement import with_effects
+from pbrl_ppl.criticism.results import Stage
 from pbrl_ppl.criticism.rivals import posterior_mode
-from pbrl_ppl.criticism.stages import Stage
 from pbrl_ppl.criticism.unexplained import unexplained_acceleration
 from pbrl_ppl.effects import LEARNED_REMAINDER, Effect, LearnedRemainder, learned_remainder
 from pbrl_ppl.effects import catalogue as full_catalogue
@@ -28,18 +27,7 @@ from pbrl_ppl.posterior import draws as posterior_draws
 from pbrl_ppl.sampling import sample
 from pbrl_ppl.scene import state_sizes
 from pbrl_ppl.state import STATE, Floats
-
-#: Transitions that the process is fitted to, at most.
-_MOST = 400
-#: Length scales, as shares of the range of recorded speeds; a longer one is a constant.
-_SHORTEST, _LONGEST = 0.15, 10.0
-#: How far beyond that range the process extends, as a share of it; there it returns to zero.
-_BEYOND = 0.3
-#: Kernel centres of each force; the share of its variance that eigenvectors keep, and how many at
-#: most.
-_BUMPS, _SHARE, _FORMS = 48, 0.9995, 24
-#: Draws of each chain; they are independent.
-DRAWS = 250
+from pbrl_ppl.threads import one_blas_thread
 
 
 def check_scikit_learn() -> None:
@@ -57,13 +45,14 @@ def check_scikit_learn() -> None:
         )
 
 
+@one_blas_thread
 def learn_remainder(
     posterior: Any,
     body: str,
     *,
     catalogue: Iterable[Effect] = full_catalogue,
     seed: int = 0,
-    draws: int = DRAWS,
+    draws: int = 250,
     criteria: Criteria = DEFAULT,
     progress: Callable[[str], None] | None = None,
 ) -> Any:
@@ -112,26 +101,25 @@ def learn_remainder(
     """
     check_scikit_learn()
     say = progress or (lambda stage: None)
-    with threadpool_limits(1, "blas"):
-        mode = posterior_mode(Fit.of(posterior, catalogue))
-        present = [attached.effect.name for attached in mode.problem.physics.effects]
-        if LEARNED_REMAINDER in present:
-            raise FitError("posterior: it has a learned remainder already; take one without")
-        say(Stage.LEARN)
-        effect = _learned(mode, body, seed, criteria)
-        say(Stage.REFIT)
-        attached = effect.on(body)
-        start = with_effects(mode, (*mode.problem.physics.effects, attached), {attached: 0.0})
-        refitted = trajectory_mode(*start, mode.sigma)
-        gained = gain(mode, refitted, criteria)
-        if gained.total < criteria.min_elpd or not gained.certain(criteria.min_elpd_se):
-            raise FitError(
-                f"nothing to learn: a force on {body} that follows its velocity does not help on"
-                " trajectories that were left out"
-            )
-        problem = refitted.problem.with_physics(threads=1)
-        fit = sample(problem, method="laplace", seed=seed, draws=draws, start=refitted)
-        return fit.posterior
+    mode = posterior_mode(Fit.of(posterior, catalogue))
+    present = [attached.effect.name for attached in mode.problem.physics.effects]
+    if LEARNED_REMAINDER in present:
+        raise FitError("posterior: it has a learned remainder already; take one without")
+    say(Stage.LEARN)
+    effect = _learned(mode, body, seed, criteria)
+    say(Stage.REFIT)
+    attached = effect.on(body)
+    start = with_effects(mode, (*mode.problem.physics.effects, attached), {attached: 0.0})
+    refitted = trajectory_mode(*start, mode.sigma)
+    gained = gain(mode, refitted, criteria)
+    if gained.total < criteria.min_elpd or not gained.certain(criteria.min_elpd_se):
+        raise FitError(
+            f"nothing to learn: a force on {body} that follows its velocity does not help on"
+            " trajectories that were left out"
+        )
+    problem = refitted.problem.with_physics(threads=1)
+    fit = sample(problem, method="laplace", seed=seed, draws=draws, start=refitted)
+    return fit.posterior
 
 
 def remainder_in_words(before: Any, after: Any) -> str:
@@ -147,11 +135,27 @@ def remainder_in_words(before: Any, after: Any) -> str:
     )
 
 
-def _learned(mode: Mode, body: str, seed: int, criteria: Criteria) -> LearnedRemainder:
-    """Return the effect with the eigenvectors of each significant force's process."""
+def _learned(
+    mode: Mode,
+    body: str,
+    seed: int,
+    criteria: Criteria,
+    *,
+    most_transitions: int = 400,
+    margin: float = 0.3,
+    centres: int = 48,
+    variance_share: float = 0.9995,
+    most_forms: int = 24,
+) -> LearnedRemainder:
+    """Return the effect with the eigenvectors of each significant force's process.
+
+    The process extends by ``margin`` of the recorded range of speeds beyond it; there it returns to
+    zero. Of ``centres`` kernels of each force the eigenvectors with ``variance_share`` of the
+    variance are kept, at most ``most_forms``.
+    """
     x, forces = residual_forces(mode, body)
     rng = np.random.default_rng(seed)
-    chosen = np.sort(rng.permutation(len(x))[:_MOST])
+    chosen = np.sort(rng.permutation(len(x))[:most_transitions])
     low, high = x.min(axis=0), x.max(axis=0)
     size = np.maximum(high - low, 1e-9 * state_sizes(mode.problem.scene)[3:])
     table: dict[str, list[Any]] = {"centre": [], "width": [], "output": []}
@@ -165,16 +169,16 @@ def _learned(mode: Mode, body: str, seed: int, criteria: Criteria) -> LearnedRem
         if found is None:
             continue
         sd, lengths = found
-        centre = rng.uniform(-_BEYOND, 1.0 + _BEYOND, (_BUMPS, x.shape[1]))
+        centre = rng.uniform(-margin, 1.0 + margin, (centres, x.shape[1]))
         off = (centre[:, None] - centre) / lengths
         values, vectors = np.linalg.eigh(np.exp(-0.5 * (off**2).sum(axis=-1)))
         values, vectors = values[::-1], vectors[:, ::-1]
-        enough = int(np.searchsorted(np.cumsum(values) / values.sum(), _SHARE)) + 1
-        kept = slice(0, min(enough, _FORMS))
+        enough = int(np.searchsorted(np.cumsum(values) / values.sum(), variance_share)) + 1
+        kept = slice(0, min(enough, most_forms))
         blocks.append(sd * vectors[:, kept].T / np.sqrt(values[kept])[:, None])
         table["centre"] += (low + size * centre).tolist()
-        table["width"] += [(size * lengths).tolist()] * _BUMPS
-        table["output"] += [output] * _BUMPS
+        table["width"] += [(size * lengths).tolist()] * centres
+        table["output"] += [output] * centres
     if not blocks:
         raise FitError(
             f"nothing to learn: the unexplained force on {body} is negligible, or does not depend"
@@ -183,8 +187,17 @@ def _learned(mode: Mode, body: str, seed: int, criteria: Criteria) -> LearnedRem
     return learned_remainder(json.dumps(table | {"forms": block_diag(*blocks).tolist()}))
 
 
-def _process(x: Floats, y: Floats, seed: int, needed: float) -> tuple[float, Floats] | None:
-    """Return the standard deviation of a force and its length scales; None if it is noise."""
+def _process(
+    x: Floats,
+    y: Floats,
+    seed: int,
+    needed: float,
+    length_bounds: tuple[float, float] = (0.15, 10.0),
+) -> tuple[float, Floats] | None:
+    """Return the standard deviation of a force and its length scales; None if it is noise.
+
+    Length scales are shares of the range of recorded speeds; a longer one is a constant.
+    """
     from sklearn.exceptions import ConvergenceWarning
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
@@ -193,7 +206,7 @@ def _process(x: Floats, y: Floats, seed: int, needed: float) -> tuple[float, Flo
     if not scale > 0:
         return None
     kernel = ConstantKernel(1.0, (1e-4, 1e2)) * RBF(
-        np.full(x.shape[1], 0.5), (_SHORTEST, _LONGEST)
+        np.full(x.shape[1], 0.5), length_bounds
     ) + WhiteKernel(0.5, (1e-4, 2.0))
     process = GaussianProcessRegressor(kernel, n_restarts_optimizer=2, random_state=seed)
     with warnings.catch_warnings():

@@ -13,12 +13,9 @@ from pbrl_ppl.effects import Attached, Effect
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.state import Floats
 
-#: Grid points that are simulated in one call.
-_AT_ONCE = 8
-
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class GridPoint:
     """An effect at one grid point of its scan.
 
     Parameters
@@ -44,7 +41,9 @@ class Look:
         return point
 
 
-def looks(mode: Mode, candidate: Attached, proposed: Floats | None = None) -> list[Look]:
+def grid_points(
+    mode: Mode, candidate: Attached, proposed: Floats | None = None, *, at_once: int = 8
+) -> list[GridPoint]:
     """Simulate a candidate at grid points.
 
     Parameters
@@ -56,10 +55,12 @@ def looks(mode: Mode, candidate: Attached, proposed: Floats | None = None) -> li
     proposed : ndarray, optional
         The grid points, shape (point, q); by default all that its scan proposes, simulated with as
         few engine steps as tell them apart.
+    at_once : int
+        Grid points that are simulated in one call.
 
     Returns
     -------
-    list of Look
+    list of GridPoint
         The grid points that change a prediction.
     """
     effect, problem = candidate.effect, mode.problem
@@ -69,9 +70,8 @@ def looks(mode: Mode, candidate: Attached, proposed: Floats | None = None) -> li
     wide = problem.with_physics(effects=(*problem.physics.effects, candidate)).rough
     if proposed is None:
         proposed, wide = effect.scan(problem.scene, problem.data.history, body), wide.coarse
-    labels = wide.layout.labels
-    declared = [labels.index(label) for label in problem.layout.labels]
-    own = [labels.index(label) for label in candidate.labels]  # places in the wider vector
+    declared = wide.layout.places(problem.layout.labels)
+    own = wide.layout.places(candidate.labels)
     null = np.array(effect.null)
 
     def whitened(points: Floats) -> Floats:
@@ -87,8 +87,8 @@ def looks(mode: Mode, candidate: Attached, proposed: Floats | None = None) -> li
     ahead, behind = np.minimum(null + steps, upper) - null, np.maximum(null - steps, lower) - null
     nothing = whitened(null[None])[0]
     found = []
-    for begin in range(0, len(proposed), _AT_ONCE):
-        part = slice(begin, begin + _AT_ONCE)
+    for begin in range(0, len(proposed), at_once):
+        part = slice(begin, begin + at_once)
         points, plan = _points(proposed[part], free[part], null, (ahead, behind))
         states = whitened(points)
         for values, columns, rows in plan:
@@ -99,7 +99,7 @@ def looks(mode: Mode, candidate: Attached, proposed: Floats | None = None) -> li
             else:
                 signature = (states[rows] - nothing).T
             if np.any(signature):
-                found.append(Look(values, signature, columns))
+                found.append(GridPoint(values, signature, columns))
     return found
 
 
@@ -126,7 +126,7 @@ def _points(
 
 def detection_limits_of_scan(
     effect: Effect,
-    looks: Sequence[Look],
+    points: Sequence[GridPoint],
     units: Sequence[Floats],
     candidates: int,
     criteria: ScoreCriteria,
@@ -140,7 +140,7 @@ def detection_limits_of_scan(
     ----------
     effect : Effect
         The effect.
-    looks : sequence of Look
+    points : sequence of GridPoint
         Its grid points.
     units : sequence of ndarray
         Change of the prediction by one unit of each column of a grid point, or all of a whole
@@ -150,28 +150,28 @@ def detection_limits_of_scan(
     criteria : ScoreCriteria
         P-value and power of the limit.
     """
-    tried = candidates * len(looks)
+    tried = candidates * len(points)
     names = [parameter.name for parameter in effect.parameters]
     found: dict[str, float] = {}
     whole = [
-        (look.values, unit) for look, unit in zip(looks, units, strict=True) if not look.columns
+        (point.values, unit) for point, unit in zip(points, units, strict=True) if not point.columns
     ]
     if whole and len(names) == 1:
         null = effect.null[0]
         seen = [values[0] for values, unit in whole if unit[0] >= _needed(tried, criteria)]
         found[names[0]] = float(min(seen, key=lambda value: abs(value - null), default=np.inf))
-    for look, unit in zip(looks, units, strict=True):
+    for point, unit in zip(points, units, strict=True):
         for column, size in zip(
-            look.columns, detectable_sizes(unit, tried, criteria), strict=False
+            point.columns, detectable_sizes(unit, tried, criteria), strict=False
         ):
             found[names[column]] = min(found.get(names[column], np.inf), size)
     return found
 
 
-def caps(effect: Effect, looks: Sequence[Look]) -> bool:
+def caps(effect: Effect, points: Sequence[GridPoint]) -> bool:
     """Return whether smaller is stronger, as for a limit: grid points below the null value."""
-    return bool(looks) and all(
-        not look.columns and look.values[0] < effect.null[0] for look in looks
+    return bool(points) and all(
+        not point.columns and point.values[0] < effect.null[0] for point in points
     )
 
 

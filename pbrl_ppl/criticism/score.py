@@ -11,18 +11,19 @@ from scipy.stats import chi2, norm
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.results import Candidate
-from pbrl_ppl.criticism.scan import Look, caps, detectable_sizes, detection_limits_of_scan, looks
+from pbrl_ppl.criticism.scan import (
+    GridPoint,
+    caps,
+    detectable_sizes,
+    detection_limits_of_scan,
+    grid_points,
+)
 from pbrl_ppl.effects import Attached, Noise
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import Mode, posterior_slopes
 from pbrl_ppl.parameters import prior_residual, prior_slopes
 from pbrl_ppl.state import Floats, Ints
 from pbrl_ppl.threads import in_parallel
-
-#: Decimals of a p-value's logarithm: effects that are the same physics differ by rounding.
-_EQUAL = 3
-#: Grid points of a scan that are simulated again with more engine steps.
-_LEADING = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,11 +101,12 @@ def rank_candidates(
             evidence = test.evidence(derived[attached], _sides(attached), _scales(attached))
             values = np.array(attached.effect.null) + evidence.size
             return _signature(attached, evidence, values, 1, test)
-        return _best_look(mode, attached, test)
+        return _best_grid_point(mode, attached, test)
 
-    # the noise's shape comes last: any missing effect makes tails heavy
+    # the noise's shape comes last: any missing effect makes tails heavy; p-values of the same
+    # physics differ by rounding
     def order(signature: Signature) -> tuple[bool, float]:
-        return _of_noise(signature.attached), round(signature.log_p, _EQUAL)
+        return _of_noise(signature.attached), round(signature.log_p, 3)
 
     return sorted(in_parallel(score, candidates), key=order)
 
@@ -141,8 +143,8 @@ def _slopes(mode: Mode, attached: Attached | None = None) -> Floats:
     labels = mode.problem.layout.labels
     if attached is not None:
         labels = attached.labels
-        null[[layout.labels.index(label) for label in labels]] = attached.effect.null
-    new = [layout.labels.index(label) for label in labels]
+        null[layout.places(labels)] = attached.effect.null
+    new = layout.places(labels)
     if not new:
         return np.zeros((mode.whitened_residual.size, 0))
     lower, upper = (bound[new] for bound in layout.bounds)
@@ -257,7 +259,7 @@ def _scales(attached: Attached) -> Floats:
 
 
 def _signature(
-    attached: Attached, evidence: _Evidence, values: Floats, n_looks: int, test: _Test
+    attached: Attached, evidence: _Evidence, values: Floats, n_points: int, test: _Test
 ) -> Signature:
     """Return a candidate's signature, its p-value corrected for grid points and candidates."""
     effect, limits = attached.effect, {}
@@ -265,7 +267,7 @@ def _signature(
     if effect.scan is None:
         sizes = detectable_sizes(evidence.unit, test.candidates, test.criteria.score)
         limits = dict(zip(names, sizes, strict=True))
-    log_p = min(0.0, evidence.log_p + np.log(max(1, n_looks)))
+    log_p = min(0.0, evidence.log_p + np.log(max(1, n_points)))
     candidate = Candidate(
         effect=effect.name,
         body=attached.body,
@@ -276,7 +278,7 @@ def _signature(
         estimate=dict(zip(names, values.tolist(), strict=True)),
         units={parameter.name: parameter.unit for parameter in effect.parameters},
         identifiable=evidence.share,
-        looks=n_looks,
+        looks=n_points,
         detectable=limits,
     )
     fall = 0.5 * evidence.statistic / max(float(test.residual @ test.residual), 1e-300)
@@ -285,29 +287,32 @@ def _signature(
     )
 
 
-def _best_look(mode: Mode, attached: Attached, test: _Test) -> Signature:
-    """Return the signature of the grid point that explains most; a whole change has one sign."""
+def _best_grid_point(mode: Mode, attached: Attached, test: _Test, again: int = 4) -> Signature:
+    """Return the signature of the grid point that explains most; a whole change has one sign.
+
+    The ``again`` leading ones are simulated again with more engine steps.
+    """
     effect, n = attached.effect, len(test.residual)
 
-    def evidence(look: Look) -> _Evidence:
-        rows = np.pad(look.signature, ((0, n - len(look.signature)), (0, 0)))
-        columns = list(look.columns)
+    def evidence(point: GridPoint) -> _Evidence:
+        rows = np.pad(point.signature, ((0, n - len(point.signature)), (0, 0)))
+        columns = list(point.columns)
         sides = _sides(attached)[columns] if columns else np.ones(1, dtype=np.intp)
         scales = _scales(attached)[columns] if columns else np.ones(1)
         return test.evidence(rows, sides, scales)
 
-    tried = looks(mode, attached)
-    scores = [evidence(look) for look in tried]
+    tried = grid_points(mode, attached)
+    scores = [evidence(point) for point in tried]
     units = [found.unit for found in scores]
     best, values = _none(n, len(test.back)), np.array(effect.null)
-    leading = sorted(range(len(tried)), key=lambda i: scores[i].log_p)[:_LEADING]
-    again: list[Look] = []
+    leading = sorted(range(len(tried)), key=lambda i: scores[i].log_p)[:again]
+    finer: list[GridPoint] = []
     if leading and scores[leading[0]].log_p < 0.0:
-        again = looks(mode, attached, np.array([tried[i].proposed for i in leading]))
-    if again:  # with more engine steps a body may pass by
-        best, look = min(((evidence(look), look) for look in again), key=lambda own: own[0].log_p)
-        values = look.values.copy()
-        for column, size in zip(look.columns, best.size, strict=False):
+        finer = grid_points(mode, attached, np.array([tried[i].proposed for i in leading]))
+    if finer:  # with more engine steps a body may pass by
+        best, point = min(((evidence(each), each) for each in finer), key=lambda own: own[0].log_p)
+        values = point.values.copy()
+        for column, size in zip(point.columns, best.size, strict=False):
             values[column] += size
     signature = _signature(attached, best, values, len(tried), test)
     candidate = replace(

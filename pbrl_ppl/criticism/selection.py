@@ -18,11 +18,10 @@ from pbrl_ppl.criticism.cross_validation import (
     relative_fall,
 )
 from pbrl_ppl.criticism.forecast import forecast_change, longest_forecast
-from pbrl_ppl.criticism.refinement import with_effects, with_enough_substeps
+from pbrl_ppl.criticism.refinement import structure_mode, with_effects, with_enough_substeps
 from pbrl_ppl.criticism.results import Candidate
 from pbrl_ppl.criticism.score import Signature, inseparable, rank_candidates, twins
 from pbrl_ppl.criticism.simulated import Law, Simulated, sizes_of, worth_of
-from pbrl_ppl.criticism.structure_search import structure_mode
 from pbrl_ppl.effects import Attached, Effect, Noise, Structure, candidates
 from pbrl_ppl.modes import Mode, fit_pieces, nearby_mode, trajectory_mode
 from pbrl_ppl.parameters import prior_residual, prior_slopes
@@ -262,7 +261,7 @@ class Selection:
         if not _informed(mode, attached, self.criteria.selection.informed):
             return "the data do not inform its size"
         layout = mode.problem.layout
-        places = [layout.labels.index(label) for label in attached.labels]
+        places = layout.places(attached.labels)
         away = np.abs(prior_residual(layout.priors, mode.phi)[places])
         worst = int(np.argmax(away))
         if away[worst] < self.criteria.far_out:
@@ -379,13 +378,12 @@ def _informed(mode: Mode, attached: Attached, informed: float) -> int:
     parameters always count.
     """
     problem = mode.problem
-    labels = problem.layout.labels
-    places = [labels.index(label) for label in attached.labels]
+    places = problem.layout.places(attached.labels)
     narrow = _width_over_prior(mode)[places] < informed
     if attached.effect.scan is not None:
         body = problem.scene.body(attached.body)
-        looks = np.nan_to_num(attached.effect.scan(problem.scene, problem.data.history, body))
-        narrow |= np.ptp(looks, axis=0) > 0
+        points = np.nan_to_num(attached.effect.scan(problem.scene, problem.data.history, body))
+        narrow |= np.ptp(points, axis=0) > 0
     return int(narrow.sum())
 
 

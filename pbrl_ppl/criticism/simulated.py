@@ -152,15 +152,14 @@ def net_evidence(
 
 def _more_informed(before: Mode, after: Mode) -> int:
     """Return how many of a model's further parameters the data inform; all that are scanned."""
-    labels = after.problem.layout.labels
+    layout = after.problem.layout
     width = np.sqrt(np.maximum(np.diag(after.covariance), 0.0))
-    width = width * np.abs(prior_slopes(after.problem.layout.priors, after.phi))
+    informed = width * np.abs(prior_slopes(layout.priors, after.phi)) < DEFAULT.selection.informed
     return sum(
-        attached.effect.scan is not None
-        or bool(width[labels.index(label)] < DEFAULT.selection.informed)
+        attached.effect.scan is not None or bool(informed[place])
         for attached in after.problem.physics.effects
         if attached not in before.problem.physics.effects
-        for label in attached.labels
+        for place in layout.places(attached.labels)
     )
 
 
@@ -419,8 +418,7 @@ def _law(mode: Mode, accepted: Accepted, without: Mode) -> Law:
     """Return an accepted law with what it is worth in the last model."""
     attached = accepted.attached
     effect = attached.effect
-    labels = mode.problem.layout.labels
-    places = [labels.index(label) for label in attached.labels]
+    places = mode.problem.layout.places(attached.labels)
     sd = np.sqrt(np.diag(mode.covariance)[places])
     names = [parameter.name for parameter in effect.parameters]
     return Law(
@@ -467,8 +465,7 @@ def _without(mode: Mode, laws: Sequence[Attached]) -> Mode:
 
 def sizes_of(mode: Mode, law: Attached) -> Floats:
     """Return the parameters of a law at a mode, shape (q,)."""
-    labels = mode.problem.layout.labels
-    return mode.phi[[labels.index(label) for label in law.labels]]
+    return mode.phi[mode.problem.layout.places(law.labels)]
 
 
 def _prior(mode: Mode) -> float:

@@ -206,6 +206,10 @@ class Layout:
             )
         return self.labels.index(label)
 
+    def places(self, labels: Iterable[str]) -> list[int]:
+        """Return the places of labels in the vector."""
+        return [self.labels.index(label) for label in labels]
+
     def to_vector(self, values: Mapping[str, object]) -> Floats:
         """Return the vector phi, shape (p,), of named values, scalars or (owner,) arrays.
 

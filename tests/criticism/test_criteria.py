@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pbrl_ppl.criticism import DEFAULT
-from pbrl_ppl.criticism.stages import Stage
+from pbrl_ppl.criticism.results import Stage
 
 PAGE = Path(__file__).parents[2] / "analysis/docs/pages/explanation/decisions.md"
 

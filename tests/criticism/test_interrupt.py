@@ -2,21 +2,20 @@
 
 import pytest
 
-from pbrl_ppl import sampling
-from pbrl_ppl.criticism import LoopInterrupted, close_loop
+from pbrl_ppl.criticism import LoopInterrupted, close_loop, closing
 from pbrl_ppl.history import History
 from tests.helpers.free_puck import BOX, box2d
 
 
 def test_the_loop_is_finished_with_gaussians(make_history, monkeypatch) -> None:
-    fit = sampling.fit
+    sample = closing.sample
 
     def stopped(*args, method, **settings):
         if method != "laplace":
             raise KeyboardInterrupt
-        return fit(*args, method=method, **settings)
+        return sample(*args, method=method, **settings)
 
-    monkeypatch.setattr(sampling, "fit", stopped)
+    monkeypatch.setattr(closing, "sample", stopped)
     rows = box2d(make_history, 3, linear_drag=0.5)
     train, test = (History.from_dataframe(each, BOX) for each in rows)
     with pytest.raises(LoopInterrupted) as caught:

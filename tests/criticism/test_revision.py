@@ -28,6 +28,7 @@ from pbrl_ppl.errors import (
     PosteriorError,
     PriorWarning,
 )
+from pbrl_ppl.posterior import Fit
 from pbrl_ppl.state import STATE, WRENCH
 from tests.helpers.free_puck import BOX, DISC, MASS, Disc, box2d, fitted
 from tests.helpers.places import load
@@ -405,13 +406,12 @@ def test_only_chains_are_said_not_to_converge(method, said, monkeypatch) -> None
 
     def rough(*args: Any, **options: Any) -> Any:
         warnings.warn("the chains have not converged", ConvergenceWarning, stacklevel=1)
-        return SimpleNamespace(attrs={"max_rhat": 1.02, "min_ess": 350.0})
+        return Fit(None, SimpleNamespace(attrs={"max_rhat": 1.02, "min_ess": 350.0}))
 
-    monkeypatch.setattr("pbrl_ppl.sampling.fit", rough)
-    monkeypatch.setattr("pbrl_ppl.model.build_model", lambda problem: problem)
+    monkeypatch.setattr("pbrl_ppl.criticism.closing.sample", rough)
     mode = _Mode(SimpleNamespace(with_physics=lambda threads: None))
     task = SimpleNamespace(method=method, seed=1, draws=None, criteria=DEFAULT, say=print)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        loop_module._posteriors(task, [mode])
+        loop_module._fits(task, [mode])
     assert len(caught) == said

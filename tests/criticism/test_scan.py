@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import binom, chi2, norm
 
 from pbrl_ppl.criticism.criteria import DEFAULT
-from pbrl_ppl.criticism.scan import Look, caps, detection_limits_of_scan, looks
+from pbrl_ppl.criticism.scan import GridPoint, caps, detection_limits_of_scan, grid_points
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.effects import candidates, catalogue
 from pbrl_ppl.state import STATE
@@ -37,19 +37,19 @@ def test_looks_are_paid_for(mode) -> None:
 
 
 def test_what_is_not_scanned_is_differentiated(mode) -> None:
-    tried = looks(mode, EFFECTS["mass_change"].on("puck"))
+    tried = grid_points(mode, EFFECTS["mass_change"].on("puck"))
     assert {look.columns for look in tried} == {(0,)}  # the factor
     assert {look.values[0] for look in tried} == {1.0}
     moments = {(look.values[1], look.values[2]) for look in tried}
     assert (0.5, 0.0) in moments  # from the second trajectory on
     assert any(time > 0 for _, time in moments)
-    whole = looks(mode, EFFECTS["force_cutoff"].on("puck"))
+    whole = grid_points(mode, EFFECTS["force_cutoff"].on("puck"))
     assert {look.columns for look in whole} == {()}
 
 
 def test_a_signature_is_what_the_effect_does(mode) -> None:
     """The change that a look at the truth predicts is what brings the residual down."""
-    thresholds = looks(mode, EFFECTS["force_cutoff"].on("puck"))
+    thresholds = grid_points(mode, EFFECTS["force_cutoff"].on("puck"))
     residual = mode.whitened_residual.ravel()
 
     def left(look) -> float:
@@ -63,11 +63,11 @@ def test_a_signature_is_what_the_effect_does(mode) -> None:
 def test_the_smallest_size_is_of_the_look_that_shows_it_best() -> None:
     needed = norm.isf(0.005 / (2 * 2)) + norm.isf(0.1)  # two candidates, two looks
     signature = np.zeros((3, 1))
-    free = [Look(np.array([1.0, begin, 0.0]), signature, (0,)) for begin in (0.5, 1.5)]
+    free = [GridPoint(np.array([1.0, begin, 0.0]), signature, (0,)) for begin in (0.5, 1.5)]
     units = [np.array([2.0]), np.array([5.0])]
     sizes = detection_limits_of_scan(EFFECTS["mass_change"], free, units, 2, DEFAULT.score)
     assert sizes == {"factor": pytest.approx(needed / 5.0)}
-    whole = [Look(np.array([value]), signature, ()) for value in (1.0, 2.0, 3.0)]
+    whole = [GridPoint(np.array([value]), signature, ()) for value in (1.0, 2.0, 3.0)]
     units = [np.array([change]) for change in (1.0, 9.0, 12.0)]
     assert detection_limits_of_scan(EFFECTS["force_cutoff"], whole, units, 2, DEFAULT.score) == {
         "threshold": 2.0
@@ -77,7 +77,7 @@ def test_the_smallest_size_is_of_the_look_that_shows_it_best() -> None:
     }
     none = detection_limits_of_scan(EFFECTS["force_cutoff"], whole[:1], units[:1], 2, DEFAULT.score)
     assert none == {"threshold": np.inf}
-    there = [Look(np.zeros(3), signature, ())]
+    there = [GridPoint(np.zeros(3), signature, ())]
     assert (
         detection_limits_of_scan(EFFECTS["hidden_obstacle"], there, units[1:2], 2, DEFAULT.score)
         == {}
@@ -115,4 +115,4 @@ def test_p_values_of_scans_are_no_smaller_than_chance_makes_them() -> None:
 
 
 def test_an_effect_without_a_scan_has_no_looks(mode) -> None:
-    assert looks(mode, EFFECTS["linear_drag"].on("puck")) == []
+    assert grid_points(mode, EFFECTS["linear_drag"].on("puck")) == []

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pbrl_ppl.criticism.structure_search import structure_mode
+from pbrl_ppl.criticism.refinement import structure_mode
 from pbrl_ppl.effects import attach, candidates
 from tests.helpers.free_puck import BOX, box2d, fitted
 
