@@ -14,7 +14,6 @@ import pytest
 from scipy.stats import norm
 
 import pbrl_ppl as pp
-from pbrl_ppl import sampling
 from pbrl_ppl.criticism import close_loop
 from pbrl_ppl.criticism import closing as loop_module
 from pbrl_ppl.criticism.criteria import DEFAULT
@@ -240,12 +239,12 @@ def test_weights_that_miss_a_part_give_no_verdict(clean, monkeypatch) -> None:
     """Whatever the other diagnostics say."""
 
     def weighted(*arguments, **options):
-        fitted = fit(*arguments, **options)
-        fitted.attrs["pareto_k"] = 0.8
+        fitted = sample(*arguments, **options)
+        fitted.posterior.attrs["pareto_k"] = 0.8
         return fitted
 
-    fit = sampling.fit
-    monkeypatch.setattr(sampling, "fit", weighted)
+    sample = loop_module.sample
+    monkeypatch.setattr(loop_module, "sample", weighted)
     assert loop(clean).verdict == "not-converged"
 
 
