@@ -37,13 +37,17 @@ def test_posteriors_agree(here, generation: str) -> None:
             assert (gap < 4 * np.hypot(*(each.values for each in errors))).all()
 
 
+@pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning")
 @pytest.mark.parametrize("generation", GENERATIONS)
-def test_a_file_of_either_generation_is_whole_and_of_use(generation: str, tmp_path: Path) -> None:
+def test_a_file_of_either_generation_is_whole_and_of_use(
+    generation: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     there = load_posterior(file(generation))
     assert scene_of(there) == SCENE
     assert draws(there)["mass"].shape == (1000, 1)
     likelihood = group(there, "log_likelihood")["next_state"]
     assert likelihood.sizes == {"chain": 2, "draw": 500, "transition": 12}
+    monkeypatch.setattr("pbrl_ppl.posterior.MIN_ESS", 30)  # no refit
     further = update(there, history(2, trajectories=1))
     assert group(further, "log_likelihood")["next_state"].sizes["transition"] == 16
     save_posterior(further, tmp_path / "again.nc")

@@ -25,7 +25,7 @@ import pymc as pm
 from scipy.stats import norm
 
 import pbrl_ppl as pp
-from pbrl_ppl.parameters import fold_wheels
+from pbrl_ppl.parameters import by_prior
 from pbrl_ppl.posterior import convergence, parameter_draws
 
 STORED = Path(__file__).parents[2] / "tests" / "sampling" / "reference_posteriors.json"
@@ -83,7 +83,7 @@ def moments(model: pm.Model, idata: Any) -> dict[str, Moments]:
     """
     layout = model.problem.layout
     phi, sigma = parameter_draws(model.problem, idata)
-    phi = fold_wheels(layout, phi)
+    phi = by_prior(layout, phi)
     columns: dict[str, Any] = {}
     for label, prior, x in zip(layout.labels, layout.priors, phi.T, strict=True):
         columns[label] = np.log(x) if prior.family == "log_normal" else x

@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 
 from pbrl_ppl.likelihood import Problem, log_posterior
 from pbrl_ppl.modes.noise import FAR_OFF, best_tails, noise_gaussian, profile_sigma, tail_precision
-from pbrl_ppl.parameters import box, differentiate, inside, most_probable_wheels, prior_residual
+from pbrl_ppl.parameters import box, by_prior, differentiate, inside, prior_residual
 from pbrl_ppl.physics import PartedSimulator
 from pbrl_ppl.state import Floats
 
@@ -178,7 +178,7 @@ def profiled(problem: Problem, phi: Floats) -> tuple[Floats, float]:
 
 def described(problem: Problem, peak: Peak) -> Peak:
     """Return a peak with each wheel in its most probable description; it predicts the same."""
-    better = most_probable_wheels(problem.layout, peak.phi)
+    better = by_prior(problem.layout, peak.phi)
     gain = problem.layout.log_prior(better) - problem.layout.log_prior(peak.phi)
     return Peak(better, peak.sigma, peak.log_posterior + float(gain.sum()))
 

@@ -12,7 +12,7 @@ from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import Problem, estimate_sigma
 from pbrl_ppl.modes.laplace import STALLED, Mode, Peak, climb, described, finish
 from pbrl_ppl.modes.noise import FAR_OFF, finite, gaussian_profile
-from pbrl_ppl.parameters import box, inside, most_probable_wheels, prior_draws
+from pbrl_ppl.parameters import box, by_prior, inside, prior_draws
 from pbrl_ppl.state import Floats
 from pbrl_ppl.threads import one_blas_thread
 
@@ -150,7 +150,7 @@ def _distinct(problem: Problem, found: list[Peak]) -> list[Peak]:
     Equivalent wheels and uninformed directions are connected; mirror images are not: they predict
     the same, but points between them do not.
     """
-    folded = most_probable_wheels(problem.layout, np.array([peak.phi for peak in found]))
+    folded = by_prior(problem.layout, np.array([peak.phi for peak in found]))
     z = problem.whitened(folded, found[0].sigma)
     z = np.nan_to_num(z, nan=FAR_OFF)
     kept: dict[int, Floats] = {}

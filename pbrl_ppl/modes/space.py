@@ -11,7 +11,7 @@ from scipy.special import expit
 
 from pbrl_ppl.likelihood import Problem, exponential, log_noise_prior
 from pbrl_ppl.modes.laplace import Mode
-from pbrl_ppl.parameters import Prior, evened, gathered, inside, wheels
+from pbrl_ppl.parameters import Prior, inside, nearest, symmetrised, wheels
 from pbrl_ppl.state import Bools, Floats, Ints, wrapped
 
 #: Noise that may vanish is a power of its coordinate.
@@ -72,7 +72,7 @@ class Space:
     accelerations and correlated errors, which may vanish, are by their cube root (E. B. Wilson and
     M. M. Hilferty, The distribution of chi-square, 1931) of either sign, so that nothing ends at
     zero. The equal descriptions of a wheel share
-    its prior evenly; see `parameters.evened`. A circle is cut opposite to the centre.
+    its prior evenly; see `parameters.symmetrised`. A circle is cut opposite to the centre.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ class Space:
 
         All wheels are at one mode.
         """
-        phi = gathered(problem.layout, phi)
+        phi = nearest(problem.layout, phi, any_prior=True)
         space = cls(problem, phi.mean(axis=0))
         return space, space.at(phi, sigma)
 
@@ -209,7 +209,7 @@ class Space:
         priors = problem.layout.priors
         with np.errstate(all="ignore"):
             slopes = [unconstrain(prior, phi[..., i])[1] for i, prior in enumerate(priors)]
-            density = problem.layout.log_prior(phi) + evened(problem.layout, phi)
+            density = problem.layout.log_prior(phi) + symmetrised(problem.layout, phi)
             density -= np.moveaxis(np.log(np.abs(slopes)), 0, -1) if slopes else 0.0
         for i in self._circles:
             beyond = np.abs(q[..., i] - self.centre[i]) > np.pi

@@ -15,12 +15,8 @@ from .priors import prior_draws as prior_draws
 from .priors import prior_residual as prior_residual
 from .priors import prior_slopes as prior_slopes
 from .wheel_symmetry import Wheel as Wheel
-from .wheel_symmetry import beside as beside
+from .wheel_symmetry import by_prior as by_prior
 from .wheel_symmetry import change_from as change_from
-from .wheel_symmetry import evened as evened
-from .wheel_symmetry import fold_draws as fold_draws
-from .wheel_symmetry import fold_wheels as fold_wheels
-from .wheel_symmetry import gathered as gathered
-from .wheel_symmetry import most_probable_wheels as most_probable_wheels
-from .wheel_symmetry import redescribed as redescribed
+from .wheel_symmetry import nearest as nearest
+from .wheel_symmetry import symmetrised as symmetrised
 from .wheel_symmetry import wheels as wheels

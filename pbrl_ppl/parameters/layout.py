@@ -242,6 +242,15 @@ class Layout:
         columns = [draws[block.name].reshape(n, -1) for block in self.blocks]
         return np.concatenate([np.zeros((n, 0)), *columns], axis=1)
 
+    def columns(self, draws: Mapping[str, Floats]) -> Floats:
+        """Return vectors, shape (n, p), of draws by label, shape (n,) each; NaN where one lacks."""
+        n = len(next(iter(draws.values()), ()))
+        phi = np.full((n, self.size), np.nan)
+        for place, label in enumerate(self.labels):
+            if label in draws:
+                phi[:, place] = draws[label]
+        return phi
+
     def to_dict(self, vector: Floats) -> dict[str, Floats]:
         """Return named arrays, shape (..., owner), of phi, shape (..., p)."""
         return {block.name: vector[..., place] for block, place in self.slices()}

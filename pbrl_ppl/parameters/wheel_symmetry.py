@@ -1,12 +1,12 @@
-"""Symmetry of the wheel: four descriptions of equal likelihood, and the folding onto one of them.
+"""Symmetry of the wheel: four descriptions of equal likelihood, and the choice of one of them.
 
 ``w_theta`` and ``w_theta + pi/2`` with ``mu_x`` and ``mu_y`` swapped are the same wheel, so the
 likelihood is the same for both. The prior is the same only where it is uniform in the angle and
-equal in both frictions: there, which description a draw has means nothing, and draws are folded
-onto one. Elsewhere each description keeps the probability that the prior gives it.
+equal in both frictions: there, which description a draw has means nothing, and `nearest` brings
+draws to one. Elsewhere each description keeps the probability that the prior gives it (`by_prior`),
+unless the prior is `symmetrised`.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product
 
@@ -22,8 +22,6 @@ from pbrl_ppl.state import Floats, wrapped
 MIXED = ("w_theta", "mu_x", "mu_y")
 #: Prefixes of a wheel's parameters: Table 1's and the effect's.
 _BEGINNINGS = ("", "wheel_")
-_ANGLES = tuple(f"{begin}w_theta[" for begin in _BEGINNINGS)
-_ROUNDS = 20
 
 
 @dataclass(frozen=True)
@@ -88,55 +86,90 @@ def wheels(layout: Layout) -> tuple[Wheel, ...]:
     return tuple(found)
 
 
-def fold_draws(layout: Layout, draws: Mapping[str, Floats]) -> dict[str, Floats]:
-    """Return draws with every wheel folded onto one description of equal prior probability.
+def nearest(
+    layout: Layout, phi: Floats, centre: Floats | None = None, *, any_prior: bool = False
+) -> Floats:
+    """Return draws with each wheel in that of its equal descriptions that is nearest to a centre.
+
+    Descriptions are equal where the prior is the same for them; `any_prior` takes all four.
 
     Parameters
     ----------
     layout : Layout
         Says which bodies' wheels are unknown, and their prior.
-    draws : mapping of str to ndarray
-        By label, such as ``w_theta[cart]``, shape (draw,) each; rad and 1.
+    phi : ndarray
+        Draws in the layout's order, shape (draw, p), SI units. Wheels with NaN are left alone.
+    centre : ndarray, optional
+        Draws whose mean is the centre, shape (other, p); by default the draws' own mean, which is
+        then described by w_theta in (-pi/2, pi/2] and, if all four are equal, mu_x <= mu_y.
+    any_prior : bool
+        Whether descriptions count as equal that the prior tells apart.
 
     Returns
     -------
-    dict of str to ndarray
-        The same labels.
+    ndarray
+        The same shape.
 
     Examples
     --------
     >>> from pbrl_ppl.physics import build_layout
     >>> from pbrl_ppl.scene import Body, Scene, Shape
-    >>> cart = Body("cart", Shape.box(1.0, 0.6), wheel=True)
+    >>> known = {"mass": 8.0, "r": 0.1, "mu_c": 0.2, "w_x": 0.0, "w_y": 0.0}
+    >>> cart = Body("cart", Shape.box(1.0, 0.6), wheel=True, known=known)
     >>> layout = build_layout(Scene(time_step=0.1, normal_gravity=9.81, bodies=(cart,)))
-    >>> equal = {"w_theta[cart]": np.array([0.0, np.pi / 2]), "mu_x[cart]": np.array([0.1, 0.4]),
-    ...     "mu_y[cart]": np.array([0.4, 0.1])}
-    >>> fold_draws(layout, equal)["mu_x[cart]"]
+    >>> layout.labels
+    ('w_theta[cart]', 'mu_x[cart]', 'mu_y[cart]')
+    >>> nearest(layout, np.array([[0.0, 0.1, 0.4], [np.pi / 2, 0.4, 0.1]]))[:, 1]
     array([0.1, 0.1])
     """
-    folded = dict(draws)
     for wheel in wheels(layout):
-        if wheel.period < 4 and all(label in draws for label in wheel.labels):
-            angle, x, y = (draws[label] for label in wheel.labels)
-            folded |= dict(zip(wheel.labels, _fold(angle, x, y, wheel.period), strict=True))
-    return folded
-
-
-def gathered(layout: Layout, phi: Floats) -> Floats:
-    """Return draws (draw, p) with all wheels at one mode of the likelihood, for any prior."""
-    phi = phi.copy()
-    for wheel in wheels(layout):
+        period = 1 if any_prior else wheel.period
         places = list(wheel.places)
-        angle, x, y = phi[:, places].T
-        phi[:, places] = np.stack(_fold(angle, x, y, 1), axis=1)
+        if period == 4 or np.isnan(phi[:, places]).any():
+            continue
+        equal = np.array([wheel.turned(phi, turns) for turns in range(0, 4, period)])
+        points = _points(equal[..., places])
+        if centre is None:
+            chosen = _about_own_mean(points)
+        else:
+            middle = _points(centre[:, places]).mean(axis=0)
+            chosen = ((points - middle) ** 2).sum(axis=-1).argmin(axis=0)
+        phi = equal[chosen, np.arange(len(phi))]
     return phi
 
 
-def fold_wheels(layout: Layout, phi: Floats) -> Floats:
-    """Return each draw in one of the descriptions of a wheel with equal prior probability.
+def _about_own_mean(points: Floats, rounds: int = 20) -> NDArray[np.intp]:
+    """Return which description each draw has about their mean, from points (description, draw, 4).
 
-    Namely the one with mu_x <= mu_y and w_theta in (-pi/2, pi/2]; the latter alone where the
-    frictions' priors differ; none where that of w_theta is not uniform.
+    Descriptions are as many equal turns apart.
+    """
+    n, draw = len(points), np.arange(points.shape[1])
+    half = n // 2
+    chosen = np.zeros(len(draw), dtype=np.intp)
+    if n == 4:
+        chosen[points[0, :, 2] > points[0, :, 3]] = 1
+    # half a turn changes nothing else: begin on the first draw's side
+    first = points[chosen[0], 0, :2]
+    chosen = (chosen + np.where(points[chosen, draw, :2] @ first < 0, half, 0)) % n
+    for _ in range(rounds):
+        centre = points[chosen, draw].mean(axis=0)
+        closest = ((points - centre) ** 2).sum(axis=-1).argmin(axis=0)
+        if (closest == chosen).all():
+            break
+        chosen = closest
+    centre = points[chosen, draw].mean(axis=0)
+    if n == 4 and centre[2] > centre[3]:
+        chosen = (chosen + 1) % n
+    if points[chosen, draw, 0].mean() < 0:  # in (-pi/2, pi/2]
+        chosen = (chosen + half) % n
+    return chosen
+
+
+def by_prior(layout: Layout, phi: Floats, rng: np.random.Generator | None = None) -> Floats:
+    """Return each wheel in its most probable description, or in one drawn by the prior.
+
+    The likelihood being the same for all, drawing is a Gibbs step of the posterior: draws of it
+    stay draws of it, and chains need not cross from one description to another by themselves.
 
     Parameters
     ----------
@@ -144,6 +177,9 @@ def fold_wheels(layout: Layout, phi: Floats) -> Floats:
         Says which bodies' wheels are unknown, and their prior.
     phi : ndarray
         Parameters in the layout's order, shape (..., p), SI units.
+    rng : Generator, optional
+        Of the draws, which leave descriptions alone that the prior cannot tell apart. Without it,
+        of those the one with mu_x <= mu_y and w_theta in (-pi/2, pi/2] is taken.
 
     Returns
     -------
@@ -152,6 +188,13 @@ def fold_wheels(layout: Layout, phi: Floats) -> Floats:
     """
     phi = phi.copy()
     for wheel in wheels(layout):
+        if wheel.period > 1:
+            score = wheel.log_priors(phi, wheel.period)
+            # the largest of log-probabilities with Gumbel noise is a draw
+            score = score if rng is None else score + rng.gumbel(size=score.shape)
+            phi = wheel.turned(phi, score.argmax(axis=0))
+        if rng is not None:
+            continue
         angle, x, y = wheel.places
         if wheel.period == 1:
             phi[..., angle] += np.where(phi[..., x] > phi[..., y], np.pi / 2, 0.0)
@@ -161,8 +204,10 @@ def fold_wheels(layout: Layout, phi: Floats) -> Floats:
     return phi
 
 
-def most_probable_wheels(layout: Layout, phi: Floats) -> Floats:
-    """Return each wheel in its most probable description; ties go as in `fold_wheels`.
+def symmetrised(layout: Layout, phi: Floats) -> Floats:
+    """Return the change of log-prior that makes a wheel's four descriptions equally probable.
+
+    A chain then needs to see one of them only; `by_prior` draws each with its prior probability.
 
     Parameters
     ----------
@@ -170,32 +215,20 @@ def most_probable_wheels(layout: Layout, phi: Floats) -> Floats:
         Says which bodies' wheels are unknown, and their prior.
     phi : ndarray
         Shape (..., p).
+
+    Returns
+    -------
+    ndarray
+        Shape (..., p), at the place of each wheel's angle; zero where the prior is symmetric.
     """
+    result = np.zeros(np.shape(phi))
     for wheel in wheels(layout):
         if wheel.period > 1:
-            phi = wheel.turned(phi, wheel.log_priors(phi, wheel.period).argmax(axis=0))
-    return fold_wheels(layout, phi)
-
-
-def beside(layout: Layout, phi: Floats, others: Floats) -> Floats:
-    """Map each draw to the same symmetry branch as other draws, where the prior is symmetric.
-
-    Parameters
-    ----------
-    layout : Layout
-        Says which bodies' wheels are unknown, and their prior.
-    phi : ndarray
-        Draws to be described, shape (draw, p).
-    others : ndarray
-        Draws whose mean each is to be nearest to, shape (other, p).
-    """
-    for wheel in wheels(layout):
-        if wheel.period < 4:
-            centre = _points(others[:, list(wheel.places)]).mean(axis=0)
-            equal = np.array([wheel.turned(phi, turns) for turns in range(0, 4, wheel.period)])
-            off = ((_points(equal[..., list(wheel.places)]) - centre) ** 2).sum(axis=-1)
-            phi = equal[off.argmin(axis=0), np.arange(len(phi))]
-    return phi
+            log_prior = wheel.log_priors(phi)
+            with np.errstate(invalid="ignore"):  # outside the support, where there is no prior
+                change = logsumexp(log_prior, axis=0) - np.log(4.0) - log_prior[0]
+            result[..., wheel.places[0]] = np.nan_to_num(change)
+    return result
 
 
 def change_from(layout: Layout, phi: Floats, origin: Floats) -> Floats:
@@ -223,8 +256,9 @@ def change_from(layout: Layout, phi: Floats, origin: Floats) -> Floats:
         if turns.any():
             phi = wheel.turned(phi, turns)
     change = phi - origin
+    angles = tuple(f"{begin}w_theta[" for begin in _BEGINNINGS)
     for i, (label, prior) in enumerate(zip(layout.labels, layout.priors, strict=True)):
-        if label.startswith(_ANGLES):  # a wheel turned half way round is the same
+        if label.startswith(angles):  # a wheel turned half way round is the same
             change[..., i] = wrapped(2.0 * change[..., i]) / 2.0
         elif prior.family == "von_mises":
             change[..., i] = wrapped(change[..., i])
@@ -235,90 +269,3 @@ def _points(values: Floats) -> Floats:
     """Return wheels (..., 3) as points (..., 4) that are close where the wheels are alike."""
     angle = values[..., 0]
     return np.stack([np.cos(angle), np.sin(angle), values[..., 1], values[..., 2]], axis=-1)
-
-
-def redescribed(layout: Layout, phi: Floats, rng: np.random.Generator) -> Floats:
-    """Return draws with each wheel's description drawn from its conditional prior.
-
-    The likelihood being the same for all, that is a Gibbs step of the posterior: draws of it stay
-    draws of it, and chains need not cross from one description to another by themselves. Where
-    the prior cannot tell any apart, nothing is changed.
-
-    Parameters
-    ----------
-    layout : Layout
-        Says which bodies' wheels are unknown, and their prior.
-    phi : ndarray
-        Shape (draw, p).
-    rng : Generator
-        Of the choices.
-    """
-    for wheel in wheels(layout):
-        if wheel.period > 1:
-            log_prior = wheel.log_priors(phi, wheel.period)
-            # the largest of log-probabilities with Gumbel noise is a draw
-            phi = wheel.turned(phi, (log_prior + rng.gumbel(size=log_prior.shape)).argmax(axis=0))
-    return phi
-
-
-def evened(layout: Layout, phi: Floats) -> Floats:
-    """Return the change of log-prior that makes a wheel's four descriptions equally probable.
-
-    A chain then needs to see one of them only; `redescribed` draws each with its prior probability.
-
-    Parameters
-    ----------
-    layout : Layout
-        Says which bodies' wheels are unknown, and their prior.
-    phi : ndarray
-        Shape (..., p).
-
-    Returns
-    -------
-    ndarray
-        Shape (..., p), at the place of each wheel's angle; zero where the prior is even.
-    """
-    result = np.zeros(np.shape(phi))
-    for wheel in wheels(layout):
-        if wheel.period > 1:
-            log_prior = wheel.log_priors(phi)
-            with np.errstate(invalid="ignore"):  # outside the support, where there is no prior
-                change = logsumexp(log_prior, axis=0) - np.log(4.0) - log_prior[0]
-            result[..., wheel.places[0]] = np.nan_to_num(change)
-    return result
-
-
-def _fold(angle: Floats, mu_x: Floats, mu_y: Floats, period: int) -> tuple[Floats, Floats, Floats]:
-    """Return each draw in the description nearest to the mean, of those ``period`` apart.
-
-    Where all four may be chosen, mu_x <= mu_y on average.
-    """
-    turns = np.arange(4)[:, None]
-    odd = turns % 2 == 1
-    theta = angle + turns * np.pi / 2
-    points = np.stack(
-        [np.cos(theta), np.sin(theta), np.where(odd, mu_y, mu_x), np.where(odd, mu_x, mu_y)]
-    )
-    barred = np.where(turns % period == 0, 0.0, np.inf)
-    draw = np.arange(len(angle))
-    chosen = np.where((mu_x <= mu_y) | (period > 1), 0, 1)
-    # half a turn changes nothing else: begin on the first draw's side
-    chosen = chosen + np.where(np.cos(theta[chosen, draw] - theta[chosen[0], 0]) < 0, 2, 0)
-    for _ in range(_ROUNDS):
-        centre = points[:, chosen, draw].mean(axis=1)
-        off = ((points - centre[:, None, None]) ** 2).sum(axis=0) + barred
-        nearest = off.argmin(axis=0)
-        if (nearest == chosen).all():
-            break
-        chosen = nearest
-    centre = points[:, chosen, draw].mean(axis=1)
-    if period == 1 and centre[2] > centre[3]:
-        chosen = (chosen + 1) % 4
-    if np.mean(np.cos(theta[chosen, draw])) < 0:  # in (-pi/2, pi/2]
-        chosen = (chosen + 2) % 4
-    swapped = chosen % 2 == 1
-    return (
-        wrapped(theta[chosen, draw]),
-        np.where(swapped, mu_y, mu_x),
-        np.where(swapped, mu_x, mu_y),
-    )

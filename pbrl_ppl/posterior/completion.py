@@ -27,7 +27,7 @@ from pbrl_ppl.likelihood import (
     smoothed,
 )
 from pbrl_ppl.modes import ATTRIBUTE, doubts
-from pbrl_ppl.parameters import Prior, beside, fold_draws, prior_draws, redescribed
+from pbrl_ppl.parameters import Prior, by_prior, nearest, prior_draws
 from pbrl_ppl.posterior.data import CELLS, placed, places, record_of, recording
 from pbrl_ppl.posterior.identifiability import uninformed
 from pbrl_ppl.posterior.mode import Point, packed_mode
@@ -260,7 +260,7 @@ def prior_groups(
         )
 
     return {
-        "prior": shaped(posterior, beside(layout, drawn, phi), noise_drawn),
+        "prior": shaped(posterior, nearest(layout, drawn, phi), noise_drawn),
         "log_prior": shaped(posterior.drop_attrs(), layout.log_prior(phi), density),
     }
 
@@ -430,12 +430,9 @@ def _folded(problem: Problem, trace: Any, seed: int | None) -> xr.Dataset:
     layout = problem.layout
     phi, _ = parameter_draws(problem, trace)
     if seed is not None:
-        phi = redescribed(layout, phi, np.random.default_rng([seed, len(phi)]))
-    folded = fold_draws(layout, dict(zip(layout.labels, phi.T, strict=True)))
-    for block in layout.blocks:
-        for i, owner in enumerate(block.owners):
-            values = posterior[block.name].values
-            values[..., i] = folded[f"{block.name}[{owner}]"].reshape(values.shape[:2])
+        phi = by_prior(layout, phi, np.random.default_rng([seed, len(phi)]))
+    for name, values in layout.to_dict(nearest(layout, phi)).items():
+        posterior[name].values[:] = values.reshape(posterior[name].shape)
     return posterior
 
 

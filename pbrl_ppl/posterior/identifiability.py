@@ -12,7 +12,7 @@ import pandas as pd
 from pbrl_ppl.effects import LEARNED_REMAINDER, Effect, catalogue
 from pbrl_ppl.likelihood import Observations, TransitionLikelihood
 from pbrl_ppl.modes import Mode, posterior_slopes
-from pbrl_ppl.parameters import JOINT_INDICES, Layout, Prior, fold_draws, inside, wheels
+from pbrl_ppl.parameters import JOINT_INDICES, Layout, Prior, inside, nearest, wheels
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.posterior.record import PosteriorRecord, layout_of
 from pbrl_ppl.posterior.store import best_draw, group, labelled_draws
@@ -237,7 +237,8 @@ def _prior_draws(layout: Layout) -> dict[str, Floats]:
         for owner, prior in zip(block.owners, block.priors, strict=True)
         if (owner not in free or block.of != "joint") and LEARNED_REMAINDER not in block.name
     }
-    return fold_draws(layout, draws)
+    folded = dict(zip(layout.labels, nearest(layout, layout.columns(draws)).T, strict=True))
+    return {label: folded[label] for label in draws}
 
 
 def _natural(prior: Prior, x: Floats) -> Floats:
@@ -264,7 +265,7 @@ def _widths(
     layout: Layout, prior: Mapping[str, Floats], posterior: Mapping[str, Floats]
 ) -> tuple[Width, ...]:
     """Return the widths of all parameters with prior draws."""
-    folded = fold_draws(layout, posterior)
+    folded = dict(zip(layout.labels, nearest(layout, layout.columns(posterior)).T, strict=True))
     turned = {x for wheel in wheels(layout) if wheel.period == 1 for x in wheel.labels}
     widths = []
     for label, law in zip(layout.labels, layout.priors, strict=True):

@@ -9,7 +9,7 @@ import numpy as np
 
 from pbrl_ppl.likelihood import Problem, log_posterior
 from pbrl_ppl.modes import find_mode
-from pbrl_ppl.parameters import beside
+from pbrl_ppl.parameters import nearest
 from pbrl_ppl.posterior.record import PosteriorRecord, StoredMode
 from pbrl_ppl.state import Floats, Ints
 
@@ -104,7 +104,7 @@ def _packed(
     """Return a point for a record, its wheels described as in draws (draw, p)."""
     layout, point, sets = problem.layout, mode.phi, None
     if problem.library is None and draws is not None:
-        point = beside(layout, point[None], draws)[0]
+        point = nearest(layout, point[None], draws)[0]
     if problem.library is not None and mode.choice is not None:
         names = problem.library.names
         chosen = zip(problem.scene.owners, mode.choice.tolist(), strict=True)

@@ -17,7 +17,7 @@ from scipy.stats import truncnorm
 from pbrl_ppl.effects import LEARNED_REMAINDER, Effect, catalogue
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.modes import ATTRIBUTE, index_law
-from pbrl_ppl.parameters import JOINT_INDICES, ParameterLibrary, Prior, fold_draws
+from pbrl_ppl.parameters import JOINT_INDICES, ParameterLibrary, Prior, nearest
 from pbrl_ppl.physics import index_priors
 from pbrl_ppl.posterior.record import layout_of, scene_of
 from pbrl_ppl.posterior.store import group, labelled_draws, scalars
@@ -67,7 +67,9 @@ def updated_scene(idata: Any, *, effects: Iterable[Effect] = catalogue) -> Scene
         model = pp.physics_model(scene, pp.History.load("tuesday.csv", scene))
     """
     scene, layout = scene_of(idata), layout_of(idata, effects)
-    draws = fold_draws(layout, labelled_draws(idata))
+    draws = labelled_draws(idata)
+    folded = nearest(layout, layout.columns(draws))
+    draws |= {x: folded[:, i] for i, x in enumerate(layout.labels) if x in draws}
     found: defaultdict[str, dict[str, dict[str, float]]] = defaultdict(dict)
     for block in layout.blocks:
         # a learned remainder belongs to one recording and cannot be declared in a scene

@@ -22,7 +22,7 @@ from pbrl_ppl.likelihood import (
     variable_dims,
 )
 from pbrl_ppl.modes import Mode, Space
-from pbrl_ppl.parameters import gathered
+from pbrl_ppl.parameters import nearest
 from pbrl_ppl.posterior import (
     LIKELIHOOD,
     PARETO_K,
@@ -203,7 +203,7 @@ def _metropolis(job: Job) -> Any:
     else:
         phi, sigma = last_draws(job.problem, job.resume, walkers)
         chains = len(phi) // walkers
-        q = reference.space.at(gathered(problem.layout, phi), sigma)
+        q = reference.space.at(nearest(problem.layout, phi, any_prior=True), sigma)
     ensemble, exact = Ensemble(reference, q, rng), Posterior(reference.space)
     cost = problem.simulator.steps * problem.segments.n * problem.data.horizon
     cheap = None

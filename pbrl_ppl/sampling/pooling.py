@@ -20,7 +20,7 @@ from scipy.stats import chi2, norm
 
 from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.errors import PosteriorError
-from pbrl_ppl.parameters import Layout, Prior, beside, fold_draws, prior_draws, wheels
+from pbrl_ppl.parameters import Layout, Prior, nearest, prior_draws, wheels
 from pbrl_ppl.posterior import HDI_PROB, labelled_draws, layout_of, moment_matched, scene_of
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Bools, Floats, wrapped
@@ -322,10 +322,9 @@ def _drawn(
         posterior = labelled_draws(idata)
         if lacking := [label for label in layout.labels if label not in posterior]:
             raise PosteriorError(f"pool: {name} has no {lacking[0]}, which its scene asks for")
-        folded = fold_draws(layout, posterior)
-        phi = np.stack([folded[label] for label in layout.labels], axis=1)
+        phi = nearest(layout, layout.columns(posterior))
         first = phi if first is None else first
-        phi = beside(layout, phi, first)  # Table 1 comes first in all
+        phi = nearest(layout, phi, first)  # Table 1 comes first in all
         own = dict(zip(layout.labels, phi.T, strict=True))
         of_bodies = [f"{b.name}[{o}]" for b in layout.blocks if b.of == "body" for o in b.owners]
         for label in of_bodies:
@@ -341,8 +340,10 @@ def _priors(layout: Layout) -> dict[str, Prior]:
     for wheel in wheels(layout):
         if wheel.period < 4:
             drawn = prior_draws(wheel.priors, np.random.default_rng(0), _PRIOR_DRAWS)
-            folded = fold_draws(layout, dict(zip(wheel.labels, drawn.T, strict=True)))
-            priors |= {label: moment_matched(priors[label], x) for label, x in folded.items()}
+            columns = layout.columns(dict(zip(wheel.labels, drawn.T, strict=True)))
+            folded = nearest(layout, columns)[:, list(wheel.places)].T
+            for label, x in zip(wheel.labels, folded, strict=True):
+                priors[label] = moment_matched(priors[label], x)
     return priors
 
 

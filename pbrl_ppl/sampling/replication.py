@@ -25,7 +25,7 @@ from pbrl_ppl.likelihood import (
     simulated_trajectories,
     with_measurements,
 )
-from pbrl_ppl.parameters import fold_wheels
+from pbrl_ppl.parameters import by_prior
 from pbrl_ppl.posterior import convergence, from_groups, group, parameter_draws, problem_of
 from pbrl_ppl.sampling.fitting import sample
 from pbrl_ppl.sampling.ranks import MOST_DRAWS, rank
@@ -270,7 +270,7 @@ def replicate(design: Problem, truth: Truth, seed: int, settings: Mapping[str, A
 def _quantities(problem: Problem, phi: Floats, sigma: Floats, likelihood: Floats) -> Floats:
     """Return the ranked quantities: folded phi, sigma, log-likelihood, shape (draw, quantity)."""
     sigma = problem.likelihood.free(sigma)
-    return np.hstack([fold_wheels(problem.layout, phi), sigma, likelihood[:, None]])
+    return np.hstack([by_prior(problem.layout, phi), sigma, likelihood[:, None]])
 
 
 def labels(problem: Problem) -> tuple[str, ...]:

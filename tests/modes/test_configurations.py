@@ -508,8 +508,7 @@ def test_the_file_holds_all_of_it(fitted, tmp_path) -> None:
     assert updated_scene(loaded).joints[0].bodies is None
 
 
-def test_an_update_fits_anew_rather_than_move_an_index(fitted, monkeypatch) -> None:
-    """A step from body 1 to body 1.3 is none."""
+def test_an_update_refits_over_all_configurations(fitted, monkeypatch) -> None:
     truth = scene(Joint("hinge", ("a", "b"), *HELD), poses=LINED)
     more = simulated_history(
         truth, {}, seed=9, trajectories=1, intervals=2, noise=NOISE, poses=LINED, substeps=20

@@ -14,7 +14,7 @@ from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, TransitionLikelih
 from pbrl_ppl.modes import search, trajectory_mode
 from pbrl_ppl.modes.laplace import climb
 from pbrl_ppl.modes.search import find_mode, find_modes
-from pbrl_ppl.parameters import differentiate, fold_wheels
+from pbrl_ppl.parameters import by_prior, differentiate
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.carts import CART, cart_scene
@@ -169,11 +169,11 @@ def test_four_descriptions_of_a_wheel_are_one(problem, x, y, angle, mu_x, mu_y) 
         {"w_theta": angle - np.pi / 2, "mu_x": mu_y, "mu_y": mu_x},
     ]
     phis = np.array([layout.to_vector(base | one) for one in same])
-    folded = np.array([fold_wheels(problem.layout, phi) for phi in phis])
+    folded = np.array([by_prior(problem.layout, phi) for phi in phis])
     first = layout.to_dict(folded[0])
     assert first["mu_x"] <= first["mu_y"]
     assert -np.pi / 2 - 1e-12 < first["w_theta"] <= np.pi / 2  # to rounding
-    np.testing.assert_allclose(fold_wheels(problem.layout, folded[0]), folded[0])
+    np.testing.assert_allclose(by_prior(problem.layout, folded[0]), folded[0])
     if mu_x != mu_y:
         turn = 2 * layout.to_dict(folded)["w_theta"]
         np.testing.assert_allclose(np.cos(turn - turn[0]), 1.0)
@@ -190,7 +190,7 @@ def test_four_descriptions_of_a_wheel_are_one(problem, x, y, angle, mu_x, mu_y) 
 def test_fold_leaves_a_body_without_wheel_alone(history) -> None:
     problem = Problem.of(Physics(cart_scene(wheel=False)), history)
     phi = np.array([1.0, 0.2, 0.3])
-    np.testing.assert_array_equal(fold_wheels(problem.layout, phi), phi)
+    np.testing.assert_array_equal(by_prior(problem.layout, phi), phi)
 
 
 def test_a_partly_known_wheel_is_not_turned(history) -> None:
@@ -198,7 +198,7 @@ def test_a_partly_known_wheel_is_not_turned(history) -> None:
     known = KNOWN_CONTACT["known"] | {"w_theta": 0.1}
     problem = Problem.of(Physics(cart_scene(known=known)), history)
     phi = problem.layout.to_vector(CART | {"mu_x": 0.9, "mu_y": 0.1})
-    np.testing.assert_array_equal(fold_wheels(problem.layout, phi), phi)
+    np.testing.assert_array_equal(by_prior(problem.layout, phi), phi)
 
 
 def test_whole_trajectories_tell_the_sensor_s_noise(problem, modes) -> None:

@@ -11,7 +11,7 @@ from pbrl_ppl.likelihood import Problem, along_trajectories, single_transitions
 from pbrl_ppl.model import build_model
 from pbrl_ppl.modes import Space, constrain, find_mode, trajectory_mode, unconstrain
 from pbrl_ppl.modes.space import silent
-from pbrl_ppl.parameters import Prior, evened, prior_draws
+from pbrl_ppl.parameters import Prior, prior_draws, symmetrised
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.scene import Body, Scene, Shape
@@ -144,7 +144,7 @@ def test_a_circle_is_cut_opposite_to_the_centre(mode) -> None:
 def test_the_density_is_pymc_s(likelihood) -> None:
     """Prior, transforms and likelihood, with a prior that distinguishes a wheel's descriptions.
 
-    But for the evened prior of the wheel, and the cube roots of noise that may vanish.
+    But for the symmetrised prior of the wheel, and the cube roots of noise that may vanish.
     """
     scene = cart_scene(prior={"w_theta": {"mu": 0.6, "kappa": 0.7}, "mu_x": {"mu": 0.2}})
     history = simulated_history(scene, CART, seed=7, trajectories=3, intervals=4)
@@ -181,7 +181,7 @@ def test_the_density_is_pymc_s(likelihood) -> None:
         }
         values = {model.rvs_to_values[model[name]].name: v for name, v in named.items()}
         theirs.append(float(function(values)))
-    even = evened(layout, phi).sum(axis=-1)
+    even = symmetrised(layout, phi).sum(axis=-1)
     assert np.abs(even).min() > 0
     # PyMC's constant of a truncated normal distribution has nine digits
     np.testing.assert_allclose(ours - roots - even, theirs, atol=1e-6, rtol=1e-10)

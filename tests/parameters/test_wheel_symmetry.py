@@ -9,13 +9,10 @@ from pbrl_ppl.effects import attach
 from pbrl_ppl.effects.friction import wheel
 from pbrl_ppl.parameters import (
     Layout,
-    evened,
-    fold_draws,
-    fold_wheels,
-    gathered,
-    most_probable_wheels,
+    by_prior,
+    nearest,
     prior_draws,
-    redescribed,
+    symmetrised,
     wheels,
 )
 from pbrl_ppl.physics import build_layout
@@ -76,7 +73,7 @@ def test_a_wheel_that_an_effect_adds_is_folded_too() -> None:
     phi = draws_of(layout, 50)
     for turns in range(4):
         np.testing.assert_allclose(
-            fold_wheels(layout, own.turned(phi, turns)), fold_wheels(layout, phi), atol=1e-12
+            by_prior(layout, own.turned(phi, turns)), by_prior(layout, phi), atol=1e-12
         )
 
 
@@ -97,9 +94,7 @@ def test_folding_keeps_the_prior(name) -> None:
     """Draws of the prior, folded, are where it is as probable; a known angle is left alone."""
     layout = layout_of(name)
     phi = draws_of(layout)
-    folded = fold_draws(layout, dict(zip(layout.labels, phi.T, strict=True)))
-    alone = fold_wheels(layout, phi)
-    for each in (np.stack(list(folded.values()), axis=1), alone):
+    for each in (nearest(layout, phi), nearest(layout, phi, phi[:1])):
         before, after = layout.log_prior(phi).sum(axis=1), layout.log_prior(each).sum(axis=1)
         np.testing.assert_allclose(after, before)
         if PERIODS[name] == 4:
@@ -107,7 +102,7 @@ def test_folding_keeps_the_prior(name) -> None:
         if PERIODS[name] == 2:
             others = [i for i, label in enumerate(layout.labels) if label != "w_theta[cart]"]
             np.testing.assert_array_equal(each[:, others], phi[:, others])
-    angle, x, y = columns(layout, alone).T
+    angle, x, y = columns(layout, by_prior(layout, phi)).T
     if PERIODS[name] < 4:
         assert (np.abs(angle) <= np.pi / 2 + 1e-12).all()
     if PERIODS[name] == 1:
@@ -119,7 +114,7 @@ def test_the_likeliest_description_is(name) -> None:
     layout = layout_of(name)
     (wheel,) = wheels(layout)
     phi = draws_of(layout, 100)
-    best = layout.log_prior(most_probable_wheels(layout, phi)).sum(axis=1)
+    best = layout.log_prior(by_prior(layout, phi)).sum(axis=1)
     for turns in range(4):
         assert (best >= layout.log_prior(wheel.turned(phi, turns)).sum(axis=1) - 1e-12).all()
 
@@ -131,12 +126,13 @@ def test_descriptions_drawn_anew_have_the_prior_s_distribution(name) -> None:
     Two-sample Kolmogorov-Smirnov tests of three parameters: one false alarm in 3000.
     """
     layout, rng = layout_of(name), np.random.default_rng(5)
-    gone = gathered(layout, draws_of(layout))  # one description, by place and not by probability
-    phi = redescribed(layout, gone, rng)
+    gone = nearest(layout, draws_of(layout), any_prior=True)  # by place, not by probability
+    phi = by_prior(layout, gone, rng)
     if PERIODS[name] > 1:
         expected = draws_of(layout, seed=2)
         if PERIODS[name] == 2:  # the angle is known to half a turn, and no better
-            phi, expected = fold_wheels(layout, phi), fold_wheels(layout, expected)
+            at = np.array([layout.to_vector(CART)])  # any centre that is the same for both
+            phi, expected = nearest(layout, phi, at), nearest(layout, expected, at)
         for found, right in zip(columns(layout, phi).T, columns(layout, expected).T, strict=True):
             assert stats.ks_2samp(found, right).pvalue > 1e-4
     else:
@@ -144,17 +140,17 @@ def test_descriptions_drawn_anew_have_the_prior_s_distribution(name) -> None:
 
 
 @EVERY
-def test_the_evened_prior_is_the_descriptions_mean(name) -> None:
+def test_the_symmetrised_prior_is_the_descriptions_mean(name) -> None:
     """The same for each of the four; the prior itself where it is even."""
     layout = layout_of(name)
     (wheel,) = wheels(layout)
     phi = draws_of(layout, 5)
     own = layout.log_prior(phi).sum(axis=1)
     four = [np.exp(layout.log_prior(wheel.turned(phi, k)).sum(axis=1)) for k in range(4)]
-    change = evened(layout, phi).sum(axis=1)
+    change = symmetrised(layout, phi).sum(axis=1)
     np.testing.assert_allclose(own + change, np.log(np.mean(four, axis=0)))
     turned = wheel.turned(phi, 1)
-    after = layout.log_prior(turned).sum(axis=1) + evened(layout, turned).sum(axis=1)
+    after = layout.log_prior(turned).sum(axis=1) + symmetrised(layout, turned).sum(axis=1)
     np.testing.assert_allclose(after, own + change)
     if PERIODS[name] == 1:
         np.testing.assert_array_equal(change, 0.0)
