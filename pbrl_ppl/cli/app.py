@@ -11,7 +11,7 @@ import typer
 
 from pbrl_ppl import __version__
 from pbrl_ppl.cli.commands import commands
-from pbrl_ppl.cli.terminal import BAD_INPUT, in_options, interrupted, warnings_in_a_line
+from pbrl_ppl.cli.terminal import BAD_INPUT, in_a_line, interrupted, warnings_in_a_line
 from pbrl_ppl.errors import PbrlError
 
 app = typer.Typer(
@@ -45,26 +45,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     os.environ.setdefault("MPLBACKEND", "Agg")  # commands show no windows
     argv = sys.argv[1:] if argv is None else list(argv)
-    options = _options_of(argv)
     try:
-        with warnings_in_a_line(options):
+        with warnings_in_a_line():
             app(args=argv, prog_name="pbrl-ppl")
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
     except KeyboardInterrupt:
         return interrupted()
     except PbrlError as error:
-        # one line, whatever the message quotes from a file
-        print(f"error: {in_options(str(error), options)}", file=sys.stderr)  # noqa: T201
+        print(f"error: {in_a_line(error)}", file=sys.stderr)  # noqa: T201
         return BAD_INPUT
     return 0
-
-
-def _options_of(argv: Sequence[str]) -> set[str]:
-    """Return the options of the command that runs, such as ``--draws``."""
-    commands = typer.main.get_command(app).commands  # type: ignore[attr-defined]
-    asked = next((word for word in argv if word in commands), None)
-    return {name for option in commands[asked].params for name in option.opts} if asked else set()
 
 
 def _show_version(value: bool) -> None:

@@ -147,7 +147,7 @@ def _simulated(physics: Physics, phi: Floats, recorded: History) -> list[Floats]
         label = recorded.dataset["trajectory"].to_numpy()[min(lost)]
         raise HistoryError(
             f"history: trajectory {label} has no complete state to start from; measure one, drop it"
-            " or pass estimate_velocities=True"
+            " or pass --estimate-velocities"
         )
     check_history(physics.scene, recorded, segments)
     predicted = physics.predict(phi, segments.start, segments.inputs)

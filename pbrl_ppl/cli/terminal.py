@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import json
-import re
 import signal
 import sys
 import tempfile
 import threading
 import time
 import warnings
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -29,12 +28,6 @@ from pbrl_ppl.files import json_values
 #: inseparable; bad input or usage; chains that have not converged, so no verdict; an interrupt, as
 #: shells report it.
 FAILED, BAD_INPUT, UNDECIDED, INTERRUPTED = 1, 2, 3, 130
-
-#: Advice in messages for Python, by the argument that it names: left out of the messages of a
-#: command that has no such option.
-_ADVICE = {"thin": " or thin=", "resume": ", or go on with resume= this posterior"}
-#: An argument named in a message for Python.
-_ARGUMENT = re.compile(r"\b([a-z_]+)=(?:True\b|'(\w+)')?(?=[\s,;.)]|$)")
 
 
 @contextmanager
@@ -100,41 +93,17 @@ def interrupted(state: str = "nothing was written") -> int:
     return INTERRUPTED
 
 
-def in_options(message: str, options: Collection[str]) -> str:
-    """Return a message for Python in one line, with a command's options for its arguments.
-
-    Parameters
-    ----------
-    message : str
-        It names arguments as ``draws=``, ``estimate_velocities=True`` or ``likelihood='name'``.
-    options : collection of str
-        Those of the command, such as ``--draws``.
-
-    Examples
-    --------
-    >>> in_options("raise draws= or thin=, or measure y", ["--draws"])
-    'raise --draws, or measure y'
-    """
-    message = " ".join(message.split())
-    for name, words in _ADVICE.items():
-        if f"--{name}" not in options:
-            message = message.replace(words, "")
-
-    def option(match: re.Match[str]) -> str:
-        name = f"--{match[1].replace('_', '-')}"
-        if name not in options:
-            return match[0]
-        return f"{name} {match[2]}" if match[2] else name
-
-    return _ARGUMENT.sub(option, message)
+def in_a_line(message: object) -> str:
+    """Return a message in one line, whatever it quotes from a file."""
+    return " ".join(str(message).split())
 
 
 @contextmanager
-def warnings_in_a_line(options: Collection[str] = ()) -> Iterator[None]:
-    """Show each warning in one line, without its line of code, naming a command's options."""
+def warnings_in_a_line() -> Iterator[None]:
+    """Show each warning in one line, without its line of code."""
 
     def show(message: Warning | str, *_: object, **__: object) -> None:
-        print(f"warning: {in_options(str(message), options)}", file=sys.stderr)  # noqa: T201
+        print(f"warning: {in_a_line(message)}", file=sys.stderr)  # noqa: T201
 
     with warnings.catch_warnings():
         warnings.simplefilter("always", UserWarning)

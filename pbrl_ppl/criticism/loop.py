@@ -192,7 +192,7 @@ class Loop:
         bodies = [moving.name for moving in self.scene.dynamic]
         body = body or found or (bodies[0] if len(bodies) == 1 else "")
         if not body:
-            raise FitError(f"remainder: no body stands out; give body=, one of {bodies}")
+            raise FitError(f"remainder: no body stands out; give the body, one of {bodies}")
         return learn_remainder(
             self.revised, body, catalogue=self.catalogue, seed=seed,
             criteria=self.criteria, progress=progress,
@@ -307,7 +307,7 @@ def check_folder(folder: Path, overwrite: bool) -> Path:
     if not overwrite and any(folder.iterdir()):
         raise OutputError(
             f"output folder {folder}: it is not empty; choose another, or allow"
-            " overwriting: overwrite=True"
+            " overwriting (overwrite, --overwrite)"
         )
     for name in (*FILES, REMAINDER):
         if (folder / name).is_dir():

@@ -123,7 +123,7 @@ def posterior_mode(fit: Fit) -> Mode:
     if problem.likelihood.independent:
         raise PosteriorError(
             "posterior: it is of single transitions, which do not separate measurement noise from"
-            " process noise; take after.nc of close_loop, or fit with trajectories=True"
+            " process noise; take after.nc of close_loop, or fit whole trajectories"
         )
     return trajectory_mode(problem, *fit.best)
 

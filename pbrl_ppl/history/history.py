@@ -481,9 +481,10 @@ def check_start(history: History, scene: Scene) -> None:
     ]
     raise HistoryError(
         f"history: single transitions start from measured states: missing are {'; '.join(parts)};"
-        " fit whole trajectories (likelihood='trajectories'), measure them, declare the hinge that"
-        " holds the body in the scene (it gives x, y, vx, vy from theta and omega), or pass"
-        " estimate_velocities=True (it gives vx, vy, omega from x, y, theta)"
+        " fit whole trajectories (the likelihood 'trajectories'), measure them, declare the hinge"
+        " that holds the body in the scene (it gives x, y, vx, vy from theta and omega), or have"
+        " velocities estimated (estimate_velocities, --estimate-velocities: it gives vx, vy, omega"
+        " from x, y, theta)"
     )
 
 

@@ -105,7 +105,7 @@ def resampled(rows: Rows, scene: Scene, source: str) -> Rows:
         )
         message += (
             f"; {lost}: difference quotients of the positions, no measurements, and left empty"
-            " (--estimate-velocities, estimate_velocities=True)"
+            " (estimate_velocities, --estimate-velocities)"
         )
     warnings.warn(message, ResamplingWarning, stacklevel=3)
     return result

@@ -361,7 +361,7 @@ def _steps(rows: Rows, order: Ints, scene: Scene) -> tuple[Bools, Ints]:
             i,
             f"{change[i]:.6g} s since the step before",
             f"expected {dt:.6g} s, the scene's time_step, within 1 %; correct time_step, or have"
-            " the history resampled (resample=True, --time-step)",
+            " the history resampled (resample, --time-step)",
         )
     position = np.empty(len(order), dtype=np.int64)
     position[order] = group - np.maximum.accumulate(np.where(inside, 0, group))

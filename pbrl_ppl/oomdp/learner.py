@@ -171,8 +171,8 @@ class Learner(ABC):
             whole &= np.isfinite(values[:, learned]).all(axis=(1, 2))
         if not whole.any():
             raise HistoryError(
-                f"learn: none of {len(whole)} transitions was measured whole; load the history with"
-                " estimate_velocities=True if velocities are missing"
+                f"learn: none of {len(whole)} transitions was measured whole; have velocities"
+                " estimated (estimate_velocities) if they are missing"
             )
         self.observe(state[whole], action[whole], after[whole])
 

@@ -332,11 +332,11 @@ def _warnings(
     problem: Problem, idata: Any, asked: tuple[int, int] | None
 ) -> Iterator[tuple[type[Warning], str]]:
     """Yield category and message of each warning, with the cure."""
-    on = "go on with resume= this posterior"
+    on = "resume this posterior"
     if problem.layout.discrete.any():  # fit does not go on over joints of unknown bodies
-        on = "name the bodies that were found in the scene, fit that and go on with resume="
+        on = "name the bodies that were found in the scene, fit that and resume it"
     weighted = SIZE in idata.attrs
-    more = f"raise draws=, or {on}" if weighted else f"raise draws= or thin=, or {on}"
+    more = f"raise draws, or {on}" if weighted else f"raise draws or thin, or {on}"
     if "updates" in idata.attrs:  # resampled draws are no chain that could go on
         more = "these draws were reweighted by update; fit all data anew"
     found = json.loads(str(idata.attrs.get("linearisation", '{"sd": 0}')))
@@ -360,8 +360,8 @@ def _warnings(
         yield (
             ConvergenceWarning,
             f"Pareto k of the proposals' weights is {idata.attrs[PARETO_K]:.2g} (want <="
-            f" {MAX_PARETO_K}): they may miss a part of the posterior; raise draws=, or compare"
-            " with method='metropolis'",
+            f" {MAX_PARETO_K}): they may miss a part of the posterior; raise draws, or compare"
+            " with the method 'metropolis'",
         )
     rough = doubts(idata)
     if rough is not None:
@@ -381,7 +381,7 @@ def _warnings(
         yield (
             ConvergenceWarning,
             "one chain alone cannot show whether it has converged: R-hat compares chains; raise"
-            " chains= to 4",
+            " chains to 4",
         )
     else:
         short = []

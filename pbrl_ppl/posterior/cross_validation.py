@@ -102,7 +102,7 @@ def compare(before: Any, after: Any) -> Comparison | None:
     if left_out(after) != unit:
         raise PosteriorError(
             f"compare: one posterior leaves out one {unit} at a time and the other one"
-            f" {left_out(after)}; fit both with the same likelihood="
+            f" {left_out(after)}; fit both with the same likelihood"
         )
     for posterior in (before, after):
         sizes = group(posterior, "posterior").sizes
@@ -218,7 +218,7 @@ def by_number(idata: Any) -> Any:
     if left_out(idata) == "trajectory":
         raise PosteriorError(
             "by_number: the posterior is of whole trajectories, whose later transitions have seen"
-            " the one left out; fit with likelihood='transitions', or take az.loo of by_trajectory"
+            " the one left out; fit single transitions, or take az.loo of by_trajectory"
         )
     predictive = group(idata, "posterior_predictive")["next_state"]
     predictive = predictive.transpose("chain", "draw", *CELLS)

@@ -175,7 +175,7 @@ def linearised_as(problem: Problem, idata: Any) -> Problem:
     if held != kind:
         raise PosteriorError(
             f"posterior: its likelihood is of {held}, the model's of {kind}; make the model with"
-            f" likelihood={held!r}"
+            f" the likelihood {held!r}"
         )
     record = PosteriorRecord.of(idata)
     if problem.likelihood.simulated:

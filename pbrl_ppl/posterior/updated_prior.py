@@ -240,7 +240,9 @@ def library_probabilities(idata: Any) -> pd.DataFrame:
         If it is of a model without a library.
     """
     if "library" not in idata.attrs:
-        raise PosteriorError("posterior: its model has no library; pass library= to physics_model")
+        raise PosteriorError(
+            "posterior: its model has no library; pass its library to physics_model"
+        )
     names = ParameterLibrary.from_json(str(idata.attrs["library"])).names
     index = group(idata, "posterior")["library_index"].transpose("chain", "draw", ...)
     (dim,) = index.dims[2:]

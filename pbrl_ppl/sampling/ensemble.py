@@ -597,7 +597,7 @@ def anneal(
         if np.isneginf(gap).all():
             raise FitError(
                 f"fit: the model gives none of {len(gap)} draws about its mode a density; start"
-                " from another mode, or use method='laplace'"
+                " from another mode, or use the method 'laplace'"
             )
         rest = (1.0 - beta) * gap
         if weigh and (rungs == _RUNGS or _suffices(rest)):

@@ -297,23 +297,23 @@ def _check(problem: Problem, method: str, start: Any, resume: Any) -> None:
     if method not in METHODS:
         raise FitError(f"fit: method is {method!r}, expected one of {', '.join(METHODS)}")
     if start is not None and resume is not None:
-        raise FitError("fit: start= and resume= are given, but chains begin at one: leave one out")
+        raise FitError("fit: start and resume are given, but chains begin at one: leave one out")
     if start is not None and not isinstance(start, Mode):
         raise FitError(
             f"fit: start is a {type(start).__name__}, expected a Mode; pass a posterior to go on"
-            " with as resume="
+            " with as resume"
         )
     names = [] if start is None else [each.likelihood.name for each in (start.problem, problem)]
     if "simulation" in names and names[0] != names[1]:
         raise FitError(
             f"fit: start is a mode of the likelihood {names[0]}, the model's is {names[1]}; leave"
-            " out start=, or pass it to physics_model as around="
+            " out start, or pass it to physics_model as around"
         )
     given = "start" if start is not None else "resume" if resume is not None else None
     if problem.library is not None and (method not in (DEFAULT, "paper") or given):
         raise FitError(
-            "fit: a model with a library is summed over exactly, or walked over by method='paper';"
-            " leave out method= or use that, and leave out start= and resume="
+            "fit: a model with a library is summed over exactly, or walked over by the method"
+            " 'paper'; leave out method or use that, and leave out start and resume"
         )
     if problem.layout.discrete.any():
         if method == "smc":
@@ -324,9 +324,9 @@ def _check(problem: Problem, method: str, start: Any, resume: Any) -> None:
             )
         if given:
             raise FitError(
-                f"fit: {given}= was given and which bodies a joint joins is unknown; a fit cannot"
+                f"fit: {given} was given and which bodies a joint joins is unknown; a fit cannot"
                 f" go on from one choice of bodies to all of them; leave {given} out and raise"
-                " draws="
+                " draws"
             )
 
 

@@ -298,7 +298,7 @@ def test_refused_fits(apartment, monkeypatch) -> None:
     model = physics_model(scene, history, library=library)
     for options in ({"method": "nuts"}, {"resume": object()}):
         with pytest.raises(
-            FitError, match="summed over exactly, or walked over by method='paper'; leave out"
+            FitError, match="summed over exactly, or walked over by the method 'paper'; leave out"
         ):
             quick(model, **options)
     monkeypatch.setattr("pbrl_ppl.modes.library_choice._MOST", 10)
@@ -310,5 +310,5 @@ def test_refused_fits(apartment, monkeypatch) -> None:
     jointed = scene.replace(bodies=near, joints=(Joint("distance", ("a", "b"), known=False),))
     with pytest.raises(ParameterError, match="is to be inferred, and a library is of bodies"):
         physics_model(jointed, history, library=library)
-    with pytest.raises(PosteriorError, match="has no library; pass library="):
+    with pytest.raises(PosteriorError, match="has no library; pass its library"):
         library_probabilities(from_groups({}, {}))

@@ -456,7 +456,7 @@ def test_overwrite(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     )
     loop = made_up()
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(OutputError, match=r"is not empty.*overwrite=True"):
+    with pytest.raises(OutputError, match=r"is not empty.*overwrite"):
         loop.save(tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]
     loop.save(tmp_path, overwrite=True, page="a page")
