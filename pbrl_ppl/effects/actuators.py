@@ -1,7 +1,6 @@
 """Actuators: gains, rotation, delay, dead zone, cut-off and saturation of the command."""
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -10,6 +9,7 @@ from pbrl_ppl.effects.stages import Command
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene
+from pbrl_ppl.state import Floats
 
 _GAIN = Prior("log_normal", mu=0.0, sigma=0.5)
 _THRESHOLD = EffectParameter("threshold", "N", Prior("half_normal", sigma=0.5), scale="force")
@@ -20,7 +20,7 @@ _LEVELS, _CUTOFF_LEVELS = 20, 200
 _UNREACHED = 1e9
 
 
-def _rotate(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+def _rotate(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
     c, s = math.cos(parameters[0]), math.sin(parameters[0])
     x = wrench[0]
     wrench[0] = c * x - s * wrench[1]
@@ -36,7 +36,7 @@ actuator_rotation = Effect(
 )
 
 
-def _scale_force(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+def _scale_force(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
     wrench[0] *= parameters[0]
     wrench[1] *= parameters[0]
 
@@ -51,7 +51,7 @@ force_gain = Effect(
 )
 
 
-def _scale_torque(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+def _scale_torque(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
     wrench[2] *= parameters[0]
 
 
@@ -65,7 +65,7 @@ torque_gain = Effect(
 )
 
 
-def _scale_axes(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+def _scale_axes(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
     wrench[0] *= parameters[0]
     wrench[1] *= parameters[1]
 
@@ -80,7 +80,7 @@ anisotropic_gain = Effect(
 )
 
 
-def _delay(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+def _delay(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
     # a delay that ends inside a substep is blended: the likelihood stays smooth in it
     begin, end = command[6], command[7]
     late = min(1.0, max(0.0, (parameters[0] - begin) / (end - begin)))
@@ -100,7 +100,7 @@ actuator_delay = Effect(
 )
 
 
-def _force_levels(history: History, body: Body, most: int) -> Any:
+def _force_levels(history: History, body: Body, most: int) -> Floats:
     """Return at most so many forces between the sizes of those commanded, shape (level, 1), N."""
     action = history.dataset["action"].sel(body=body.name).to_numpy()[..., :2]
     size = np.linalg.norm(action, axis=-1)
@@ -112,14 +112,14 @@ def _force_levels(history: History, body: Body, most: int) -> Any:
     return np.asarray(0.5 * (size[1:] + size[:-1]))[:, None]
 
 
-def _subtract_threshold(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+def _subtract_threshold(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
     size = math.hypot(wrench[0], wrench[1])
     share = 1.0 - parameters[0] / size if size > parameters[0] else 0.0
     wrench[0] *= share
     wrench[1] *= share
 
 
-def _scan_dead_zones(scene: Scene, history: History, body: Body) -> Any:
+def _scan_dead_zones(scene: Scene, history: History, body: Body) -> Floats:
     """Return the null value, where the derivative is taken, and thresholds to try."""
     return np.vstack([[[np.nan]], _force_levels(history, body, _LEVELS)])
 
@@ -134,13 +134,13 @@ dead_zone = Effect(
 )
 
 
-def _cut_off(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+def _cut_off(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
     if math.hypot(wrench[0], wrench[1]) < parameters[0]:
         wrench[0] = 0.0
         wrench[1] = 0.0
 
 
-def _scan_cutoffs(scene: Scene, history: History, body: Body) -> Any:
+def _scan_cutoffs(scene: Scene, history: History, body: Body) -> Floats:
     """Return thresholds to try."""
     return _force_levels(history, body, _CUTOFF_LEVELS)
 
@@ -155,14 +155,14 @@ force_cutoff = Effect(
 )
 
 
-def _saturate(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+def _saturate(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
     size = math.hypot(wrench[0], wrench[1])
     if size > parameters[0]:
         wrench[0] *= parameters[0] / size
         wrench[1] *= parameters[0] / size
 
 
-def _scan_limits(scene: Scene, history: History, body: Body) -> Any:
+def _scan_limits(scene: Scene, history: History, body: Body) -> Floats:
     """Return limits to try."""
     return _force_levels(history, body, _LEVELS)
 

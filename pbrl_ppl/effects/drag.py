@@ -1,17 +1,17 @@
 """Drag: forces and torques that depend on the velocity."""
 
 import math
-from typing import Any
 
 from pbrl_ppl.effects.effect import Effect, EffectParameter
 from pbrl_ppl.effects.stages import Force
 from pbrl_ppl.parameters import Prior
+from pbrl_ppl.state import Floats
 
 #: At the typical motion such a law is of the order of the typical force or torque.
 _TYPICAL = Prior("half_normal", sigma=1.0)
 
 
-def _linear(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+def _linear(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
     wrench[0] -= parameters[0] * state[3]
     wrench[1] -= parameters[0] * state[4]
 
@@ -25,7 +25,7 @@ linear_drag = Effect(
 )
 
 
-def _quadratic(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+def _quadratic(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
     speed = math.sqrt(state[3] * state[3] + state[4] * state[4])
     wrench[0] -= parameters[0] * speed * state[3]
     wrench[1] -= parameters[0] * speed * state[4]
@@ -40,7 +40,7 @@ quadratic_drag = Effect(
 )
 
 
-def _angular(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+def _angular(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
     wrench[2] -= parameters[0] * state[5]
 
 
@@ -53,7 +53,7 @@ angular_drag = Effect(
 )
 
 
-def _magnus(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+def _magnus(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
     wrench[0] -= parameters[0] * state[5] * state[4]
     wrench[1] += parameters[0] * state[5] * state[3]
 

@@ -1,14 +1,14 @@
 """Constant forces and torques, tilted gravity, and a push beside the body's centre."""
 
 import math
-from typing import Any
 
 import numpy as np
 
 from pbrl_ppl.effects.effect import Effect, EffectParameter
-from pbrl_ppl.effects.stages import Force, Properties
+from pbrl_ppl.effects.stages import Clock, Force, Properties, Values
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene
+from pbrl_ppl.state import Floats
 
 _TYPICAL = Prior("normal", sigma=1.0)
 _FORCES = (
@@ -17,7 +17,7 @@ _FORCES = (
 )
 
 
-def _tilt(properties: Any, parameters: Any, clock: Any) -> None:
+def _tilt(properties: dict[str, Floats], parameters: Values, clock: Clock) -> None:
     c, s = np.cos(parameters["angle"]), np.sin(parameters["angle"])
     x, y = properties["gravity_x"], properties["gravity_y"]
     properties["gravity_x"], properties["gravity_y"] = c * x - s * y, s * x + c * y
@@ -37,7 +37,7 @@ gravity_tilt = Effect(
 )
 
 
-def _world_force(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+def _world_force(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
     wrench[0] += parameters[0]
     wrench[1] += parameters[1]
 
@@ -51,7 +51,7 @@ constant_force = Effect(
 )
 
 
-def _body_force(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+def _body_force(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
     c, s = math.cos(state[2]), math.sin(state[2])
     wrench[0] += c * parameters[0] - s * parameters[1]
     wrench[1] += s * parameters[0] + c * parameters[1]
@@ -66,7 +66,7 @@ body_force = Effect(
 )
 
 
-def _torque(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+def _torque(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
     wrench[2] += parameters[0]
 
 
@@ -79,7 +79,7 @@ constant_torque = Effect(
 )
 
 
-def _moment_of_push(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+def _moment_of_push(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
     c, s = math.cos(state[2]), math.sin(state[2])
     arm_x = c * parameters[0] - s * parameters[1]
     arm_y = s * parameters[0] + c * parameters[1]

@@ -1,15 +1,15 @@
 """Friction in hinges, on the floor and of wheels; the engine solves it together with contacts."""
 
 from itertools import product
-from typing import Any
 
 import numpy as np
 
 from pbrl_ppl.effects.effect import Effect, EffectParameter, body_points, is_pivoted
-from pbrl_ppl.effects.stages import Properties
+from pbrl_ppl.effects.stages import Clock, Properties, Values
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene
+from pbrl_ppl.state import Floats
 
 #: Radii that a scan tries, as shares of the body's: of even pressure under a disc, and others.
 _RADII = (2.0 / 3.0, 0.2, 0.4, 1.0)
@@ -18,7 +18,7 @@ _TURNS = 3
 _FRICTION = Prior("half_normal", sigma=0.5)
 
 
-def _add_pivot_damping(properties: Any, parameters: Any, clock: Any) -> None:
+def _add_pivot_damping(properties: dict[str, Floats], parameters: Values, clock: Clock) -> None:
     properties["pivot_damping"] = properties["pivot_damping"] + parameters["coefficient"]
 
 
@@ -36,7 +36,7 @@ pivot_damping = Effect(
 )
 
 
-def _add_pivot_torque(properties: Any, parameters: Any, clock: Any) -> None:
+def _add_pivot_torque(properties: dict[str, Floats], parameters: Values, clock: Clock) -> None:
     properties["pivot_torque"] = properties["pivot_torque"] + parameters["torque"]
 
 
@@ -50,7 +50,7 @@ pivot_friction = Effect(
 )
 
 
-def _add_patch(properties: Any, parameters: Any, clock: Any) -> None:
+def _add_patch(properties: dict[str, Floats], parameters: Values, clock: Clock) -> None:
     properties["patch_mu"] = properties["patch_mu"] + parameters["mu"]
     properties["patch_radius"] = properties["patch_radius"] + parameters["radius"]
 
@@ -59,7 +59,7 @@ def _is_pressed(scene: Scene, body: Body) -> bool:
     return scene.normal_gravity > 0
 
 
-def _scan_radii(scene: Scene, history: History, body: Body) -> Any:
+def _scan_radii(scene: Scene, history: History, body: Body) -> Floats:
     """Return radii to try, several if the body turns; the derivative is taken at zero friction.
 
     More friction would hold the body still now and then, where the derivative is meaningless.
@@ -86,7 +86,7 @@ sliding_friction = Effect(
 )
 
 
-def _add_wheel(properties: Any, parameters: Any, clock: Any) -> None:
+def _add_wheel(properties: dict[str, Floats], parameters: Values, clock: Clock) -> None:
     for name in ("w_x", "w_y", "w_theta", "mu_x", "mu_y"):
         properties[name] = properties[name] + parameters[name]
 
@@ -95,7 +95,7 @@ def _lacks_wheel(scene: Scene, body: Body) -> bool:
     return scene.normal_gravity > 0 and not body.wheel
 
 
-def _scan_wheels(scene: Scene, history: History, body: Body) -> Any:
+def _scan_wheels(scene: Scene, history: History, body: Body) -> Floats:
     """Return places and directions to try; the derivative is taken by both frictions."""
     turns = np.arange(_TURNS) * (0.5 * np.pi / _TURNS)
     grid = product(body_points(body), turns)

@@ -7,13 +7,14 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, final
+from typing import final
 
 import numpy as np
 
 from pbrl_ppl.effects.effect import Effect, EffectParameter
-from pbrl_ppl.effects.stages import Force
+from pbrl_ppl.effects.stages import Force, Law
 from pbrl_ppl.parameters import Prior
+from pbrl_ppl.state import Floats, Ints
 
 #: Name of every learned remainder.
 LEARNED_REMAINDER = "learned_remainder"
@@ -71,14 +72,14 @@ def learned_remainder(table: str) -> LearnedRemainder:
     )
 
 
-def _law_of(centre: Any, sharpness: Any, output: Any, forms: Any) -> Callable[..., None]:
+def _law_of(centre: Floats, sharpness: Floats, output: Ints, forms: Floats) -> Law:
     """Return the law, a closure over the table's arrays."""
     bumps = len(centre)
     # a bump is part of the forms of one process only, which are consecutive
     begin = np.argmax(forms != 0, axis=0)
     end = len(forms) - np.argmax(forms[::-1] != 0, axis=0)
 
-    def law(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+    def law(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
         c, s = math.cos(state[2]), math.sin(state[2])
         forward = c * state[3] + s * state[4]
         sideways = c * state[4] - s * state[3]

@@ -1,14 +1,13 @@
 """Mass, moment of inertia and centre of mass."""
 
-from typing import Any
-
 import numpy as np
 
 from pbrl_ppl.effects.effect import Effect, EffectParameter
-from pbrl_ppl.effects.stages import Properties
+from pbrl_ppl.effects.stages import Clock, Properties, Values
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene
+from pbrl_ppl.state import Floats
 
 _OFFSET = Prior("normal", sigma=0.2)
 _SCALE = Prior("log_normal", mu=0.0, sigma=0.5)
@@ -16,7 +15,7 @@ _SCALE = Prior("log_normal", mu=0.0, sigma=0.5)
 _BEGINS = 20
 
 
-def _scale_moment(properties: Any, parameters: Any, clock: Any) -> None:
+def _scale_moment(properties: dict[str, Floats], parameters: Values, clock: Clock) -> None:
     properties["moment_per_mass"] = properties["moment_per_mass"] * parameters["scale"]
 
 
@@ -29,7 +28,7 @@ inertia_scale = Effect(
 )
 
 
-def _shift_centre(properties: Any, parameters: Any, clock: Any) -> None:
+def _shift_centre(properties: dict[str, Floats], parameters: Values, clock: Clock) -> None:
     properties["com_x"] = properties["com_x"] + parameters["x"]
     properties["com_y"] = properties["com_y"] + parameters["y"]
 
@@ -46,13 +45,13 @@ com_offset = Effect(
 )
 
 
-def _scale_mass(properties: Any, parameters: Any, clock: Any) -> None:
+def _scale_mass(properties: dict[str, Floats], parameters: Values, clock: Clock) -> None:
     # the interval in which the mass changes is blended
     loaded = clock.after(parameters["time"]) * (clock.trajectory > parameters["trajectory"] - 0.5)
     properties["mass"] = properties["mass"] * (1.0 + (parameters["factor"] - 1.0) * loaded)
 
 
-def _scan_begins(scene: Scene, history: History, body: Body) -> Any:
+def _scan_begins(scene: Scene, history: History, body: Body) -> Floats:
     """Return changes from some trajectory on, then in every trajectory from some time on."""
     data = history.dataset
     numbers = data["number"].to_numpy()

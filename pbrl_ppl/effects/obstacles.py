@@ -1,12 +1,11 @@
 """Obstacles that the scene does not show: static discs."""
 
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 
 from pbrl_ppl.effects.effect import Effect, EffectParameter, is_pivoted
-from pbrl_ppl.effects.stages import Disc, Structure
+from pbrl_ppl.effects.stages import Disc, Structure, Values
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene, Shape
@@ -24,11 +23,11 @@ _TURNS = tuple((np.cos(turn), np.sin(turn)) for turn in (0.0, 0.3, -0.3))
 _NEAR = 0.1
 
 
-def _discs(parameters: Any) -> tuple[Disc, ...]:
+def _discs(parameters: Values) -> tuple[Disc, ...]:
     return (Disc(parameters["x"], parameters["y"], parameters["radius"]),)
 
 
-def _scan(scene: Scene, history: History, body: Body) -> Any:
+def _scan(scene: Scene, history: History, body: Body) -> Floats:
     """Return discs that several hits agree on, then discs of single hits.
 
     Where the velocity changed by ``dv``, the obstacle lies along ``-dv``. The change of the angular

@@ -1,27 +1,25 @@
 """Measurement: bias, scale and rotation of what is measured, and heavy-tailed noise."""
 
-from typing import Any
-
 import numpy as np
 
 from pbrl_ppl.effects.effect import Effect, EffectParameter
-from pbrl_ppl.effects.stages import Noise, Sensor
+from pbrl_ppl.effects.stages import Noise, Sensor, Values
 from pbrl_ppl.parameters import Prior
-from pbrl_ppl.state import STATE, STATE_UNITS
+from pbrl_ppl.state import STATE, STATE_UNITS, Floats
 
 #: Natural units of a body's state; an angle has none.
 _SCALES = ("range", "range", "", "speed", "speed", "turn_rate")
 
 
-def _bias(parameters: Any) -> Any:
+def _bias(parameters: Values) -> Floats:
     return np.stack(np.broadcast_arrays(*(parameters[name] for name in STATE)), axis=-1)
 
 
-def _add_bias(state: Any, parameters: Any) -> Any:
+def _add_bias(state: Floats, parameters: Values) -> Floats:
     return state + _bias(parameters)
 
 
-def _subtract_bias(measured: Any, parameters: Any) -> Any:
+def _subtract_bias(measured: Floats, parameters: Values) -> Floats:
     return measured - _bias(parameters)
 
 
@@ -37,16 +35,16 @@ sensor_bias = Effect(
 )
 
 
-def _factors(parameters: Any) -> Any:
+def _factors(parameters: Values) -> Floats:
     length, angle = np.broadcast_arrays(parameters["length"], parameters["angle"])
     return np.stack([length, length, angle, length, length, angle], axis=-1)
 
 
-def _multiply(state: Any, parameters: Any) -> Any:
+def _multiply(state: Floats, parameters: Values) -> Floats:
     return state * _factors(parameters)
 
 
-def _divide(measured: Any, parameters: Any) -> Any:
+def _divide(measured: Floats, parameters: Values) -> Floats:
     return measured / _factors(parameters)
 
 
@@ -65,18 +63,18 @@ sensor_scale = Effect(
 )
 
 
-def _turned(state: Any, angle: Any) -> Any:
+def _turned(state: Floats, angle: Floats) -> Floats:
     c, s = np.cos(angle), np.sin(angle)
     x, y, theta, vx, vy, omega = np.moveaxis(state, -1, 0)
     parts = (c * x - s * y, s * x + c * y, theta + angle, c * vx - s * vy, s * vx + c * vy, omega)
     return np.stack(np.broadcast_arrays(*parts), axis=-1)
 
 
-def _turn(state: Any, parameters: Any) -> Any:
+def _turn(state: Floats, parameters: Values) -> Floats:
     return _turned(state, parameters["angle"])
 
 
-def _turn_back(measured: Any, parameters: Any) -> Any:
+def _turn_back(measured: Floats, parameters: Values) -> Floats:
     return _turned(measured, -parameters["angle"])
 
 
@@ -90,7 +88,7 @@ frame_rotation = Effect(
 )
 
 
-def _tail(parameters: Any) -> Any:
+def _tail(parameters: Values) -> Floats:
     return parameters["inverse_nu"]
 
 

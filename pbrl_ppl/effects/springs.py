@@ -2,13 +2,12 @@
 
 from itertools import product
 from math import floor, pi
-from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
 
 from pbrl_ppl.effects.effect import Effect, EffectParameter, body_points, is_unpivoted
-from pbrl_ppl.effects.stages import Force, Rod, Structure
+from pbrl_ppl.effects.stages import Force, Rod, Structure, Values
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene
@@ -36,12 +35,12 @@ def _poses(history: History, body: Body, width: int) -> Floats:
     return np.asarray(poses[np.isfinite(poses).all(axis=1)])
 
 
-def _spring(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+def _spring(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
     wrench[0] -= parameters[0] * (state[0] - parameters[1])
     wrench[1] -= parameters[0] * (state[1] - parameters[2])
 
 
-def _scan_anchors(scene: Scene, history: History, body: Body) -> Any:
+def _scan_anchors(scene: Scene, history: History, body: Body) -> Floats:
     """Return anchors among the measured positions; the derivative is taken by the stiffness."""
     places = _poses(history, body, 2)
     if not len(places):
@@ -65,14 +64,14 @@ spring = Effect(
 )
 
 
-def _torsion_spring(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+def _torsion_spring(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
     # the shorter way round: a logged angle has no number of turns
     off = state[2] - parameters[1]
     off -= 2.0 * pi * floor((off + pi) / (2.0 * pi))
     wrench[2] -= parameters[0] * off
 
 
-def _scan_angles(scene: Scene, history: History, body: Body) -> Any:
+def _scan_angles(scene: Scene, history: History, body: Body) -> Floats:
     """Return angles of rest whose opposite the body never reaches; all if it reaches each.
 
     The torque jumps at the opposite angle, and such a saw-tooth fits any residual. The derivative
@@ -98,14 +97,14 @@ torsion_spring = Effect(
 )
 
 
-def _attraction(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+def _attraction(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
     x, y = parameters[1] - state[0], parameters[2] - state[1]
     strength = parameters[0] * (x * x + y * y + parameters[3] * parameters[3]) ** -1.5
     wrench[0] += strength * x
     wrench[1] += strength * y
 
 
-def _scan_places(scene: Scene, history: History, body: Body) -> Any:
+def _scan_places(scene: Scene, history: History, body: Body) -> Floats:
     """Return places about the measured positions; the derivative is taken by the strength."""
     places = _poses(history, body, 2)
     if not len(places):
@@ -135,11 +134,11 @@ point_attractor = Effect(
 )
 
 
-def _rod(parameters: Any) -> Rod:
+def _rod(parameters: Values) -> Rod:
     return Rod(*(parameters[name] for name in Rod._fields))
 
 
-def _scan_rods(scene: Scene, history: History, body: Body) -> Any:
+def _scan_rods(scene: Scene, history: History, body: Body) -> Floats:
     """Return rods whose length is constant over the measured poses, by least squares."""
     radius = body.shape.bounding_radius
     poses = _poses(history, body, 3) / [radius, radius, 1.0]  # in radii of the body

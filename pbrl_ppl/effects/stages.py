@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple, final
+from typing import NamedTuple, final
 
 import numpy as np
 
@@ -16,7 +16,7 @@ Values = Mapping[str, Floats]
 #: ``law(state, command, parameters, wrench)``, all arrays of floats: one body's state (6,), its
 #: command, the effect's parameters (q,), and the wrench (3,), which it changes in place. It runs
 #: inside the compiled substep loop: plain arithmetic and ``math`` only.
-Law = Callable[[Any, Any, Any, Any], None]
+Law = Callable[[Floats, Floats, Floats, Floats], None]
 
 
 @final
