@@ -10,11 +10,13 @@ from __future__ import annotations
 import platform
 import sys
 from collections import namedtuple
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+import pymunk
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
@@ -24,10 +26,10 @@ from pymunk import _chipmunk_cffi
 from pbrl_ppl.effects import Law
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.physics.joints import JOINT_KINDS
-from pbrl_ppl.physics.world import RING, World
+from pbrl_ppl.physics.world import BODY_CONSTRAINTS, RING, Placed, World
 
-#: Addresses of the engine's C functions, by their names. Those that set a joint's anchors are in
-#: `Pointers.link_settings`.
+#: Addresses of the engine's C functions, by their names. Those that set properties of constraints
+#: are in the settings of `Pointers`.
 Functions = namedtuple(
     "Functions",
     """
@@ -36,12 +38,14 @@ Functions = namedtuple(
     cpBodySetVelocity cpBodySetAngularVelocity cpBodySetForce cpBodySetTorque
     cpBodyGetPosition cpBodyGetAngle cpBodyGetVelocity cpBodyGetAngularVelocity
     cpShapeSetElasticity cpShapeSetFriction cpCircleShapeSetOffset cpCircleShapeSetRadius
-    cpConstraintSetMaxForce cpPivotJointSetAnchorA cpPinJointSetAnchorA cpPinJointSetAnchorB
-    cpDampedRotarySpringSetDamping
+    cpConstraintSetMaxForce cpPinJointSetAnchorB
     """,
 )
-#: C functions that set the anchors and lengths of joints.
-SETTERS = sorted({s.function for kind in JOINT_KINDS.values() for s in kind.settings})
+#: C functions that set properties of constraints.
+SETTERS = sorted(
+    {s.function for kind in JOINT_KINDS.values() for s in kind.settings}
+    | {s.function for kinds in BODY_CONSTRAINTS.values() for kind in kinds for s in kind.settings}
+)
 _PLACE, _DOUBLE = ir.IntType(64), ir.DoubleType()
 
 
@@ -144,9 +148,13 @@ def law_address(law: Law) -> int:
     return int(_LAWS[law].address)
 
 
-#: A property of a joint: the C function that sets it, the joint, its row, and which columns.
+#: A property of a constraint: the C function that sets it, and where in a row its number or vector
+#: is, which the body's weight or a scale multiplies.
 SETTING = np.dtype(
-    [(name, np.int64) for name in ("function", "link", "joint", "column", "vector")], align=True
+    [(name, np.int64) for name in ("function", "constraint", "row", "column", "column_y")]
+    + [(name, np.int64) for name in ("vector", "weighted")]
+    + [(name, np.float64) for name in ("scale_x", "scale_y")],
+    align=True,
 )
 
 
@@ -157,6 +165,7 @@ class Pointers(NamedTuple):
     iterations: int
     chained: NDArray[np.bool_]
     padding: int
+    normal_gravity: float  # m/s^2
     size: float  # m
     fastest: float  # m/s
     far: float  # m
@@ -166,11 +175,12 @@ class Pointers(NamedTuple):
     shape_body: NDArray[np.int64]
     wheels: NDArray[np.int64]  # (2, wheel): the rod along x, the rod along y
     wheel_body: NDArray[np.int64]
-    links: NDArray[np.int64]
-    link_settings: NDArray[np.void]  # of dtype SETTING
+    unlimited: NDArray[np.int64]
+    limited: NDArray[np.int64]
+    body_settings: NDArray[np.void]  # of dtype SETTING, as the others
+    strengths: NDArray[np.void]
+    joint_settings: NDArray[np.void]
     discs: NDArray[np.int64]
-    pivots: NDArray[np.int64]  # (2, pivot): the motor, the damper
-    pivot_body: NDArray[np.int64]
     patches: NDArray[np.int64]  # (2, patch, point of the ring): what holds it, the rod
     patch_body: NDArray[np.int64]
     ring: NDArray[np.float64]
@@ -190,22 +200,26 @@ def pointers(world: World) -> Pointers:
     def whole(*numbers: int) -> NDArray[np.int64]:
         return np.array(numbers, dtype=np.int64)
 
-    wheels, pivots, patches = world.wheels, world.pivots, world.patches
-    links = at(*(link.constraint._constraint for link in world.links))
-    settings = [
-        (_FOUND[s.function], address, link.joint, s.columns[0], len(s.columns) == 2)
-        for link, address in zip(world.links, links, strict=True)
-        for s in link.kind.settings
-    ]
-    patch_joints = [
-        *(joint for patch in patches for joint in patch.holds),
-        *(joint for patch in patches for joint in patch.rods),
-    ]
+    def table(placed: Iterable[Placed]) -> NDArray[np.void]:
+        rows = [
+            (
+                _FOUND[setting.function], *at(constraint._constraint), row, setting.columns[0],
+                setting.columns[-1], len(setting.columns) == 2, setting.weighted, *scale,
+            )
+            for constraint, setting, row, scale in placed
+        ]  # fmt: skip
+        return np.array(rows, dtype=SETTING)
+
+    def constraints(*those: Iterable[pymunk.Constraint]) -> NDArray[np.int64]:
+        return at(*(constraint._constraint for constraint in chain(*those)))
+
+    wheels, patches = world.wheels, world.patches
     return Pointers(
         space=int(ffi.cast("intptr_t", world.space._space)),
         iterations=world.iterations,
         chained=world.chained,
         padding=world.padding,
+        normal_gravity=world.scene.normal_gravity,
         size=world.size,
         fastest=world.fastest,
         far=world.far,
@@ -213,20 +227,17 @@ def pointers(world: World) -> Pointers:
         kinematic=world.kinematic,
         shapes=at(*(shape._shape for _, shape in world.shapes)),
         shape_body=whole(*(i for i, _ in world.shapes)),
-        wheels=at(
-            *(wheel.along_x._constraint for wheel in wheels),
-            *(wheel.along_y._constraint for wheel in wheels),
-        ).reshape(2, -1),
+        wheels=constraints(*(w.first for w in wheels), *(w.second for w in wheels)).reshape(2, -1),
         wheel_body=whole(*(wheel.body for wheel in wheels)),
-        links=links,
-        link_settings=np.array(settings, dtype=SETTING),
+        unlimited=constraints(world.unlimited),
+        limited=constraints(world.limited),
+        body_settings=table(p for p in world.body_settings if p.setting.attribute != "max_force"),
+        strengths=table(p for p in world.body_settings if p.setting.attribute == "max_force"),
+        joint_settings=table(world.joint_settings),
         discs=at(*(disc._shape for disc in world.discs)),
-        pivots=at(
-            *(pivot.motor._constraint for pivot in pivots),
-            *(pivot.damper._constraint for pivot in pivots),
-        ).reshape(2, -1),
-        pivot_body=whole(*(pivot.body for pivot in pivots)),
-        patches=at(*(joint._constraint for joint in patch_joints)).reshape(2, -1, len(RING)),
+        patches=constraints(*(p.first for p in patches), *(p.second for p in patches)).reshape(
+            2, -1, len(RING)
+        ),
         patch_body=whole(*(patch.body for patch in patches)),
         ring=np.array(RING),
         radii=world.radii,

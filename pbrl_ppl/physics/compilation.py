@@ -52,9 +52,10 @@ def disk_cache(function: Callable[..., Any], digest: str) -> FunctionCache:
 def compiled(function: Callable[..., Any]) -> Any:
     """Return a function as numba compiles it, without the GIL and with a cache on disk.
 
+    A division by zero is infinite: a test for it would keep loops from being vectorised.
     Where no folder can be written to, each process compiles it again.
     """
-    dispatcher = numba.njit(nogil=True)(function)
+    dispatcher = numba.njit(nogil=True, error_model="numpy")(function)
     with suppress(RuntimeError):
         dispatcher._cache = disk_cache(function, SOURCES)
     return dispatcher

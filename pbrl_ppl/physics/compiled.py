@@ -23,6 +23,7 @@ from pbrl_ppl.physics.setters import (
     set_properties,
     set_strengths,
 )
+from pbrl_ppl.physics.solids import near_contact
 from pbrl_ppl.physics.world import FINER, TINY
 
 _FREE, _TOUCHED, _LOST = 0, 1, 2
@@ -47,8 +48,7 @@ def _forget(fn, world, bodies, batch, touched):  # type: ignore[no-untyped-def]
     other, and in the same numbering. That is needed only after a contact. A joint's stored impulse
     is limited to its greatest force, here zero.
     """
-    normal_gravity = batch.normal_gravity
-    if touched == _FREE and len(world.wheel_body) + len(world.links) + len(world.patch_body) == 0:
+    if touched == _FREE and len(world.unlimited) + len(world.limited) == 0:
         return  # nothing to forget
     if touched:
         for i in range(len(world.bodies)):
@@ -63,35 +63,12 @@ def _forget(fn, world, bodies, batch, touched):  # type: ignore[no-untyped-def]
             call_pointer(fn.cpSpaceRemoveShape, world.space, world.shapes[0])
         for shape in world.shapes:
             call_pointer(fn.cpSpaceAddShape, world.space, shape)
-    set_strengths(fn, world, bodies, normal_gravity, 0.0)
+    set_strengths(fn, world, bodies, False)
     call_int(fn.cpSpaceSetIterations, world.space, 1)
     call1(fn.cpSpaceStep, world.space, TINY * batch.time_step)
-    call_int(fn.cpSpaceSetIterations, world.space, iterations(world, bodies))
-    set_strengths(fn, world, bodies, normal_gravity, 1.0)
-
-
-@compiled
-def _near_contact(i, state, radii, obstacles, can_touch):  # type: ignore[no-untyped-def]
-    """Return whether body ``i`` may touch an obstacle or a body before it."""
-    x, y = state[i, 0], state[i, 1]
-    for j in range(len(obstacles)):
-        ax, ay = obstacles[j, 0], obstacles[j, 1]
-        dx, dy = obstacles[j, 2] - ax, obstacles[j, 3] - ay
-        length = dx * dx + dy * dy
-        t = 0.0
-        if length > 0.0:
-            t = min(1.0, max(0.0, ((x - ax) * dx + (y - ay) * dy) / length))
-        reach = radii[i] + obstacles[j, 4]
-        ex, ey = x - ax - t * dx, y - ay - t * dy
-        if ex * ex + ey * ey <= reach * reach:
-            return True
-    for j in range(i):
-        if can_touch[i, j]:
-            reach = radii[i] + radii[j]
-            ex, ey = x - state[j, 0], y - state[j, 1]
-            if ex * ex + ey * ey <= reach * reach:
-                return True
-    return False
+    enough = iterations(world.iterations, world.chained, bodies)
+    call_int(fn.cpSpaceSetIterations, world.space, enough)
+    set_strengths(fn, world, bodies, True)
 
 
 @compiled
@@ -159,7 +136,7 @@ def _transition(fn, world, batch, p, t, substeps, scratch, out):  # type: ignore
     state, axes, signal, previous, command, wrench = scratch
     commands, forces = batch.commands, batch.forces
     command_parameters, force_parameters = batch.given[3][p], batch.given[4][p]
-    start, inputs, normal_gravity = batch.start, batch.inputs[t], batch.normal_gravity
+    start, inputs = batch.start, batch.inputs[t]
     properties, joints = intervals(batch.given[0], p, t, len(inputs)), batch.given[1][p]
     copy(start[p if len(start) > 1 else 0, t], state)
     bodies = properties[0]
@@ -177,8 +154,9 @@ def _transition(fn, world, batch, p, t, substeps, scratch, out):  # type: ignore
             bodies = properties[h]
             set_properties(fn, world, bodies, joints)
             place_bodies(fn, world, bodies, state)
-            set_strengths(fn, world, bodies, normal_gravity, 1.0)
-            call_int(fn.cpSpaceSetIterations, world.space, iterations(world, bodies))
+            set_strengths(fn, world, bodies, True)
+            enough = iterations(world.iterations, world.chained, bodies)
+            call_int(fn.cpSpaceSetIterations, world.space, enough)
         if driven:
             drive(fn, world, state, inputs[h])
         copy(inputs[h], wrench)
@@ -202,7 +180,7 @@ def _transition(fn, world, batch, p, t, substeps, scratch, out):  # type: ignore
                 call1(fn.cpBodySetTorque, world.bodies[i], torque)
             place_wheels(fn, world, bodies, state, axes, step)
             if sliding:
-                place_patches(fn, world, bodies, state, step, normal_gravity)
+                place_patches(fn, world, bodies, state, step)
             call1(fn.cpSpaceStep, world.space, step)
             for i in range(k):
                 body = world.bodies[i]
@@ -216,7 +194,7 @@ def _transition(fn, world, batch, p, t, substeps, scratch, out):  # type: ignore
                 if not speed < world.fastest:  # also true of NaN
                     return _LOST
                 if watch and touched == _FREE:
-                    near = _near_contact(i, state, world.radii, world.obstacles, world.can_touch)
+                    near = near_contact(i, state, world.radii, world.obstacles, world.can_touch)
                     touched = _TOUCHED if near else _FREE
         copy(state, out[h])
     return touched

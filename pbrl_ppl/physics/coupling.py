@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from pbrl_ppl.history import History
+from pbrl_ppl.physics.solids import to_segment
 from pbrl_ppl.scene import WORLD, Scene
 from pbrl_ppl.state import Floats
 
@@ -112,7 +113,5 @@ def come_near(begin: Floats, end: Floats, least: float) -> NDArray[np.bool_]:
         Place of one relative to the other before and after an interval, shape (..., 2), m.
     """
     path = end - begin
-    square = (path**2).sum(axis=-1)
-    share = np.clip(-(begin * path).sum(axis=-1) / np.where(square > 0, square, 1.0), 0.0, 1.0)
-    nearest = np.linalg.norm(begin + share[..., None] * path, axis=-1)
-    return np.asarray(~(nearest >= least + SHARE * np.sqrt(square)))
+    nearest = to_segment(-begin, path)
+    return np.asarray(~(nearest >= least + SHARE * np.linalg.norm(path, axis=-1)))

@@ -25,11 +25,16 @@ _STEPS = 3
 
 
 class Setting(NamedTuple):
-    """A property of a pymunk constraint, the C function that sets it, and the columns it takes."""
+    """A property of a pymunk constraint, the C function that sets it, and the columns it takes.
+
+    The columns are those of a joint's numbers, or of a body's for a constraint of a body. With
+    ``weighted`` the number is multiplied by the body's weight.
+    """
 
     attribute: str
     function: str
     columns: tuple[int, ...]
+    weighted: bool = False
 
 
 @dataclass(frozen=True)

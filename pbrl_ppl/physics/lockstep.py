@@ -1,8 +1,12 @@
-"""Contact-free fast path of single bodies: many transitions at once, in the engine's arithmetic.
+"""Contact-free fast path: many transitions at once, in the engine's arithmetic.
 
-A body that touches nothing needs no collision search: positions, forces and the solver's clipped
+Bodies that touch nothing need no collision search: positions, forces and the solver's clipped
 impulses are a few lines, which the compiler vectorises over transitions. They are those of
 Chipmunk's ``cpSpaceStep``, in its order, so that the results agree to rounding.
+
+A solver that has not converged depends on the order of its constraints and on the number of
+iterations: the engine's order is kept, and each transition has the iterations that the engine takes
+for its masses.
 """
 
 from __future__ import annotations
@@ -13,161 +17,173 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.physics import lockstep_solver as solver
-from pbrl_ppl.physics.compilation import compiled, copy
+from pbrl_ppl.physics.compilation import compiled
 from pbrl_ppl.physics.compiled import act
 from pbrl_ppl.physics.joints import ROD
-from pbrl_ppl.physics.lockstep_solver import BLOCK, LINK_ROWS, POINT_ROWS, ROWS, X0, Y0
-from pbrl_ppl.physics.properties import COLUMN
+from pbrl_ppl.physics.lockstep_bodies import (
+    BLOCK,
+    BODY,
+    align,
+    get_state,
+    lever,
+    lose,
+    set_body,
+    set_state,
+    set_wrench,
+    watch,
+)
+from pbrl_ppl.physics.lockstep_friction import POINT
+from pbrl_ppl.physics.lockstep_joints import JOINT, Block, set_constraints, substep
 from pbrl_ppl.physics.world import RING, World
 
 
-class FreeBody(NamedTuple):
-    """A moving body and its surroundings, for the contact-free fast path."""
+class FreeWorld(NamedTuple):
+    """A world whose bodies touch nothing, for the contact-free fast path."""
 
-    wheel: bool
-    pivot: bool
-    iterations: int
+    chained: NDArray[np.bool_]  # (body,)
+    iterations: int  # the fewest
     gravity: NDArray[np.float64]  # (2,)
+    normal_gravity: float
     size: float  # of the smallest moving body (m)
     fastest: float  # speed of divergence (m/s)
-    link_joint: NDArray[np.int64]
-    link_rod: NDArray[np.bool_]
-    link_first: NDArray[np.bool_]  # whether the body is the joint's first
-    link_pose: NDArray[np.float64]  # (link, 4): x, y, cos and sin of the fixed body
-    ring: NDArray[np.float64]  # (point, 2): empty without friction under the body
-    radius: float
+    wheel: NDArray[np.bool_]  # (body,)
+    joint_row: NDArray[np.int64]  # among all joints
+    joint_rod: NDArray[np.bool_]
+    joint_ends: NDArray[np.int64]  # (joint, 2): bodies; the first is -1 if it is fixed
+    joint_turned: NDArray[np.bool_]  # whether these are the joint's second and first
+    joint_pose: NDArray[np.float64]  # (joint, 4): x, y, cos and sin of the fixed body
+    joint_pivot: NDArray[np.int64]  # the body whose friction acts in it; -1 for none
+    patch_body: NDArray[np.int64]
+    ring: NDArray[np.float64]  # (point, 2)
+    radii: NDArray[np.float64]  # (body,)
+    can_touch: NDArray[np.bool_]  # (body, body)
     obstacles: NDArray[np.float64]  # (obstacle, 5), without the discs
 
 
-def free_bodies(world: World) -> tuple[FreeBody, ...]:
-    """Describe each moving body of a world.
-
-    Returns nothing where a body is joined to another one, follows a path, or has a joint without
-    contact-free arithmetic.
-    """
-    fixed = all(link.kind.contact_free for link in world.links)
-    if not fixed or world.chained.any() or world.kinematic.any():
-        return ()
-    return tuple(_free_body(world, i) for i in range(len(world.bodies)))
-
-
-def _free_body(world: World, index: int) -> FreeBody:
-    body = world.bodies[index]
-    links = [link for link in world.links if body in (link.constraint.a, link.constraint.b)]
-    holders = [
-        link.constraint.b if link.constraint.a is body else link.constraint.a for link in links
-    ]
-    poses = [(*h.position, math.cos(h.angle), math.sin(h.angle)) for h in holders]
-    patched = any(patch.body == index for patch in world.patches)
-    return FreeBody(
-        wheel=any(wheel.body == index for wheel in world.wheels),
-        pivot=any(pivot.body == index for pivot in world.pivots),
+def free_world(world: World) -> FreeWorld | None:
+    """Describe a world; None where a body follows a path, or a joint has no such arithmetic."""
+    if world.kinematic.any() or not all(link.kind.contact_free for link in world.links):
+        return None
+    ends, poses = [], []
+    for link in world.links:
+        pair = link.constraint.a, link.constraint.b
+        ends.append([world.bodies.index(body) if body in world.bodies else -1 for body in pair])
+        holder = pair[ends[-1].index(-1)] if -1 in ends[-1] else world.space.static_body
+        poses.append((*holder.position, math.cos(holder.angle), math.sin(holder.angle)))
+    pairs = np.array(ends, dtype=np.int64).reshape(-1, 2)
+    turned = pairs[:, 1] < 0
+    wheels = [wheel.body for wheel in world.wheels]
+    return FreeWorld(
+        chained=world.chained,
         iterations=world.iterations,
         gravity=np.array(world.space.gravity, dtype=float),
+        normal_gravity=world.scene.normal_gravity,
         size=world.size,
         fastest=world.fastest,
-        link_joint=np.array([link.joint for link in links], dtype=np.int64),
-        link_rod=np.array([link.kind is ROD for link in links], dtype=bool),
-        link_first=np.array([link.constraint.a is body for link in links], dtype=bool),
-        link_pose=np.array(poses, dtype=float).reshape(-1, 4),
-        ring=np.array(RING if patched else (), dtype=float).reshape(-1, 2),
-        radius=float(world.radii[index]),
+        wheel=np.isin(np.arange(len(world.bodies)), wheels),
+        joint_row=np.array([link.joint for link in world.links], dtype=np.int64),
+        joint_rod=np.array([link.kind is ROD for link in world.links], dtype=bool),
+        joint_ends=np.where(turned[:, None], pairs[:, ::-1], pairs),
+        joint_turned=turned,
+        joint_pose=np.array(poses, dtype=float).reshape(-1, 4),
+        joint_pivot=np.array([link.pivot for link in world.links], dtype=np.int64),
+        patch_body=np.array([patch.body for patch in world.patches], dtype=np.int64),
+        ring=np.array(RING),
+        radii=world.radii,
+        can_touch=world.can_touch,
         obstacles=world.obstacles[: len(world.obstacles) - len(world.discs)].copy(),
     )
 
 
 @compiled
-def rollout(free, batch, first, last, out, left, trail):  # type: ignore[no-untyped-def]
-    """Predict items ``first`` to ``last`` as `compiled.rollout` does, and mark those that touch.
+def rollout(world, batch, items, out, left):  # type: ignore[no-untyped-def]
+    """Predict ``items`` as `compiled.rollout` does, and mark those that the engine must predict.
 
-    All arrays are of one body; ``out`` has shape (last - first, H, 1, 6). ``trail``, shape (last -
-    first, step, 2), gets x and y after every step of every number of substeps, if it has rows.
-    ``left``, shape (last - first,), is set for items that come near an obstacle or diverge: the
-    engine must predict those.
+    ``left``, shape (item,), is set for items that come near an obstacle or diverge. A block takes
+    as long as the transition of the most iterations: items of similar numbers should be neighbours.
     """
-    bodies, joints, discs, command_parameters, force_parameters = batch.given
-    start, inputs, normal_gravity = batch.start, batch.inputs, batch.normal_gravity
-    n, horizon = len(inputs), inputs.shape[1]
-    timed = bodies.shape[1] > 1
+    rows, _, discs, command_parameters, force_parameters = batch.given
+    start, inputs = batch.start, batch.inputs
+    n, horizon, moving = len(inputs), inputs.shape[1], len(world.radii)
+    timed = rows.shape[1] > 1
     commands, forces = batch.commands, batch.forces
     acting = len(commands[0]) + len(forces[0]) > 0
-    watch = len(free.obstacles) + discs.shape[1] > 0
-    z = np.zeros(ROWS)
-    links = np.zeros((len(free.link_joint), LINK_ROWS))
-    points = np.zeros((len(free.ring), POINT_ROWS))
-    slowing, patch_radius = np.zeros(BLOCK), np.zeros(BLOCK)
+    watched = len(world.obstacles) + discs.shape[1] > 0 or world.can_touch.sum() > moving
+    bodies = np.zeros((moving + 1, BLOCK * len(BODY)))  # the last is fixed
+    joints = np.zeros((len(world.joint_row), BLOCK * len(JOINT)))
+    patches = np.zeros((len(world.patch_body), len(world.ring), BLOCK * len(POINT)))
+    slowing, radius = np.zeros((2, len(patches), BLOCK))
+    rough, most = np.zeros(len(joints), dtype=np.bool_), np.full(BLOCK, world.iterations)
+    block = Block(bodies, joints, patches, slowing, radius, rough, most)
     own_discs = np.zeros((BLOCK, discs.shape[1], 3))
     touched = np.zeros(BLOCK, dtype=np.bool_)
-    state, signal = np.empty((1, 6)), np.empty(8)
-    previous, command, wrench = np.empty((1, 3)), np.empty((1, 3)), np.empty((1, 3))
-    own = state[0]  # once: a view costs as much as its use
-    for begin in range(first, last, BLOCK):
-        width = min(BLOCK, last - begin)
+    proposal, transition, interval = np.zeros((3, BLOCK), dtype=np.int64)
+    states, signal = np.empty((moving, 6)), np.empty(8)
+    previous, command, wrench = np.empty((3, moving, 3))
+    for begin in range(0, len(items), BLOCK):
+        width = min(BLOCK, len(items) - begin)
         touched[:] = False
-        steps = 0
+        for i in range(BLOCK):
+            item = items[begin + min(i, width - 1)]  # the rest of a block repeats the last
+            proposal[i], transition[i] = item // n, item % n
+            for j in range(discs.shape[1]):
+                for d in range(3):
+                    own_discs[i, j, d] = discs[proposal[i], j, d]
         for level in range(len(batch.counts)):
             substeps, weight = batch.counts[level], batch.weights[level]
             step = batch.time_step / substeps
-            z[:], links[:], points[:] = 0.0, 0.0, 0.0
+            bodies[:], joints[:], patches[:] = 0.0, 0.0, 0.0
             shifted = False
             for h in range(horizon):
-                for i in range(BLOCK):
-                    item = begin + min(i, width - 1)  # the rest of a block repeats the last
-                    p, t = item // n, item % n
-                    if timed or h == 0:
-                        row = bodies[p, t * horizon + h if timed else 0, 0]
-                        if h == 0:
-                            for d in range(6):
-                                own[d] = start[p if len(start) > 1 else 0, t, 0, d]
-                            copy(discs[p], own_discs[i])
+                if timed:
+                    interval[:] = transition * horizon + h
+                for k in range(moving):
+                    body, wheel = bodies[k], world.wheel[k]
+                    for i in range(BLOCK):
+                        p, t = proposal[i], transition[i]
+                        if timed or h == 0:
+                            row = rows[p, interval[i], k]
+                            if h == 0:
+                                for d in range(6):
+                                    states[k, d] = start[p if len(start) > 1 else 0, t, k, d]
+                            else:
+                                get_state(body, i, states, k)
+                            shifted |= set_body(body, i, row, wheel, world.normal_gravity, step)
+                            set_state(body, i, states, k)
                         else:
-                            solver.get_state(z, i, own)
-                        shifted |= solver.set_properties(
-                            z, links, free, i, row, joints[p], normal_gravity, step
-                        )
-                        solver.set_state(z, i, own)
-                        slowing[i] = row[COLUMN.patch_mu] * normal_gravity
-                        patch_radius[i] = row[COLUMN.patch_radius]
-                    else:
-                        solver.align(z, i)
-                    solver.set_wrench(z, i, inputs[t, h, 0])
+                            align(body, i)
+                        force_x, force_y = inputs[t, h, k, 0], inputs[t, h, k, 1]
+                        set_wrench(body, i, force_x, force_y, inputs[t, h, k, 2])
+                if timed or h == 0:
+                    set_constraints(block, world, batch, proposal, interval, step)
                 for s in range(substeps):
                     if acting:
                         for i in range(width):
-                            p, t = (begin + i) // n, (begin + i) % n
-                            solver.get_state(z, i, own)
+                            p, t = proposal[i], transition[i]
+                            for k in range(moving):
+                                get_state(bodies[k], i, states, k)
                             act(
-                                state, inputs[t, h], commands, command_parameters[p], forces,
+                                states, inputs[t, h], commands, command_parameters[p], forces,
                                 force_parameters[p], s / substeps, (s + 1) / substeps, signal,
                                 previous, command, wrench,
                             )  # fmt: skip
-                            solver.set_wrench(z, i, wrench[0])
+                            for k in range(moving):
+                                set_wrench(bodies[k], i, wrench[k, 0], wrench[k, 1], wrench[k, 2])
                     if shifted:
-                        solver.lever(z)
-                    solver.substep(z, links, points, free, slowing, patch_radius, step)
-                    solver.lose(z, free, touched)
-                    if watch or len(trail):
-                        solver.locate(z)
-                    if len(trail):
-                        for i in range(width):
-                            trail[begin - first + i, steps, 0] = z[X0 + i]
-                            trail[begin - first + i, steps, 1] = z[Y0 + i]
-                        steps += 1
-                    if watch:
-                        solver.watch(z, free.radius, free.obstacles, own_discs, touched)
-                for i in range(width):
-                    solver.get_state(z, i, own)
-                    solver.add(out[begin - first + i, h, 0], own, weight, level, len(batch.counts))
-        for i in range(width):  # other bodies may have set it already
-            left[begin - first + i] |= touched[i]
-
-
-@compiled
-def meet(trail, other, reach, left):  # type: ignore[no-untyped-def]
-    """Mark the items in which two bodies come within reach of each other."""
-    for item in range(len(trail)):
-        for step in range(trail.shape[1]):
-            x = trail[item, step, 0] - other[item, step, 0]
-            y = trail[item, step, 1] - other[item, step, 1]
-            left[item] |= x * x + y * y <= reach * reach
+                        for k in range(moving):
+                            lever(bodies[k])
+                    substep(block, world, step)
+                    for k in range(moving):
+                        lose(bodies[k], world, touched)
+                    if watched:
+                        watch(bodies, world, own_discs, touched)
+                for k in range(moving):
+                    body = bodies[k]
+                    for i in range(width):
+                        item = items[begin + i]
+                        get_state(body, i, states, k)
+                        for d in range(6):
+                            total = out[item, h, k, d] if level else 0.0
+                            out[item, h, k, d] = total + weight * states[k, d]
+        for i in range(width):
+            left[begin + i] = touched[i]

@@ -1,8 +1,8 @@
-"""Joints between two moving bodies in the contact-free fast path, and a substep of all bodies.
+"""Joints in the contact-free fast path, and a substep of all bodies.
 
 The arithmetic is that of Chipmunk's pivot joint, pin joint, motor and rotary damper. ``a`` and
-``b`` are the rows of the bodies' numbers, ``own`` those of the joint. A joint to something fixed is
-a link of `lockstep_solver`, with the same rows.
+``b`` are the rows in a block of the bodies that a joint holds, ``a`` is None where that is fixed;
+``joint`` is the joint's row, and ``i`` the number of a transition in the block.
 """
 
 from __future__ import annotations
@@ -13,62 +13,40 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.physics import lockstep_solver as solver
 from pbrl_ppl.physics.compilation import compiled
 from pbrl_ppl.physics.joints import A_X, A_Y, B_X, B_Y, LENGTH
-from pbrl_ppl.physics.lockstep_solver import (
-    AX,
-    AY,
-    BLOCK,
-    BX,
-    BY,
-    DX,
-    DY,
-    H_MAX,
-    II,
-    KXY,
-    KYY,
-    LINK_ROWS,
-    LX,
-    LY,
-    MI,
-    MX,
-    MY,
-    OX,
-    OY,
-    PX,
-    PY,
-    RM,
-    RX,
-    RY,
-    VX,
-    VY,
-    C,
-    K,
-    L,
-    S,
-    W,
-    X,
-    Y,
+from pbrl_ppl.physics.lockstep_bodies import BLOCK, BODY, accelerate, row_of, turn
+from pbrl_ppl.physics.lockstep_friction import (
+    POINT,
+    begin_patch,
+    begin_wheel,
     limited,
+    place_patch,
+    push,
+    solve_patch,
+    solve_wheel,
 )
 from pbrl_ppl.physics.properties import COLUMN
+from pbrl_ppl.physics.setters import iterations
 
-_FIRST = LINK_ROWS // BLOCK
-# Anchor and arm of the first body; those of a link are the second body's.
-A1X, A1Y, R1X, R1Y = (i * BLOCK for i in range(_FIRST, _FIRST + 4))
-# Motor and damper in a hinge: greatest and stored impulse, moment; share of the speed that the
-# damper removes, as given and in use, and its target.
-M_MAX, MJ, MM, SHARE, TAKEN, GOAL = (i * BLOCK for i in range(_FIRST + 4, _FIRST + 10))
-JOINT_ROWS = LINK_ROWS + 10 * BLOCK
+#: Fields of a joint: anchors on the bodies, length; arms, a rod's direction, bias and stored
+#: impulse; a hinge's effective mass, of which a rod has the first. Then those of a hinge's motor
+#: and damper: greatest and stored impulse, effective moment; share of the speed that the damper
+#: removes, as given and in use, and its target.
+JOINT = row_of(
+    """
+    a_x a_y b_x b_y length arm_a_x arm_a_y arm_b_x arm_b_y n_x n_y bias_x bias_y impulse_x impulse_y
+    mass_xx mass_xy mass_yy most_torque torque_impulse moment damped damped_now goal
+    """
+)
 
 
 class Block(NamedTuple):
     """Numbers of the bodies, joints and patches of a block of transitions."""
 
-    bodies: NDArray[np.float64]  # (body + 1, ROWS): the last is fixed
-    joints: NDArray[np.float64]  # (joint, JOINT_ROWS)
-    patches: NDArray[np.float64]  # (patch, point, POINT_ROWS)
+    bodies: NDArray[np.float64]  # (body + 1, field): the last is fixed
+    joints: NDArray[np.float64]  # (joint, field)
+    patches: NDArray[np.float64]  # (patch, point, field)
     slowing: NDArray[np.float64]  # (patch, BLOCK): deceleration by friction (m/s^2)
     patch_radius: NDArray[np.float64]  # (patch, BLOCK), m
     rough: NDArray[np.bool_]  # (joint,): whether there is friction in it
@@ -76,194 +54,229 @@ class Block(NamedTuple):
 
 
 @compiled
-def set_joint(own, i, bodies, chain, j, joint, row, step):  # type: ignore[no-untyped-def]
-    """Set the numbers of link ``j`` in transition ``i`` for an interval."""
-    a, b, pose = bodies[chain.link_ends[j, 0]], bodies[chain.link_ends[j, 1]], chain.link_pose[j]
-    first, second = (joint[A_X], joint[A_Y]), (joint[B_X], joint[B_Y])
-    if chain.link_turned[j]:
-        first, second = second, first
-    own[A1X + i], own[A1Y + i] = first[0] - a[OX + i], first[1] - a[OY + i]
-    own[AX + i], own[AY + i] = second[0] - b[OX + i], second[1] - b[OY + i]
-    own[PX + i] = pose[0] + pose[2] * first[0] - pose[3] * first[1]
-    own[PY + i] = pose[1] + pose[3] * first[0] + pose[2] * first[1]
-    own[L + i] = joint[LENGTH]
-    if chain.link_pivot[j] >= 0:
-        own[M_MAX + i] = row[COLUMN.pivot_torque] * step
-        damping = row[COLUMN.pivot_damping] * (a[II + i] + b[II + i])
-        own[SHARE + i] = 1.0 - math.exp(-damping * step) if damping else 0.0
+def set_constraints(block, world, batch, proposal, interval, step):  # type: ignore[no-untyped-def]
+    """Set the numbers of joints, patches and iterations for an interval of each transition."""
+    rows, anchors, bodies = batch.given[0], batch.given[1], block.bodies
+    if world.chained.any():
+        for i in range(BLOCK):
+            row = rows[proposal[i], interval[i]]
+            block.iterations[i] = iterations(world.iterations, world.chained, row)
+    for j in range(len(block.joints)):
+        joint, ends = block.joints[j], world.joint_ends[j]
+        a, b = bodies[ends[0]], bodies[ends[1]]
+        number, owner, turned = world.joint_row[j], world.joint_pivot[j], world.joint_turned[j]
+        x, y, c, s = world.joint_pose[j]
+        for i in range(BLOCK):
+            p, r = proposal[i], interval[i]
+            a_x, a_y = anchors[p, number, A_X], anchors[p, number, A_Y]
+            b_x, b_y = anchors[p, number, B_X], anchors[p, number, B_Y]
+            if turned:
+                a_x, a_y, b_x, b_y = b_x, b_y, a_x, a_y
+            a_x, a_y = a_x - a[BODY.com_x + i], a_y - a[BODY.com_y + i]
+            joint[JOINT.a_x + i] = x + c * a_x - s * a_y
+            joint[JOINT.a_y + i] = y + s * a_x + c * a_y
+            joint[JOINT.b_x + i] = b_x - b[BODY.com_x + i]
+            joint[JOINT.b_y + i] = b_y - b[BODY.com_y + i]
+            joint[JOINT.length + i] = anchors[p, number, LENGTH]
+            if owner >= 0:
+                joint[JOINT.most_torque + i] = rows[p, r, owner, COLUMN.pivot_torque] * step
+                damping = rows[p, r, owner, COLUMN.pivot_damping]
+                damping *= a[BODY.inverse_moment + i] + b[BODY.inverse_moment + i]
+                joint[JOINT.damped + i] = 1.0 - math.exp(-damping * step) if damping else 0.0
+        block.rough[j] = False  # zero friction changes no number
+        for field in (JOINT.most_torque, JOINT.torque_impulse, JOINT.damped):
+            block.rough[j] |= joint[field : field + BLOCK].any()
+    for j in range(len(block.patches)):
+        k = world.patch_body[j]
+        for i in range(BLOCK):
+            p, r = proposal[i], interval[i]
+            block.slowing[j, i] = rows[p, r, k, COLUMN.patch_mu] * world.normal_gravity
+            block.patch_radius[j, i] = rows[p, r, k, COLUMN.patch_radius]
 
 
 @compiled
-def place(a, b, own, rod, step):  # type: ignore[no-untyped-def]
+def _push_both(a, b, joint, i, j_x, j_y):  # type: ignore[no-untyped-def]
+    """Apply an impulse to the second body, and its opposite to the first if it moves."""
+    if a is not None:
+        push(a, i, joint[JOINT.arm_a_x + i], joint[JOINT.arm_a_y + i], -j_x, -j_y)
+    push(b, i, joint[JOINT.arm_b_x + i], joint[JOINT.arm_b_y + i], j_x, j_y)
+
+
+@compiled
+def place_joint(a, b, joint, rod, step):  # type: ignore[no-untyped-def]
     """Set arms, drift and masses of a hinge or rod at the bodies' present places."""
     for i in range(BLOCK):
-        x_1 = a[C + i] * own[A1X + i] - a[S + i] * own[A1Y + i]
-        y_1 = a[S + i] * own[A1X + i] + a[C + i] * own[A1Y + i]
-        x_2 = b[C + i] * own[AX + i] - b[S + i] * own[AY + i]
-        y_2 = b[S + i] * own[AX + i] + b[C + i] * own[AY + i]
-        own[R1X + i], own[R1Y + i], own[RX + i], own[RY + i] = x_1, y_1, x_2, y_2
-        d_x = (b[X + i] + x_2) - (a[X + i] + x_1)
-        d_y = (b[Y + i] + y_2) - (a[Y + i] + y_1)
-        mass, i_1, i_2 = a[MI + i] + b[MI + i], a[II + i], b[II + i]
+        x_1, y_1, to_x, to_y = joint[JOINT.a_x + i], joint[JOINT.a_y + i], 0.0, 0.0
+        mass, i_1 = 0.0, 0.0
+        if a is not None:
+            c, s, to_x, to_y = a[BODY.cos + i], a[BODY.sin + i], a[BODY.x + i], a[BODY.y + i]
+            x_1, y_1 = c * x_1 - s * y_1, s * x_1 + c * y_1
+            mass, i_1 = a[BODY.inverse_mass + i], a[BODY.inverse_moment + i]
+        c, s, x, y = b[BODY.cos + i], b[BODY.sin + i], joint[JOINT.b_x + i], joint[JOINT.b_y + i]
+        x_2, y_2 = c * x - s * y, s * x + c * y
+        joint[JOINT.arm_a_x + i], joint[JOINT.arm_a_y + i] = x_1, y_1
+        joint[JOINT.arm_b_x + i], joint[JOINT.arm_b_y + i] = x_2, y_2
+        d_x = (b[BODY.x + i] + x_2) - (to_x + x_1)
+        d_y = (b[BODY.y + i] + y_2) - (to_y + y_1)
+        mass, i_2 = mass + b[BODY.inverse_mass + i], b[BODY.inverse_moment + i]
         if rod:
             distance = math.sqrt(d_x * d_x + d_y * d_y)
             scale = 1.0 / distance if distance > 0.0 else 0.0
             n_x, n_y = d_x * scale, d_y * scale
-            own[DX + i], own[DY + i] = n_x, n_y
+            joint[JOINT.n_x + i], joint[JOINT.n_y + i] = n_x, n_y
             c_1, c_2 = x_1 * n_y - y_1 * n_x, x_2 * n_y - y_2 * n_x
-            own[K + i] = 1.0 / (mass + i_1 * c_1 * c_1 + i_2 * c_2 * c_2)
-            own[BX + i] = (own[L + i] - distance) / step
+            joint[JOINT.mass_xx + i] = 1.0 / (mass + i_1 * c_1 * c_1 + i_2 * c_2 * c_2)
+            joint[JOINT.bias_x + i] = (joint[JOINT.length + i] - distance) / step
         else:
-            own[BX + i], own[BY + i] = -d_x / step, -d_y / step
+            joint[JOINT.bias_x + i], joint[JOINT.bias_y + i] = -d_x / step, -d_y / step
             xx = mass + y_1 * y_1 * i_1 + y_2 * y_2 * i_2
             xy = -x_1 * y_1 * i_1 - x_2 * y_2 * i_2
             yy = mass + x_1 * x_1 * i_1 + x_2 * x_2 * i_2
             inverse = 1.0 / (xx * yy - xy * xy)
-            own[K + i], own[KXY + i], own[KYY + i] = yy * inverse, -xy * inverse, xx * inverse
+            joint[JOINT.mass_xx + i], joint[JOINT.mass_yy + i] = yy * inverse, xx * inverse
+            joint[JOINT.mass_xy + i] = -xy * inverse
 
 
 @compiled
-def begin(a, b, own, rod):  # type: ignore[no-untyped-def]
+def begin_joint(a, b, joint, rod, rough):  # type: ignore[no-untyped-def]
     """Apply the impulse of the substep before."""
     for i in range(BLOCK):
-        j_x, j_y = own[LX + i], own[LY + i]
+        j_x, j_y = joint[JOINT.impulse_x + i], joint[JOINT.impulse_y + i]
         if rod:
-            j_x, j_y = own[DX + i] * own[LX + i], own[DY + i] * own[LX + i]
-        _push(a, b, own, i, j_x, j_y)
+            j_x, j_y = joint[JOINT.n_x + i] * j_x, joint[JOINT.n_y + i] * j_x
+        _push_both(a, b, joint, i, j_x, j_y)
+    if rough:
+        begin_pivot(a, b, joint)
 
 
 @compiled
-def _push(a, b, own, i, j_x, j_y):  # type: ignore[no-untyped-def]
-    """Apply an impulse to the second body, and its opposite to the first."""
-    a[VX + i] -= j_x * a[MI + i]
-    a[VY + i] -= j_y * a[MI + i]
-    a[W + i] -= a[II + i] * (own[R1X + i] * j_y - own[R1Y + i] * j_x)
-    b[VX + i] += j_x * b[MI + i]
-    b[VY + i] += j_y * b[MI + i]
-    b[W + i] += b[II + i] * (own[RX + i] * j_y - own[RY + i] * j_x)
-
-
-@compiled
-def solve(a, b, own, rod):  # type: ignore[no-untyped-def]
+def solve_joint(a, b, joint, rod, rough):  # type: ignore[no-untyped-def]
     """Do one iteration of a hinge or rod."""
     for i in range(BLOCK):
-        w_1, w_2 = a[W + i], b[W + i]
-        v_x = (b[VX + i] - own[RY + i] * w_2) - (a[VX + i] - own[R1Y + i] * w_1)
-        v_y = (b[VY + i] + own[RX + i] * w_2) - (a[VY + i] + own[R1X + i] * w_1)
+        w = b[BODY.omega + i]
+        v_x = b[BODY.vx + i] - joint[JOINT.arm_b_y + i] * w
+        v_y = b[BODY.vy + i] + joint[JOINT.arm_b_x + i] * w
+        if a is not None:
+            w = a[BODY.omega + i]
+            v_x -= a[BODY.vx + i] - joint[JOINT.arm_a_y + i] * w
+            v_y -= a[BODY.vy + i] + joint[JOINT.arm_a_x + i] * w
         if rod:
-            n_x, n_y = own[DX + i], own[DY + i]
-            j = (own[BX + i] - (n_x * v_x + n_y * v_y)) * own[K + i]
-            own[LX + i] += j
-            _push(a, b, own, i, n_x * j, n_y * j)
+            n_x, n_y = joint[JOINT.n_x + i], joint[JOINT.n_y + i]
+            j = (joint[JOINT.bias_x + i] - (n_x * v_x + n_y * v_y)) * joint[JOINT.mass_xx + i]
+            joint[JOINT.impulse_x + i] += j
+            _push_both(a, b, joint, i, n_x * j, n_y * j)
         else:
-            d_x, d_y = own[BX + i] - v_x, own[BY + i] - v_y
-            j_x = own[K + i] * d_x + own[KXY + i] * d_y
-            j_y = own[KXY + i] * d_x + own[KYY + i] * d_y
-            own[LX + i] += j_x
-            own[LY + i] += j_y
-            _push(a, b, own, i, j_x, j_y)
+            d_x, d_y = joint[JOINT.bias_x + i] - v_x, joint[JOINT.bias_y + i] - v_y
+            j_x = joint[JOINT.mass_xx + i] * d_x + joint[JOINT.mass_xy + i] * d_y
+            j_y = joint[JOINT.mass_xy + i] * d_x + joint[JOINT.mass_yy + i] * d_y
+            joint[JOINT.impulse_x + i] += j_x
+            joint[JOINT.impulse_y + i] += j_y
+            _push_both(a, b, joint, i, j_x, j_y)
+    if rough:
+        solve_pivot(a, b, joint)
 
 
 @compiled
-def begin_pivot(a, b, own):  # type: ignore[no-untyped-def]
+def begin_pivot(a, b, joint):  # type: ignore[no-untyped-def]
     """Apply the motor's impulse of the substep before."""
     for i in range(BLOCK):
-        own[MM + i], own[TAKEN + i] = 1.0 / (a[II + i] + b[II + i]), own[SHARE + i]
-        own[GOAL + i] = 0.0
-        a[W + i] -= own[MJ + i] * a[II + i]
-        b[W + i] += own[MJ + i] * b[II + i]
+        i_1, i_2 = 0.0, b[BODY.inverse_moment + i]
+        impulse = joint[JOINT.torque_impulse + i]
+        if a is not None:
+            i_1 = a[BODY.inverse_moment + i]
+            a[BODY.omega + i] -= impulse * i_1
+        b[BODY.omega + i] += impulse * i_2
+        joint[JOINT.moment + i] = 1.0 / (i_1 + i_2)
+        joint[JOINT.damped_now + i], joint[JOINT.goal + i] = joint[JOINT.damped + i], 0.0
 
 
 @compiled
-def solve_pivot(a, b, own):  # type: ignore[no-untyped-def]
+def solve_pivot(a, b, joint):  # type: ignore[no-untyped-def]
     """Do one iteration of friction in a hinge: the motor, then the damper."""
     for i in range(BLOCK):
-        i_1, i_2, mass = a[II + i], b[II + i], own[MM + i]
-        w_1, w_2, most, old = a[W + i], b[W + i], own[M_MAX + i], own[MJ + i]
-        new = limited(old - (w_2 - w_1) * mass, most)
-        own[MJ + i] = new
+        i_1, w_1, i_2, w_2 = 0.0, 0.0, b[BODY.inverse_moment + i], b[BODY.omega + i]
+        if a is not None:
+            i_1, w_1 = a[BODY.inverse_moment + i], a[BODY.omega + i]
+        moment, old = joint[JOINT.moment + i], joint[JOINT.torque_impulse + i]
+        new = limited(old - (w_2 - w_1) * moment, joint[JOINT.most_torque + i])
+        joint[JOINT.torque_impulse + i] = new
         w_1 -= (new - old) * i_1
         w_2 += (new - old) * i_2
         w = w_1 - w_2
-        change = (own[GOAL + i] - w) * own[TAKEN + i]
-        own[GOAL + i] = w + change
-        a[W + i] = w_1 + change * mass * i_1
-        b[W + i] = w_2 - change * mass * i_2
+        change = (joint[JOINT.goal + i] - w) * joint[JOINT.damped_now + i]
+        joint[JOINT.goal + i] = w + change
+        if a is not None:
+            a[BODY.omega + i] = w_1 + change * moment * i_1
+        b[BODY.omega + i] = w_2 - change * moment * i_2
 
 
 @compiled
 def _finish(block, i):  # type: ignore[no-untyped-def]
     """Make further iterations change nothing in transition ``i``."""
-    for z in block.bodies:
-        z[MX + i] = z[MY + i] = 0.0
-    for own in block.joints:
-        own[K + i] = own[KXY + i] = own[KYY + i] = own[MM + i] = own[TAKEN + i] = 0.0
+    for body in block.bodies:
+        body[BODY.mass_along + i] = body[BODY.mass_across + i] = 0.0
+    for joint in block.joints:
+        joint[JOINT.mass_xx + i] = joint[JOINT.mass_xy + i] = joint[JOINT.mass_yy + i] = 0.0
+        joint[JOINT.moment + i] = joint[JOINT.damped_now + i] = 0.0
     for points in block.patches:
-        for own in points:
-            own[K + i] = own[KXY + i] = own[KYY + i] = own[RM + i] = 0.0
-            own[H_MAX + i] = math.inf  # else rounding clips an impulse on the limit once more
+        for point in points:
+            point[POINT.mass_xx + i] = point[POINT.mass_xy + i] = point[POINT.mass_yy + i] = 0.0
+            point[POINT.rod_mass + i] = 0.0
+            point[POINT.most_hold + i] = math.inf  # else rounding clips an impulse once more
 
 
 @compiled
-def _iterate(block, chain, times):  # type: ignore[no-untyped-def]
-    """Iterate all constraints, in the engine's order."""
-    bodies, joints, patches = block.bodies, block.joints, block.patches
-    for _ in range(times):
-        for k in range(len(chain.wheel)):
-            if chain.wheel[k]:
-                solver.solve_wheel(bodies[k])
-        for j in range(len(joints)):
-            a, b = bodies[chain.link_ends[j, 0]], bodies[chain.link_ends[j, 1]]
-            if chain.link_ends[j, 0] < 0:
-                solver.solve_link(b, joints[j], chain.link_rod[j])
-            else:
-                solve(a, b, joints[j], chain.link_rod[j])
-            if block.rough[j]:
-                solve_pivot(a, b, joints[j])
-        for j in range(len(patches)):
-            solver.solve_patch(bodies[chain.patch_body[j]], patches[j])
-
-
-@compiled
-def substep(block, chain, step):  # type: ignore[no-untyped-def]
+def substep(block, world, step):  # type: ignore[no-untyped-def]
     """Do one step of the engine, with the iterations of each transition of the block."""
-    bodies, joints, patches = block.bodies, block.joints, block.patches
-    moving, ends, most = len(chain.radii), chain.link_ends, block.iterations
-    for k in range(moving):
-        solver.turn(bodies[k], step)
-    for j in range(len(patches)):
-        z = bodies[chain.patch_body[j]]
-        solver.place_patch(z, patches[j], chain.ring, block.slowing[j], block.patch_radius[j], step)
+    bodies, joints, patches, ends = block.bodies, block.joints, block.patches, world.joint_ends
+    for k in range(len(world.wheel)):
+        turn(bodies[k], step)
+    for j in range(len(patches)):  # by the velocities before, at the heading after
+        body, slowing, radius = bodies[world.patch_body[j]], block.slowing[j], block.patch_radius[j]
+        place_patch(body, patches[j], world.ring, slowing, radius, step)
     for j in range(len(joints)):
         a, b = bodies[ends[j, 0]], bodies[ends[j, 1]]
         if ends[j, 0] < 0:
-            solver.place_link(b, joints[j], chain.link_rod[j], step)
+            place_joint(None, b, joints[j], world.joint_rod[j], step)
         else:
-            place(a, b, joints[j], chain.link_rod[j], step)
-    for k in range(moving):
-        solver.accelerate(bodies[k], chain.gravity, step)
-    for k in range(moving):
-        if chain.wheel[k]:
-            solver.begin_wheel(bodies[k])
+            place_joint(a, b, joints[j], world.joint_rod[j], step)
+    for k in range(len(world.wheel)):
+        accelerate(bodies[k], world.gravity, step)
+    for k in range(len(world.wheel)):
+        if world.wheel[k]:
+            begin_wheel(bodies[k])
     for j in range(len(joints)):
         a, b = bodies[ends[j, 0]], bodies[ends[j, 1]]
         if ends[j, 0] < 0:
-            solver.begin_link(b, joints[j], chain.link_rod[j])
+            begin_joint(None, b, joints[j], world.joint_rod[j], block.rough[j])
         else:
-            begin(a, b, joints[j], chain.link_rod[j])
-        if block.rough[j]:
-            begin_pivot(a, b, joints[j])
+            begin_joint(a, b, joints[j], world.joint_rod[j], block.rough[j])
     for j in range(len(patches)):
-        solver.begin_patch(bodies[chain.patch_body[j]], patches[j])
-    done, longest = 0, most.max()
+        begin_patch(bodies[world.patch_body[j]], patches[j])
+    patches_alone = len(patches) > 0 and len(joints) == 0 and not world.wheel.any()
+    done, longest = 0, block.iterations.max()
     while done < longest:
         until = longest
         for i in range(BLOCK):
-            if most[i] > done:
-                until = min(until, most[i])
-        _iterate(block, chain, until - done)
+            if block.iterations[i] > done:
+                until = min(until, block.iterations[i])
+        for _ in range(until - done):  # in the engine's order
+            for k in range(len(world.wheel)):
+                if world.wheel[k]:
+                    solve_wheel(bodies[k])
+            for j in range(len(joints)):
+                a, b = bodies[ends[j, 0]], bodies[ends[j, 1]]
+                if ends[j, 0] < 0:
+                    solve_joint(None, b, joints[j], world.joint_rod[j], block.rough[j])
+                else:
+                    solve_joint(a, b, joints[j], world.joint_rod[j], block.rough[j])
+            changed = 0
+            for j in range(len(patches)):
+                changed += solve_patch(bodies[world.patch_body[j]], patches[j])
+            if patches_alone and changed == 0:
+                break
         if until < longest:
             for i in range(BLOCK):
-                if most[i] == until:
+                if block.iterations[i] == until:
                     _finish(block, i)
         done = until

@@ -24,19 +24,21 @@ R = TypeVar("R")
 #: Largest difference of one world's prediction from a part's that counts as rounding, in radii of
 #: the smallest body, rad and sampling intervals.
 _ROUNDING = 1e-6
-#: A Metropolis step asks for the proposed point and the current one: the latter was just computed.
-_REMEMBERED = 4
 
 
 class Memory:
-    """The last few results of a function, by its arguments; they do not go into a pickle."""
+    """The last few results of a function, by its arguments; they do not go into a pickle.
 
-    def __init__(self) -> None:
+    A Metropolis step asks for the proposed point and the current one: the latter was just computed.
+    """
+
+    def __init__(self, size: int = 4) -> None:
+        self._size = size
         self._known: OrderedDict[Hashable, Any] = OrderedDict()
 
     def __getstate__(self) -> dict[str, object]:
         """Nothing."""
-        return {"_known": OrderedDict()}
+        return {"_size": self._size, "_known": OrderedDict()}
 
     def recall(self, arguments: tuple[Floats, ...], compute: Callable[..., R]) -> R:
         """Return ``compute(*arguments)``, from memory for equal arguments.
@@ -55,7 +57,7 @@ class Memory:
             self._known.move_to_end(key)
         else:
             self._known[key] = compute(*arguments)
-            if len(self._known) > _REMEMBERED:
+            if len(self._known) > self._size:
                 self._known.popitem(last=False)
         result: R = self._known[key]
         return result

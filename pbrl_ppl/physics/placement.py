@@ -16,7 +16,6 @@ from pbrl_ppl.state import Floats
 #: Violation that noise and resting contact may explain, as a share of the smaller body's size.
 ALLOWED = 0.25
 _ORIGIN = (0.0, 0.0, 0.0)
-_CHUNK = 2048  # transitions at a time, to spare memory
 
 
 def check_placement(scene: Scene, start: Floats, where: Callable[[int], str] | None = None) -> None:
@@ -68,8 +67,8 @@ def check_placement(scene: Scene, start: Floats, where: Callable[[int], str] | N
         )
     complete = np.isfinite(start).all(axis=-1, keepdims=True)
     poses = np.where(complete, start[..., :3], np.nan)
-    for begin in range(0, len(poses), _CHUNK):
-        part = poses[begin : begin + _CHUNK]
+    for begin in range(0, len(poses), chunk := 2048):  # to spare memory
+        part = poses[begin : begin + chunk]
         faults = [*_apart(scene, part), *_overlaps(scene, part)]
         if faults:
             first, message = min(faults, key=lambda fault: fault[0])

@@ -11,7 +11,9 @@ import pymunk
 
 from pbrl_ppl.effects import Attached, Command, Force, at_stage
 from pbrl_ppl.physics.properties import COLUMN, EngineInput
-from pbrl_ppl.physics.world import RING, STICKING, World
+from pbrl_ppl.physics.setters import glide, iterations, patch_point, wheel_ends
+from pbrl_ppl.physics.solids import near_contact
+from pbrl_ppl.physics.world import RING, World
 from pbrl_ppl.state import Floats
 
 _EXTRA = [COLUMN.extra_gravity_x, COLUMN.extra_gravity_y]
@@ -57,37 +59,37 @@ def rollout(
     properties, joints = given.bodies[proposal], given.joints[proposal]
     timed = len(properties) > 1
     bodies = properties[item * len(inputs) if timed else 0]
-    world.set_properties(bodies, joints)
-    world.set_discs(given.discs[proposal])
+    set_properties(world, bodies, joints)
+    set_discs(world, given.discs[proposal])
     _place_bodies(world, start)
     names = [body.name for body in world.scene.moving]
     commands = list(_laws(effects, Command, given.commands[proposal], names))
     forces = list(_laws(effects, Force, given.forces[proposal], names))
     step = world.scene.time_step / substeps
     states = np.empty((len(inputs), len(names), 6))
-    touched = False
+    touched, nearness = False, (world.radii, world.obstacles, world.can_touch)
     for h, interval in enumerate(inputs):
         if timed and h > 0:
             bodies = properties[item * len(inputs) + h]
-            world.set_properties(bodies, joints)
+            set_properties(world, bodies, joints)
             _place_bodies(world, states[h - 1])
         for i, body in enumerate(world.bodies):
             if world.kinematic[i]:
                 body.velocity, body.angular_velocity = tuple(interval[i, :2]), interval[i, 2]
+        now = _states(world)
         for s in range(substeps):
             command = interval[:, :3].copy()
             previous = interval[:, 3:6].copy() if interval.shape[1] > 3 else None
             phase = s / substeps, (s + 1) / substeps
             for i, stage, parameters in commands:
-                state = _state(world, i)
                 before = np.zeros(3) if previous is None else previous[i]
-                stage.law(state, np.array([*command[i], *before, *phase]), parameters, command[i])
+                stage.law(now[i], np.array([*command[i], *before, *phase]), parameters, command[i])
                 if previous is not None and not stage.memory:
                     signal = np.array([*before, *before, *phase])
-                    stage.law(state, signal, parameters, previous[i])
+                    stage.law(now[i], signal, parameters, previous[i])
             wrench = command.copy()
             for i, stage, parameters in forces:
-                stage.law(_state(world, i), command[i], parameters, wrench[i])
+                stage.law(now[i], command[i], parameters, wrench[i])
             for i, body in enumerate(world.bodies):
                 if world.kinematic[i]:
                     continue
@@ -95,16 +97,16 @@ def rollout(
                 x, y = _arm(body)
                 body.force = tuple(wrench[i, :2] + weight)
                 body.torque = wrench[i, 2] - (x * wrench[i, 1] - y * wrench[i, 0])
-            _place_wheels(world, bodies, step)
-            _place_patches(world, bodies, step)
+            _place_constraints(world, bodies, now, step)
             world.space.step(step)
-            touched = touched or near_contact(world)
-            speeds = np.abs([_state(world, i)[3:] for i in range(len(names))])
+            now = _states(world)
+            near = (near_contact(i, now, *nearness) for i in range(len(names)))
+            touched = touched or any(near)
+            speeds = np.abs(now[:, 3:])
             if not (speeds @ (1.0, 1.0, world.size) < world.fastest).all():  # also true of NaN
                 states[:] = np.nan
                 return states, True
-        for i in range(len(names)):
-            states[h, i] = _state(world, i)
+        states[h] = now
     return states, touched
 
 
@@ -136,77 +138,66 @@ def _arm(body: pymunk.Body) -> tuple[float, float]:
     return c * x - s * y, s * x + c * y
 
 
-def _state(world: World, i: int) -> Floats:
-    """Return the state of a body's origin, shape (6,)."""
-    body = world.bodies[i]
-    x, y = _arm(body)
-    turn = body.angular_velocity
-    velocity = body.velocity.x + turn * y, body.velocity.y - turn * x
-    return np.array([*body.position, body.angle, *velocity, turn], dtype=float)
+def _states(world: World) -> Floats:
+    """Return the states of the bodies' origins, shape (body, 6)."""
+    states = np.empty((len(world.bodies), 6))
+    for body, state in zip(world.bodies, states, strict=True):
+        (x, y), turn, velocity = _arm(body), body.angular_velocity, body.velocity
+        state[:3] = *body.position, body.angle
+        state[3:] = velocity.x + turn * y, velocity.y - turn * x, turn
+    return states
 
 
-def _centre(world: World, i: int) -> Floats:
-    """Return the state of the centre of mass, which moves straight in a substep."""
-    body = world.bodies[i]
-    place = body.local_to_world(body.center_of_gravity)
-    return np.array([*place, body.angle, *body.velocity, body.angular_velocity], dtype=float)
+def set_discs(world: World, discs: Floats) -> None:
+    """Place the hidden discs: x, y and radius, shape (disc, 3). A radius of 0 is no disc.
+
+    They are removed and added again, since the order of contacts depends on the earlier places of
+    static shapes.
+    """
+    first = len(world.obstacles) - len(world.discs)
+    world.space.remove(*world.discs)
+    for j, (shape, (x, y, radius)) in enumerate(zip(world.discs, discs, strict=True)):
+        if not radius > 0:
+            x, y, radius = -world.far, -world.far * (j + 1), 0.0
+        shape.unsafe_set_offset((x, y))
+        shape.unsafe_set_radius(radius)
+        world.space.add(shape)
+        world.obstacles[first + j] = x, y, x, y, radius
 
 
-def _place_wheels(world: World, bodies: Floats, step: float) -> None:
-    """Put the rods' ends on the wheels' axes as predicted for the end of the substep."""
-    for wheel in world.wheels:
-        row = bodies[wheel.body]
-        at_x, at_y, angle, v_x, v_y, omega = _centre(world, wheel.body)
-        theta = angle + omega * step
-        c, s = math.cos(theta), math.sin(theta)
-        x, y = row[COLUMN.w_x] - row[COLUMN.com_x], row[COLUMN.w_y] - row[COLUMN.com_y]
-        at_x, at_y = at_x + v_x * step + c * x - s * y, at_y + v_y * step + s * x + c * y
-        c, s = math.cos(theta + row[COLUMN.w_theta]), math.sin(theta + row[COLUMN.w_theta])
-        wheel.along_x.anchor_b, wheel.along_y.anchor_b = (at_x + c, at_y + s), (at_x - s, at_y + c)
+def set_properties(world: World, bodies: Floats, joints: Floats) -> None:
+    """Set the engine's properties; shapes (body, column) and (joint, column)."""
+    world.space.iterations = iterations(world.iterations, world.chained, bodies)
+    for body, row, kinematic in zip(world.bodies, bodies, world.kinematic, strict=True):
+        if not kinematic:
+            body.mass, body.moment = row[COLUMN.mass], row[COLUMN.moment]
+            body.center_of_gravity = row[COLUMN.com_x], row[COLUMN.com_y]
+    for i, shape in world.shapes:
+        shape.elasticity, shape.friction = bodies[i, COLUMN.r], bodies[i, COLUMN.mu_c]
+    for rows, settings in ((bodies, world.body_settings), (joints, world.joint_settings)):
+        for constraint, setting, i, scale in settings:
+            value = tuple(rows[i, setting.columns])
+            if len(value) == 2:
+                value = value[0] * scale[0], value[1] * scale[1]
+                setattr(constraint, setting.attribute, value)
+            else:
+                load = (
+                    rows[i, COLUMN.mass] * world.scene.normal_gravity if setting.weighted else 1.0
+                )
+                setattr(constraint, setting.attribute, value[0] * load)
 
 
-def _place_patches(world: World, bodies: Floats, step: float) -> None:
-    """Put each point's rod along its velocity; split its friction with the pivot joint."""
-    for patch in world.patches:
-        row = bodies[patch.body]
-        at_x, at_y, angle, v_x, v_y, omega = _centre(world, patch.body)
-        radius = row[COLUMN.patch_radius]
+def _place_constraints(world: World, bodies: Floats, states: Floats, step: float) -> None:
+    """Put the far ends of rods where the substep is predicted to end; split a patch's friction."""
+    for i, (along_x,), (along_y,) in world.wheels:
+        after, turn = glide(bodies[i], states[i], step), bodies[i, COLUMN.w_theta]
+        x_1, y_1, x_2, y_2 = wheel_ends(bodies[i], after, math.cos(turn), math.sin(turn))
+        along_x.anchor_b, along_y.anchor_b = (x_1, y_1), (x_2, y_2)
+    for i, holds, rods in world.patches:
+        row, after = bodies[i], glide(bodies[i], states[i], step)
         slowing = row[COLUMN.patch_mu] * world.scene.normal_gravity
         most = slowing * row[COLUMN.mass] / len(RING)
-        theta = angle + omega * step
-        c, s = math.cos(theta), math.sin(theta)
-        for (x, y), hold, rod in zip(RING, patch.holds, patch.rods, strict=True):
-            x, y = x * radius - row[COLUMN.com_x], y * radius - row[COLUMN.com_y]
-            x, y = c * x - s * y, s * x + c * y
-            along_x, along_y = v_x - omega * y, v_y + omega * x
-            speed = math.sqrt(along_x * along_x + along_y * along_y)
-            slow = STICKING * slowing * step
-            share = 1.0 if speed >= slow else speed / slow
-            if speed == 0.0:  # at rest any direction will do
-                along_x, speed = 1.0, 1.0
-            rod.anchor_b = (
-                at_x + v_x * step + x + along_x / speed,
-                at_y + v_y * step + y + along_y / speed,
-            )
+        for point, hold, rod in zip(RING, holds, rods, strict=True):
+            x, y, share = patch_point(row, after, states[i, 5], point, step, slowing)
+            rod.anchor_b = x, y
             hold.max_force, rod.max_force = (1.0 - share) * most, share * most
-
-
-def near_contact(world: World) -> bool:
-    """Return whether bounding circles reach a wall or each other, as the compiled path does."""
-    for i, body in enumerate(world.bodies):
-        x, y = body.position
-        for segment in world.obstacles:
-            ax, ay, bx, by, radius = segment
-            dx, dy = bx - ax, by - ay
-            length = dx * dx + dy * dy
-            t = min(1.0, max(0.0, ((x - ax) * dx + (y - ay) * dy) / length)) if length else 0.0
-            reach = world.radii[i] + radius
-            if (x - ax - t * dx) ** 2 + (y - ay - t * dy) ** 2 <= reach * reach:
-                return True
-        for j in range(i):
-            if world.can_touch[i, j]:
-                ox, oy = world.bodies[j].position
-                reach = world.radii[i] + world.radii[j]
-                if (x - ox) ** 2 + (y - oy) ** 2 <= reach * reach:
-                    return True
-    return False

@@ -13,55 +13,58 @@ from pbrl_ppl.physics.world import ITERATIONS_A_RATIO, MOST_ITERATIONS, STICKING
 
 
 @compiled
-def iterations(world, bodies):  # type: ignore[no-untyped-def]
-    """Return the solver iterations for these masses, as in World.set_properties."""
+def iterations(fewest, chained, bodies):  # type: ignore[no-untyped-def]
+    """Return the solver iterations for the masses of these bodies."""
     lightest, heaviest = np.inf, 0.0
-    for i in range(len(world.chained)):
-        if world.chained[i]:
+    for i in range(len(chained)):
+        if chained[i]:
             lightest = min(lightest, bodies[i, COLUMN.mass])
             heaviest = max(heaviest, bodies[i, COLUMN.mass])
     enough = min(ITERATIONS_A_RATIO * (heaviest / lightest), MOST_ITERATIONS)
-    return max(world.iterations, int(enough))
+    return max(fewest, int(enough))
+
+
+@compiled
+def _apply(settings, rows, normal_gravity):  # type: ignore[no-untyped-def]
+    """Set properties of constraints by their rows of numbers."""
+    for j in range(len(settings)):
+        setting = settings[j]
+        row, column = rows[setting.row], setting.column
+        if setting.vector:
+            x, y = row[column] * setting.scale_x, row[setting.column_y] * setting.scale_y
+            call2(setting.function, setting.constraint, x, y)
+        else:
+            weight = row[COLUMN.mass] * normal_gravity if setting.weighted else 1.0
+            call1(setting.function, setting.constraint, row[column] * weight)
 
 
 @compiled
 def set_properties(fn, world, bodies, joints):  # type: ignore[no-untyped-def]
-    """Set masses, moments, surfaces and anchors, as in World.set_properties."""
+    """Set masses, moments, surfaces and anchors, but no strengths of constraints."""
     for i in range(len(world.bodies)):
         if world.kinematic[i]:
             continue
-        call1(fn.cpBodySetMass, world.bodies[i], bodies[i, COLUMN.mass])
-        call1(fn.cpBodySetMoment, world.bodies[i], bodies[i, COLUMN.moment])
-        call2(
-            fn.cpBodySetCenterOfGravity,
-            world.bodies[i],
-            bodies[i, COLUMN.com_x],
-            bodies[i, COLUMN.com_y],
-        )
+        body, row = world.bodies[i], bodies[i]
+        call1(fn.cpBodySetMass, body, row[COLUMN.mass])
+        call1(fn.cpBodySetMoment, body, row[COLUMN.moment])
+        call2(fn.cpBodySetCenterOfGravity, body, row[COLUMN.com_x], row[COLUMN.com_y])
     for j in range(len(world.shapes)):
         row = bodies[world.shape_body[j]]
         call1(fn.cpShapeSetElasticity, world.shapes[j], row[COLUMN.r])
         call1(fn.cpShapeSetFriction, world.shapes[j], row[COLUMN.mu_c])
-    for j in range(len(world.wheel_body)):
-        row = bodies[world.wheel_body[j]]
-        for wheel in world.wheels[:, j]:
-            call2(fn.cpPinJointSetAnchorA, wheel, row[COLUMN.w_x], row[COLUMN.w_y])
-    for j in range(len(world.link_settings)):
-        setting = world.link_settings[j]
-        row, column = joints[setting.joint], setting.column
-        if setting.vector:
-            call2(setting.function, setting.link, row[column], row[column + 1])
-        else:
-            call1(setting.function, setting.link, row[column])
-    for j in range(len(world.pivot_body)):
-        damping = bodies[world.pivot_body[j], COLUMN.pivot_damping]
-        call1(fn.cpDampedRotarySpringSetDamping, world.pivots[1, j], damping)
-    for j in range(len(world.patch_body)):
-        radius = bodies[world.patch_body[j], COLUMN.patch_radius]
-        for point in range(len(world.ring)):
-            x, y = world.ring[point] * radius
-            call2(fn.cpPivotJointSetAnchorA, world.patches[0, j, point], x, y)
-            call2(fn.cpPinJointSetAnchorA, world.patches[1, j, point], x, y)
+    _apply(world.body_settings, bodies, world.normal_gravity)
+    _apply(world.joint_settings, joints, world.normal_gravity)
+
+
+@compiled
+def set_strengths(fn, world, bodies, on):  # type: ignore[no-untyped-def]
+    """Set the constraints' greatest forces, or set them to zero; patches get theirs as placed."""
+    for constraint in world.unlimited:
+        call1(fn.cpConstraintSetMaxForce, constraint, np.inf if on else 0.0)
+    for constraint in world.limited:
+        call1(fn.cpConstraintSetMaxForce, constraint, 0.0)
+    if on:
+        _apply(world.strengths, bodies, world.normal_gravity)
 
 
 @compiled
@@ -75,10 +78,42 @@ def arm(row, theta):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _centre(row, state):  # type: ignore[no-untyped-def]
-    """Return place and velocity of the centre of mass, which moves straight in a substep."""
+def glide(row, state, step):  # type: ignore[no-untyped-def]
+    """Return where a substep without forces takes a body: heading, centre of mass, its velocity."""
     x, y = arm(row, state[2])
-    return state[0] + x, state[1] + y, state[3] - state[5] * y, state[4] + state[5] * x
+    v_x, v_y = state[3] - state[5] * y, state[4] + state[5] * x
+    theta = state[2] + state[5] * step
+    x, y = state[0] + x + v_x * step, state[1] + y + v_y * step
+    return math.cos(theta), math.sin(theta), x, y, v_x, v_y
+
+
+@compiled
+def wheel_ends(row, after, axis_cos, axis_sin):  # type: ignore[no-untyped-def]
+    """Return the far ends of a wheel's rods: x and y of the one along it, of the one across."""
+    c, s, x, y, _, _ = after
+    w_x, w_y = row[COLUMN.w_x] - row[COLUMN.com_x], row[COLUMN.w_y] - row[COLUMN.com_y]
+    x, y = x + c * w_x - s * w_y, y + s * w_x + c * w_y
+    c, s = c * axis_cos - s * axis_sin, s * axis_cos + c * axis_sin
+    return x + c, y + s, x - s, y + c
+
+
+@compiled
+def patch_point(row, after, omega, point, step, most):  # type: ignore[no-untyped-def]
+    """Return the far end of a point's rod, along its velocity, and the rod's share of the friction.
+
+    ``point`` is in units of the ring's radius; ``most`` is the deceleration by friction (m/s^2).
+    """
+    c, s, at_x, at_y, v_x, v_y = after
+    x = point[0] * row[COLUMN.patch_radius] - row[COLUMN.com_x]
+    y = point[1] * row[COLUMN.patch_radius] - row[COLUMN.com_y]
+    x, y = c * x - s * y, s * x + c * y
+    along_x, along_y = v_x - omega * y, v_y + omega * x
+    speed = math.sqrt(along_x * along_x + along_y * along_y)
+    slow = STICKING * most * step
+    share = 1.0 if speed >= slow else speed / slow
+    if speed == 0.0:  # at rest any direction will do
+        along_x, speed = 1.0, 1.0
+    return at_x + x + along_x / speed, at_y + y + along_y / speed, share
 
 
 @compiled
@@ -95,7 +130,7 @@ def place_bodies(fn, world, bodies, state):  # type: ignore[no-untyped-def]
 
 @compiled
 def set_discs(fn, world, discs):  # type: ignore[no-untyped-def]
-    """Place the hidden discs, as in World.set_discs.
+    """Place the hidden discs, as in `plain.set_discs`.
 
     They are removed and added again, since the order of contacts depends on their earlier places.
     """
@@ -121,71 +156,27 @@ def set_discs(fn, world, discs):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def set_strengths(fn, world, bodies, normal_gravity, on):  # type: ignore[no-untyped-def]
-    """Set the joints' greatest forces (``on`` is 1), or set them to zero (0)."""
-    for j in range(len(world.wheel_body)):
-        row = bodies[world.wheel_body[j]]
-        load = on * row[COLUMN.mass] * normal_gravity
-        call1(fn.cpConstraintSetMaxForce, world.wheels[0, j], row[COLUMN.mu_x] * load)
-        call1(fn.cpConstraintSetMaxForce, world.wheels[1, j], row[COLUMN.mu_y] * load)
-    for j in range(len(world.links)):
-        call1(fn.cpConstraintSetMaxForce, world.links[j], np.inf if on else 0.0)
-    for j in range(len(world.pivot_body)):
-        torque = on * bodies[world.pivot_body[j], COLUMN.pivot_torque]
-        call1(fn.cpConstraintSetMaxForce, world.pivots[0, j], torque)
-        call1(fn.cpConstraintSetMaxForce, world.pivots[1, j], np.inf if on else 0.0)
-    for j in range(len(world.patch_body)):
-        for point in range(len(world.ring)):  # on again in every substep
-            call1(fn.cpConstraintSetMaxForce, world.patches[0, j, point], 0.0)
-            call1(fn.cpConstraintSetMaxForce, world.patches[1, j, point], 0.0)
-
-
-@compiled
 def place_wheels(fn, world, bodies, state, axes, step):  # type: ignore[no-untyped-def]
     """Put the rods' ends on the wheels' axes as predicted for the end of the substep."""
     for j in range(len(world.wheel_body)):
-        i = world.wheel_body[j]
-        theta = state[i, 2] + state[i, 5] * step
-        c, s = math.cos(theta), math.sin(theta)
-        x, y, v_x, v_y = _centre(bodies[i], state[i])
-        w_x, w_y = (
-            bodies[i, COLUMN.w_x] - bodies[i, COLUMN.com_x],
-            bodies[i, COLUMN.w_y] - bodies[i, COLUMN.com_y],
-        )
-        x, y = x + v_x * step + c * w_x - s * w_y, y + v_y * step + s * w_x + c * w_y
-        c, s = c * axes[j, 0] - s * axes[j, 1], s * axes[j, 0] + c * axes[j, 1]
-        call2(fn.cpPinJointSetAnchorB, world.wheels[0, j], x + c, y + s)
-        call2(fn.cpPinJointSetAnchorB, world.wheels[1, j], x - s, y + c)
+        row, own = bodies[world.wheel_body[j]], state[world.wheel_body[j]]
+        x_1, y_1, x_2, y_2 = wheel_ends(row, glide(row, own, step), axes[j, 0], axes[j, 1])
+        call2(fn.cpPinJointSetAnchorB, world.wheels[0, j], x_1, y_1)
+        call2(fn.cpPinJointSetAnchorB, world.wheels[1, j], x_2, y_2)
 
 
 @compiled
-def place_patches(fn, world, bodies, state, step, normal_gravity):  # type: ignore[no-untyped-def]
-    """Put each point's rod along its velocity and split its friction, as the reference path."""
+def place_patches(fn, world, bodies, state, step):  # type: ignore[no-untyped-def]
+    """Put each point's rod along its velocity; split its friction with the pivot joint."""
     for j in range(len(world.patch_body)):
-        i = world.patch_body[j]
-        radius, slowing = (
-            bodies[i, COLUMN.patch_radius],
-            bodies[i, COLUMN.patch_mu] * normal_gravity,
-        )
-        most = slowing * bodies[i, COLUMN.mass] / len(world.ring)
-        theta = state[i, 2] + state[i, 5] * step
-        c, s = math.cos(theta), math.sin(theta)
-        at_x, at_y, v_x, v_y = _centre(bodies[i], state[i])
-        for point in range(len(world.ring)):
-            x = world.ring[point, 0] * radius - bodies[i, COLUMN.com_x]
-            y = world.ring[point, 1] * radius - bodies[i, COLUMN.com_y]
-            x, y = c * x - s * y, s * x + c * y
-            along_x, along_y = v_x - state[i, 5] * y, v_y + state[i, 5] * x
-            speed = math.sqrt(along_x * along_x + along_y * along_y)
-            slow = STICKING * slowing * step
-            share = 1.0 if speed >= slow else speed / slow
-            if speed == 0.0:
-                along_x, speed = 1.0, 1.0
-            x = at_x + v_x * step + x + along_x / speed
-            y = at_y + v_y * step + y + along_y / speed
-            call2(fn.cpPinJointSetAnchorB, world.patches[1, j, point], x, y)
-            call1(fn.cpConstraintSetMaxForce, world.patches[0, j, point], (1.0 - share) * most)
-            call1(fn.cpConstraintSetMaxForce, world.patches[1, j, point], share * most)
+        row, own = bodies[world.patch_body[j]], state[world.patch_body[j]]
+        slowing, after = row[COLUMN.patch_mu] * world.normal_gravity, glide(row, own, step)
+        most = slowing * row[COLUMN.mass] / len(world.ring)
+        for i in range(len(world.ring)):
+            x, y, share = patch_point(row, after, own[5], world.ring[i], step, slowing)
+            call2(fn.cpPinJointSetAnchorB, world.patches[1, j, i], x, y)
+            call1(fn.cpConstraintSetMaxForce, world.patches[0, j, i], (1.0 - share) * most)
+            call1(fn.cpConstraintSetMaxForce, world.patches[1, j, i], share * most)
 
 
 @compiled

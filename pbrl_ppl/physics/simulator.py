@@ -305,7 +305,7 @@ class Simulator:
     ) -> None:
         batch = Batch(
             tuple(given[:-1]), self._commands, self._forces, starts, inputs,
-            self.physics.scene.time_step, self.physics.scene.normal_gravity, *self.levels,
+            self.physics.scene.time_step, *self.levels,
         )  # fmt: skip
         steps = len(out) * inputs.shape[1] * int(self.levels[0].sum())
         workers = max(1, min(self.physics.threads, len(out), steps // _A_THREAD))
@@ -318,10 +318,9 @@ class Simulator:
             found, slides = out, engines[0].slides and len(out) > 0
             if slides:
                 found, (batch, order) = np.empty_like(out), batch.by_speed()
-            alone = batch.alone() if engines[0].free else ()
 
             def run(engine: Engine, first: int, last: int) -> None:
-                engine.rollout(batch, alone, first, last, found)
+                engine.rollout(batch, first, last, found)
 
             share_out(run, engines[:workers], len(out))
         if slides:

@@ -1,4 +1,4 @@
-"""Solids of convex parts: penetration depths, and contacts within an interval."""
+"""What is near what: bounding circles, penetration depths of solids, contacts in an interval."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 import pymunk
 from numpy.typing import NDArray
 
+from pbrl_ppl.physics.compilation import compiled
 from pbrl_ppl.physics.world import engine_shapes
 from pbrl_ppl.scene import WORLD, Body, Scene
 from pbrl_ppl.state import Floats
@@ -220,3 +221,42 @@ def _touch_on_path(a: Solid, b: Solid, begin: Floats, end: Floats, dt: float) ->
             if len(near):
                 touched[near] |= depth(a, at[near, 0], b, at[near, 1]) > -gap[near]
     return touched
+
+
+@compiled
+def segment(obstacle):  # type: ignore[no-untyped-def]
+    """Return an obstacle's begin, its way to the end, one over the way's square, and its radius."""
+    a_x, a_y, b_x, b_y, radius = obstacle
+    d_x, d_y = b_x - a_x, b_y - a_y
+    square = d_x * d_x + d_y * d_y
+    return a_x, a_y, d_x, d_y, 1.0 / square if square > 0.0 else 0.0, radius
+
+
+@compiled
+def reaches(x, y, d_x, d_y, scale, reach):  # type: ignore[no-untyped-def]
+    """Return whether a place relative to a segment's begin is within ``reach`` of the segment."""
+    t = (x * d_x + y * d_y) * scale
+    t = 0.0 if t < 0.0 else t
+    t = 1.0 if t > 1.0 else t
+    x, y = x - t * d_x, y - t * d_y
+    return x * x + y * y <= reach * reach
+
+
+@compiled
+def near_contact(i, state, radii, obstacles, can_touch):  # type: ignore[no-untyped-def]
+    """Return whether body ``i`` may touch an obstacle or a body before it.
+
+    ``state`` has x and y of each body first; obstacles are segments with a radius, shape
+    (obstacle, 5).
+    """
+    x, y = state[i, 0], state[i, 1]
+    for j in range(len(obstacles)):
+        a_x, a_y, d_x, d_y, scale, radius = segment(obstacles[j])
+        if reaches(x - a_x, y - a_y, d_x, d_y, scale, radii[i] + radius):
+            return True
+    for j in range(i):
+        if can_touch[i, j]:
+            reach = radii[i] + radii[j]
+            if reaches(x - state[j, 0], y - state[j, 1], 0.0, 0.0, 0.0, reach):
+                return True
+    return False

@@ -26,20 +26,11 @@ from pbrl_ppl.physics.properties import COLUMNS, SEEN
 from pbrl_ppl.scene import Body, Scene, Units, units_of
 from pbrl_ppl.state import STATE, STATE_UNITS, Floats
 
-#: Time after which a trial counts as an endless loop (s).
-PATIENCE = 10.0
-#: Parameter values drawn from the prior, beside the null value.
-_DRAWS = 4
 #: Wrench of a trial, in the body's natural units.
 _TRIAL = np.array([1.0, -0.5, 0.2])
-#: Intervals that are simulated with the effect at its null value and without it, and their engine
-#: steps.
-_INTERVALS, _STEPS = 6, 2
-#: Largest difference between the two that is rounding, as a share of the coordinate's size.
-_ROUNDING = 1e-9
 
 
-def try_effect(effect: Effect, scene: Scene, history: History, patience: float = PATIENCE) -> None:
+def try_effect(effect: Effect, scene: Scene, history: History, patience: float = 10.0) -> None:
     """Evaluate an effect's functions at a measured state and at parameters from its prior.
 
     In the compiled rollout, a law that raises would stop silently, and an endless one could not be
@@ -53,7 +44,7 @@ def try_effect(effect: Effect, scene: Scene, history: History, patience: float =
     scene, history : Scene and History
         Scene and data that it would act on.
     patience : float
-        Time limit (s).
+        Time after which a trial counts as an endless loop (s).
 
     Raises
     ------
@@ -61,6 +52,10 @@ def try_effect(effect: Effect, scene: Scene, history: History, patience: float =
         If it raises, returns a number that is not finite, does not return in time, or does not
         vanish at its null value.
     """
+    # what the trial simulates with is compiled first: that is no endless loop
+    plain = Physics(scene, substeps=1, extrapolate=False, engine="python")
+    centre, k = np.array([prior.centre for prior in plain.layout.priors]), len(scene.moving)
+    plain.predict(centre, np.zeros((1, k, 6)), np.zeros((1, 1, k, 3)))
     outcome: Future[None] = Future()
 
     def run() -> None:
@@ -86,13 +81,14 @@ def try_effect(effect: Effect, scene: Scene, history: History, patience: float =
         ) from error
 
 
-def _try(effect: Effect, scene: Scene, history: History) -> None:
+def _try(effect: Effect, scene: Scene, history: History, draws: int = 4) -> None:
+    """Raise if a function fails at a state, at the null value or at draws from the prior."""
     bodies = [body for body in scene.dynamic if effect.applies(scene, body)]
     rng = np.random.default_rng(0)
     for body in bodies:
         units = units_of(scene, body.name)
         sized = effect.in_si(units)
-        drawn = np.array([parameter.prior.sample(rng, _DRAWS) for parameter in sized.parameters])
+        drawn = np.array([parameter.prior.sample(rng, draws) for parameter in sized.parameters])
         values = np.vstack([sized.null, drawn.T])
         if effect.scan is not None:
             points = np.asarray(effect.scan(scene, history, body), dtype=float)
@@ -116,8 +112,14 @@ def _try(effect: Effect, scene: Scene, history: History) -> None:
         _check_null(sized, scene, history, body)
 
 
-def _check_null(effect: Effect, scene: Scene, history: History, body: Body) -> None:
-    """Raise if simulations with the effect at its null value differ from those without it."""
+def _check_null(
+    effect: Effect, scene: Scene, history: History, body: Body, rounding: float = 1e-9
+) -> None:
+    """Raise if simulations with the effect at its null value differ from those without it.
+
+    Six intervals are simulated. A smaller difference than ``rounding``, as a share of the
+    coordinate's size, is none.
+    """
     at_null = ", ".join(
         f"{parameter.name} = {parameter.null:.4g} {parameter.unit}".removesuffix(" 1")
         for parameter in effect.parameters
@@ -133,8 +135,8 @@ def _check_null(effect: Effect, scene: Scene, history: History, body: Body) -> N
         return
     states = np.nan_to_num(history.dataset["start"].to_numpy())
     segments = history.pieces(states, 1)
-    chosen = np.unique(np.linspace(0, segments.n - 1, _INTERVALS).astype(int))
-    settings: dict[str, Any] = {"substeps": _STEPS, "extrapolate": False, "engine": "python"}
+    chosen = np.unique(np.linspace(0, segments.n - 1, 6).astype(int))
+    settings: dict[str, Any] = {"substeps": 2, "extrapolate": False, "engine": "python"}
     without = Physics(scene, **settings)
     there = Physics(scene, (effect.on(body.name),), **settings)
     values = {
@@ -153,7 +155,7 @@ def _check_null(effect: Effect, scene: Scene, history: History, body: Body) -> N
     change = np.nan_to_num(np.abs(after - before))
     size = np.abs(np.nan_to_num(before)) + _sizes(scene)
     relative = (change / size).max(axis=(0, 1))
-    if relative.max() > _ROUNDING:
+    if relative.max() > rounding:
         moved, k = np.unravel_index(relative.argmax(), relative.shape)
         most = change[..., moved, k].max()
         raise EffectError(

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TypeVar
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import pymunk
 from pymunk import autogeometry
 
 from pbrl_ppl.effects import hanging_body
-from pbrl_ppl.physics.joints import JOINT_KINDS, ROD, JointKind
+from pbrl_ppl.physics.joints import HINGE, JOINT_KINDS, ROD, JointKind, Setting
 from pbrl_ppl.physics.properties import COLUMN
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene, smallest_radius
-from pbrl_ppl.state import Floats
 
 #: Solver iterations. A single body without obstacles needs few, since its wheel or hinge then
 #: converges to rounding; several bodies need the engine's default, and a chain of joints more, in
@@ -34,8 +33,6 @@ _CART_TIME = math.sqrt(_CART / 9.81)
 COLLISION_SLOP = 1e-4 / _CART
 #: Share of an overlap that the engine leaves after the engine time; its default for the cart.
 OVERLAP_LEFT = pymunk.Space().collision_bias ** _CART_TIME
-#: Engine time without gravity, in sampling intervals; that of the cart.
-ENGINE_INTERVALS = _CART_TIME / 0.1
 #: Least share of an overlap that is left after 1 s: the power underflows where the engine time is
 #: below a hundredth of the cart's, and overlaps are then corrected more slowly.
 LEAST_LEFT = 1e-300
@@ -45,63 +42,90 @@ FAR, TINY = 1e9, 1e-9
 #: Refinement of the substeps near contacts in a scene with hidden discs: a disc's inferred place
 #: must not depend on the substep in which a body stops.
 FINER = 8
-#: Sizes of the engine's hash tables; it takes the first that is larger than the number of entries.
-_TABLES = (5, 13, 23, 47, 97, 193, 389, 769, 1543, 3079, 6151, 12289)
 #: Speed from which the engine counts as diverged, in radii of the smallest body an interval.
 DIVERGED = 1e5
-#: Rounding of a corner's cross product as a share of the outline's extent squared.
-_ROUNDING = 1e-12
 
 
-Brake = TypeVar("Brake", pymunk.PinJoint, pymunk.PivotJoint)
+class ConstraintKind(NamedTuple):
+    """What a constraint on a body is in the engine: a maker, properties, a limit of its force."""
+
+    constraint: Callable[[pymunk.Body, pymunk.Body], pymunk.Constraint]
+    settings: tuple[Setting, ...]
+    limited: bool = True
 
 
-@dataclass(frozen=True)
-class Wheel:
-    """Wheel constraint J_w: two rods from the wheel to the ground, each with limited force.
+#: Beside joints, two kinds of constraints on a body for each use, with their settings.
+#:
+#: ``wheel`` is the constraint J_w: two rods to the ground, each with limited force. Every substep,
+#: their far ends are put on the wheel's axes, 1 m away. A rod is the engine's only joint that
+#: resists motion along a line and leaves motion across it alone. (Off-centre, its groove joint
+#: turns motion along the groove into a force across it.)
+#:
+#: ``pivot`` is friction and damping in a hinge, with the parameters of the hanging body.
+#:
+#: ``patch`` is Coulomb friction under a body, at points of a ring that share its weight. A pivot
+#: joint to the ground, whose force is limited as a vector, holds a point if it rests; a rod along
+#: its velocity brakes it if it slides. (The pivot joint alone would not do: its force on a sliding
+#: point is not opposite to the motion, because the engine solves it in the metric of the point's
+#: inertia.) Both get their strength every substep.
+BODY_CONSTRAINTS = {
+    "wheel": tuple(
+        ConstraintKind(
+            ROD.constraint,
+            (
+                Setting("anchor_a", "cpPinJointSetAnchorA", (COLUMN.w_x, COLUMN.w_y)),
+                Setting("max_force", "cpConstraintSetMaxForce", (friction,), weighted=True),
+            ),
+        )
+        for friction in (COLUMN.mu_x, COLUMN.mu_y)
+    ),
+    "pivot": (
+        ConstraintKind(
+            lambda a, b: pymunk.SimpleMotor(a, b, 0.0),
+            (Setting("max_force", "cpConstraintSetMaxForce", (COLUMN.pivot_torque,)),),
+        ),
+        ConstraintKind(
+            lambda a, b: pymunk.DampedRotarySpring(a, b, 0.0, 0.0, 0.0),
+            (Setting("damping", "cpDampedRotarySpringSetDamping", (COLUMN.pivot_damping,)),),
+            limited=False,
+        ),
+    ),
+    "patch": tuple(
+        ConstraintKind(
+            kind.constraint, (Setting("anchor_a", function, 2 * (COLUMN.patch_radius,)),)
+        )
+        for kind, function in ((HINGE, "cpPivotJointSetAnchorA"), (ROD, "cpPinJointSetAnchorA"))
+    ),
+}
 
-    Every substep, their far ends are put on the wheel's axes, 1 m away. A rod is the engine's only
-    joint that resists motion along a line and leaves motion across it alone. (Off-centre, its
-    groove joint turns motion along the groove into a force across it.)
+
+class Placed(NamedTuple):
+    """A setting of a constraint in a world."""
+
+    constraint: pymunk.Constraint
+    setting: Setting
+    row: int  # of the bodies' or of the joints' numbers
+    scale: tuple[float, float] = (1.0, 1.0)  # of a vector
+
+
+class OnBody(NamedTuple):
+    """The two kinds of constraints on a body: one each of a wheel, one a point of a patch."""
+
+    body: int
+    first: tuple[pymunk.Constraint, ...]
+    second: tuple[pymunk.Constraint, ...]
+
+
+class Link(NamedTuple):
+    """Joint constraint J_d, its kind and its row among all joints.
+
+    ``pivot`` is the body whose friction acts in it, -1 for none.
     """
-
-    body: int
-    along_x: pymunk.PinJoint
-    along_y: pymunk.PinJoint
-
-
-@dataclass(frozen=True)
-class Pivot:
-    """Friction and damping in a hinge, with the parameters of the hanging body."""
-
-    body: int
-    motor: pymunk.SimpleMotor
-    damper: pymunk.DampedRotarySpring
-
-
-@dataclass(frozen=True)
-class Link:
-    """Joint constraint J_d, its kind, its row among all joints, and the friction in it."""
 
     joint: int
     kind: JointKind
     constraint: pymunk.Constraint
-    pivot: Pivot | None
-
-
-@dataclass(frozen=True)
-class Patch:
-    """Coulomb friction under a body, at points of a ring that share its weight.
-
-    A rod along a point's velocity brakes it if it slides; a pivot joint to the ground, whose force
-    is limited as a vector, holds it if it rests. (The pivot joint alone would not do: its force on
-    a sliding point is not opposite to the motion, because the engine solves it in the metric of the
-    point's inertia.) Both are placed every substep.
-    """
-
-    body: int
-    holds: tuple[pymunk.PivotJoint, ...]
-    rods: tuple[pymunk.PinJoint, ...]
+    pivot: int
 
 
 class World:
@@ -147,9 +171,14 @@ class World:
         self.space.collision_bias = max(OVERLAP_LEFT ** (1.0 / engine_time(scene)), LEAST_LEFT)
         self.bodies: list[pymunk.Body] = []
         self.shapes: list[tuple[int, pymunk.Shape]] = []
-        self.wheels: list[Wheel] = []
+        self.wheels: list[OnBody] = []
         self.links: list[Link] = []
-        self.pivots: list[Pivot] = []
+        #: Constraints whose force is limited and others, and the settings of all of them by the
+        #: bodies' and the joints' numbers.
+        self.limited: list[pymunk.Constraint] = []
+        self.unlimited: list[pymunk.Constraint] = []
+        self.body_settings: list[Placed] = []
+        self.joint_settings: list[Placed] = []
         self.discs: list[pymunk.Circle] = []
         self._by_name: dict[str, pymunk.Body] = {WORLD: self.space.static_body}
         self._add_fixed()
@@ -168,13 +197,16 @@ class World:
             self.space.add(rigid)
             self.shapes += [(i, shape) for shape in engine_shapes(body, rigid)]
             if body.wheel or i in wheels:
-                self._add_wheel(i, rigid)
+                self.wheels.append(self._constrain("wheel", i, rigid, self.space.static_body))
         self._add_shapes()
         self.can_touch = np.ones((len(self.bodies), len(self.bodies)), dtype=bool)
         self._add_joints(kinds, joined)
         for i, position in rods:
             self._add_link(position, self.bodies[i], self.space.static_body, ROD)
-        self.patches = [self._new_patch(i) for i in patches]
+        self.patches = [
+            self._constrain("patch", i, self.bodies[i], self.space.static_body, RING)
+            for i in patches
+        ]
         #: Which dynamic bodies are joined to other moving ones.
         self.chained = np.logical_not(self.can_touch.all(axis=1)) & ~self.kinematic
         alone = len(scene.bodies) == 1 and not scene.walls and not (discs or patches)
@@ -196,9 +228,11 @@ class World:
         """Add the moving shapes so that contacts have one order, whatever was simulated before.
 
         The engine numbers shapes as they are added and visits them by that number modulo the size
-        of a hash table. The first must get a multiple of it, here and whenever they are added anew.
+        of a hash table: the first in a list that is larger than the number of entries. The first
+        shape must get a multiple of it, here and whenever they are added anew.
         """
-        table = next(size for size in _TABLES if size > len(self.shapes))
+        tables = (5, 13, 23, 47, 97, 193, 389, 769, 1543, 3079, 6151, 12289)
+        table = next(size for size in tables if size > len(self.shapes))
         self.padding = -len(self.shapes) % table
         first = self.shapes[0][1]
         for _ in range(-len(self.space.shapes) % table):
@@ -228,21 +262,28 @@ class World:
         shape.elasticity = shape.friction = 1.0  # the engine multiplies both shapes' values
         self.space.add(shape)
 
-    def _add_wheel(self, index: int, body: pymunk.Body) -> None:
-        along_x, along_y = (self._brake(pymunk.PinJoint, body) for _ in range(2))
-        self.wheels.append(Wheel(index, along_x, along_y))
+    def _constrain(
+        self,
+        use: str,
+        row: int,
+        a: pymunk.Body,
+        b: pymunk.Body,
+        points: tuple[tuple[float, float], ...] = ((1.0, 1.0),),
+    ) -> OnBody:
+        """Add the constraints of a use, which resist motion but do not correct drift."""
+        made = []
+        for kind in BODY_CONSTRAINTS[use]:
+            made.append(tuple(kind.constraint(a, b) for _ in points))
+            for constraint, point in zip(made[-1], points, strict=True):
+                if kind.limited:
+                    constraint.max_bias = constraint.max_force = 0.0
+                self._add_constraint(constraint, kind.limited)
+                self.body_settings += [Placed(constraint, s, row, point) for s in kind.settings]
+        return OnBody(row, *made)
 
-    def _brake(self, kind: type[Brake], body: pymunk.Body) -> Brake:
-        """Return a new joint to the ground that resists motion but does not correct drift."""
-        joint = kind(body, self.space.static_body, (0, 0), (0, 0))
-        joint.max_bias = joint.max_force = 0.0
-        self.space.add(joint)
-        return joint
-
-    def _new_patch(self, index: int) -> Patch:
-        body = self.bodies[index]
-        holds = tuple(self._brake(pymunk.PivotJoint, body) for _ in RING)
-        return Patch(index, holds, tuple(self._brake(pymunk.PinJoint, body) for _ in RING))
+    def _add_constraint(self, constraint: pymunk.Constraint, limited: bool) -> None:
+        (self.limited if limited else self.unlimited).append(constraint)
+        self.space.add(constraint)
 
     def _add_joints(
         self, kinds: tuple[JointKind, ...], joined: tuple[tuple[int, int], ...]
@@ -273,75 +314,24 @@ class World:
         link = kind.constraint(a, b)
         link.error_bias = 0.0  # correct the whole drift every substep
         link.collide_bodies = False
-        self.space.add(link)
-        pivot = None
+        self._add_constraint(link, limited=False)
+        pivot = -1
         if joint is not None and joint.bodies is not None and JOINT_KINDS[joint.kind].friction:
-            motor = pymunk.SimpleMotor(a, b, 0.0)
-            motor.max_force = 0.0
-            damper = pymunk.DampedRotarySpring(a, b, 0.0, 0.0, 0.0)
-            self.space.add(motor, damper)
-            hanging = self._by_name[hanging_body(self.scene, joint)]
-            pivot = Pivot(self.bodies.index(hanging), motor, damper)
-            self.pivots.append(pivot)
+            pivot = self.bodies.index(self._by_name[hanging_body(self.scene, joint)])
+            self._constrain("pivot", pivot, a, b)
         self.links.append(Link(position, kind, link, pivot))
-
-    def set_discs(self, discs: Floats) -> None:
-        """Place the hidden discs: x, y and radius, shape (disc, 3). A radius of 0 is no disc.
-
-        They are removed and added again, since the order of contacts depends on the earlier places
-        of static shapes.
-        """
-        first = len(self.obstacles) - len(self.discs)
-        self.space.remove(*self.discs)
-        for j, (shape, (x, y, radius)) in enumerate(zip(self.discs, discs, strict=True)):
-            if not radius > 0:
-                x, y, radius = -self.far, -self.far * (j + 1), 0.0
-            shape.unsafe_set_offset((x, y))
-            shape.unsafe_set_radius(radius)
-            self.space.add(shape)
-            self.obstacles[first + j] = x, y, x, y, radius
-
-    def set_properties(self, bodies: Floats, joints: Floats) -> None:
-        """Set the engine's properties; shapes (body, column) and (joint, column)."""
-        mass = bodies[self.chained, COLUMN.mass]
-        ratio = mass.max() / mass.min() if len(mass) else 0.0
-        enough = min(ITERATIONS_A_RATIO * ratio, MOST_ITERATIONS)
-        self.space.iterations = max(self.iterations, int(enough))
-        for i, body in enumerate(self.bodies):
-            if self.kinematic[i]:
-                continue
-            body.mass = bodies[i, COLUMN.mass]
-            body.moment = bodies[i, COLUMN.moment]
-            body.center_of_gravity = bodies[i, COLUMN.com_x], bodies[i, COLUMN.com_y]
-        for i, shape in self.shapes:
-            shape.elasticity = bodies[i, COLUMN.r]
-            shape.friction = bodies[i, COLUMN.mu_c]
-        for wheel in self.wheels:
-            row = bodies[wheel.body]
-            load = row[COLUMN.mass] * self.scene.normal_gravity
-            place = row[COLUMN.w_x], row[COLUMN.w_y]
-            wheel.along_x.anchor_a = wheel.along_y.anchor_a = place
-            wheel.along_x.max_force = row[COLUMN.mu_x] * load
-            wheel.along_y.max_force = row[COLUMN.mu_y] * load
-        for patch in self.patches:
-            radius = bodies[patch.body, COLUMN.patch_radius]
-            for (x, y), hold, rod in zip(RING, patch.holds, patch.rods, strict=True):
-                hold.anchor_a = rod.anchor_a = x * radius, y * radius
-        for link in self.links:
-            for setting in link.kind.settings:
-                value = tuple(joints[link.joint, setting.columns])
-                setattr(link.constraint, setting.attribute, value if len(value) > 1 else value[0])
-        for pivot in self.pivots:
-            pivot.motor.max_force = bodies[pivot.body, COLUMN.pivot_torque]
-            pivot.damper.damping = bodies[pivot.body, COLUMN.pivot_damping]
+        self.joint_settings += [Placed(link, setting, position) for setting in kind.settings]
 
 
 def engine_time(scene: Scene) -> float:
-    """Return the time in which gravity moves the smallest body by about its size (s)."""
+    """Return the time in which gravity moves the smallest body by about its size (s).
+
+    Without gravity it is that of the cart, in sampling intervals.
+    """
     gravity = max(math.hypot(*scene.gravity), scene.normal_gravity)
     if gravity > 0.0:
         return math.sqrt(smallest_radius(scene) / gravity)
-    return ENGINE_INTERVALS * scene.time_step
+    return _CART_TIME / 0.1 * scene.time_step
 
 
 def _extent(scene: Scene) -> float:
@@ -361,9 +351,10 @@ def engine_shapes(body: Body, rigid: pymunk.Body) -> list[pymunk.Shape]:
     return [pymunk.Poly(rigid, part) for part in autogeometry.convex_decomposition(closed, 0.0)]
 
 
-def _is_convex(outline: tuple[tuple[float, float], ...]) -> bool:
+def _is_convex(outline: tuple[tuple[float, float], ...], rounding: float = 1e-12) -> bool:
+    """Whether no corner turns inwards, to rounding: a share of the outline's extent squared."""
     corners = np.array(outline)
     edge = np.roll(corners, -1, axis=0) - corners
     after = np.roll(edge, -1, axis=0)
     cross = edge[:, 0] * after[:, 1] - edge[:, 1] * after[:, 0]
-    return bool((cross >= -_ROUNDING * np.ptp(corners, axis=0).max() ** 2).all())
+    return bool((cross >= -rounding * np.ptp(corners, axis=0).max() ** 2).all())

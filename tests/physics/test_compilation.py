@@ -9,7 +9,7 @@ import pymunk
 import pytest
 from pymunk import _chipmunk_cffi
 
-from pbrl_ppl.physics import calls, compiled, lockstep, lockstep_chain
+from pbrl_ppl.physics import calls, compiled, lockstep
 from pbrl_ppl.physics.compilation import SOURCES, disk_cache, sources_digest
 from pbrl_ppl.physics.compilation import compiled as decorator
 
@@ -115,7 +115,7 @@ def test_an_older_cache_that_cannot_be_read_is_deleted(module) -> None:
     assert not index.exists()
 
 
-@pytest.mark.parametrize("rollout", [compiled.rollout, lockstep.rollout, lockstep_chain.rollout])
+@pytest.mark.parametrize("rollout", [compiled.rollout, lockstep.rollout])
 def test_rollouts_are_cached_by_the_digest(rollout) -> None:
     assert rollout._cache._cache_file._source_stamp == SOURCES
 

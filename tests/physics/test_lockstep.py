@@ -179,19 +179,16 @@ def test_one_of_several_bodies_at_a_wall_is_enough(at_the_wall) -> None:
     assert (ours[:, -1, :, 0] > -0.85).all()
 
 
-def test_bodies_without_joints_to_others_are_free() -> None:
-    assert len(lockstep.free_bodies(World(SCENES["wheel"]))) == 1
+def test_worlds_of_the_fast_path() -> None:
+    """All without kinematic bodies, whose joints it knows."""
+    assert lockstep.free_world(World(SCENES["wheel"])) is not None
     bodies = (Body("a", BOX), Body("b", BOX, wheel=True))
     two = SCENES["wheel"].replace(bodies=bodies)
-    assert [free.wheel for free in lockstep.free_bodies(World(two))] == [False, True]
+    assert lockstep.free_world(World(two)).wheel.tolist() == [False, True]
     joint = Joint("hinge", ("a", "b"), (0.5, 0.0), (-0.5, 0.0))
-    assert not lockstep.free_bodies(World(two.replace(joints=(joint,)), (HINGE,)))
+    assert lockstep.free_world(World(two.replace(joints=(joint,)), (HINGE,))) is not None
     pushed = (bodies[0], Body("finger", BOX, kinematic=True))
-    assert not lockstep.free_bodies(World(two.replace(bodies=pushed)))
-
-
-def test_a_joint_without_contact_free_arithmetic_is_left_to_the_engine() -> None:
-    slider = dataclasses.replace(HINGE, contact_free=False)
-    scene = SCENES["hinge"]
-    assert lockstep.free_bodies(World(scene, (HINGE,)))
-    assert not lockstep.free_bodies(World(scene, (slider,)))
+    assert lockstep.free_world(World(two.replace(bodies=pushed))) is None
+    unknown = dataclasses.replace(HINGE, contact_free=False)
+    assert lockstep.free_world(World(SCENES["hinge"], (HINGE,))) is not None
+    assert lockstep.free_world(World(SCENES["hinge"], (unknown,))) is None

@@ -5,9 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from pbrl_ppl.physics import Simulator, calls, compiled, lockstep_chain
-from pbrl_ppl.physics.joints import HINGE
-from pbrl_ppl.physics.world import World
+from pbrl_ppl.physics import Simulator, calls, compiled
 from pbrl_ppl.scene import Body, Scene, Wall
 from tests.helpers.chains import LINK, cart_with_trailers, case, chain
 from tests.helpers.engines import BOX
@@ -186,15 +184,6 @@ def test_energy_and_momentum_are_kept() -> None:
     # the rod's two impulses lie on one line; a hinge's anchors are apart by the drift to correct
     assert drifts("-rr", 40, extrapolate=False)[1] < 1e-9
     assert drifts("-hh", 40)[1] / drifts("-hh", 80)[1] > 5.0
-
-
-def test_worlds_for_the_fast_path() -> None:
-    assert lockstep_chain.chain_of(World(chain("hh"), (HINGE, HINGE))) is not None
-    assert (
-        lockstep_chain.chain_of(World(chain("h"), (HINGE,))) is None
-    )  # no two moving bodies are joined
-    pushed = chain("hh").replace(bodies=(*chain("hh").bodies, Body("finger", LINK, kinematic=True)))
-    assert lockstep_chain.chain_of(World(pushed, (HINGE, HINGE))) is None
 
 
 # -- single bodies ---------------------------------------------------------------------------------

@@ -1,0 +1,199 @@
+"""Bodies in the contact-free fast path: states, properties and free motion, a block at a time.
+
+This is Chipmunk's ``cpSpaceStep`` without contacts, in its order. States, wrenches and obstacles
+refer to a body's origin; a substep moves its centre of mass. ``body`` is the row of a body in a
+block, and ``i`` the number of a transition in the block.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import namedtuple
+from typing import Any
+
+from pbrl_ppl.physics.compilation import compiled
+from pbrl_ppl.physics.properties import COLUMN
+from pbrl_ppl.physics.solids import reaches, segment
+
+#: Number of transitions in a block, which are computed side by side.
+BLOCK = 32
+
+
+def row_of(fields: str) -> Any:
+    """Return where the values of each field begin in a row: those of a block follow each other.
+
+    All fields are in one array: the compiler then knows that they do not overlap.
+    """
+    names = fields.split()
+    return namedtuple("Row", names)(*range(0, BLOCK * len(names), BLOCK))
+
+
+#: Fields of a body: the state of its centre of mass, which is at ``com`` in its frame; the place of
+#: its origin; the wrench on it and the weight beside the scene's gravity; the accelerations that
+#: they give. Then those of its wheel: place and axis in its frame, greatest and stored impulses of
+#: both rods; the axis in the world, levers and effective masses in a substep.
+BODY = row_of(
+    """
+    x y angle vx vy omega cos sin com_x com_y inverse_mass inverse_moment
+    origin_x origin_y force_x force_y torque weight_x weight_y acceleration_x acceleration_y spin_up
+    wheel_x wheel_y wheel_cos wheel_sin most_along most_across impulse_along impulse_across
+    axis_x axis_y lever_along lever_across mass_along mass_across
+    """
+)
+#: Smaller rotations in a substep (rad) are computed by a series, exact to rounding.
+_SMALL_TURN = 0.5
+_C1, _C2, _C3, _C4, _C5, _C6, _C7 = ((-1) ** k / math.factorial(2 * k) for k in range(1, 8))
+_S1, _S2, _S3, _S4, _S5, _S6, _S7 = ((-1) ** k / math.factorial(2 * k + 1) for k in range(1, 8))
+
+
+@compiled
+def set_body(body, i, row, wheel, normal_gravity, step):  # type: ignore[no-untyped-def]
+    """Set a body's properties for an interval; keep stored impulses.
+
+    Returns whether the centre of mass is off the origin.
+    """
+    mass, com_x, com_y = row[COLUMN.mass], row[COLUMN.com_x], row[COLUMN.com_y]
+    body[BODY.inverse_mass + i] = 1.0 / mass
+    body[BODY.inverse_moment + i] = 1.0 / row[COLUMN.moment]
+    body[BODY.weight_x + i] = mass * row[COLUMN.extra_gravity_x]
+    body[BODY.weight_y + i] = mass * row[COLUMN.extra_gravity_y]
+    body[BODY.com_x + i], body[BODY.com_y + i] = com_x, com_y
+    if wheel:
+        load, angle = mass * normal_gravity, row[COLUMN.w_theta]
+        body[BODY.wheel_x + i] = row[COLUMN.w_x] - com_x
+        body[BODY.wheel_y + i] = row[COLUMN.w_y] - com_y
+        body[BODY.wheel_cos + i], body[BODY.wheel_sin + i] = math.cos(angle), math.sin(angle)
+        body[BODY.most_along + i] = row[COLUMN.mu_x] * load * step
+        body[BODY.most_across + i] = row[COLUMN.mu_y] * load * step
+    return com_x != 0.0 or com_y != 0.0
+
+
+@compiled
+def align(body, i):  # type: ignore[no-untyped-def]
+    """Set the heading from the angle, which removes accumulated rounding."""
+    angle = body[BODY.angle + i]
+    body[BODY.cos + i], body[BODY.sin + i] = math.cos(angle), math.sin(angle)
+
+
+@compiled
+def _arm(body, i):  # type: ignore[no-untyped-def]
+    """Return the arm from the origin to the centre of mass, in the world's frame."""
+    x, y = body[BODY.com_x + i], body[BODY.com_y + i]
+    if x == 0.0 and y == 0.0:
+        return 0.0, 0.0
+    c, s = body[BODY.cos + i], body[BODY.sin + i]
+    return c * x - s * y, s * x + c * y
+
+
+@compiled
+def set_state(body, i, states, k):  # type: ignore[no-untyped-def]
+    """Set the state of the centre of mass from that of the origin, row ``k`` of the states."""
+    omega = states[k, 5]
+    body[BODY.angle + i], body[BODY.omega + i] = states[k, 2], omega
+    align(body, i)
+    x, y = _arm(body, i)
+    body[BODY.x + i], body[BODY.y + i] = states[k, 0] + x, states[k, 1] + y
+    body[BODY.vx + i], body[BODY.vy + i] = states[k, 3] - omega * y, states[k, 4] + omega * x
+
+
+@compiled
+def get_state(body, i, states, k):  # type: ignore[no-untyped-def]
+    """Write the state of the origin into row ``k`` of the states."""
+    (x, y), omega = _arm(body, i), body[BODY.omega + i]
+    states[k, 0], states[k, 1] = body[BODY.x + i] - x, body[BODY.y + i] - y
+    states[k, 2] = body[BODY.angle + i]
+    states[k, 3], states[k, 4] = body[BODY.vx + i] + omega * y, body[BODY.vy + i] - omega * x
+    states[k, 5] = omega
+
+
+@compiled
+def set_wrench(body, i, force_x, force_y, torque):  # type: ignore[no-untyped-def]
+    """Set the accelerations by a wrench and the additional weight."""
+    body[BODY.force_x + i], body[BODY.force_y + i], body[BODY.torque + i] = force_x, force_y, torque
+    inverse_mass = body[BODY.inverse_mass + i]
+    body[BODY.acceleration_x + i] = (force_x + body[BODY.weight_x + i]) * inverse_mass
+    body[BODY.acceleration_y + i] = (force_y + body[BODY.weight_y + i]) * inverse_mass
+    body[BODY.spin_up + i] = torque * body[BODY.inverse_moment + i]
+
+
+@compiled
+def lever(body):  # type: ignore[no-untyped-def]
+    """Set the angular accelerations by forces on origins that are off the centres of mass."""
+    for i in range(BLOCK):
+        c, s = body[BODY.cos + i], body[BODY.sin + i]
+        x = c * body[BODY.com_x + i] - s * body[BODY.com_y + i]
+        y = s * body[BODY.com_x + i] + c * body[BODY.com_y + i]
+        moment = x * body[BODY.force_y + i] - y * body[BODY.force_x + i]
+        body[BODY.spin_up + i] = (body[BODY.torque + i] - moment) * body[BODY.inverse_moment + i]
+
+
+@compiled
+def turn(body, step):  # type: ignore[no-untyped-def]
+    """Move a body and rotate its heading."""
+    fast = False
+    for i in range(BLOCK):
+        body[BODY.x + i] += body[BODY.vx + i] * step
+        body[BODY.y + i] += body[BODY.vy + i] * step
+        a = body[BODY.omega + i] * step
+        body[BODY.angle + i] += a
+        fast |= not abs(a) < _SMALL_TURN
+        d = a * a
+        c = 1.0 + d * (_C1 + d * (_C2 + d * (_C3 + d * (_C4 + d * (_C5 + d * (_C6 + d * _C7))))))
+        s = _S1 + d * (_S2 + d * (_S3 + d * (_S4 + d * (_S5 + d * (_S6 + d * _S7)))))
+        s = a * (1.0 + d * s)
+        before = body[BODY.cos + i]
+        body[BODY.cos + i] = before * c - body[BODY.sin + i] * s
+        body[BODY.sin + i] = body[BODY.sin + i] * c + before * s
+    if fast:
+        for i in range(BLOCK):
+            if not abs(body[BODY.omega + i] * step) < _SMALL_TURN:
+                align(body, i)
+
+
+@compiled
+def accelerate(body, gravity, step):  # type: ignore[no-untyped-def]
+    """Add the velocity changes by gravity and the wrench."""
+    g_x, g_y = gravity
+    for i in range(BLOCK):
+        body[BODY.vx + i] += (g_x + body[BODY.acceleration_x + i]) * step
+        body[BODY.vy + i] += (g_y + body[BODY.acceleration_y + i]) * step
+        body[BODY.omega + i] += body[BODY.spin_up + i] * step
+
+
+@compiled
+def lose(body, world, touched):  # type: ignore[no-untyped-def]
+    """Mark the transitions that have diverged."""
+    for i in range(BLOCK):
+        speed = abs(body[BODY.vx + i]) + abs(body[BODY.vy + i])
+        speed += world.size * abs(body[BODY.omega + i])
+        touched[i] |= not speed < world.fastest  # also true of NaN
+
+
+@compiled
+def watch(bodies, world, discs, touched):  # type: ignore[no-untyped-def]
+    """Mark the transitions in which a body is near an obstacle or another that it may touch."""
+    for k in range(len(world.radii)):
+        body, radius = bodies[k], world.radii[k]
+        for i in range(BLOCK):
+            c, s = body[BODY.cos + i], body[BODY.sin + i]
+            com_x, com_y = body[BODY.com_x + i], body[BODY.com_y + i]
+            body[BODY.origin_x + i] = body[BODY.x + i] - (c * com_x - s * com_y)
+            body[BODY.origin_y + i] = body[BODY.y + i] - (s * com_x + c * com_y)
+        for j in range(len(world.obstacles)):
+            a_x, a_y, d_x, d_y, scale, size = segment(world.obstacles[j])
+            for i in range(BLOCK):
+                x, y = body[BODY.origin_x + i] - a_x, body[BODY.origin_y + i] - a_y
+                touched[i] |= reaches(x, y, d_x, d_y, scale, radius + size)
+        for j in range(discs.shape[1]):
+            for i in range(BLOCK):
+                x = body[BODY.origin_x + i] - discs[i, j, 0]
+                y = body[BODY.origin_y + i] - discs[i, j, 1]
+                near = reaches(x, y, 0.0, 0.0, 0.0, radius + discs[i, j, 2])
+                touched[i] |= near & (discs[i, j, 2] > 0.0)
+        for j in range(k):
+            if world.can_touch[k, j]:
+                other = bodies[j]
+                for i in range(BLOCK):
+                    x = body[BODY.origin_x + i] - other[BODY.origin_x + i]
+                    y = body[BODY.origin_y + i] - other[BODY.origin_y + i]
+                    touched[i] |= reaches(x, y, 0.0, 0.0, 0.0, radius + world.radii[j])
