@@ -33,6 +33,7 @@ from .results import ONE_TRAJECTORY as ONE_TRAJECTORY
 from .results import Added as Added
 from .results import Candidate as Candidate
 from .results import Errors as Errors
+from .results import Estimate as Estimate
 from .results import Stage as Stage
 from .results import Unexplained as Unexplained
 from .results import diverged_after as diverged_after

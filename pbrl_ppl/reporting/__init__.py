@@ -1,8 +1,5 @@
 """Plots and reports; the only place that imports matplotlib."""
 
-from pbrl_ppl.reporting.brief import in_brief as in_brief
-from pbrl_ppl.reporting.check_plots import plot_calibration as plot_calibration
-from pbrl_ppl.reporting.check_plots import plot_prior_check as plot_prior_check
 from pbrl_ppl.reporting.effect_plots import plot_candidates as plot_candidates
 from pbrl_ppl.reporting.error_plots import plot_errors as plot_errors
 from pbrl_ppl.reporting.error_plots import plot_rollout as plot_rollout
@@ -14,6 +11,8 @@ from pbrl_ppl.reporting.many import ManyLoops as ManyLoops
 from pbrl_ppl.reporting.many import close_loop_many as close_loop_many
 from pbrl_ppl.reporting.many_page import in_words as in_words
 from pbrl_ppl.reporting.page import Source as Source
+from pbrl_ppl.reporting.posterior_plots import plot_calibration as plot_calibration
+from pbrl_ppl.reporting.posterior_plots import plot_prior_check as plot_prior_check
 from pbrl_ppl.reporting.posterior_plots import plot_rank as plot_rank
 from pbrl_ppl.reporting.posterior_plots import plot_trace as plot_trace
 from pbrl_ppl.reporting.posterior_plots import summary as summary
@@ -23,3 +22,4 @@ from pbrl_ppl.reporting.scene_plots import draw_goal as draw_goal
 from pbrl_ppl.reporting.scene_plots import draw_motion as draw_motion
 from pbrl_ppl.reporting.scene_plots import draw_scene as draw_scene
 from pbrl_ppl.reporting.style import png as png
+from pbrl_ppl.reporting.words import in_brief as in_brief

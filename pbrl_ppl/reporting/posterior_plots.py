@@ -1,4 +1,4 @@
-"""Plots of posteriors: chains, priors, pairs, predictions; and ArviZ's summary."""
+"""Plots of posteriors, of the prior against the data, of calibration; and ArviZ's summary."""
 
 from __future__ import annotations
 
@@ -11,11 +11,13 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from scipy.stats import gaussian_kde, rankdata
+from scipy.stats import binom, gaussian_kde, rankdata
 
+from pbrl_ppl.criticism import PriorCheck
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.posterior import (
     DATATREE,
@@ -30,13 +32,22 @@ from pbrl_ppl.posterior import (
     scalars,
     separate,
 )
-from pbrl_ppl.reporting.style import AFTER, BAND, BEFORE, NARROW, PLAIN, WIDE, blank_figure, legend
+from pbrl_ppl.reporting.style import (
+    AFTER,
+    BAND,
+    BEFORE,
+    NARROW,
+    PLAIN,
+    UNITS,
+    WIDE,
+    blank_figure,
+    legend,
+)
+from pbrl_ppl.sampling import Calibration, bins
 from pbrl_ppl.state import Floats
 
 #: Parameters in one picture, at most; the report's tables show all.
 MOST_PARAMETERS = 6
-#: Kolmogorov's distance of an even sample from evenness, times the root of its size, at 1 %.
-_WORST_SHIFT = 1.63
 
 
 def summary(posterior: Any) -> pd.DataFrame:
@@ -124,8 +135,7 @@ def plot_rank(
         chains = values.to_numpy()
         ranks = rankdata(chains).reshape(chains.shape) / chains.size
         fewest = min(ess[str(name)] for ess in sizes)
-        edge = _WORST_SHIFT / np.sqrt(max(fewest, 1.0)) if np.isfinite(fewest) else 1.0
-        axes.axhspan(-edge, edge, color=BAND, zorder=0)
+        edge = _band(axes, fewest if np.isfinite(fewest) else 1.63**2)
         grid = np.linspace(0.0, 1.0, 201)
         shares = [np.searchsorted(np.sort(chain), grid) / len(chain) for chain in ranks]
         off = np.array(shares) - grid
@@ -137,6 +147,14 @@ def plot_rank(
         axes.set_ylim(-largest, largest)
         axes.set_xlabel("rank among all draws", fontsize=8)
     return figure
+
+
+def _band(axes: Axes, size: float) -> float:
+    """Draw the band that an even sample of a size leaves once in 100 times; return its edge."""
+    # Kolmogorov's distance times the root of the size, at 1 %
+    edge = float(1.63 / np.sqrt(max(size, 1.0)))
+    axes.axhspan(-edge, edge, color=BAND, zorder=0)
+    return edge
 
 
 def _chosen(posterior: Any, parameters: Sequence[str] | None) -> xr.Dataset:
@@ -286,8 +304,7 @@ def plot_predictions(posterior: Any, width: float = WIDE) -> Figure:
         colour, mark = (BEFORE, AFTER)[i % 2], marks[i // 2 % 3]
         axes.plot(grid, off, mark, color=colour, linewidth=1.5)
         handles.append(Line2D([], [], color=colour, linestyle=mark, label=name))
-    edge = _WORST_SHIFT / np.sqrt(max(fewest, 1.0)) if np.isfinite(fewest) else 0.0
-    axes.axhspan(-edge, edge, color=BAND, zorder=0)
+    _band(axes, fewest)
     axes.set_xlabel("position in the prediction: 0 below all draws, 1 above")
     axes.set_ylabel("share below, less expected")
     if handles:
@@ -329,7 +346,7 @@ def pareto_k(posterior: Any) -> tuple[Floats, float, str]:
         warnings.simplefilter("ignore")  # ArviZ warns of a high k, which the result shows
         try:
             loo = az.loo(separate(posterior), pointwise=True)
-        except Exception as error:  # a report can do without, whatever the cause
+        except (TypeError, ValueError, KeyError, IndexError) as error:  # no finite likelihood
             raise PosteriorError(f"leave-one-out cross-validation: {error}") from error
     return np.asarray(loo.pareto_k, dtype=float).ravel(), float(loo.good_k), left_out(posterior)
 
@@ -357,3 +374,59 @@ def _correlations(draws: xr.Dataset, names: Sequence[str]) -> Floats:
     """Return rank correlations, shape (parameter, parameter)."""
     table = pd.DataFrame({name: draws[name].to_numpy().ravel() for name in names})
     return np.asarray(table.corr("spearman"))
+
+
+def plot_prior_check(check: PriorCheck) -> Figure:
+    """Plot the measured changes of state over a segment beside those that the prior predicts."""
+    bodies, states = check.dataset["body"].values, check.dataset["state"].values
+    rows = len(bodies) * -(-len(states) // 2)
+    pairs = [(body, state) for body in bodies for state in states]
+    figure, panels = blank_figure(8.0, 0.8 + 1.3 * rows, rows, 2, "x", count=len(pairs))
+    for axes, (body, state) in zip(panels, pairs, strict=False):
+        changes = check.dataset.sel(body=body, state=state)
+        for place, (name, colour) in enumerate((("predicted", PLAIN), ("measured", AFTER))):
+            low, lower, middle, upper, high = changes[name].to_numpy()
+            axes.plot([low, high], [place] * 2, color=colour, linewidth=2)
+            axes.plot([lower, upper], [place] * 2, color=colour, linewidth=7)
+            axes.plot(middle, place, "o", color="white", markeredgecolor=colour)
+        axes.set_yticks([0, 1], ["prior", "measured"])
+        axes.set_ylim(1.6, -0.6)
+        share = float(changes["share_inside"])
+        axes.set_title(f"{state} of {body}: {100 * share:.0f} % as expected", fontsize=9)
+        axes.set_xlabel(f"change in {check.seconds:g} s ({UNITS[str(state)]})", fontsize=8)
+    return figure
+
+
+def plot_calibration(calibration: Calibration) -> Figure:
+    """Plot rank histograms of a simulation-based calibration, one panel a parameter.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        As made by :func:`pbrl_ppl.calibrate`.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        The band holds 99 % of each bar's heights if ranks are uniform; failed parameters stand out.
+    """
+    table, positions = calibration.table(), calibration.dataset["position"]
+    n, columns = positions.sizes["replication"], min(4, len(table))
+    rows = -(-len(table) // columns)
+    size = (2.6 * columns, 1.7 * rows + 0.6)
+    figure, panels = blank_figure(*size, rows, columns, count=len(table))
+    count = bins(n)
+    low, high = binom.interval(0.99, n, 1 / count)
+    for axes, (label, row) in zip(panels, table.iterrows(), strict=False):
+        axes.axhspan(low, high, color=BAND)
+        axes.axhline(n / count, color=PLAIN, linewidth=1)
+        color = AFTER if row["passed"] else BEFORE
+        axes.hist(
+            positions.sel(parameter=label), bins=count, range=(0, 1), histtype="step", color=color
+        )
+        verdict = "" if row["passed"] else ", failed"
+        axes.set_title(f"{label}: p = {row['p_holm']:.2g}{verdict}", fontsize=9, color=color)
+        axes.set_ylim(bottom=0)
+    figure.supxlabel("rank of the true value among posterior draws, as a share", fontsize=9)
+    figure.supylabel("replications", fontsize=9)
+    return figure

@@ -1,8 +1,9 @@
-"""A loop in words: the verdict, and numbers as a reader wants them."""
+"""Closed loops in words: the verdict, a summary for a terminal, and numbers for a reader."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -14,15 +15,13 @@ from pbrl_ppl.criticism import (
     TRIED,
     UNEXPLAINED,
     Added,
+    Estimate,
     Loop,
     acceleration_in_words,
     share_in_words,
 )
+from pbrl_ppl.reporting.style import UNITS
 
-_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-
-#: The asymptotic distribution of a statistic is not accurate below this p-value.
-_SMALLEST_P = 1e-16
 #: A held-out error above this many times the noise needs an explanation.
 _TOO_LARGE = 1.5
 
@@ -74,9 +73,14 @@ def _size(added: Added) -> str:
     if not has_size(added):
         return ""
     (size,) = added.parameters.values()
+    return f", {_with_interval(size, '94 %')}"
+
+
+def _with_interval(size: Estimate, name: str) -> str:
+    """Write an estimate and its interval, with the digits that tell the ends apart."""
     digits = digits_of(*size.hdi)
     low, high = (number(end, digits) for end in size.hdi)
-    return f", {quantity(size.mean, size.unit, digits)} (94 % {low} to {high})"
+    return f"{quantity(size.mean, size.unit, digits)} ({name} {low} to {high})"
 
 
 def _gained(loop: Loop) -> str:
@@ -216,20 +220,24 @@ def error_in_words(loop: Loop) -> str:
 def held_out_in_words(loop: Loop) -> str:
     """Return the held-out errors of one model, or of both and their change."""
     before, after = loop.before.normalised_rmse, loop.after.normalised_rmse
-    floor = f"; noise alone gives {number(loop.noise_floor.normalised_rmse)}."
+    fell = 1 - after / before if before > 0 else np.nan
     if not loop.added:
-        said = f"the error of the declared model is {error(before)} times the noise"
+        text = f"the error of the declared model is {error(before)} times the noise"
     elif np.isposinf(after):
-        said = (
+        text = (
             f"the revised model diverges; the error of the declared one is {error(before)} times"
             " the noise"
         )
     else:
-        said = (
-            f"the prediction error {change(before, after)}, from {error(before)} to"
-            f" {number(after)} times the noise"
+        changed = f"{'fell' if fell > 0 else 'rose'} by {abs(fell) * 100:.0f} %"
+        if not np.isfinite(fell) or abs(fell) < 0.005:
+            changed = "did not change"
+        text = (
+            f"the prediction error {changed}, from {error(before)} to {number(after)} times the"
+            " noise"
         )
-    return f"On held-out recordings {said}{floor}"
+    floor = number(loop.noise_floor.normalised_rmse)
+    return f"On held-out recordings {text}; noise alone gives {floor}."
 
 
 def caution_in_words(loop: Loop) -> str:
@@ -256,6 +264,95 @@ def left_out_in_words(loop: Loop) -> str:
     return f"{'; '.join(first)}{rest}." if first else ""
 
 
+def in_brief(loop: Loop, folder: str | Path, remainder: str = "") -> list[str]:
+    """Return a summary of a closed loop in about ten lines.
+
+    Parameters
+    ----------
+    loop : Loop
+        Result of :func:`pbrl_ppl.close_loop`.
+    folder : str or pathlib.Path
+        Folder of the results, to name in commands.
+    remainder : str
+        What a learned remainder does, or why there is none; empty if none was requested.
+    """
+    folder = Path(folder)
+    lines = [f"Verdict: {loop.verdict}. {verdict_in_words(loop)}"]
+    lines += [_sizes(added) for added in accepted(loop)]
+    lines += [caution] if (caution := caution_in_words(loop)) else []
+    lines += _worst_error(loop)
+    lines += [f"  {remains}"] if (remains := remains_in_words(loop)) else []
+    lines += [f"Left out: {words}"] if (words := left_out_in_words(loop)) else []
+    lines += [f"Remainder: {remainder}"] if remainder else []
+    lines.append(f"Next: {_next_step(loop, folder, bool(remainder))}")
+    lines.append(f"Report: {folder / 'report.html'}; posteriors before.nc and after.nc beside it.")
+    return lines
+
+
+def _sizes(added: Added) -> str:
+    """Write the sizes of an effect with their intervals, and the effects confounded with it."""
+    sizes = [
+        f"{plain(name)} {_with_interval(size, '94 % interval')}"
+        for name, size in added.parameters.items()
+    ]
+    name = f"{plain(added.effect)} on the {plain(added.body)}"
+    text = f"  {name} ({added.sentence.rstrip('.')}): {', '.join(sizes)}"
+    if added.not_separable_from:
+        others = joined((plain(name) for name in added.not_separable_from), "or")
+        text += f"; these data cannot tell it from {others}"
+    return text
+
+
+def _worst_error(loop: Loop) -> list[str]:
+    """Write the held-out error far ahead that is worst, before and after if something was added."""
+    before, after, floor = (
+        each.rollout_rmse for each in (loop.before, loop.after, loop.noise_floor)
+    )
+
+    def times_floor(name: str) -> float:
+        if np.isposinf(after.get(name, 0.0)):
+            return float("inf")
+        return before[name] / (floor.get(name, 0.0) or np.inf)
+
+    lines = []
+    if before:
+        name = max(before, key=times_floor)
+        seconds = loop.rollout_horizon * loop.scene.time_step
+        errors = (before[name], after.get(name, np.nan)) if loop.added else (before[name],)
+        unit = f" {UNITS[name]}" * bool(np.isfinite(errors[-1]))
+        lines.append(
+            f"Held-out error of {name} {number(seconds)} s ahead:"
+            f" {' -> '.join(map(error, errors))}{unit} (noise floor {number(floor.get(name))}"
+            f" {UNITS[name]})."
+        )
+    return [*lines, *([f"  {note}"] if (note := error_in_words(loop)) else [])]
+
+
+def _next_step(loop: Loop, folder: Path, tried: bool) -> str:
+    """Return what to do next."""
+    left = loop.unexplained
+    if loop.verdict == NOT_CONVERGED:
+        return "close the loop again with more --draws, or with tighter priors in the scene."
+    if diverges(loop):
+        return "open the report, which shows where forecasts diverge; do not plan with this model."
+    if left is not None and depends_on_records(loop):
+        learn = loop.verdict == UNEXPLAINED and not tried
+        return (
+            f"open the report, which plots the residual against {left.depends_on}; write an effect"
+            f" for it{', or close the loop again with --learn-remainder' if learn else ''}."
+        )
+    if loop.verdict == UNEXPLAINED:
+        return "open the report; record more quantities, or longer."
+    if any(added.not_separable_from for added in loop.added):
+        return (
+            f"pbrl-ppl suggest {folder / 'after.nc'} -o next.csv: a recording that tells these"
+            " effects apart."
+        )
+    if loop.verdict == ADEQUATE:
+        return "open the report for the detection limit of each effect."
+    return "open the report; plan and update with the posterior after.nc."
+
+
 def plain(name: str) -> str:
     """Write a catalogue name as words."""
     return name.replace("_", " ")
@@ -272,8 +369,9 @@ def number(value: float | None, digits: int = 3) -> str:
     if value is None or not np.isfinite(value):
         return "–"
     if value != 0 and not 1e-4 <= abs(value) < 1e6:
+        raised = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
         mantissa, _, exponent = f"{value:.{digits - 1}e}".partition("e")
-        return f"{mantissa} × 10{str(int(exponent)).translate(_RAISED)}".replace("-", "−")
+        return f"{mantissa} × 10{str(int(exponent)).translate(raised)}".replace("-", "−")
     places = digits - 1 - int(np.floor(np.log10(abs(value)))) if value else 0
     return f"{value:,.{max(places, 0)}f}".replace("-", "−")
 
@@ -302,16 +400,16 @@ def percent(share: float) -> str:
     return f"{number(100 * share, 2)} %"
 
 
-def chance(p_value: float) -> str:
-    """Write a p-value: two significant digits, and a bound below 1e-16.
+def chance(p_value: float, smallest: float = 1e-16) -> str:
+    """Write a p-value: two significant digits, and a bound where its asymptotics are inaccurate.
 
     Examples
     --------
     >>> chance(0.0312), chance(3e-8), chance(1e-80)
     ('0.031', '3.0e-8', '< 1e-16')
     """
-    if p_value < _SMALLEST_P:
-        return f"< {_SMALLEST_P:.0e}"
+    if p_value < smallest:
+        return f"< {smallest:.0e}"
     if p_value < 1e-4:
         return f"{p_value:.1e}".replace("e-0", "e-")
     return number(p_value, 2)
@@ -343,14 +441,6 @@ def share(relative: float) -> str:
     ('1.2 %', '> 100 %')
     """
     return percent(relative) if relative < LARGEST_SHARE else "> 100 %"
-
-
-def change(before: float, after: float) -> str:
-    """Return by how much an error fell or rose."""
-    share = 1 - after / before if before > 0 else float("nan")
-    if not np.isfinite(share) or abs(share) < 0.005:
-        return "did not change"
-    return f"{'fell' if share > 0 else 'rose'} by {abs(share) * 100:.0f} %"
 
 
 def gains_in_words(

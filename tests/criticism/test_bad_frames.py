@@ -9,8 +9,7 @@ from pbrl_ppl.criticism.recordings import checked_histories
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.history import History, without_bad_frames
 from pbrl_ppl.posterior import recorded, recording
-from pbrl_ppl.reporting import render
-from pbrl_ppl.reporting.brief import in_brief
+from pbrl_ppl.reporting import in_brief, render
 from tests.helpers.free_puck import DISC, fitted
 from tests.helpers.histories import simulated_history
 from tests.helpers.made_up import made_up

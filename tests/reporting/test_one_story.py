@@ -8,9 +8,8 @@ from pbrl_ppl.criticism.loop import Loop
 from pbrl_ppl.criticism.results import Acceleration, Candidate, Unexplained
 from pbrl_ppl.effects import Effect, EffectParameter, catalogue
 from pbrl_ppl.parameters import Prior
+from pbrl_ppl.reporting import in_brief, render
 from pbrl_ppl.reporting import page as page_module
-from pbrl_ppl.reporting import render
-from pbrl_ppl.reporting.brief import in_brief
 from pbrl_ppl.reporting.loop_tables import limits_in_words
 from pbrl_ppl.reporting.words import gains_in_words, remains_in_words, verdict_in_words
 from tests.helpers.html import Page
