@@ -20,16 +20,14 @@ from pbrl_ppl.reporting.words import plain
 from pbrl_ppl.scene import units_of
 from pbrl_ppl.state import Floats
 
-#: Candidates are significant below this corrected p-value.
-_LEVEL = 0.01
 #: Below this identifiable share a candidate is marked as hardly identifiable.
 HARDLY = 0.01
-#: Bars and parameters in one picture, at most; the report's tables show all.
-MOST_CANDIDATES, MOST_ADDED = 20, 12
+#: Bars of candidates, at most; the report's table has all.
+MOST_CANDIDATES = 20
 
 
-def plot_candidates(loop: Loop, width: float = WIDE) -> Figure:
-    """Plot the score statistic of the candidates, best on top, with the threshold of each."""
+def plot_candidates(loop: Loop, width: float = WIDE, level: float = 0.01) -> Figure:
+    """Plot the score of the candidates, best on top, with the threshold of each at a level."""
     added = {(addition.effect, addition.body) for addition in loop.added}
     rest = (c for c in loop.candidates[MOST_CANDIDATES:] if (c.effect, c.body) in added)
     shown = [*loop.candidates[:MOST_CANDIDATES], *rest]
@@ -37,7 +35,7 @@ def plot_candidates(loop: Loop, width: float = WIDE) -> Figure:
     several = len({candidate.body for candidate in shown}) > 1
     total = max(len(loop.candidates), 1)
     thresholds = [
-        float(chi2.isf(_LEVEL / (total * max(candidate.looks, 1)), candidate.dof))
+        float(chi2.isf(level / (total * max(candidate.looks, 1)), candidate.dof))
         for candidate in shown
     ]
     for place, (candidate, threshold) in enumerate(zip(shown, thresholds, strict=True)):
@@ -63,19 +61,19 @@ def plot_candidates(loop: Loop, width: float = WIDE) -> Figure:
         Patch(color=AFTER, label="added"),
         Patch(color=PLAIN, label="not added"),
         Patch(facecolor=PLAIN, edgecolor="white", hatch="////", label="hardly identifiable"),
-        Line2D([], [], color=BEFORE, linewidth=2, label="1 % threshold"),
+        Line2D([], [], color=BEFORE, linewidth=2, label=f"{100 * level:g} % threshold"),
     ]
     legend(figure, handles)
     return figure
 
 
-def plot_added(loop: Loop, width: float = WIDE) -> Figure:
+def plot_added(loop: Loop, width: float = WIDE, most: int = 12) -> Figure:
     """Plot the posterior of the added effects' parameters, and the values that mean no effect."""
     shown = [
         (added, name, estimate)
         for added in loop.added
         for name, estimate in added.parameters.items()
-    ][:MOST_ADDED]
+    ][:most]
     columns = min(max(len(shown), 1), 2)
     rows = max(-(-len(shown) // columns), 1)
     width = width if columns > 1 else min(width, 5.0)
@@ -121,10 +119,6 @@ def _mark_null(axes: Axes, null: float, mean: float, sd: float, top: float) -> N
     axes.annotate(text, (x, 0.93), xycoords="axes fraction", ha=side, fontsize=8)
 
 
-#: Bars of measured numbers in one panel, at most.
-_MOST_BARS = 12
-
-
 def plot_evidence(evidence: Evidence, width: float = WIDE) -> Figure:
     """Plot the gain of log-likelihood by measured number, speed, place, time and contact."""
     figure, panels = blank_figure(width, 8.0, 3, 2)
@@ -138,8 +132,8 @@ def plot_evidence(evidence: Evidence, width: float = WIDE) -> Figure:
     return figure
 
 
-def _by_cell(axes: Axes, evidence: Evidence) -> None:
-    sums = list(evidence.by_cell.items())[:_MOST_BARS]
+def _by_cell(axes: Axes, evidence: Evidence, most: int = 12) -> None:
+    sums = list(evidence.by_cell.items())[:most]
     names, values = [name for name, _ in sums], [value for _, value in sums]
     colours = [AFTER if value >= 0 else BEFORE for value in values]
     axes.barh(range(len(sums)), values, color=colours)

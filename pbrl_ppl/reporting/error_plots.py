@@ -200,12 +200,6 @@ def _beside(line: Floats, measured: Floats) -> Floats:
     return np.asarray(line + 2 * np.pi * turns)
 
 
-#: Probability that noise alone puts any correlation of a panel outside the band.
-_CHANCE = 0.01
-#: Curves that a legend names, at most.
-_NAMED = 4
-
-
 def plot_correlations(loop: Loop, width: float = WIDE) -> Figure:
     """Plot correlations of errors with earlier errors and with commands."""
     found = loop.correlations
@@ -230,18 +224,21 @@ def plot_correlations(loop: Loop, width: float = WIDE) -> Figure:
 
 
 def _plot_correlations(
-    axes: Axes, lags: Ints, values: Floats, pairs: Floats, names: list[str]
+    axes: Axes, lags: Ints, values: Floats, pairs: Floats, names: list[str], most: int = 4
 ) -> None:
-    """Draw correlations over lags; name those that leave the band of noise alone."""
-    edge = norm.isf(_CHANCE / 2 / max(values.size, 1)) / np.sqrt(np.maximum(pairs, 1)).min()
+    """Draw correlations over lags; name the largest that leave the band of noise alone.
+
+    Noise alone puts any curve of a panel outside the band once in 100 times.
+    """
+    edge = norm.isf(0.01 / 2 / max(values.size, 1)) / np.sqrt(np.maximum(pairs, 1)).min()
     axes.axhspan(-edge, edge, color=BAND, zorder=0)
     axes.axhline(0.0, color="black", linewidth=0.8, zorder=1)
     largest = np.abs(values).max(axis=0)
     outside = [i for i in np.argsort(-largest) if largest[i] > edge]
     for i in range(values.shape[1]):
-        if i not in outside[:_NAMED]:
+        if i not in outside[:most]:
             axes.plot(lags, values[:, i], ".-", color=PLAIN, linewidth=0.7, markersize=4)
-    for i in outside[:_NAMED]:
+    for i in outside[:most]:
         axes.plot(lags, values[:, i], ".-", linewidth=1.6, markersize=7, label=names[i])
     if outside:
         axes.legend(frameon=False, fontsize="small")

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from pbrl_ppl.criticism import QUANTITIES, Loop, recorded_quantities
@@ -14,11 +15,6 @@ from pbrl_ppl.posterior import Fit
 from pbrl_ppl.reporting.style import acceleration_unit
 from pbrl_ppl.reporting.words import depends_on_records
 from pbrl_ppl.state import STATE, Bools, Floats, Ints
-
-#: Bins of a quantity, each with as many transitions, and the fewest transitions that a bin has.
-_BINS, _LEAST = 10, 8
-#: Further quantities whose bins explain less than this share of the residual are left out.
-_SMALLEST_SHARE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,19 +157,21 @@ class Bins:
     error: Floats
 
 
-def bin_means(x: Floats, y: Floats) -> Bins:
-    """Return the means of y in bins of x; equal values of x share a bin."""
-    wanted = int(np.clip(len(x) // _LEAST, 1, _BINS))
+def bin_means(x: Floats, y: Floats, most: int = 10, least: int = 8) -> Bins:
+    """Return the means of y in bins of x; equal values of x share a bin.
+
+    There are at most ``most`` bins, each with at least about ``least`` values.
+    """
+    wanted = int(np.clip(len(x) // least, 1, most))
     edges = np.unique(np.quantile(x, np.linspace(0, 1, wanted + 1)[1:-1]))
     # equal values share a bin, so that some may be empty
     _, which = np.unique(np.searchsorted(edges, x, side="left"), return_inverse=True)
-    members = [which == i for i in range(int(which.max()) + 1)]
-    spreads = [y[inside].std(ddof=1) if inside.sum() > 1 else np.nan for inside in members]
+    means = pd.DataFrame({"x": x, "y": y}).groupby(which)
     return Bins(
         which,
-        centre=np.array([np.median(x[inside]) for inside in members]),
-        mean=np.array([y[inside].mean() for inside in members]),
-        error=np.array(spreads) / np.sqrt([inside.sum() for inside in members]),
+        centre=means["x"].median().to_numpy(),
+        mean=means["y"].mean().to_numpy(),
+        error=means["y"].sem().to_numpy(),
     )
 
 
@@ -235,11 +233,13 @@ class Law:
     curve: Curve
 
 
-def find_laws(loop: Loop, most: int = 3) -> list[Law]:
+def find_laws(loop: Loop, most: int = 3, least: float = 0.02) -> list[Law]:
     """Return the residual force against the quantity that it depends on, then against others.
 
     The residual force is the process noise that each step adds to the smoothed states, over the
     time step, times the body's mass or moment of inertia at the draw of highest likelihood.
+
+    Of the others, those whose bins explain at least the share ``least`` of the residual.
 
     Empty where the test of dependence passed, no body is named, or the posterior does not hold
     its recording.
@@ -264,7 +264,7 @@ def find_laws(loop: Loop, most: int = 3) -> list[Law]:
     laws.sort(key=lambda law: (law.quantity != remains.depends_on, -law.curve.share))
     if not laws or laws[0].quantity != remains.depends_on:
         return []
-    return [laws[0], *(law for law in laws[1:most] if law.share > _SMALLEST_SHARE)]
+    return [laws[0], *(law for law in laws[1:most] if law.share > least)]
 
 
 def _residual_force(

@@ -19,10 +19,6 @@ from pbrl_ppl.reporting.words import chance, error, number, percent, plain, quan
 from pbrl_ppl.scene import units_of
 from pbrl_ppl.state import STATE, Floats
 
-#: A size is plausible if the effect's prior has more than this probability beyond it.
-_IMPLAUSIBLE = 1e-3
-_DRAWS = 20_000
-
 
 def measured_parameters(candidate: Candidate, loop: Loop) -> tuple[str, ...]:
     """Return a candidate's parameters without those of state dimensions that were not measured."""
@@ -64,19 +60,18 @@ def limits_in_words(candidate: Candidate, loop: Loop) -> str:
 
 
 def _plausible(prior: Prior, null: float, size: float, caps: bool) -> bool:
-    """Return whether the prior reaches a size: a distance from the null value, or a cap."""
+    """Return whether the prior reaches a size more than once in 1000 draws.
+
+    The size is a distance from the null value, or a cap.
+    """
     draws = _draws(prior)
     reached = draws <= size if caps else np.abs(draws - null) >= size
-    return bool(reached.mean() > _IMPLAUSIBLE)
+    return bool(reached.mean() > 1e-3)
 
 
 @cache
 def _draws(prior: Prior) -> Floats:
-    return prior.sample(np.random.default_rng(0), _DRAWS)
-
-
-#: Transitions in the table of those that carry most.
-_CARRIERS = 8
+    return prior.sample(np.random.default_rng(0), 20_000)
 
 
 def error_tables(loop: Loop) -> list[Table]:
@@ -237,10 +232,10 @@ def _estimates(candidate: Candidate, names: Iterable[str]) -> str:
     )
 
 
-def carrier_table(evidence: Evidence) -> Table:
+def carrier_table(evidence: Evidence, most: int = 8) -> Table:
     """Tabulate the transitions that carry most of the evidence."""
     gains = evidence.by_transition
-    shown = np.argsort(-gains, kind="stable")[:_CARRIERS]
+    shown = np.argsort(-gains, kind="stable")[:most]
     return Table(
         f"The {len(shown)} transitions with most evidence",
         ("Trajectory", "Time (s)", "Gain (nats)", "Mostly in", "Speed (m/s)",

@@ -35,8 +35,7 @@ from pbrl_ppl.reporting.many_page import effect_table, in_words, page, summary_t
 from pbrl_ppl.reporting.page import Source
 from pbrl_ppl.sampling import Pooled, pool
 
-#: Files of all logs together; the first marks the folder.
-_SUMMARY, _TABLE, _EFFECTS, _PAGE = "summary.json", "summary.csv", "effects.csv", "index.html"
+#: Marks the summary of many logs, and with it their folder.
 _KIND = "pbrl_ppl logs 1"
 
 
@@ -212,7 +211,7 @@ def _ordered(logs: Iterable[Log], rows: Mapping[str, Any]) -> tuple[Mapping[str,
 def _opened(folder: Path) -> Path:
     """Make the folder of many logs, or check that it is one."""
     check_folder(folder, overwrite=True)
-    summary = folder / _SUMMARY
+    summary = folder / "summary.json"
     try:
         folder.mkdir(parents=True, exist_ok=True)
         ours = not any(folder.iterdir())
@@ -270,10 +269,10 @@ def _write_summary(
         "not_pooled": not_pooled,
     }
     texts = {
-        _SUMMARY: json.dumps(contents, indent=1, default=dict) + "\n",
-        _TABLE: summary_table(rows).to_csv(index=False, lineterminator="\n"),
-        _EFFECTS: effect_table(rows).to_csv(index=False, lineterminator="\n"),
-        _PAGE: page(rows, pooled, not_pooled, source),
+        "summary.json": json.dumps(contents, indent=1, default=dict) + "\n",
+        "summary.csv": summary_table(rows).to_csv(index=False, lineterminator="\n"),
+        "effects.csv": effect_table(rows).to_csv(index=False, lineterminator="\n"),
+        "index.html": page(rows, pooled, not_pooled, source),
     }
     for kind, each in pooled.items():
         texts[f"kind-{kind}.toml"] = each.scene.to_toml()

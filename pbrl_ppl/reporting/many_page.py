@@ -18,14 +18,11 @@ from pbrl_ppl.sampling import Pooled
 
 Row = Mapping[str, Any]
 
-_COLUMNS = ("name", "kind", "status", "verdict", "effects", "error_before", "error_after",
-            "seconds", "warnings", "message", "report")  # fmt: skip
-_ESTIMATE = ("name", "kind", "effect", "body", "parameter", "mean", "sd", "low", "high", "unit",
-             "p_value")  # fmt: skip
-
 
 def summary_table(rows: Iterable[Row]) -> pd.DataFrame:
     """Return one row a log; errors are in units of the noise, paths relative to the folder."""
+    columns = ["name", "kind", "status", "verdict", "effects", "error_before", "error_after",
+               "seconds", "warnings", "message", "report"]  # fmt: skip
     table = []
     for row in rows:
         done = row["status"] == "done"
@@ -35,12 +32,14 @@ def summary_table(rows: Iterable[Row]) -> pd.DataFrame:
             "warnings": len(row.get("warnings", ())),
             "report": f"{row['name']}/report.html" if done else "",
         }
-        table.append({name: (dict(row) | more).get(name, "") for name in _COLUMNS})
-    return pd.DataFrame(table, columns=list(_COLUMNS))
+        table.append({name: (dict(row) | more).get(name, "") for name in columns})
+    return pd.DataFrame(table, columns=columns)
 
 
 def effect_table(rows: Iterable[Row]) -> pd.DataFrame:
     """Return one row a log, effect and parameter, with its estimate and 94 % interval."""
+    columns = ["name", "kind", "effect", "body", "parameter", "mean", "sd", "low", "high", "unit",
+               "p_value"]  # fmt: skip
     table = [
         (row["name"], row["kind"], added["effect"], added["body"], name, each["mean"], each["sd"],
          *each["hdi"], each["unit"], added["p_value"])
@@ -48,7 +47,7 @@ def effect_table(rows: Iterable[Row]) -> pd.DataFrame:
         for added in row.get("effects", ())
         for name, each in added["parameters"].items()
     ]  # fmt: skip
-    return pd.DataFrame(table, columns=list(_ESTIMATE))
+    return pd.DataFrame(table, columns=columns)
 
 
 def in_words(rows: Iterable[Row]) -> str:

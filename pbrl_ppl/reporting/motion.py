@@ -16,9 +16,6 @@ from pbrl_ppl.reporting.words import number
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats, wrapped
 
-#: Motions in one page, and their rows in all, at most; the declared model's worst come first.
-MOST, _MOST_ROWS = 6, 3000
-
 
 @dataclass(frozen=True, eq=False)
 class Motion:
@@ -43,10 +40,11 @@ class Motion:
     after: Floats
 
 
-def held_out_motions(loop: Loop) -> list[Motion]:
+def held_out_motions(loop: Loop, most: int = 6, most_rows: int = 3000) -> list[Motion]:
     """Return predictions of held-out trajectories, those worst predicted by the old model first.
 
-    Those of which the new model's prediction diverges come before them.
+    Those of which the new model's prediction diverges come before them. At most ``most``
+    trajectories, with at most ``most_rows`` rows together.
 
     Each posterior predicts with its draw of highest likelihood.
     """
@@ -75,10 +73,10 @@ def held_out_motions(loop: Loop) -> list[Motion]:
         return not np.isposinf(last), -float(np.nan_to_num(first))
 
     for motion in sorted(motions, key=worst):
-        if shown and sum(len(each.time) for each in [*shown, motion]) > _MOST_ROWS:
+        if shown and sum(len(each.time) for each in [*shown, motion]) > most_rows:
             break
         shown.append(motion)
-    return shown[:MOST]
+    return shown[:most]
 
 
 def distance(scene: Scene, motion: Motion, predicted: Floats) -> float:

@@ -46,9 +46,6 @@ from pbrl_ppl.reporting.style import (
 from pbrl_ppl.sampling import Calibration, bins
 from pbrl_ppl.state import Floats
 
-#: Parameters in one picture, at most; the report's tables show all.
-MOST_PARAMETERS = 6
-
 
 def summary(posterior: Any) -> pd.DataFrame:
     """Return ArviZ's summary of every scalar parameter, with the same columns on every ArviZ.
@@ -76,7 +73,7 @@ def summary(posterior: Any) -> pd.DataFrame:
     return result
 
 
-def most_interesting(table: pd.DataFrame, added: Iterable[str] = ()) -> list[str]:
+def most_interesting(table: pd.DataFrame, added: Iterable[str] = (), most: int = 6) -> list[str]:
     """Return the parameters to look at first: those of added effects, then the worst by R-hat.
 
     Parameters
@@ -85,10 +82,12 @@ def most_interesting(table: pd.DataFrame, added: Iterable[str] = ()) -> list[str
         The posterior's :func:`summary`.
     added : iterable of str
         Labels of the added effects' parameters.
+    most : int
+        As many parameters, at most.
     """
     worst = table["r_hat"].fillna(np.inf).sort_values(ascending=False, kind="stable").index
     first = [name for name in added if name in table.index]
-    return list(dict.fromkeys([*first, *worst]))[:MOST_PARAMETERS]
+    return list(dict.fromkeys([*first, *worst]))[:most]
 
 
 def plot_trace(
@@ -191,11 +190,6 @@ def _trace(draws: xr.Dataset, width: float) -> Figure:
     return result
 
 
-#: Parameters in a picture of pairs, and beside their priors, at most.
-MOST_PAIRS, MOST_PRIORS = 4, 12
-_POINTS = 800
-
-
 def plot_prior(posterior: Any, parameters: Sequence[str], width: float = WIDE) -> Figure:
     """Plot posterior densities over those of the prior.
 
@@ -240,7 +234,7 @@ def plot_prior(posterior: Any, parameters: Sequence[str], width: float = WIDE) -
     return figure
 
 
-def most_dependent(posterior: Any, most: int = MOST_PAIRS) -> list[str]:
+def most_dependent(posterior: Any, most: int = 4) -> list[str]:
     """Return the parameters whose draws depend most on each other, by rank correlation."""
     draws = scalars(posterior)
     names = [str(name) for name, v in draws.items() if float(v.max() - v.min()) > 0]
@@ -255,8 +249,10 @@ def most_dependent(posterior: Any, most: int = MOST_PAIRS) -> list[str]:
     return [names[i] for i in chosen]
 
 
-def plot_pairs(posterior: Any, parameters: Sequence[str], width: float = WIDE) -> Figure:
-    """Plot draws of each pair of parameters, with their rank correlation."""
+def plot_pairs(
+    posterior: Any, parameters: Sequence[str], width: float = WIDE, points: int = 800
+) -> Figure:
+    """Plot some draws of each pair of parameters, with the rank correlation of all."""
     draws = scalars(posterior)
     n = len(parameters) - 1
     correlation = _correlations(draws, parameters)
@@ -270,7 +266,7 @@ def plot_pairs(posterior: Any, parameters: Sequence[str], width: float = WIDE) -
                 continue
             first, second = parameters[column], parameters[row + 1]
             x, y = (draws[name].to_numpy().ravel() for name in (first, second))
-            some = slice(None, None, max(1, len(x) // _POINTS))
+            some = slice(None, None, max(1, len(x) // points))
             axes.plot(x[some], y[some], ".", color=AFTER, markersize=2, alpha=0.4)
             axes.set_title(f"{correlation[row + 1, column]:+.2f}".replace("-", "−"), fontsize=9)
             axes.locator_params(nbins=3)

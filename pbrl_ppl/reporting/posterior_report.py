@@ -26,7 +26,6 @@ from pbrl_ppl.posterior import (
 from pbrl_ppl.reporting.loop_tables import loo_table
 from pbrl_ppl.reporting.page import Draw, Section, Source, Table, render_page
 from pbrl_ppl.reporting.posterior_plots import (
-    MOST_PRIORS,
     Coverage,
     coverage,
     most_dependent,
@@ -48,9 +47,6 @@ from pbrl_ppl.reporting.words import plain
 from pbrl_ppl.state import Floats
 
 T = TypeVar("T")
-
-#: Fewest draws for diagnostics of chains, densities and cross-validation.
-LEAST_DRAWS = 100
 
 
 def render_posterior(
@@ -84,12 +80,12 @@ def render_posterior(
         page = render_posterior(pp.load_posterior("cart.nc"))
         Path("cart.html").write_text(page, encoding="utf-8")
     """
-    effects = tuple(effects)
+    effects, least = tuple(effects), 100  # for diagnostics of chains and cross-validation
     sizes = group(posterior, "posterior").sizes
-    if sizes["chain"] * sizes["draw"] < LEAST_DRAWS:
+    if sizes["chain"] * sizes["draw"] < least:
         raise PosteriorError(
             f"posterior: it has {sizes['chain'] * sizes['draw']} draws, a report needs at least"
-            f" {LEAST_DRAWS}; fit with a method that draws, and more draws"
+            f" {least}; fit with a method that draws, and more draws"
         )
     scene, parameters = scene_of(posterior), Parameters(posterior, effects)
     known, why_unknown = _or_why(lambda: identify(posterior, effects=effects))
@@ -125,9 +121,10 @@ def _or_why(compute: Callable[[], T]) -> tuple[T | None, str]:
 
 @dataclass(frozen=True, eq=False)
 class AllParameters(Section):
-    """Table of all parameters, with their priors and pairs."""
+    """Table of all parameters; at most ``most`` are drawn over their priors."""
 
     parameters: Parameters
+    most: int = 12
 
     template = "parameters"
     title = "Parameters"
@@ -143,7 +140,7 @@ class AllParameters(Section):
         """The parameters that are drawn over their prior: those that move, if any does."""
         draws = scalars(self.parameters.posterior)
         moving = [str(name) for name, v in draws.items() if float(v.max() - v.min()) > 0]
-        return (moving or list(map(str, draws)))[:MOST_PRIORS]
+        return (moving or list(map(str, draws)))[: self.most]
 
     def context(self) -> Mapping[str, object]:
         return {

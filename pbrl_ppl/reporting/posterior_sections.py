@@ -84,12 +84,6 @@ def meaning(label: str, effects: Iterable[Effect]) -> str:
     return ""
 
 
-#: Chains are good up to this R-hat and from this effective sample size on ...
-GOOD_R_HAT, GOOD_ESS = 1.01, 400.0
-#: ... and up to these good enough for a verdict, and for the first digits of an interval.
-ROUGH_R_HAT, ROUGH_ESS = 1.05, 100.0
-
-
 @dataclass(frozen=True, eq=False)
 class Parameters:
     """Summary of a posterior's parameters and of the chains that it comes from.
@@ -102,11 +96,19 @@ class Parameters:
         Where the names of its effects are looked up.
     first : tuple of str
         Labels of parameters to show first.
+    good_r_hat, good_ess : float
+        Chains are good up to this R-hat and from this effective sample size on.
+    rough_r_hat, rough_ess : float
+        Up to these they are good enough for a verdict, and for the first digits of an interval.
     """
 
     posterior: Any
     effects: tuple[Effect, ...]
     first: tuple[str, ...] = ()
+    good_r_hat: float = 1.01
+    good_ess: float = 400.0
+    rough_r_hat: float = 1.05
+    rough_ess: float = 100.0
 
     @cached_property
     def summary(self) -> pd.DataFrame:
@@ -116,13 +118,14 @@ class Parameters:
         table["unit"] = [self._unit(label) for label in table.index]
         ess = table[["ess_bulk", "ess_tail"]].min(axis=1)
         # written so that a value that is not a number counts as bad
-        agree = table["r_hat"] <= (ROUGH_R_HAT if self.weighted else GOOD_R_HAT)
+        agree = table["r_hat"] <= (self.rough_r_hat if self.weighted else self.good_r_hat)
         table["wrong"] = [
             [f"R-hat {number(r_hat, 4)}"] * (self.chains and not fine)
-            + [f"effective sample size {number(size)}"] * (self.chains and not size >= GOOD_ESS)
+            + [f"effective sample size {number(size)}"]
+            * (self.chains and not size >= self.good_ess)
             for r_hat, fine, size in zip(table["r_hat"], agree, ess, strict=True)
         ]
-        good = (table["r_hat"] <= ROUGH_R_HAT) & (ess >= ROUGH_ESS)
+        good = (table["r_hat"] <= self.rough_r_hat) & (ess >= self.rough_ess)
         table["failed"] = ~good & self.chains
         return table
 
@@ -191,8 +194,8 @@ class Parameters:
         failed, rough = len(self.failed), int(table["wrong"].astype(bool).sum())
         found = (
             f"The largest R-hat of {count} parameters is {number(hats.max(), 4)} (at most"
-            f" {GOOD_R_HAT} is wanted), the smallest effective sample size"
-            f" {number(ess.min())} (at least {GOOD_ESS:.0f})."
+            f" {self.good_r_hat} is wanted), the smallest effective sample size"
+            f" {number(ess.min())} (at least {self.good_ess:.0f})."
             f"{_weights_in_words(self.posterior.attrs)}"
         )
         agree = "The draws suffice" if self.weighted else "The chains agree"
@@ -202,8 +205,8 @@ class Parameters:
             return "Well enough.", (
                 f"{agree}, but {rough} of {count} parameters have fewer effective draws"
                 f" or a larger R-hat than is wanted: the last digits of their intervals are rough."
-                f" {found} With R-hat up to {ROUGH_R_HAT} and from {ROUGH_ESS:.0f} effective draws"
-                " on conclusions stand; for more digits take more draws."
+                f" {found} With R-hat up to {self.rough_r_hat} and from {self.rough_ess:.0f}"
+                " effective draws on conclusions stand; for more digits take more draws."
             )
         return "Yes.", f"{agree}{'' if self.weighted else ' and are long enough'}. {found}"
 

@@ -21,12 +21,6 @@ from pbrl_ppl.state import Floats
 #: Okabe and Ito's colours, one a moving body, in turn; what is static is grey.
 _COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
 _STATIC = "#777777"
-#: A body that moved less than this share of its bounding radius has no track.
-_STILL = 0.1
-#: Duration of a moving picture (s): a plan is shown at its real speed between these.
-_LASTS = 1.0, 20.0
-#: Draws in a moving picture, at most.
-_SHOWN = 12
 
 
 def draw_scene(
@@ -69,6 +63,8 @@ def draw_scene(
 def draw_motion(axes: Axes, scene: Scene, states: Floats) -> None:
     """Draw bodies where they end, dashed where they began, and the tracks of those that moved.
 
+    A track is drawn if it is longer than a tenth of the body's bounding radius.
+
     Parameters
     ----------
     axes, scene
@@ -80,7 +76,7 @@ def draw_motion(axes: Axes, scene: Scene, states: Floats) -> None:
     draw_scene(axes, scene, states[-1])
     for i, body in enumerate(scene.moving):
         x, y = states[:, i, :2].T
-        if np.hypot(x - x[0], y - y[0]).max() > _STILL * body.shape.bounding_radius:
+        if np.hypot(x - x[0], y - y[0]).max() > 0.1 * body.shape.bounding_radius:
             axes.plot(x, y, color=_colour(i), linewidth=1.5, zorder=3)
 
 
@@ -159,27 +155,29 @@ def _outline(body: Body, pose: Floats, **how: Any) -> Patch:
     return Polygon(np.array(corners) @ np.array([[c, s], [-s, c]]) + pose[:2], **how)
 
 
-def animate_plan(plan: Plan, path: str | Path, *, frames: int = 20) -> None:
+def animate_plan(plan: Plan, path: str | Path, *, frames: int = 20, draws: int = 12) -> None:
     """Write a plan as a moving picture: the bodies under each draw, and where they should be.
 
     Parameters
     ----------
     plan : Plan
-        Its predicted states are drawn, of at most a dozen draws.
+        Its predicted states are drawn.
     path : str or Path
         Ends in ``.gif``; written whole or not at all.
     frames : int
         Pictures a second at most; the plan is shown at its real speed, or so as to last 1 to 20 s.
+    draws : int
+        Posterior draws that are shown, at most.
 
     Raises
     ------
     OutputError
         If it cannot be written there.
     """
-    states = plan.predicted["predicted"].to_numpy()[:_SHOWN]
+    states = plan.predicted["predicted"].to_numpy()[:draws]
     # at the speed of the plan, with no more pictures than the eye can tell apart
     intervals = max(states.shape[1] - 1, 1)
-    step = float(np.clip(intervals * plan.scene.time_step, *_LASTS)) / intervals  # shown (s)
+    step = float(np.clip(intervals * plan.scene.time_step, 1.0, 20.0)) / intervals  # shown (s)
     every = max(1, round(1.0 / (frames * step)))
     times = [*range(0, states.shape[1] - 1, every), states.shape[1] - 1]
     figure = Figure(figsize=(6.0, 6.0), layout="constrained")
