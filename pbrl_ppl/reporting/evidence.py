@@ -171,7 +171,7 @@ def bin_means(x: Floats, y: Floats, most: int = 10, least: int = 8) -> Bins:
         which,
         centre=means["x"].median().to_numpy(),
         mean=means["y"].mean().to_numpy(),
-        error=means["y"].sem().to_numpy(),
+        error=np.asarray(means["y"].sem(), dtype=float),
     )
 
 
