@@ -8,7 +8,6 @@ import pytest
 from pbrl_ppl.criticism.loop import Loop
 from pbrl_ppl.criticism.results import Estimate
 from pbrl_ppl.reporting import in_brief, render
-from pbrl_ppl.reporting import page as page_module
 from pbrl_ppl.reporting.error_plots import plot_errors, plot_growth, plot_rollout
 from pbrl_ppl.reporting.loop_tables import acceleration_table, error_tables
 from pbrl_ppl.reporting.words import gains_in_words, number, remains_in_words, verdict_in_words
@@ -34,13 +33,6 @@ HEADLINES = {
     "diverging": "Linear drag on the puck, 0.8000 kg/s (94 % 0.7800 to 0.8200): held-out error 2.40"
     " -> 1.02 times the noise; forecasts of 2.00 s diverge.",
 }
-
-
-@pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A page without its pictures, which take nearly all of its time."""
-    nothing = "data:image/png;base64,"
-    monkeypatch.setattr(page_module, "_picture", lambda draw: {"wide": nothing, "narrow": nothing})
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -9,7 +9,6 @@ from pbrl_ppl.criticism.results import Acceleration, Candidate, Unexplained
 from pbrl_ppl.effects import Effect, EffectParameter, catalogue
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.reporting import in_brief, render
-from pbrl_ppl.reporting import page as page_module
 from pbrl_ppl.reporting.loop_tables import limits_in_words
 from pbrl_ppl.reporting.words import gains_in_words, remains_in_words, verdict_in_words
 from tests.helpers.html import Page
@@ -22,13 +21,6 @@ pytestmark = [
 ]
 
 ONE = "The noise is that of the measurements alone, one interval ahead."
-
-
-@pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A page without its pictures, which take nearly all of its time."""
-    nothing = "data:image/png;base64,"
-    monkeypatch.setattr(page_module, "_picture", lambda draw: {"wide": nothing, "narrow": nothing})
 
 
 def text_of(findings: Loop) -> str:

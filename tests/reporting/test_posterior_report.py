@@ -9,7 +9,6 @@ import pytest
 from pbrl_ppl.cli import main
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.posterior import DATATREE, from_groups, groups, load_posterior
-from pbrl_ppl.reporting import page as page_module
 from pbrl_ppl.reporting import plot_rank, render_posterior
 from pbrl_ppl.reporting.posterior_plots import (
     coverage,
@@ -24,13 +23,6 @@ from tests.helpers.revised import revised
 from tests.helpers.stacks import GENERATIONS, file
 
 pytestmark = pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning")
-
-
-@pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A page without its pictures, which take nearly all of its time."""
-    nothing = "data:image/png;base64,"
-    monkeypatch.setattr(page_module, "_picture", lambda draw: {"wide": nothing, "narrow": nothing})
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -19,7 +19,6 @@ from pbrl_ppl.parameters import BODY_PARAMETERS
 from pbrl_ppl.posterior import Fit
 from pbrl_ppl.posterior.cross_validation import Comparison, LeaveOneOut
 from pbrl_ppl.posterior.identifiability import Direction, Identifiability, Width
-from pbrl_ppl.reporting import page as page_module
 from pbrl_ppl.reporting import render
 from pbrl_ppl.reporting.error_plots import plot_rollout, unwrap
 from pbrl_ppl.reporting.page import Source
@@ -29,13 +28,6 @@ from pbrl_ppl.reporting.words import number, rejected_in_words, remains_in_words
 from tests.helpers.html import Page, stands_alone
 from tests.helpers.made_up import DRAG, idata, made_up, made_up_posterior
 from tests.helpers.revised import revised, unexplained
-
-
-@pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A page without its pictures, which take nearly all of its time."""
-    nothing = "data:image/png;base64,"
-    monkeypatch.setattr(page_module, "_picture", lambda draw: {"wide": nothing, "narrow": nothing})
 
 
 def page(verdict: str) -> Page:
@@ -282,7 +274,7 @@ def test_added_effects_with_a_rest() -> None:
 
 
 def test_odd_findings_still_make_a_page(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(page_module, "png", lambda figure: b"")
+    monkeypatch.setattr("pbrl_ppl.reporting.page.png", lambda figure: b"")
     findings = made_up()
     nothing = Errors({}, {}, float("nan"), float("nan"))
     many = 9 * findings.candidates

@@ -1,0 +1,12 @@
+"""What the tests of pages share."""
+
+import pytest
+
+from pbrl_ppl.reporting import page
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A page without its pictures, which take nearly all of its time."""
+    nothing = "data:image/png;base64,"
+    monkeypatch.setattr(page, "_picture", lambda draw: {"wide": nothing, "narrow": nothing})
