@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -146,6 +147,38 @@ class Coordinates:
             states[..., hung] = np.nan
             fill_hinges(states.reshape(-1, 1, *states.shape[-2:]), scene)
         return states
+
+    def slopes(
+        self, scene: Scene, states: Floats, steps: Floats, predict: Callable[[Floats], Floats]
+    ) -> Floats:
+        """Return the derivative of the next state by the state, by central differences.
+
+        Parameters
+        ----------
+        scene : Scene
+            Bodies; hinged ones follow the others.
+        states : ndarray
+            States before transitions, shape (transition, body, 6), SI units.
+        steps : ndarray
+            Steps of the differences, shape (coordinate,).
+        predict : callable
+            Returns the states after an interval, shape (point, transition, body, 6), for such
+            states before it.
+
+        Returns
+        -------
+        ndarray
+            Shape (transition, coordinate, coordinate); 0 where the engine diverged.
+        """
+        d = len(steps)
+        moved = np.tile(states, (2 * d, 1, 1, 1))
+        flat = moved.reshape(2 * d, len(states), -1)
+        for i, place in enumerate(self.places):
+            flat[i, :, place] += steps[i]
+            flat[d + i, :, place] -= steps[i]
+        after = self.of(predict(self.completed(scene, moved)))
+        slopes = (after[:d] - after[d:]) / (2 * steps[:, None, None])
+        return np.nan_to_num(slopes).transpose(1, 2, 0)
 
     def wrapped(self, difference: Floats) -> Floats:
         """Return differences (..., coordinate) with angles wrapped to (-pi, pi]."""

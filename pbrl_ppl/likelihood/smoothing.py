@@ -265,20 +265,17 @@ def _sloped(
     chosen = np.arange(segments.n) if rows is None else np.flatnonzero(rows)
     if not len(chosen):
         return linearised(problem, coordinates, problem.trajectory_noise.slope, sigma)
-    start = segments.start[chosen]
-    d, n = len(coordinates.places), len(chosen)
-    moved = np.tile(start, (2 * d, 1, 1, 1))
-    flat = moved.reshape(2 * d, n, -1)
-    for i, place in enumerate(coordinates.places):
-        flat[2 * i, :, place] += steps[i]
-        flat[2 * i + 1, :, place] -= steps[i]
-    moved = coordinates.completed(problem.scene, moved).reshape(2 * d * n, *start.shape[1:])
-    inputs = np.tile(problem.inputs[chosen], (2 * d, 1, 1, 1))
-    # a coarse engine's slope agrees with a fine one's
-    ends = coordinates.of(problem.rough.simulator(phi, moved, inputs)[:, 0]).reshape(d, 2, n, d)
-    own = ((ends[:, 0] - ends[:, 1]) / (2 * steps[:, None, None])).transpose(1, 2, 0)
-    slope = np.nan_to_num(own) if rows is None else problem.trajectory_noise.slope.copy()
-    slope[chosen] = np.nan_to_num(own)
+    inputs = problem.inputs[chosen]
+
+    def predict(states: Floats) -> Floats:
+        """Return the states after an interval; a coarse engine's slope agrees with a fine one's."""
+        begin = states.reshape(-1, *states.shape[2:])
+        held = np.tile(inputs, (len(states), 1, 1, 1))
+        return np.asarray(problem.rough.simulator(phi, begin, held)[:, 0]).reshape(states.shape)
+
+    d = len(steps)
+    slope = np.empty((segments.n, d, d)) if rows is None else problem.trajectory_noise.slope.copy()
+    slope[chosen] = coordinates.slopes(problem.scene, segments.start[chosen], steps, predict)
     return linearised(problem, coordinates, slope, sigma)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from copy import copy
 from dataclasses import dataclass
@@ -66,19 +67,25 @@ def rollout(
     wrenches: Floats,
     rng: np.random.Generator | None = None,
 ) -> Floats:
-    """Play wrenches (time, body, 3) from a state (body, 6): shape (draw, time + 1, body, 6).
+    """Play wrenches (..., time, body, 3) from a state (body, 6).
 
     With a generator, the noise of a step is added after each interval.
+
+    Returns
+    -------
+    ndarray
+        States, shape (draw, ..., time + 1, body, 6), SI units; the first is the start.
     """
-    states = np.broadcast_to(start, (model.draws, 1, *start.shape))
-    path = [states]
-    last = model.before
-    for wrench in wrenches:
-        states, last = model.step(states, wrench[None], last[None]), wrench
+    lead, held = wrenches.shape[:-3], np.moveaxis(wrenches, -3, 0)
+    held = held.reshape(len(held), math.prod(lead), *wrenches.shape[-2:])
+    states = np.broadcast_to(start, (model.draws, held.shape[1], *start.shape))
+    path, last = [states], np.broadcast_to(model.before, held.shape[1:])
+    for wrench in held:
+        states, last = model.step(states, wrench, last), wrench
         if rng is not None:
             states = model.noisy(states, rng)
         path.append(states)
-    return np.concatenate(path, axis=1)
+    return np.stack(path, axis=2).reshape(model.draws, *lead, len(path), *start.shape)
 
 
 @dataclass(frozen=True, eq=False)

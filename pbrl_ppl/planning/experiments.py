@@ -17,23 +17,16 @@ from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.errors import EffectError, GoalError
 from pbrl_ppl.files import write_atomically
 from pbrl_ppl.history import from_segments
-from pbrl_ppl.likelihood import TrajectoryNoise
 from pbrl_ppl.parameters import differentiate
 from pbrl_ppl.physics import touching
 from pbrl_ppl.planning.actions import ActionSet, Allowed, Bounds, allowed_wrenches
-from pbrl_ppl.planning.dynamics import Dynamics
+from pbrl_ppl.planning.dynamics import Dynamics, rollout
 from pbrl_ppl.planning.planner import start_state
 from pbrl_ppl.scene import Scene, body_sizes
 from pbrl_ppl.state import WRENCH, WRENCH_UNITS, Bools, Floats
 
 if TYPE_CHECKING:  # with the samplers, which a plan does not need
     from pbrl_ppl.criticism import Rival
-
-
-#: Engine steps an interval at most: models are compared with each other, in the same engine.
-_SUBSTEPS = 10
-#: Step of a finite difference, in posterior standard deviations.
-_STEP = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +52,23 @@ class _Paths:
     intervals: int
     lost: Bools
 
+    @classmethod
+    def of(cls, dynamics: Dynamics, start: Floats, wrenches: Floats) -> _Paths:
+        """Return the paths of each draw from a state under wrenches (n, time, body, 3)."""
+        states = rollout(dynamics, start, wrenches)
+        lost = np.asarray(~np.isfinite(states).all(axis=(2, 3, 4)))
+        states[lost] = start
+        first = np.broadcast_to(dynamics.before, wrenches[:, :1].shape)
+        before = np.concatenate([first, wrenches[:, :-1]], axis=1)
+        return cls(
+            states[:, :, :-1].reshape(-1, *start.shape),
+            states[:, :, 1:].reshape(-1, *start.shape),
+            np.tile(wrenches, (dynamics.draws, 1, 1, 1)).reshape(-1, *wrenches.shape[2:]),
+            np.tile(before, (dynamics.draws, 1, 1, 1)).reshape(-1, *wrenches.shape[2:]),
+            wrenches.shape[1],
+            lost.ravel(),
+        )
+
 
 class Separation:
     """Expected log Bayes factors of experiments between rival models.
@@ -78,21 +88,39 @@ class Separation:
         Wrenches before it, shape (body, 3).
     threads : int
         Engine worlds side by side.
+    substeps : int
+        Engine steps an interval at most: models are compared with each other, in the same engine.
+
+    Attributes
+    ----------
+    dynamics : list of Dynamics
+        Those of each rival at its mode.
     """
 
     def __init__(
-        self, rivals: Sequence[Rival], start: Floats, before: Floats, threads: int = 2
+        self,
+        rivals: Sequence[Rival],
+        start: Floats,
+        before: Floats,
+        threads: int = 2,
+        substeps: int = 10,
     ) -> None:
-        self.rivals, self.start, self.before = rivals, start, before
+        self.rivals, self.start = rivals, start
         # the rivals differ in the effects that bodies declare
         scene = rivals[0].mode.problem.scene
         self.scene = scene.replace(bodies=tuple(replace(body, effects=()) for body in scene.bodies))
-        self._engines = [self._engine(rival, threads) for rival in rivals]
+        every = [rival.mode.problem.physics for rival in rivals]
+        self.dynamics = [
+            Dynamics(
+                self.scene, rival.mode.phi, physics.effects, threads=threads, declared=(),
+                substeps=min(substeps, physics.substeps),
+            ).after(before)
+            for rival, physics in zip(rivals, every, strict=True)
+        ]  # fmt: skip
 
     def path(self, wrenches: Floats) -> Floats:
         """Return the states (n, time + 1, body, 6) that the first rival's mode predicts."""
-        first = self.rivals[0]
-        return np.asarray(self._rolled(first, first.mode.phi[None], wrenches)[0])
+        return np.asarray(rollout(self.dynamics[0], self.start, wrenches)[0])
 
     def __call__(self, wrenches: Floats, draws: int) -> tuple[Floats, Bools]:
         """Return the expected log Bayes factors of experiments.
@@ -115,128 +143,73 @@ class Separation:
         m, n = len(self.rivals), len(wrenches)
         result, meeting = np.zeros((m, m, n)), np.zeros(n, dtype=bool)
         for i, true in enumerate(self.rivals):
-            paths = self._paths(true, true.draws[:draws], wrenches)
+            paths = _Paths.of(self.dynamics[i].at(true.draws[:draws]), self.start, wrenches)
             met = touching(self.scene, paths.begin, paths.end)
             meeting |= met.reshape(-1, n, paths.intervals).any(axis=(0, 2))
-            widening = self._explained(true, paths, met)[1]
-            for j, rival in enumerate(self.rivals):
-                if i == j:
-                    continue
-                misfit, spread, absorbed = self._explained(rival, paths, met)
-                value = 0.5 * (misfit - absorbed + spread - widening)
+            misfit, widening = zip(*(self._explained(j, paths, met) for j in range(m)), strict=True)
+            for j in set(range(m)) - {i}:
+                value = 0.5 * (misfit[j] + widening[j] - widening[i])
                 value[paths.lost] = np.nan
                 result[i, j] = value.reshape(-1, n).mean(axis=0)
         return result, meeting
 
-    def _engine(self, rival: Rival, threads: int) -> Dynamics:
-        physics = rival.mode.problem.physics
-        found = Dynamics(
-            self.scene, rival.mode.phi, physics.effects, threads=threads, declared=(),
-            substeps=min(_SUBSTEPS, physics.substeps),
-        )  # fmt: skip
-        return found.after(self.before)
+    def _explained(self, number: int, paths: _Paths, met: Bools) -> tuple[Floats, Floats]:
+        """Return how a rival explains the paths of another, two arrays of shape (path,).
 
-    def _dynamics(self, rival: Rival, phi: Floats) -> Dynamics:
-        """Return a rival's dynamics at parameters (draw, p)."""
-        return self._engines[self.rivals.index(rival)].at(phi)
-
-    def _rolled(self, rival: Rival, phi: Floats, wrenches: Floats) -> Floats:
-        """Return the states predicted under each draw, shape (draw, n, time + 1, body, 6)."""
-        dynamics = self._dynamics(rival, phi)
-        n, intervals = wrenches.shape[:2]
-        states = np.broadcast_to(self.start, (len(phi), n, *self.start.shape))
-        every, last = [states], np.broadcast_to(self.before, (n, *self.before.shape))
-        for t in range(intervals):
-            states, last = dynamics.step(states, wrenches[:, t], last), wrenches[:, t]
-            every.append(states)
-        return np.stack(every, axis=2)
-
-    def _paths(self, rival: Rival, phi: Floats, wrenches: Floats) -> _Paths:
-        states = self._rolled(rival, phi, wrenches)
-        before = np.concatenate(
-            [np.broadcast_to(self.before, wrenches[:, :1].shape), wrenches[:, :-1]], axis=1
-        )
-        lost = np.asarray(~np.isfinite(states).all(axis=(2, 3, 4)))
-        states = np.where(lost[:, :, None, None, None], self.start, states)
-        body = states.shape[3:]
-
-        def along(values: Floats) -> Floats:
-            return np.tile(values, (len(phi), 1, 1, 1)).reshape(-1, *values.shape[2:])
-
-        return _Paths(
-            states[:, :, :-1].reshape(-1, *body), states[:, :, 1:].reshape(-1, *body),
-            along(wrenches), along(before), wrenches.shape[1], lost.ravel(),
-        )  # fmt: skip
-
-    def _explained(self, rival: Rival, paths: _Paths, met: Bools) -> tuple[Floats, Floats, Floats]:
-        """Return how a model explains the paths of another, three arrays of shape (path,).
-
-        Squared whitened residual less what the parameters absorb, log-determinant of the
-        predictions' widening by the parameters, and number of parameters that the data inform.
+        Squared whitened residual less what the parameters absorb, in excess of what they absorb of
+        noise; and log-determinant of the predictions' widening by the parameters.
         """
-        mode = rival.mode
-        coordinates = mode.problem.trajectory_noise.coordinates
-        seen = mode.problem.trajectory_noise.seen.any(axis=0)
-        spread = np.sqrt(np.maximum(np.diag(mode.covariance), 0.0))
-        lower, upper = mode.problem.layout.bounds
+        rival = self.rivals[number]
+        mode, problem = rival.mode, rival.mode.problem
+        coordinates, bounds = problem.trajectory_noise.coordinates, problem.layout.bounds
 
-        def steps(phi: Floats, begin: Floats) -> Floats:
-            """Return the coordinates after an interval, shape (point, transition, cell)."""
-            dynamics = self._dynamics(rival, phi)
-            ends = dynamics.step(begin, paths.wrenches, paths.before)
-            return np.nan_to_num(coordinates.of(ends))
+        def predict(phi: Floats, states: Floats) -> Floats:
+            """Return the states after an interval, shape (point, transition, body, 6)."""
+            dynamics = self.dynamics[number].at(phi)
+            return np.nan_to_num(dynamics.step(states, paths.wrenches, paths.before))
 
-        def of_phi(points: Floats) -> Floats:
-            return steps(points, np.broadcast_to(paths.begin, (len(points), *paths.begin.shape)))
+        def by_phi(points: Floats) -> Floats:
+            states = np.broadcast_to(paths.begin, (len(points), *paths.begin.shape))
+            return coordinates.of(predict(points, states))
 
-        residual = coordinates.wrapped(coordinates.of(paths.end) - of_phi(mode.phi[None])[0])
-        by_phi = differentiate(of_phi, mode.phi, _STEP * spread, lower, upper)
-        c, n = len(coordinates.places), len(paths.begin)
-        natural = body_sizes(mode.problem.scene).ravel()[list(coordinates.places)]
+        def by_state(states: Floats) -> Floats:
+            return predict(np.tile(mode.phi, (len(states), 1)), states)
+
+        residual = coordinates.wrapped(coordinates.of(paths.end) - by_phi(mode.phi[None])[0])
+        # in posterior standard deviations
+        steps = 0.3 * np.sqrt(np.maximum(np.diag(mode.covariance), 0.0))
+        slopes = differentiate(by_phi, mode.phi, steps, *bounds)
+        natural = body_sizes(problem.scene).ravel()[coordinates.places]
         size = np.maximum(coordinates.errors(rival.sigma), 1e-6 * natural)
-        moved = np.tile(paths.begin, (2 * c, 1, 1, 1))
-        flat = moved.reshape(2 * c, n, -1)
-        for i, place in enumerate(coordinates.places):
-            flat[i, :, place] += size[i]
-            flat[c + i, :, place] -= size[i]
-        moved = coordinates.completed(mode.problem.scene, moved)
-        ends = steps(np.tile(mode.phi, (2 * c, 1)), moved)
-        slope = np.moveaxis((ends[:c] - ends[c:]) / (2 * size[:, None, None]), 0, -1)
-        nothing = np.zeros((n, c))
-        noise = TrajectoryNoise(
-            coordinates=coordinates,
+        slope = coordinates.slopes(problem.scene, paths.begin, size, by_state)
+        nothing = np.zeros(residual.shape)
+        noise = replace(
+            problem.trajectory_noise,
             slope=np.ascontiguousarray(slope),
-            first=np.arange(n) % paths.intervals == 0,
-            seen=np.tile(seen, (n, 1)),
+            first=np.arange(len(residual)) % paths.intervals == 0,
+            seen=np.tile(problem.trajectory_noise.seen.any(axis=0), (len(residual), 1)),
             measured=nothing,
             begin=nothing,
             wide=nothing,
             sigma=rival.sigma,
             touching=met,
+            sensitivity=None,
         )
-        rows = np.concatenate([residual[None], -np.moveaxis(by_phi, -1, 0)])
-        white, _ = noise.filtered(rows, rival.sigma)
-        white = white.reshape(len(rows), -1, paths.intervals * c)
+        rows = np.concatenate([residual[None], -np.moveaxis(slopes, -1, 0)])
+        white = noise.filtered(rows, rival.sigma)[0]
+        white = white.reshape(len(rows), len(paths.lost), -1)
         r, jacobian = white[0], np.moveaxis(white[1:], 0, -1)
         scaled = jacobian @ mode.factor  # by a posterior standard deviation of each direction
-        inner = np.eye(len(mode.phi)) + scaled.transpose(0, 2, 1) @ scaled
+        precision = np.eye(len(mode.phi)) + scaled.transpose(0, 2, 1) @ scaled
+        inverse = np.linalg.inv(precision)
         shared = np.einsum("nap,na->np", scaled, r)
-        solved = np.linalg.solve(inner, np.concatenate(
-            [shared[..., None], np.broadcast_to(np.eye(len(mode.phi)), inner.shape)], axis=-1
-        ))  # fmt: skip
-        misfit = (r**2).sum(axis=1) - (shared * solved[..., 0]).sum(axis=1)
-        absorbed = len(mode.phi) - np.trace(solved[..., 1:], axis1=1, axis2=2)
-        return misfit, np.linalg.slogdet(inner)[1], absorbed
+        absorbed = np.einsum("np,npq,nq->n", shared, inverse, shared)
+        of_noise = len(mode.phi) - np.trace(inverse, axis1=1, axis2=2)
+        return (r**2).sum(axis=1) - absorbed - of_noise, np.linalg.slogdet(precision)[1]
 
 
-#: A log Bayes factor from which one effect is named alone: half the score statistic's `DECISIVE`.
+#: A log Bayes factor from which one effect is named alone: half the `decisive` score statistic.
 _NAMED = 5.0
-#: Sequences of a generation, its parents, generations, and draws to rank them by.
-_POPULATION, _PARENTS, _GENERATIONS, _ROUGH_DRAWS = 40, 10, 8, 3
-#: Share of a child's pieces that are new; leaders that are ranked by all draws.
-_NEW, _LEADERS = 0.2, 4
-#: More than any separation (nats).
-_MEETING = 1e9
 
 
 @dataclass(frozen=True, eq=False)
@@ -403,7 +376,7 @@ def suggest_actions(
     from pbrl_ppl.criticism import fit_rivals, kept_groups, named_effects
     from pbrl_ppl.posterior import scene_of
 
-    say = progress or (lambda stage: None)
+    progress = progress or (lambda stage: None)
     posterior = getattr(known, "posterior_after", known)
     catalogue = tuple(getattr(known, "catalogue", catalogue))
     scene = scene_of(posterior)
@@ -427,15 +400,15 @@ def suggest_actions(
     )
     # matrices are small: threads of linear algebra only get in each other's way
     with threadpool_limits(1, "blas"):
-        say("fitting each effect to the recording")
+        progress("fitting each effect to the recording")
         rivals = fit_rivals(posterior, chosen, catalogue, draws, seed)
         judge = Separation(rivals, first, last)
-        genes, at_random = _bred(judge, allowed, np.random.default_rng(seed), say)
-        say("judging the best sequences")
+        genes, at_random = _bred(judge, allowed, np.random.default_rng(seed), progress)
+        progress("judging the best sequences")
         wrenches = allowed.wrenches(genes, judge.path)
-        found, meeting = judge(wrenches, draws)
-    best = int(np.argmax(_value(found, meeting)))
-    if not np.isfinite(found[..., best]).all():
+        separation, meeting = judge(wrenches, draws)
+    best = int(np.argmax(_value(separation, meeting)))
+    if not np.isfinite(separation[..., best]).all():
         raise GoalError(
             "actions: the engine diverges in all sequences; allow weaker actions or fewer steps"
         )
@@ -454,7 +427,7 @@ def suggest_actions(
             attrs={"units": ", ".join(WRENCH_UNITS)},
         ),
         xr.DataArray(
-            found[..., best], {"true": names, "rival": names}, ("true", "rival"),
+            separation[..., best], {"true": names, "rival": names}, ("true", "rival"),
             attrs={"units": "nats"},
         ),
         at_random,
@@ -463,36 +436,41 @@ def suggest_actions(
 
 
 def _bred(
-    judge: Separation, allowed: Allowed, rng: np.random.Generator, say: Callable[[str], None]
+    judge: Separation,
+    allowed: Allowed,
+    rng: np.random.Generator,
+    progress: Callable[[str], None],
+    *,
+    population: int = 40,
+    n_parents: int = 10,
+    generations: int = 8,
+    draws: int = 3,
+    new_share: float = 0.2,
+    leaders: int = 4,
 ) -> tuple[Floats, float]:
     """Return the leading sequences of the last generation, and the mean value of the first.
 
-    Children take pieces from two parents, and some from the allowed set.
+    Children take pieces from two parents, and a share of new ones from the allowed set.
     """
-    genes = allowed.random(rng, _POPULATION)
+    genes = allowed.random(rng, population)
     at_random, parents, values = np.nan, genes[:0], np.zeros(0)
-    for generation in range(_GENERATIONS):
-        say(f"looking for actions that tell them apart, {generation + 1} of {_GENERATIONS}")
-        found, meeting = judge(allowed.wrenches(genes, judge.path), _ROUGH_DRAWS)
+    # a piece of a sequence is taken whole
+    shape = (population, allowed.pieces, *(1,) * (genes.ndim - 2))
+    for generation in range(generations):
+        progress(f"looking for actions that tell them apart, {generation + 1} of {generations}")
+        separation, meeting = judge(allowed.wrenches(genes, judge.path), draws)
         if generation == 0:
-            usable = _weakest(found)
+            usable = _weakest(separation)
             at_random = float(np.nanmean(usable)) if np.isfinite(usable).any() else np.nan
         genes = np.concatenate([parents, genes])
-        values = np.concatenate([values, _value(found, meeting)])
-        best = np.argsort(-values, kind="stable")[:_PARENTS]
+        values = np.concatenate([values, _value(separation, meeting)])
+        best = np.argsort(-values, kind="stable")[:n_parents]
         parents, values = genes[best], values[best]
-        pairs = rng.integers(_PARENTS, size=(2, _POPULATION))
-        shape = (_POPULATION, allowed.pieces)
-        mixed = np.where(
-            _wide(rng.random(shape) < 0.5, genes), parents[pairs[0]], parents[pairs[1]]
-        )
-        fresh = allowed.extreme(rng, _POPULATION)
-        genes = np.where(_wide(rng.random(shape) < _NEW, genes), fresh, mixed)
-    return parents[:_LEADERS], at_random
-
-
-def _wide(mask: Bools, genes: Floats) -> Bools:
-    return mask.reshape(*mask.shape, *(1,) * (genes.ndim - 2))
+        pairs = rng.integers(n_parents, size=(2, population))
+        mixed = np.where(rng.random(shape) < 0.5, parents[pairs[0]], parents[pairs[1]])
+        fresh = allowed.extreme(rng, population)
+        genes = np.where(rng.random(shape) < new_share, fresh, mixed)
+    return parents[:leaders], at_random
 
 
 def _weakest(separation: Floats) -> Floats:
@@ -504,4 +482,4 @@ def _weakest(separation: Floats) -> Floats:
 def _value(separation: Floats, meeting: Bools) -> Floats:
     """Return what sequences are ranked by: those in which bodies meet come last."""
     value = _weakest(separation)
-    return np.where(np.isfinite(value), value - np.where(meeting, _MEETING, 0.0), -np.inf)
+    return np.where(np.isfinite(value), value - 1e9 * meeting, -np.inf)

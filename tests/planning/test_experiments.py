@@ -15,6 +15,7 @@ from pbrl_ppl.criticism.results import Added
 from pbrl_ppl.criticism.rivals import keep_groups
 from pbrl_ppl.criticism.selection import Selection, Step
 from pbrl_ppl.errors import EffectError, GoalError, PosteriorError
+from pbrl_ppl.planning import rollout
 from pbrl_ppl.planning.experiments import Separation
 from pbrl_ppl.posterior.record import scene_of
 from tests.helpers.free_puck import BOX, fitted
@@ -140,10 +141,10 @@ def test_expected_is_what_bayes_factors_are_in_the_mean(posterior) -> None:
     assert (expected[~np.eye(2, dtype=bool)] > 0).all()
     rng, noise = np.random.default_rng(4), _noise(judge, 6)
     factor = np.linalg.cholesky(noise)
-    moments = [_moments(judge, rival, pushes) for rival in rivals]
+    moments = [_moments(judge, i, pushes) for i in range(2)]
     for i, j in ((0, 1), (1, 0)):
         gains = []
-        for path in judge._rolled(rivals[i], rivals[i].draws, pushes)[:, 0, 1:]:
+        for path in rollout(judge.dynamics[i].at(rivals[i].draws), start, pushes)[:, 0, 1:]:
             for _ in range(50):
                 data = path.ravel() + factor @ rng.standard_normal(len(factor))
                 ours, theirs = (_density(data, mean, noise + cov) for mean, cov in moments)
@@ -152,12 +153,12 @@ def test_expected_is_what_bayes_factors_are_in_the_mean(posterior) -> None:
         assert abs(np.mean(gains) - expected[i, j]) < 3 * error + 0.05 * expected[i, j]
 
 
-def _moments(judge: Separation, rival: Rival, pushes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _moments(judge: Separation, rival: int, pushes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean and covariance of a rival's predictions, by many draws."""
-    draws = rival.mode.draws(np.random.default_rng(0), 400)
-    cloud = judge._rolled(rival, draws, pushes)[:, 0, 1:].reshape(len(draws), -1)
-    mean = judge._rolled(rival, rival.mode.phi[None], pushes)[0, 0, 1:].ravel()
-    return mean, np.cov(cloud.T)
+    draws = judge.rivals[rival].mode.draws(np.random.default_rng(0), 400)
+    dynamics = judge.dynamics[rival]
+    cloud = rollout(dynamics.at(draws), judge.start, pushes)[:, 0, 1:].reshape(len(draws), -1)
+    return rollout(dynamics, judge.start, pushes)[0, 0, 1:].ravel(), np.cov(cloud.T)
 
 
 def _density(data: np.ndarray, mean: np.ndarray, cov: np.ndarray) -> float:
