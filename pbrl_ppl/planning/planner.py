@@ -85,9 +85,13 @@ class Plan:
         DataFrame
             Columns as of :meth:`History.to_dataframe`; state cells after the start are missing.
         """
-        nothing = np.full((1, len(self.wrenches), *self.start.shape), np.nan)
-        planned = from_segments(self.scene, self.start[None], self.wrenches[None], nothing)
-        return planned.to_dataframe()
+        # a history has an interval at least, an empty plan none
+        wrenches = self.wrenches if len(self.wrenches) else np.zeros((1, *self.wrenches.shape[1:]))
+        nothing = np.full((1, len(wrenches), *self.start.shape), np.nan)
+        table = from_segments(self.scene, self.start[None], wrenches[None], nothing).to_dataframe()
+        if len(self.wrenches):
+            return table
+        return table[table["step"] == 0].assign(**dict.fromkeys(WRENCH, np.nan))
 
     def save(self, path: str | Path) -> None:
         """Write the plan as a CSV file, whole or not at all.
