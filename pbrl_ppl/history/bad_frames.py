@@ -3,35 +3,13 @@
 import warnings
 from dataclasses import dataclass
 from itertools import product
-from typing import Any
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
 from pbrl_ppl.history.history import History
-from pbrl_ppl.state import STATE, STATE_UNITS, THETA, Bools, Floats, wrapped
-
-#: Rows on either side that a curve is fitted to: each width is tried.
-_WIDTHS = (3, 4, 5)
-#: Neighbouring bad rows, at most.
-_LONGEST = 2
-#: Degree of the curve through the rows of one side, and of both.
-_ONE_SIDE, _BOTH_SIDES = 2, 3
-#: Robust standard deviations that a bad row is off the curve through both sides, and off those
-#: through either side. Under Gaussian noise a row is beyond the first with a probability of 1e-15.
-_FAR, _FAR_OF_SIDE = 8.0, 5.0
-#: The curves must agree on how far the row is off, to this share of it.
-_AGREE = 0.5
-#: A velocity is off its curve in truth if its position moves on by this share of that.
-_CONFIRMED = 0.25
-#: Rounding of numbers, as a share of a column's range.
-_ROUNDING = 1e-9
-#: Standard deviation of a Gaussian over the median of its absolute values.
-_GAUSSIAN = 1.4826
-#: Share of a column's rows that may be left out, at most.
-_MOST = 0.05
-#: Rows on either side that a velocity estimated for ``start`` looks at.
-_REACH = 2
+from pbrl_ppl.history.kinematics import GAUSSIAN, RATE_REACH, finest_step
+from pbrl_ppl.state import STATE, STATE_UNITS, THETA, VELOCITY, Bools, Floats, wrapped
 
 
 @dataclass(frozen=True)
@@ -61,7 +39,7 @@ class BadFrame:
     x of puck at t = 0.35 s of trajectory 2 is off by 0.31 m and left out (1 of 400 rows)
     """
 
-    trajectory: Any
+    trajectory: int | str
     row: int
     time: float
     body: str
@@ -110,7 +88,7 @@ def bad_frames(history: History) -> Bools:
     return np.asarray(np.isfinite(_deviations(history)))
 
 
-def without_bad_frames(history: History) -> tuple[History, list[BadFrame]]:
+def without_bad_frames(history: History, *, most: float = 0.05) -> tuple[History, list[BadFrame]]:
     """Return the history with its bad frames missing, and the list of them.
 
     They become NaN in ``observed``, so that they take no part in a likelihood, and what was
@@ -120,6 +98,8 @@ def without_bad_frames(history: History) -> tuple[History, list[BadFrame]]:
     ----------
     history : History
         What was measured.
+    most : float
+        Share of a column's rows that may be left out.
 
     Returns
     -------
@@ -131,7 +111,7 @@ def without_bad_frames(history: History) -> tuple[History, list[BadFrame]]:
     Warns
     -----
     UserWarning
-        If more than 5 % of a column's rows are off: that is heavy-tailed noise, and all are kept.
+        If more of a column's rows are off: that is heavy-tailed noise, and all are kept.
 
     Examples
     --------
@@ -145,11 +125,11 @@ def without_bad_frames(history: History) -> tuple[History, list[BadFrame]]:
     bad: Bools = np.isfinite(off)
     count = bad.sum(axis=(0, 1))
     rows = int(dataset["n_rows"].sum())
-    many = (count > 1) & (count > _MOST * rows)
+    many = (count > 1) & (count > most * rows)
     for body, d in np.argwhere(many):
         warnings.warn(
             f"{STATE[d]} of {history.bodies[body]}: {100 * count[body, d] / rows:.2g} % of the rows"
-            f" are far off their neighbours, more than {100 * _MOST:g} %: heavy-tailed noise rather"
+            f" are far off their neighbours, more than {100 * most:g} %: heavy-tailed noise rather"
             " than single bad frames, so all rows are kept",
             stacklevel=2,
         )
@@ -179,22 +159,26 @@ def without_measurements(history: History, off: Floats) -> tuple[History, list[B
     # start states lose what was computed from bad frames
     computed: Bools = ~np.isfinite(observed.to_numpy())
     lost: Bools = computed & bad.any(axis=(2, 3), keepdims=True)
-    near = maximum_filter1d(bad.any(axis=-1).astype(np.uint8), 2 * _REACH + 1, axis=1) > 0
-    never = computed.all(axis=(0, 1)) & (np.arange(len(STATE)) >= len(STATE) // 2)
+    near = maximum_filter1d(bad.any(axis=-1).astype(np.uint8), 2 * RATE_REACH + 1, axis=1) > 0
+    never = computed.all(axis=(0, 1)) & (np.arange(len(STATE)) >= VELOCITY)
     lost |= near[..., None] & never
     return History(dataset.assign(observed=observed, start=dataset["start"].where(~lost))), found
 
 
-def _deviations(history: History) -> Floats:
-    """Return how far bad frames are off; NaN elsewhere, shape (trajectory, time, body, state)."""
+def _deviations(history: History, widths: tuple[int, ...] = (3, 4, 5), longest: int = 2) -> Floats:
+    """Return how far bad frames are off; NaN elsewhere, shape (trajectory, time, body, state).
+
+    Each of the ``widths`` is tried, the rows on either side that a curve is fitted to, with up to
+    ``longest`` neighbouring bad rows.
+    """
     observed = history.dataset["observed"].to_numpy()
     dt = float(history.dataset.attrs["time_step"])
     result = np.full(observed.shape, np.nan)
     bodies = np.flatnonzero(~history.dataset["kinematic"].to_numpy())
     for body, velocities in product(bodies, (False, True)):
-        columns = range(3, 6) if velocities else range(3)
+        columns = range(VELOCITY, len(STATE)) if velocities else range(VELOCITY)
         found = result[:, :, body, columns.start : columns.stop]
-        for gap, width in product(range(1, _LONGEST + 1), _WIDTHS):
+        for gap, width in product(range(1, longest + 1), widths):
             kept = np.where(np.isfinite(result[:, :, body]), np.nan, observed[:, :, body])
             each = [_off(kept[..., d], width, gap, angle=d == THETA) for d in columns]
             first, rough = (np.stack(one, axis=2) for one in zip(*each, strict=True))
@@ -209,7 +193,16 @@ def _deviations(history: History) -> Floats:
     return result
 
 
-def _off(column: Floats, width: int, gap: int, *, angle: bool) -> tuple[Floats, Bools]:
+def _off(
+    column: Floats,
+    width: int,
+    gap: int,
+    *,
+    angle: bool,
+    limit: float = 8.0,
+    limit_of_side: float = 5.0,
+    agreement: float = 0.5,
+) -> tuple[Floats, Bools]:
     """Return how far neighbouring rows are off, and where the rows around them are not smooth.
 
     Parameters
@@ -222,6 +215,12 @@ def _off(column: Floats, width: int, gap: int, *, angle: bool) -> tuple[Floats, 
         Neighbouring rows that are left out together.
     angle : bool
         Whether the column wraps (rad).
+    limit, limit_of_side : float
+        Robust standard deviations that a bad row is off the curve through both sides, and off those
+        through either side. Under Gaussian noise a row is beyond the first with a probability of
+        1e-15.
+    agreement : float
+        The curves must agree on how far the row is off, to this share of it.
 
     Returns
     -------
@@ -252,20 +251,20 @@ def _off(column: Floats, width: int, gap: int, *, angle: bool) -> tuple[Floats, 
         off = rows[:, middle] - sides[:, side] @ predict.T
         off = wrapped(off) if angle else off
         size = np.abs(off) / np.sqrt(1.0 + (predict**2).sum(axis=1))
-        scale = max(_GAUSSIAN * float(np.median(size)), least)
+        scale = max(GAUSSIAN * float(np.median(size)), least)
         return off, size, size / scale
 
-    off, size, far = off_curve(slice(None), _BOTH_SIDES)
-    powers = np.vander(other, _BOTH_SIDES + 1)
+    off, size, far = off_curve(slice(None), 3)
+    powers = np.vander(other, 4)
     remainder = sides - sides @ (powers @ np.linalg.pinv(powers)).T
-    misfit = np.sqrt((remainder**2).sum(axis=1) / (len(other) - _BOTH_SIDES - 1))
-    good = ((far > _FAR) & (size > _FAR * misfit[:, None])).all(axis=1)
+    misfit = np.sqrt((remainder**2).sum(axis=1) / (len(other) - 4))
+    good = ((far > limit) & (size > limit * misfit[:, None])).all(axis=1)
     for side in (slice(width), slice(width, None)):
-        off_side, _, far = off_curve(side, _ONE_SIDE)
+        off_side, _, far = off_curve(side, 2)
         apart = wrapped(off_side - off) if angle else off_side - off
-        agree = np.abs(apart) <= _AGREE * np.abs(off)
-        good &= ((far > _FAR_OF_SIDE) & agree).all(axis=1)
-    ragged = misfit > _FAR * max(float(np.median(misfit)), least)
+        agree = np.abs(apart) <= agreement * np.abs(off)
+        good &= ((far > limit_of_side) & agree).all(axis=1)
+    ragged = misfit > limit * max(float(np.median(misfit)), least)
     result[trajectory[good], first[good] + width] = off[good]
     rough[trajectory[ragged], first[ragged] + width] = True
     return result, rough
@@ -284,20 +283,10 @@ def _happened(state: Floats, off: Floats, dt: float) -> Bools:
         Time step (s).
     """
     more = np.nan_to_num(off)
-    curve = state[..., 3:] - more
-    change = np.diff(state[..., :3], axis=1) - dt / 2 * (curve[:, 1:] + curve[:, :-1])
+    curve = state[..., VELOCITY:] - more
+    change = np.diff(state[..., :VELOCITY], axis=1) - dt / 2 * (curve[:, 1:] + curve[:, :-1])
     change[..., THETA] = wrapped(change[..., THETA])
     change = np.pad(change, ((0, 0), (1, 1), (0, 0)))
     beside = change[:, :-1] + change[:, 1:]
-    return np.asarray(beside * more > _CONFIRMED * dt * more**2)
-
-
-def finest_step(column: Floats) -> float:
-    """Return the finest step between a column's values: its quantisation or rounding."""
-    values = np.unique(column[np.isfinite(column)])
-    if len(values) < 2:
-        return np.inf
-    least = _ROUNDING * float(max(np.abs(values).max(), values[-1] - values[0]))
-    steps = np.diff(values)
-    steps = steps[steps > least]
-    return max(least, float(steps.min()) if len(steps) else 0.0)
+    # the position moves on by a quarter of what the velocity says
+    return np.asarray(beside * more > dt / 4 * more**2)

@@ -5,41 +5,62 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any
 
 import numpy as np
 
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history.history import History, hashed
+from pbrl_ppl.history.kinematics import RATE_REACH, column_noise, finest_step
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import THETA, Floats
 
-#: Rows at rest, at least, and rows of motion beside them that are looked at, at least and at most.
-LEAST, BESIDE, _MOST = 3, 6, 200
-#: Rows of motion that are looked at, over those at rest: each is tried.
-_LENGTHS = (1, 2, 4)
-#: Measurement noises within which a body is at rest.
-_STILL = 4.0
-#: A bend is one if it takes this much off the sum of squares of a cubic, in variances of the noise,
-#: and this share of it.
-_CERTAIN, _SHARE = 100.0, 0.9
-#: A cubic must fit the end this many times worse than it fits the median window of all rows.
-_OUTSIDE = 2.5
-#: A change of velocity in standard errors, and over the 90th percentile of all rows' changes.
-_ABRUPT, _LARGE = 8.0, 4.0
-#: Places of a bend that are tried, at most.
-_PLACES = 60
-#: A moment of release may fit worse than the best by so much (in variances): its upper limit.
-_LIMIT = 4.0
+#: Least rows at rest, and of a trajectory without its ends.
+LEAST = 3
+#: Least rows of motion beside those at rest.
+BESIDE = 6
 
 
 @dataclass(frozen=True, eq=False)
 class Column:
-    """Positions of a dimension in all trajectories: their noise, and their changes of velocity."""
+    """Positions of a dimension in all trajectories.
+
+    Attributes
+    ----------
+    series : list of ndarray
+        Shape (time,) each.
+    noise : float
+        Standard deviation of the measurement noise.
+    change : float
+        90th percentile of the changes of velocity, per row.
+    still : float
+        Measurement noises within which a body is at rest.
+    longest : int
+        Rows at rest, and rows of motion, that are looked at, at most.
+    places : int
+        Places of a bend that are tried, at most.
+    gain, share : float
+        A bend takes this much off the sum of squares of a cubic, in variances of the noise, and
+        this share of it.
+    outside : float
+        A cubic fits the end this many times worse than it fits the median window of all rows.
+    certainty, large : float
+        An abrupt change of velocity in standard errors, and over ``change``.
+    limit : float
+        A moment of release may fit worse than the best by so much, in variances.
+    """
 
     series: list[Floats]
     noise: float
     change: float
+    still: float = 4.0
+    longest: int = 200
+    places: int = 60
+    gain: float = 100.0
+    share: float = 0.9
+    outside: float = 2.5
+    certainty: float = 8.0
+    large: float = 4.0
+    limit: float = 4.0
 
     @classmethod
     def of(cls, series: list[Floats]) -> Column | None:
@@ -47,16 +68,11 @@ class Column:
 
         Noise comes from fourth differences, changes of velocity from second ones.
         """
-        longer = [np.diff(values, 4) for values in series if len(values) > 4]
-        if not longer or not any(np.ptp(values) > 0 for values in series):
+        if not any(len(values) > 4 for values in series) or not any(map(np.ptp, series)):
             return None
-        every = np.concatenate(series)
-        steps = np.diff(np.unique(every))
-        rounding = 1e-9 * float(np.abs(every).max())
-        finest = float(steps[steps > rounding].min()) if (steps > rounding).any() else 0.0
-        noise = 1.4826 * float(np.median(np.abs(np.concatenate(longer)))) / np.sqrt(70.0)
+        finest = finest_step(np.concatenate(series))
+        noise = max(column_noise(series, 4, robust=True), finest / np.sqrt(12))
         second = np.concatenate([np.diff(values, 2) for values in series])
-        noise = max(noise, finest / np.sqrt(12), rounding)
         # of independent errors the second differences have six times the variance
         change = float(np.quantile(np.abs(second), 0.9)) ** 2 - 6 * (1.8 * noise) ** 2
         return cls(series, noise, float(np.sqrt(max(change, 0.0))))
@@ -66,12 +82,12 @@ class Column:
         still = self._still(values)
         if not LEAST <= still < len(values) - BESIDE:
             return 0
-        skip = max(0, still - _MOST)  # of a long rest its last rows are enough
+        skip = max(0, still - self.longest)  # of a long rest its last rows are enough
         still -= skip
-        for window in _windows(values[skip:], still):
+        for window in self._windows(values[skip:], still):
             if push[: skip + len(window)].any():
                 break
-            places = np.linspace(2, still, min(2 * still - 3, _PLACES))
+            places = np.linspace(2, still, min(2 * still - 3, self.places))
             bend = self._bend(window, places, 3, rest=True, abrupt=False)
             if bend is not None and bend.place >= LEAST - 1:
                 return skip + int(np.ceil(bend.latest))
@@ -82,20 +98,20 @@ class Column:
         back = values[::-1]
         still = self._still(back)
         n = len(values)
-        tries = [(min(max(LEAST, n // 4), _MOST), 0, False)]
+        tries = [(min(max(LEAST, n // 4), self.longest), 0, False)]
         if LEAST <= still < n - BESIDE:
-            skip = max(0, still - _MOST)
+            skip = max(0, still - self.longest)
             tries.append((still - skip, skip, True))
         best, rows = None, 0
         for longest, skip, rest in tries:
-            places = np.linspace(1.5, longest, min(2 * longest - 2, _PLACES))
-            for window in _windows(back[skip:], longest):
+            places = np.linspace(1.5, longest, min(2 * longest - 2, self.places))
+            for window in self._windows(back[skip:], longest):
                 if np.ptp(push[n - skip - len(window) : -1], axis=0).any():
                     continue
                 bend = self._bend(window, places, 2, rest=rest, abrupt=True)
-                if bend is None or abs(bend.jump) < _LARGE * self.change:
+                if bend is None or abs(bend.jump) < self.large * self.change:
                     continue
-                if bend.certainty < _ABRUPT:
+                if bend.certainty < self.certainty:
                     continue
                 if best is None or bend.certainty > best.certainty:
                     # rows after the moment of the stop: in reversed time those before it
@@ -105,8 +121,13 @@ class Column:
     def _still(self, values: Floats) -> int:
         """Return the number of rows at the beginning that stay within the noise of their mean."""
         mean = np.cumsum(values) / np.arange(1, len(values) + 1)
-        off = np.abs(values - mean) > _STILL * self.noise
+        off = np.abs(values - mean) > self.still * self.noise
         return int(np.argmax(off)) if off.any() else len(values)
+
+    def _windows(self, values: Floats, still: int) -> list[Floats]:
+        """Return beginnings of a series: the rows at rest, and more and more beside them."""
+        beside = (int(np.clip(times * still, BESIDE, self.longest)) for times in (1, 2, 4))
+        return [values[: still + rows] for rows in beside if still + rows <= len(values)]
 
     def _bend(
         self, window: Floats, places: Floats, degree: int, *, rest: bool, abrupt: bool
@@ -121,7 +142,7 @@ class Column:
         cubic = np.vander(time / n, 4)
         smooth = np.eye(n) - cubic @ np.linalg.pinv(cubic)
         without = float(((smooth @ window) ** 2).sum())
-        for place in np.linspace(1, n - 2, min(2 * n, _PLACES)) if abrupt else ():
+        for place in np.linspace(1, n - 2, min(2 * n, self.places)) if abrupt else ():
             parts = [time, time**2, np.maximum(time - place, 0.0) ** 2]
             without = min(without, _fitted(window, parts)[2])
         bends, powers = [], range(2 if rest else 1, degree + 1)
@@ -134,16 +155,16 @@ class Column:
             bends.append(Bend(float(place), float(place), jump, error, left))
         best = min(bends, key=lambda bend: bend.left)
         variance = max(self.noise**2, best.left / max(n - 5, 1))
-        if without - best.left < _CERTAIN * variance or best.left > (1 - _SHARE) * without:
+        if without - best.left < self.gain * variance or best.left > (1 - self.share) * without:
             return None
         elsewhere = [
             ((np.lib.stride_tricks.sliding_window_view(values, n) @ smooth) ** 2).sum(axis=1)
             for values in self.series
             if len(values) >= n
         ]
-        if without < _OUTSIDE**2 * float(np.median(np.concatenate(elsewhere))):
+        if without < self.outside**2 * float(np.median(np.concatenate(elsewhere))):
             return None
-        near = [bend.place for bend in bends if bend.left < best.left + _LIMIT * variance]
+        near = [bend.place for bend in bends if bend.left < best.left + self.limit * variance]
         return replace(best, latest=max(near))
 
 
@@ -172,19 +193,6 @@ def _fitted(window: Floats, parts: list[Floats]) -> tuple[float, float, float]:
     return float(size[0]), float(np.linalg.norm(inverse[0])), left
 
 
-def _windows(values: Floats, still: int) -> list[Floats]:
-    """Return beginnings of a series: the rows at rest, and more and more beside them."""
-    beside = (int(np.clip(times * still, BESIDE, _MOST)) for times in _LENGTHS)
-    return [values[: still + each] for each in beside if still + each <= len(values)]
-
-
-HELD, STOPPED = "held", "stopped"
-#: Rows on either side that a velocity estimated for ``start`` looks at.
-_ESTIMATED = 2
-#: Reach of a contact beyond the shapes' radii, as a share of them.
-_REACH = 0.25
-
-
 @dataclass(frozen=True)
 class End:
     """Rows at one end of a trajectory that belong to no model.
@@ -211,7 +219,7 @@ class End:
     ball is held in the first 6 rows of trajectory 2 (t = 0 to 0.167 s)
     """
 
-    trajectory: Any
+    trajectory: int | str
     first: bool
     rows: int
     begin: float
@@ -279,7 +287,7 @@ def strange_ends(history: History, scene: Scene) -> list[End]:
                 if not explained:
                     times = clock[t, :rows] if first else clock[t, n - rows : n]
                     begin, end = float(times[0]), float(times[-1])
-                    what, name = HELD if first else STOPPED, history.bodies[body]
+                    what, name = "held" if first else "stopped", history.bodies[body]
                     found[t, first] = End(labels[t], first, rows, begin, end, name, what)
     return [found[key] for key in sorted(found, key=lambda key: (key[0], not key[1]))]
 
@@ -338,7 +346,7 @@ def trimmed(history: History, ends: Iterable[End]) -> History:
     start = result["start"].to_numpy().copy()
     for t in np.flatnonzero(end < n_rows):
         kept = end[t] - begin[t]
-        start[t, max(kept - _ESTIMATED, 1) : kept, :, 3:][:, never] = np.nan
+        start[t, max(kept - RATE_REACH, 1) : kept, :, 3:][:, never] = np.nan
     action, before = dataset["action"].to_numpy(), dataset["before"].to_numpy().copy()
     late = np.flatnonzero(begin)
     before[late] = np.nan_to_num(action[late, begin[late] - 1])
@@ -371,15 +379,18 @@ def _moves(states: Floats) -> bool:
     return bool((np.nan_to_num(spread) > 0).any())
 
 
-def _near(scene: Scene, body: int, states: Floats, row: int) -> bool:
-    """Return whether a wall, another body or a joint may have stopped a body at a row."""
+def _near(scene: Scene, body: int, states: Floats, row: int, slack: float = 0.25) -> bool:
+    """Return whether a wall, another body or a joint may have stopped a body at a row.
+
+    A contact reaches beyond the shapes' radii by the share ``slack`` of them.
+    """
     moving = scene.moving
     places = states[max(row - 2, 0) : row + 2, :, :2]
     values = places[:, body]
     if not np.isfinite(values).all():
         return False  # a hinged body with a measured angle alone
     speed = np.abs(np.diff(values, axis=0)).max() if len(values) > 1 else 0.0
-    reach = (1 + _REACH) * moving[body].shape.bounding_radius + 2 * float(speed)
+    reach = (1 + slack) * moving[body].shape.bounding_radius + 2 * float(speed)
     for wall in scene.walls:
         start, way = np.array(wall.start), np.array(wall.end) - np.array(wall.start)
         along = np.clip(
@@ -391,7 +402,7 @@ def _near(scene: Scene, body: int, states: Floats, row: int) -> bool:
     others += [(each, np.array(each.pose)[:2]) for each in scene.bodies if each.static]
     for other, place in others:
         far = np.linalg.norm(values - place, axis=1)
-        if not (far > reach + (1 + _REACH) * other.shape.bounding_radius).all():
+        if not (far > reach + (1 + slack) * other.shape.bounding_radius).all():
             return True
     return any(
         joint.traits.stops_bodies and moving[body].name in (joint.bodies or ())

@@ -1,10 +1,18 @@
-"""Kinematics of a history: angles, recorded paths, hinges, and complete start states."""
+"""Kinematics of a history: angles, noise, recorded paths, hinges, and complete start states."""
+
+from collections.abc import Iterable
+from math import comb
 
 import numpy as np
 from scipy.signal import savgol_filter
 
 from pbrl_ppl.scene import WORLD, Point, Scene
 from pbrl_ppl.state import THETA, Bools, Floats, wrapped
+
+#: Standard deviation of a Gaussian over the median of its absolute values.
+GAUSSIAN = 1.4826
+#: Rows on either side that an estimated velocity depends on.
+RATE_REACH = 2
 
 
 def unwrapped(time: Floats, angle: Floats, rate: Floats) -> Floats:
@@ -26,6 +34,71 @@ def unwrapped(time: Floats, angle: Floats, rate: Floats) -> Floats:
     turned = np.cumsum(0.5 * np.diff(time) * (rate[1:] + rate[:-1]))
     turned = np.concatenate([np.zeros(1), turned])
     return np.asarray(np.unwrap(angle - turned) + turned)
+
+
+def column_noise(
+    series: Iterable[Floats], order: int = 3, *, robust: bool = False, angle: bool = False
+) -> float:
+    """Return the standard deviation of the noise of a column, from differences of its rows.
+
+    Differences of a smooth motion vanish with their order; those of white noise have ``comb(2
+    order, order)`` times its variance.
+
+    Parameters
+    ----------
+    series : iterable of ndarray
+        Values of each trajectory at even times, shape (time,), NaN where missing.
+    order : int
+        Of the differences: the higher, the faster a motion may be.
+    robust : bool
+        Whether the median tells the size rather than the mean square, so that impacts do not count.
+    angle : bool
+        Whether the column wraps (rad).
+
+    Returns
+    -------
+    float
+        In the column's unit; 0 where there are no differences.
+
+    Examples
+    --------
+    >>> rng, t = np.random.default_rng(1), 0.01 * np.arange(4000)
+    >>> round(column_noise([np.sin(t) + rng.normal(0.0, 0.002, 4000)]), 4)
+    0.002
+    """
+    changes = [np.diff(values) for values in series]
+    if angle:
+        changes = [wrapped(change) for change in changes]
+    change = np.concatenate([np.zeros(0), *(np.diff(one, order - 1) for one in changes)])
+    change = np.abs(change[np.isfinite(change)])
+    if not len(change):
+        return 0.0
+    size = GAUSSIAN * np.median(change) if robust else np.sqrt(np.mean(change**2))
+    return float(size / np.sqrt(comb(2 * order, order)))
+
+
+def finest_step(column: Floats, *, rounding: float = 1e-9) -> float:
+    """Return the finest step between a column's values: its quantisation, or rounding.
+
+    Parameters
+    ----------
+    column : ndarray
+        Any shape, NaN where missing.
+    rounding : float
+        Of numbers, as a share of the column's largest value or range.
+
+    Returns
+    -------
+    float
+        Infinite where fewer than two values differ.
+    """
+    values = np.unique(column[np.isfinite(column)])
+    if len(values) < 2:
+        return np.inf
+    least = rounding * float(max(np.abs(values).max(), values[-1] - values[0]))
+    steps = np.diff(values)
+    steps = steps[steps > least]
+    return max(least, float(steps.min()) if len(steps) else 0.0)
 
 
 def kinematic_bodies(scene: Scene) -> Bools:
@@ -189,6 +262,6 @@ def _derivative(values: Floats, dt: float, *, angle: bool) -> Floats:
     for run in np.split(np.arange(len(finite)), np.flatnonzero(np.diff(finite) > 1) + 1):
         if len(run) > 2:
             # An even window would give the rate between samples.
-            window = 5 if len(run) >= 5 else 3
+            window = min(2 * RATE_REACH + 1, len(run) - 1 + len(run) % 2)
             rate[finite[run]] = savgol_filter(level[run], window, 2, deriv=1, delta=dt)
     return rate

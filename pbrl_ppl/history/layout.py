@@ -14,6 +14,7 @@ from scipy.signal import find_peaks
 
 from pbrl_ppl.errors import HistoryError, RecordingWarning
 from pbrl_ppl.history.files import COLUMNS
+from pbrl_ppl.history.kinematics import column_noise
 from pbrl_ppl.scene import Recording, Scene, nearest
 from pbrl_ppl.state import STATE, WRENCH, Bools, Floats, Ints
 
@@ -23,8 +24,6 @@ _LEAST_ROWS = 3
 _STILL = 8.0
 #: Rows on each side of a jump whose slope is the velocity there.
 _SIDE = 5
-#: Standard deviation of a normal variable, over the median of its absolute value.
-_MEDIAN = 1.4826
 
 
 def layout_of(frame: pd.DataFrame, layout: Recording | None) -> Recording | None:
@@ -205,7 +204,7 @@ def _at_rest(times: Floats, states: Floats, seconds: float) -> Bools:
     for column in states.T:
         change = np.abs(np.diff(column, 2))
         change = change[np.isfinite(change)]
-        noise = _MEDIAN * np.median(change) / np.sqrt(6) if len(change) else 0.0
+        noise = column_noise([column], 2, robust=True)
         steps = change[change > 0]
         tolerance = max(_STILL * noise, steps.min() if len(steps) else 0.0)
         windows = pd.Series(column).rolling(n)

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Unpack
 
 from pbrl_ppl.history.conversion import Reading
-from pbrl_ppl.history.derived import unit_mismatches
 from pbrl_ppl.history.ends import strange_ends, trimmed
 from pbrl_ppl.history.history import History
+from pbrl_ppl.history.units import unit_mismatches
 from pbrl_ppl.scene import Scene
 
 

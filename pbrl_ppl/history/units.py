@@ -1,4 +1,4 @@
-"""Natural units of the bodies of a recording: typical motions, forces and places."""
+"""Units of a recording: natural ones of its bodies, and columns in units that do not agree."""
 
 from __future__ import annotations
 
@@ -10,12 +10,7 @@ from scipy.stats import linregress
 from pbrl_ppl.history.history import History
 from pbrl_ppl.history.kinematics import hung_bodies
 from pbrl_ppl.scene import MASS_PRIOR, Scene, units_of
-from pbrl_ppl.state import THETA, WRENCH, Floats
-
-#: Standard deviations of the noise by which a difference over some rows must stand out.
-_STANDS_OUT = 5.0
-#: Fewer accelerations show no mass.
-_FEW = 8
+from pbrl_ppl.state import STATE, THETA, VELOCITY, WRENCH, Floats, wrapped
 
 
 def with_units(scene: Scene, history: History) -> Scene:
@@ -89,11 +84,11 @@ def _size(vectors: Floats) -> float:
     return float(np.sqrt(np.mean(size**2))) if len(size) else 0.0
 
 
-def _rates(values: Floats, dt: float) -> tuple[float, float]:
+def _rates(values: Floats, dt: float, stands_out: float = 5.0) -> tuple[float, float]:
     """Return the root mean square rate and acceleration of series (trajectory, time, d).
 
-    They are differences over as few rows as stand out of the noise, which third differences of
-    neighbours show.
+    They are differences over as few rows as stand out of the noise by so many of its standard
+    deviations. Third differences of neighbours show it.
     """
     noise = _size(np.diff(values, 3, axis=1)) / np.sqrt(20.0)
     rates = []
@@ -104,14 +99,16 @@ def _rates(values: Floats, dt: float) -> tuple[float, float]:
             for _ in range(order):
                 change = change[:, lag:] - change[:, :-lag]
             size = _size(change) / (lag * dt) ** order
-            if _size(change) > _STANDS_OUT * np.sqrt(gain) * noise:
+            if _size(change) > stands_out * np.sqrt(gain) * noise:
                 break
             lag *= 2
         rates.append(size)
     return rates[0], rates[1]
 
 
-def shown_mass(scene: Scene, history: History, name: str) -> float | None:
+def shown_mass(
+    scene: Scene, history: History, name: str, *, few: int = 8, certainty: float = 5.0
+) -> float | None:
     """Return the mass (kg) that the commands and the accelerations of a body show.
 
     It is the regression of accelerations on commanded forces, or about a hinge of angular
@@ -135,14 +132,14 @@ def shown_mass(scene: Scene, history: History, name: str) -> float | None:
     # between the middles of two intervals each command acts for half of the time
     push = (0.5 * (wrench[:, :-2, columns] + wrench[:, 1:-1, columns])).ravel() / moment
     seen = np.isfinite(response) & np.isfinite(push)
-    if seen.sum() < _FEW or not np.any(push[seen]):
+    if seen.sum() < few or not np.any(push[seen]):
         return None
     fitted = linregress(push[seen], response[seen])
-    shows = fitted.slope > _STANDS_OUT * fitted.stderr
+    shows = fitted.slope > certainty * fitted.stderr
     return 1.0 / float(fitted.slope) if shows else None
 
 
-def mass_contradictions(scene: Scene, history: History) -> list[str]:
+def mass_contradictions(scene: Scene, history: History, *, far: float = 5.0) -> list[str]:
     """Return a sentence for each prior of a mass that the recording contradicts."""
     sentences = []
     for body in scene.dynamic:
@@ -151,7 +148,7 @@ def mass_contradictions(scene: Scene, history: History) -> list[str]:
         hyper |= dict(dict(body.prior).get("mass", ()))
         if "mass" in dict(body.known) or shown is None:
             continue
-        if abs(np.log(shown) - hyper["mu"]) > _STANDS_OUT * hyper["sigma"]:
+        if abs(np.log(shown) - hyper["mu"]) > far * hyper["sigma"]:
             sentences.append(
                 f"mass of {body.name}: commands and accelerations of the recording show some"
                 f" {shown:.1g} kg, and its prior has the median {np.exp(hyper['mu']):.2g} kg;"
@@ -160,3 +157,91 @@ def mass_contradictions(scene: Scene, history: History) -> list[str]:
                 " check the units of the commands"
             )
     return sentences
+
+
+def unit_mismatches(history: History) -> tuple[str, ...]:
+    """Return a sentence for each velocity that differs from its position's changes by a unit.
+
+    Changes of a position are divided by the integral of the measured velocity. A position is left
+    out where that factor varies (noise), where it is near one, or where no unit is near it.
+
+    Parameters
+    ----------
+    history : History
+        Positions and velocities of which both were measured are compared; an angle's turns between
+        two rows count as none.
+
+    Returns
+    -------
+    tuple of str
+        Empty where all agree.
+    """
+    observed = history.dataset["observed"].to_numpy()
+    found = []
+    for i, body in enumerate(history.bodies):
+        for d in range(3):
+            position, rate = observed[:, :, i, d], observed[:, :, i, d + VELOCITY]
+            dt = float(history.dataset.attrs["time_step"])
+            factor = _unit_factor(position, rate, dt, angle=d == THETA)
+            if factor is not None and (words := _unit_sentence(body, d, factor)):
+                found.append(words)
+    return tuple(found)
+
+
+def _unit_factor(
+    position: Floats, rate: Floats, dt: float, *, angle: bool, few: int = 8, spread: float = 0.2
+) -> float | None:
+    """Return a position's change over the integral of its rate; None where that varies.
+
+    Half of the single factors, of which there are at least ``few``, are within the share ``spread``
+    of their median. Changes are taken over more and more intervals: measurement noise counts less.
+    """
+    best, least = None, spread
+    for span in (1, 4, 16):
+        n = (position.shape[1] - 1) // span
+        change = np.diff(position[:, : n * span + 1 : span], axis=1).ravel()
+        mean = ((rate[:, 1:] + rate[:, :-1]) / 2)[:, : n * span].reshape(len(rate), n, span)
+        integral = dt * span * mean.mean(axis=2).ravel()
+        seen = np.isfinite(change) & np.isfinite(integral)
+        change, integral = change[seen], integral[seen]
+        if len(integral) < few:
+            continue
+        size = np.abs(integral)
+        fast = (size > 0) & (size >= np.quantile(size, 0.9) / 2)  # where noise counts least
+        change, integral = change[fast], integral[fast]
+        if len(integral) < few:
+            continue
+        # angles may have been wrapped between two rows
+        off = np.median(np.abs(wrapped(change - integral)))
+        if angle and off < 0.5 * min(1.0, float(np.median(np.abs(integral)))):
+            return 1.0
+        factor = float(np.median(change / integral))
+        varies = float(np.median(np.abs(change / integral - factor))) / (abs(factor) or np.inf)
+        if factor > 0 and varies < least:
+            best, least = factor, varies
+    return best
+
+
+def _unit_sentence(body: str, d: int, factor: float, near: float = 0.1) -> str:
+    """Return a sentence about a factor between a position and its rate that is near a unit's.
+
+    A position in other units changes faster than its velocity says by that factor; where the
+    velocity is too large by as much, it may be in these units per second.
+    """
+    place, rate = STATE[d], STATE[d + VELOCITY]
+    units = {1000.0: "mm", 100.0: "cm", 9.81: ""}
+    rates = {1000.0: "mm/s", 100.0: "cm/s", 9.81: ""}
+    if d == THETA:
+        units = {180 / np.pi: "deg", 1000.0: "mrad"}
+        rates = {180 / np.pi: "deg/s", 1000.0: "mrad/s", 30 / np.pi: "rpm"}
+    faster = f"{place} of {body} changes {factor:.3g} times as fast as {rate} says"
+    larger = f"{rate} of {body} is {1 / factor:.3g} times the rate at which {place} changes"
+    for words, column, size, known in (
+        (faster, place, factor, units),
+        (larger, rate, 1 / factor, rates),
+    ):
+        for one, unit in known.items():
+            if abs(size / one - 1) < near:
+                cure = f" {column} may be in {unit}; read it with --units {column}={unit}"
+                return f"{words}: units?{cure if unit else ''}"
+    return ""

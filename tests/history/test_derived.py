@@ -7,9 +7,14 @@ import pandas as pd
 import pytest
 from scipy.signal import butter, filtfilt, lfilter, savgol_filter
 
-from pbrl_ppl.history import History, measured_alone, measurement_noise, unused_velocities
-from pbrl_ppl.history.derived import velocity_lag
-from pbrl_ppl.history.filters import computed_by
+from pbrl_ppl.history import (
+    History,
+    computed_by,
+    measured_alone,
+    measurement_noise,
+    unused_velocities,
+    velocity_lag,
+)
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.histories import COLUMNS
 from tests.helpers.places import RECORDED

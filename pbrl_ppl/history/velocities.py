@@ -1,0 +1,493 @@
+"""Velocity columns that were computed from positions of the log, or lag them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from itertools import chain
+from math import comb
+
+import numpy as np
+from scipy.signal import savgol_coeffs
+from scipy.stats import f as f_distribution
+from scipy.stats import t as t_distribution
+
+from pbrl_ppl.history.history import History
+from pbrl_ppl.history.kinematics import column_noise, finest_step, unwrapped
+from pbrl_ppl.state import STATE, THETA, VELOCITY, Floats
+
+#: Positions and velocities of rows without gaps, m and m/s or rad and rad/s.
+Runs = list[tuple[Floats, Floats]]
+
+
+@dataclass(frozen=True)
+class UnusedVelocity:
+    """A velocity column that does not count as measured, and why.
+
+    Attributes
+    ----------
+    body : str
+        Name of the body.
+    state : str
+        Name of the velocity: "vx", "vy" or "omega".
+    position : str
+        Name of its position: "x", "y" or "theta".
+    computed_by : str or None
+        The filter that gives it from the position; None if it lags the position only.
+    lag : float
+        By how much it is late (s); negative if early.
+
+    Examples
+    --------
+    >>> UnusedVelocity("ball", "vy", "y", "central differences", 0.0).sentence
+    'vy of ball was computed from y (central differences) and is not used'
+    >>> UnusedVelocity("arm", "omega", "theta", None, 0.012).sentence
+    'omega of arm lags theta by 12 ms and is not used'
+    """
+
+    body: str
+    state: str
+    position: str
+    computed_by: str | None
+    lag: float
+
+    @property
+    def sentence(self) -> str:
+        """Sentence: the column, how it was computed or by how much it lags."""
+        name, late = f"{self.state} of {self.body}", f"{abs(self.lag):.3g} s"
+        if 1e-3 <= abs(self.lag) < 1.0:
+            late = f"{1e3 * abs(self.lag):.3g} ms"
+        if self.computed_by is None:
+            verb = "lags" if self.lag > 0 else "leads"
+            return f"{name} {verb} {self.position} by {late} and is not used"
+        lag = f", {late} {'late' if self.lag > 0 else 'early'}" if self.lag else ""
+        return f"{name} was computed from {self.position} ({self.computed_by}{lag}) and is not used"
+
+
+def unused_velocities(history: History) -> tuple[UnusedVelocity, ...]:
+    """Return the velocity columns that were computed from positions of the log, or lag them.
+
+    Tests are made so that fewer than one in a hundred logs with independently measured velocities
+    loses one; it then costs information, as positions are enough for a fit.
+
+    Parameters
+    ----------
+    history : History
+        What was measured. Rows with gaps are left out.
+
+    Returns
+    -------
+    tuple of UnusedVelocity
+        By body and state.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> from pbrl_ppl.scene import Body, Scene, Shape
+    >>> from pbrl_ppl.state import STATE, WRENCH
+    >>> scene = Scene(time_step=0.05, bodies=(Body("puck", Shape.circle(0.2)),))
+    >>> table = pd.DataFrame(0.0, range(50), [*STATE, *WRENCH]).assign(trajectory=0, body="puck")
+    >>> table["step"] = np.arange(50)
+    >>> table["time"] = 0.05 * table["step"]
+    >>> table["x"] = np.cumsum(np.random.default_rng(1).normal(0.0, 0.02, 50))
+    >>> table["vx"] = np.gradient(table["x"], 0.05)
+    >>> print(unused_velocities(History.from_dataframe(table, scene))[0].sentence)
+    vx of puck was computed from x (central differences) and is not used
+    """
+    dt = float(history.dataset.attrs["time_step"])
+    found: list[UnusedVelocity] = []
+    for body in np.flatnonzero(~history.dataset["kinematic"].to_numpy()):
+        for d in range(3):
+            runs = _runs(history, int(body), d)
+            names = (history.bodies[body], STATE[d + VELOCITY], STATE[d])
+            if match := computed_by(runs, dt):
+                late = match.lag if abs(match.lag) > 0.05 * dt else 0.0
+                found.append(UnusedVelocity(*names, match.name, late))
+            elif lag := velocity_lag(runs, dt):
+                found.append(UnusedVelocity(*names, None, lag))
+    return tuple(found)
+
+
+def measured_alone(history: History, unused: Sequence[UnusedVelocity] | None = None) -> History:
+    """Return the history without unused velocities: they stay as states to start from.
+
+    Parameters
+    ----------
+    history : History
+        What was recorded.
+    unused : sequence of UnusedVelocity, optional
+        Which columns not to count as measured; :func:`unused_velocities` by default.
+    """
+    unused = unused_velocities(history) if unused is None else unused
+    if not unused:
+        return history
+    columns = np.zeros((len(history.bodies), len(STATE)), dtype=bool)
+    for each in unused:
+        columns[history.bodies.index(each.body), STATE.index(each.state)] = True
+    observed = history.dataset["observed"]
+    return History(history.dataset.assign(observed=observed.where(~columns)))
+
+
+def velocity_lag(runs: Runs, dt: float, *, material: float = 0.05) -> float:
+    """Return by how much (s) velocities are late; 0 where that is negligible or not significant.
+
+    The position's change in an interval is its mean velocity; of a velocity that is late by ``tau``
+    it differs by ``tau`` times the acceleration. Of differences of velocities that bracket the
+    interval as instruments the estimate is consistent whatever the noise of both. A constant
+    offset, a scale and the curvature within an interval are fitted alongside. Residuals of
+    neighbouring intervals share a velocity, for which the standard error is multiplied by sqrt(2).
+
+    Parameters
+    ----------
+    runs : list of (ndarray, ndarray)
+        Positions and velocities of rows without gaps, shape (n,) each.
+    dt : float
+        Time step (s).
+    material : float
+        Smaller lags, in time steps, are negligible.
+
+    Examples
+    --------
+    >>> t = np.arange(200) * 0.02
+    >>> round(velocity_lag([(np.sin(5 * t), 5 * np.cos(5 * (t - 0.012)))], 0.02), 4)
+    0.012
+    >>> velocity_lag([(np.sin(5 * t), 5 * np.cos(5 * t))], 0.02)
+    0.0
+    """
+    lag, found = _shifted(runs, dt, 0, material)
+    if not found:
+        return 0.0
+    shift = 0
+    for _ in range(20):  # it is linear in the lag only near it
+        if not np.isfinite(lag) or abs(lag - shift) <= 0.5:
+            break
+        shift = int(np.clip(round(lag), shift - 1, shift + 1))
+        lag = _shifted(runs, dt, shift, material)[0]
+    return float(lag) * dt if np.isfinite(lag) else 0.0
+
+
+def _shifted(
+    runs: Runs, dt: float, shift: int, material: float, alarm: float = 1e-4, enough: int = 12
+) -> tuple[float, bool]:
+    """Return the lag (rows) linearised about ``shift`` rows, and whether it differs materially.
+
+    The instrument's covariance with the residual at the least lag that matters is tested, which
+    needs no accurate lag (Anderson and Rubin's test). ``alarm`` is the test's size, ``enough`` the
+    least number of intervals.
+    """
+    parts: list[Floats] = []
+    for position, rate in runs:
+        k = np.arange(max(0, 1 - shift), len(position) - max(1, 2 + shift))
+        if len(k):
+            before, one, two, after = (rate[k + shift + i] for i in (-1, 0, 1, 2))
+            mean, off = (one + two) / 2, (position[k + 1] - position[k]) / dt
+            curve = before - one - two + after
+            parts.append(np.stack([off - mean, mean, curve, two - one, after - before]))
+    if sum(part.shape[1] for part in parts) < enough:
+        return np.nan, False
+    y, mean, curve, x, z = np.concatenate(parts, axis=1)
+    basis = np.linalg.svd(np.stack([np.ones(len(y)), mean, curve], axis=1), full_matrices=False)[0]
+    y, x, z = (each - basis @ (basis.T @ each) for each in (y, x, z))
+    slope, square, dof = float(z @ x), float(z @ z), len(y) - 4
+    if not slope > 0 or not square > 0:
+        return np.nan, False
+    lag = float(z @ y) / slope
+    rest = y - np.copysign(material, lag) * x
+    residual = rest - float(z @ rest) / square * z
+    spread = max(  # the second in collisions
+        float(residual @ residual) / dof * square, float((z * residual) @ (z * residual))
+    )
+    bound = float(t_distribution.isf(alarm / 2, dof)) * np.sqrt(2 * spread)
+    # rounding alone leaves a millionth of a row, without any noise
+    found = abs(lag) > material and abs(float(z @ rest)) > max(bound, 1e-6 * slope)
+    return lag + shift, bool(found)
+
+
+def measurement_noise(history: History) -> Floats:
+    """Return the measurement noise of each state, from kinematics alone, shape (body, state).
+
+    Zero where nothing is known. It is no more than third differences show, so that a position in
+    another unit than its velocity does not look noisy; and what they show where no velocity was
+    measured, which a local polynomial then knows that much less at a trajectory's end.
+    """
+    dt = float(history.dataset.attrs["time_step"])
+    observed = history.dataset["observed"].to_numpy()
+    result = np.zeros(observed.shape[2:])
+    for body in range(len(result)):
+        for d in range(VELOCITY):
+            pair = [d, d + VELOCITY]
+            if runs := _runs(history, body, d):
+                most = [column_noise(column) for column in zip(*runs, strict=True)]
+                result[body, pair] = np.minimum(np.sqrt(position_noise(runs, dt)), most)
+            elif np.isnan(observed[:, :, body, d + VELOCITY]).all():
+                column = observed[:, :, body, d]
+                size, coarse = column_noise(column, angle=d == THETA), finest_step(column)
+                if coarse < np.inf:  # rounding looks like no noise where hardly anything moves
+                    size = max(size, coarse / np.sqrt(12.0))
+                # the error at the end of a quadratic of five positions is 1.1 of theirs a time step
+                result[body, pair] = size, 1.1 * size / dt
+    # an angle that looks noisier than half a radian turns too far between rows to be followed
+    result[result[:, THETA] > 0.5, THETA] = 0.0
+    return result
+
+
+def _runs(history: History, body: int, d: int, shortest: int = 5) -> Runs:
+    """Return positions of a dimension and their rates, in rows between gaps of either."""
+    observed = history.dataset["observed"].to_numpy()[:, :, body]
+    dt = float(history.dataset.attrs["time_step"])
+    runs: Runs = []
+    for own, n in zip(observed, history.dataset["n_rows"].to_numpy(), strict=True):
+        both = own[:n, [d, d + VELOCITY]]
+        seen = np.flatnonzero(np.isfinite(both).all(axis=1))
+        for rows in np.split(seen, np.flatnonzero(np.diff(seen) > 1) + 1):
+            if len(rows) < shortest:
+                continue
+            position, rate = np.asarray(both[rows].T, dtype=np.float64)
+            if d == THETA:
+                position = unwrapped(dt * np.arange(float(len(rows))), position, rate)
+            runs.append((position, rate))
+    return runs
+
+
+@dataclass(frozen=True)
+class Filter:
+    """A linear relation between a velocity, its neighbours and positions.
+
+    Attributes
+    ----------
+    name : str
+        As the report says it.
+    places : tuple of int
+        Rows of the positions, relative to the velocity's.
+    weights : tuple of float, optional
+        Of the positions, in units of 1 / time step; fitted if empty.
+    rates : tuple of tuple of int
+        Rows of earlier (later) velocities, relative; those of a group share a fitted weight.
+    rows : float
+        Rows per fitted coefficient, at least.
+    exact : float
+        Without noise it leaves no more than this share of the velocity's variance.
+    """
+
+    name: str
+    places: tuple[int, ...]
+    weights: tuple[float, ...] = ()
+    rates: tuple[tuple[int, ...], ...] = ()
+    rows: float = 2.5
+    exact: float = 1e-12
+
+
+@dataclass(frozen=True)
+class Match:
+    """A filter that gives a velocity, its delay (s), and its misfit over the bound of noise."""
+
+    name: str
+    lag: float
+    misfit: float = field(repr=False)
+
+
+@lru_cache(maxsize=1)
+def known_filters() -> tuple[Filter, ...]:
+    """Return the filters without unknown coefficients.
+
+    Examples
+    --------
+    >>> [each.name for each in known_filters()][:3]
+    ['forward differences', 'backward differences', 'central differences']
+    """
+    quotients = (
+        ("forward differences", 0, 1),
+        ("backward differences", 1, 0),
+        ("central differences", 1, 1),
+        *((f"backward differences over {m} rows", m, 0) for m in range(2, 11)),
+        *((f"central differences over {2 * m} rows", m, m) for m in range(2, 6)),
+    )
+    filters = [Filter(name, (-m, n), (-1 / (m + n), 1 / (m + n))) for name, m, n in quotients]
+    for window in range(5, 22, 2):
+        half = window // 2
+        for order, orders in ((2, "2"), (4, "3 or 4")):  # of odd windows, 3 and 4 are the same
+            weights = savgol_coeffs(window, order, deriv=1, use="dot")
+            name = f"a Savitzky-Golay filter of {window} rows, order {orders}"
+            places = tuple(range(-half, half + 1))
+            filters.append(Filter(name, places, tuple(weights.tolist())))
+    return tuple(filters)
+
+
+#: Filters with fitted coefficients, the fewest first: exponential smoothing and Butterworth
+#: low-passes of a difference, causal and forward-backward, and any finite filter.
+FITTED = (
+    Filter("a finite filter of 5 rows", (-2, -1, 0, 1, 2), exact=0.0),
+    Filter("a causal first-order low-pass of differences", (-2, -1, 0, 1), (), ((-1,),), exact=0.0),
+    Filter(
+        "a zero-phase first-order low-pass of differences",
+        (-2, -1, 0, 1, 2),
+        rates=((-1, 1),),
+        exact=0.0,
+    ),
+    Filter(
+        "a causal second-order low-pass of differences",
+        (-3, -2, -1, 0, 1),
+        rates=((-1,), (-2,)),
+        exact=0.0,
+    ),
+    Filter(
+        "a zero-phase second-order low-pass of differences",
+        (-3, -2, -1, 0, 1, 2, 3),
+        rates=((-1, 1), (-2, 2)),
+        exact=0.0,
+    ),
+    Filter("a finite filter of 17 rows", tuple(range(-8, 9)), rows=4.0, exact=1e-8),
+)
+
+
+def position_noise(runs: Runs, dt: float) -> tuple[float, float]:
+    """Return the noise variances of positions and of velocities, from their kinematic residuals.
+
+    The mean of two neighbouring velocities differs from the difference quotient between them by
+    noise alone. Second differences take off what a smooth acceleration leaves. Of those,
+    independent noises of positions (in units of ``dt``) and velocities have variance ``20 A + B``
+    and covariance at lag one ``-15 A - B / 4``.
+
+    Parameters
+    ----------
+    runs : list of (ndarray, ndarray)
+        Positions and velocities, shape (n,) each.
+    dt : float
+        Time step (s).
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> x, v = rng.normal(0.0, 0.002, 4000), rng.normal(0.0, 0.01, 4000)
+    >>> float(np.sqrt(position_noise([(x, v)], 0.01)[0]).round(4))
+    0.002
+    """
+    square = product = 0.0
+    n = m = 0
+    for position, rate in runs:
+        off = np.diff(np.diff(position) / dt - (rate[1:] + rate[:-1]) / 2, 2)
+        square, n = square + float(off @ off), n + len(off)
+        product, m = product + float(off[1:] @ off[:-1]), m + max(len(off) - 1, 0)
+    place = max(0.0, -(square / max(n, 1) + 4 * product / max(m, 1)) / 40)
+    return place * dt**2, max(0.0, square / max(n, 1) - 20 * place)
+
+
+def computed_by(runs: Runs, dt: float) -> Match | None:
+    """Return the filter that computed velocities from positions, or None.
+
+    A velocity with independent noise differs from a filter of noisy positions with weights ``w``
+    by a variance of at least ``|w|^2 s^2``, ``s`` being the positions' noise. A computed velocity
+    does not. The ratio of what a filter leaves to that bound is compared with the lower tail of the
+    F distribution (1e-5 for each filter), degrees of freedom corrected for serial correlation.
+
+    Parameters
+    ----------
+    runs : list of (ndarray, ndarray)
+        Positions and velocities of rows without gaps, shape (n,) each.
+    dt : float
+        Time step (s).
+
+    Examples
+    --------
+    >>> x = np.random.default_rng(1).normal(size=40)
+    >>> computed_by([(x[1:], np.diff(x) / 0.1)], 0.1)
+    Match(name='backward differences', lag=0.05)
+    """
+    rates = np.concatenate([rate for _, rate in runs]) if runs else np.zeros(0)
+    total = float(rates.var()) if len(rates) else 0.0
+    if not total > 0:
+        return None
+    least, most = _noise_bounds(runs)
+    noise = min(max(position_noise(runs, dt)[0], least), most)
+    shown = sum(max(len(position) - 3, 0) for position, _ in runs) / _correlation([-1, 3, -3, 1])
+    found = [_tested(each, runs, dt, noise, shown, total) for each in known_filters()]
+    if matches := [match for match in found if match is not None]:
+        return min(matches, key=lambda match: match.misfit)
+    for each in FITTED:
+        if match := _tested(each, runs, dt, noise, shown, total):
+            return match
+    return None
+
+
+def _noise_bounds(runs: Runs, floor: float = 1e-3) -> tuple[float, float]:
+    """Return bounds of the variance of positions' noise, from positions alone.
+
+    Kinematics do not tell it where a velocity is late, which leaves more than noise does, and tell
+    too much where bodies collide: high differences of smooth positions leave noise, their median
+    no collision. The noise is no less than a share ``floor`` of what eighth differences show, where
+    ninth ones have at least twice their variance: those of white noise have 3.8 times.
+    """
+    positions = [position for position, _ in runs]
+    eighth, ninth = (column_noise(positions, order) ** 2 for order in (8, 9))
+    white = ninth * comb(18, 9) > 2.0 * eighth * comb(16, 8)
+    return (floor * eighth if white else 0.0), column_noise(positions, 8, robust=True) ** 2
+
+
+def _tested(
+    candidate: Filter,
+    runs: Runs,
+    dt: float,
+    noise: float,
+    shown: float,
+    total: float,
+    *,
+    alarm: float = 1e-5,
+    most: float = 0.25,
+    pole: float = 0.1,
+) -> Match | None:
+    """Return the match of a filter; None if its misfit is above the bound.
+
+    ``alarm`` is the test's size: some forty are made of a column. However many rows there are, a
+    filter leaves at most the share ``most`` of the variance that the positions' noise would leave
+    of an independent measurement (half of its amplitude). ``pole`` is the least denominator of a
+    low-pass at half the sampling rate: it is zero in a relation that holds of noiseless
+    measurements too, that the mean of two velocities is the difference quotient.
+    """
+    near = (0, *candidate.places, *chain(*candidate.rates))
+    places, rates, middle = [], [], []
+    for position, rate in runs:
+        k = np.arange(-min(near), len(position) - max(near))
+        if len(k):
+            places.append(position[k[:, None] + candidate.places] - position[k, None])
+            groups = [rate[k[:, None] + group].sum(axis=1) for group in candidate.rates]
+            rates.append(np.array(groups).T.reshape(len(k), len(groups)))
+            middle.append(rate[k])
+    if not middle:
+        return None
+    x, v, y = np.concatenate(places), np.concatenate(rates), np.concatenate(middle)
+    fitted = 0 if candidate.weights else x.shape[1] - 1 + v.shape[1]
+    if len(y) < candidate.rows * fitted:
+        return None
+    a, b, errors = np.zeros(0), np.array(candidate.weights) / dt, np.zeros((0, len(y)))
+    if fitted:
+        zero = candidate.places.index(0)
+        inverse = np.linalg.pinv(np.hstack([v, np.delete(x, zero, axis=1) / dt]))
+        errors = inverse[v.shape[1] :] / dt
+        errors = np.insert(errors, zero, -errors.sum(axis=0), axis=0)
+        a, b = inverse[: v.shape[1]] @ y, errors @ y
+        ends = (sum((-1.0) ** row for row in group) for group in candidate.rates)
+        if 1 - sum(weight * end for weight, end in zip(a, ends, strict=True)) < pole:
+            return None
+    dof = len(y) - fitted
+    variance = float(((y - v @ a - x @ b) ** 2).sum()) / dof
+    square = float(b @ b) - variance * float((errors**2).sum())  # without the errors of the weights
+    if not square > 0:
+        return None
+    share = min(most, float(f_distribution.ppf(alarm, dof / _correlation(b), max(shown, 1.0))))
+    if not variance < max(share * square * noise, candidate.exact * total):
+        return None
+    return Match(candidate.name, _lag(candidate, a, b) * dt, variance / square)
+
+
+def _correlation(weights: Floats | list[int]) -> float:
+    """Return how many squares of filtered white noise count as one independent square."""
+    product = np.correlate(weights, weights, "full")
+    return float(product @ product / product.max() ** 2)
+
+
+def _lag(candidate: Filter, a: Floats, b: Floats) -> float:
+    """Return the group delay of a differentiator at low frequency, in rows."""
+    row = np.array(candidate.places, dtype=float)
+    lag = -float(b @ row**2) / (2 * float(b @ row))
+    for weight, group in zip(a, candidate.rates, strict=True):
+        lag -= float(weight) * sum(group) / (1 - sum(a * [len(each) for each in candidate.rates]))
+    return round(float(lag), 6) + 0.0
