@@ -4,6 +4,8 @@ from .bad_frames import bad_frames as bad_frames
 from .bad_frames import without_bad_frames as without_bad_frames
 from .bad_frames import without_measurements as without_measurements
 from .conversion import as_history as as_history
+from .conversion import is_history as is_history
+from .cuts import propose as propose
 from .ends import End as End
 from .ends import strange_ends as strange_ends
 from .ends import trimmed as trimmed
@@ -19,8 +21,6 @@ from .kinematics import estimate_rates as estimate_rates
 from .kinematics import fill_hinges as fill_hinges
 from .kinematics import hung_bodies as hung_bodies
 from .kinematics import lever as lever
-from .layout import is_history as is_history
-from .proposal import propose as propose
 from .reading import read_recording as read_recording
 from .reading import read_scene as read_scene
 from .units import mass_contradictions as mass_contradictions

@@ -1,14 +1,16 @@
 """Tables of other programs: columns renamed, units converted."""
 
+import warnings
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TypedDict, Unpack
 
 import numpy as np
 import pandas as pd
 
-from pbrl_ppl.errors import HistoryError
+from pbrl_ppl.errors import HistoryError, RecordingWarning
+from pbrl_ppl.history.cuts import cut
 from pbrl_ppl.history.files import COLUMNS
-from pbrl_ppl.history.layout import completed, numbered, unseen_emptied
 from pbrl_ppl.history.rows import with_clean_names
 from pbrl_ppl.scene import Recording, Scene, nearest
 from pbrl_ppl.state import STATE, WRENCH
@@ -186,11 +188,116 @@ def as_history(
     columns, units = dict(reading.get("columns") or {}), dict(reading.get("units") or {})
     if layout is not None:
         columns, units = dict(layout.columns) | columns, dict(layout.units) | units
-    columns = dict(numbered(frame, columns, source))
+    columns = dict(_numbered(frame, columns, source))
     if columns or layout is not None:
         frame = renamed(frame, scene, columns, source)
     if layout is not None:
-        frame = unseen_emptied(frame, layout, source)
+        frame = _unseen_emptied(frame, layout, source)
     if units:
         frame = in_si(frame, units)
-    return frame if layout is None else completed(frame, scene, layout, source)
+    return frame if layout is None else _completed(frame, scene, layout, source)
+
+
+def layout_of(frame: pd.DataFrame, layout: Recording | None) -> Recording | None:
+    """Return how a table is laid out; names and units of a history's columns are as they should."""
+    if layout is None or not is_history(frame):
+        return layout
+    return replace(layout, columns=(), units=(), not_seen=())
+
+
+def is_history(frame: pd.DataFrame) -> bool:
+    """Return whether a table has all columns of a history."""
+    return {*COLUMNS} - {"step"} <= {str(name).strip() for name in frame.columns}
+
+
+def _numbered(
+    frame: pd.DataFrame, columns: Mapping[str, str | float], source: str
+) -> Mapping[str, str | float]:
+    """Return the columns of a table by name; of one without header they are numbered from 0.
+
+    Raises
+    ------
+    HistoryError
+        If the table has no header, and a number is none of its columns'.
+    """
+    if not frame.attrs.get("headerless"):
+        return columns
+    if not columns:
+        raise HistoryError(
+            f"{source}: it has no header; say which of its {len(frame.columns)} columns is which,"
+            f" from 0 (--columns time=0,x=1, or columns = {{ time = 0, x = 1 }} in [recording])"
+        )
+    found: dict[str, str | float] = {}
+    for name, column in columns.items():
+        text = f"{column:g}" if isinstance(column, int | float) else column
+        if text not in frame:
+            raise HistoryError(
+                f"{source}: it has no header and {len(frame.columns)} columns, numbered from 0; got"
+                f" {text} for {name}"
+            )
+        found[name] = text
+    return found
+
+
+def _unseen_emptied(frame: pd.DataFrame, layout: Recording, source: str) -> pd.DataFrame:
+    """Return a table without the states of rows that stand for "not seen"."""
+    values = dict(layout.not_seen)
+    for name in values:
+        if name not in frame or name not in STATE:
+            raise HistoryError(
+                f'{source}: not_seen names "{name}", which is no state column of it'
+                f"{nearest(name, [each for each in STATE if each in frame])}"
+            )
+    if not values:
+        return frame
+    unseen = np.all(
+        [pd.to_numeric(frame[name], errors="coerce") == value for name, value in values.items()],
+        axis=0,
+    )
+    frame = frame.copy()
+    frame.loc[unseen, [name for name in STATE if name in frame]] = np.nan
+    return frame
+
+
+def _completed(frame: pd.DataFrame, scene: Scene, layout: Recording, source: str) -> pd.DataFrame:
+    """Return a table with times, wrenches and trajectories as its layout says.
+
+    Parameters
+    ----------
+    frame : pandas.DataFrame
+        With a history's column names, in SI units.
+    scene : Scene
+        Its time step is that of rows without a time.
+    layout : Recording
+        The layout.
+    source : str
+        Name of the table in messages.
+
+    Warns
+    -----
+    RecordingWarning
+        How many rows are left out, and why.
+    """
+    frame, by_body = frame.copy(), ["trajectory", "body"]
+    if not {*by_body} <= {*frame} or frame[by_body].isna().any(axis=None):
+        return frame  # which is an error, and said where rows are read
+    if "duration" in frame:
+        duration = pd.to_numeric(frame.pop("duration"), errors="coerce").fillna(0.0)
+        frame["time"] = duration.groupby([frame[name] for name in by_body]).cumsum()
+    elif "time" not in frame:
+        frame["time"] = frame.groupby(by_body).cumcount() * scene.time_step
+    if not set(WRENCH) & set(frame):
+        frame[list(WRENCH)] = 0.0
+    if layout.velocities == "computed":
+        frame = frame.drop(columns=[name for name in STATE[3:] if name in frame])
+    repeated = frame.duplicated([*by_body, "time"])
+    said = [f"{repeated.sum()} rows repeat a time and are left out"] if repeated.any() else []
+    frame = frame[~repeated].reset_index(drop=True)
+    if layout.cut:
+        before = len(frame)
+        frame = cut(frame, dict(layout.cut), source)
+        pieces = frame["trajectory"].nunique()
+        said.append(f"cut into {pieces} trajectories, {before - len(frame)} rows between them")
+    if said:
+        warnings.warn(f"{source}: {'; '.join(said)}", RecordingWarning, stacklevel=5)
+    return frame

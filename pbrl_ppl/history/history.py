@@ -14,10 +14,9 @@ import pandas as pd
 import xarray as xr
 
 from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.history.conversion import Reading, as_history
+from pbrl_ppl.history.conversion import Reading, as_history, layout_of
 from pbrl_ppl.history.files import read_table, to_table, write_dataset
 from pbrl_ppl.history.kinematics import complete_start, kinematic_bodies, path_velocities
-from pbrl_ppl.history.layout import layout_of
 from pbrl_ppl.history.resampling import resampled
 from pbrl_ppl.history.rows import Rows, padded, rows_of_arrays, rows_of_table
 from pbrl_ppl.scene import Recording, Scene

@@ -10,14 +10,10 @@ from pbrl_ppl.errors import HistoryError, ResamplingWarning
 from pbrl_ppl.history.kinematics import unwrapped
 from pbrl_ppl.history.rows import TIME_TOLERANCE, Rows, rows_of_arrays
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import STATE, THETA, WRENCH, Bools, Floats, Ints
+from pbrl_ppl.state import STATE, THETA, VELOCITY, WRENCH, Bools, Floats, Ints
 
-#: Time steps that are interpolated across (not a lost sample), and that may be missing at most.
-REACH, LONGEST = 1.9, 5.0
-#: Mean time steps between samples, at most: with fewer samples than rows, rows are made up.
-_COARSEST = 1.1
-#: A velocity this near to a difference quotient (a share of its spread) is one.
-_QUOTIENT = 1e-3
+#: Longest gap of a trajectory, in time steps.
+LONGEST = 5.0
 #: A sample this near to a row's time (in time steps) is taken as it is.
 _SAME = 1e-6
 
@@ -32,13 +28,12 @@ class _Track:
     row: Ints
 
 
-def resampled(rows: Rows, scene: Scene, source: str) -> Rows:
+def resampled(rows: Rows, scene: Scene, source: str, *, reach: float = 1.9) -> Rows:
     """Return rows every ``time_step`` of the scene; the same if they are that already.
 
     Positions are interpolated by cubics (Hermite's, where velocities were measured), velocities
     linearly, both exact for a constant acceleration between samples. A wrench, held until the next
-    sample, is averaged over each step, which keeps its impulse. Steps in a gap of more than 1.9
-    time steps are left empty.
+    sample, is averaged over each step, which keeps its impulse.
 
     Parameters
     ----------
@@ -48,6 +43,8 @@ def resampled(rows: Rows, scene: Scene, source: str) -> Rows:
         Its time step and bodies are used.
     source : str
         Name of the recording in messages.
+    reach : float
+        Rows in a longer gap, in time steps, are left empty: a sample was lost there.
 
     Raises
     ------
@@ -85,7 +82,7 @@ def resampled(rows: Rows, scene: Scene, source: str) -> Rows:
     for i, (grid, bodies) in enumerate(zip(grids, tracks, strict=True)):
         clock[i, : len(grid)] = grid
         for body, track in enumerate(bodies):
-            state[i, : len(grid), body] = _states(track, grid, dt)
+            state[i, : len(grid), body] = _states(track, grid, reach * dt, _SAME * dt)
             action[i, : len(grid), body] = _mean_wrenches(track, grid)
             weights.append(_weights(track.time, grid, dt))
             measured = ~np.isnan(track.state).all(axis=0)
@@ -98,7 +95,7 @@ def resampled(rows: Rows, scene: Scene, source: str) -> Rows:
         f" {len(result.time)}{_noise_in_words(weights)}"
     )
     if empty:
-        message += f"; {empty} rows have empty cells, in gaps of more than {REACH * dt:.4g} s"
+        message += f"; {empty} rows have empty cells, in gaps of more than {reach * dt:.4g} s"
     if quotients.any():
         lost = ", ".join(
             f"{STATE[d]} of {scene.moving[body].name}" for body, d in np.argwhere(quotients)
@@ -141,13 +138,18 @@ def _tracks(rows: Rows, label: int, scene: Scene) -> list[_Track]:
     return tracks
 
 
-def _check_spacing(rows: Rows, tracks: list[list[_Track]], dt: float) -> None:
-    """Refuse samples that are too far apart, and gaps that are too long."""
+def _check_spacing(
+    rows: Rows, tracks: list[list[_Track]], dt: float, coarsest: float = 1.1
+) -> None:
+    """Refuse samples that are too far apart, and gaps that are too long.
+
+    With a median of more than ``coarsest`` time steps between samples rows would be made up.
+    """
     for track in (track for bodies in tracks for track in bodies if len(track.time) > 1):
         spacing = np.diff(track.time)
         worst, median = int(spacing.argmax()), np.median(spacing)
         row = int(track.row[worst + 1])
-        if median > _COARSEST * dt:
+        if median > coarsest * dt:
             raise rows.error(
                 row,
                 f"samples of {rows.trajectory_of(row)} are {median:.4g} s apart, more than the time"
@@ -163,20 +165,21 @@ def _check_spacing(rows: Rows, tracks: list[list[_Track]], dt: float) -> None:
             )
 
 
-def _quotients(tracks: tuple[_Track, ...]) -> Bools:
+def _quotients(tracks: tuple[_Track, ...], near: float = 1e-3) -> Bools:
     """Return which velocities of a body are difference quotients of its positions, shape (6,).
 
-    After interpolation at uneven times they would look like independent measurements.
+    They are as near to one as the share ``near`` of their spread. After interpolation at uneven
+    times they would look like independent measurements.
     """
     found = np.zeros(len(STATE), dtype=bool)
-    for d in range(3, len(STATE)):
+    for d in range(VELOCITY, len(STATE)):
         off: list[list[Floats]] = [[], [], []]
         rates = []
         for track in tracks:
-            place, rate = track.state[:, d - 3], track.state[:, d]
+            place, rate = track.state[:, d - VELOCITY], track.state[:, d]
             if len(place) < 3 or not np.isfinite([place, rate]).all():
                 continue
-            place = unwrapped(track.time, place, rate) if d - 3 == THETA else place
+            place = unwrapped(track.time, place, rate) if d - VELOCITY == THETA else place
             one = np.diff(place) / np.diff(track.time)
             two = (place[2:] - place[:-2]) / (track.time[2:] - track.time[:-2])
             for kind, quotient in enumerate((one[:-1], two, one[1:])):
@@ -185,22 +188,22 @@ def _quotients(tracks: tuple[_Track, ...]) -> Bools:
         if rates and (spread := float(np.concatenate(rates).std())) > 0:
             # at the ends and in gaps they may be anything
             misfit = min(float(np.quantile(np.abs(np.concatenate(each)), 0.95)) for each in off)
-            found[d] = misfit < _QUOTIENT * spread
+            found[d] = misfit < near * spread
     return found
 
 
-def _states(track: _Track, grid: Floats, dt: float) -> Floats:
-    """Return the states at the grid's times, shape (step, 6); NaN in gaps."""
+def _states(track: _Track, grid: Floats, gap: float, same: float) -> Floats:
+    """Return the states at the grid's times, shape (step, 6); NaN in longer gaps (s)."""
     result = np.full((len(grid), len(STATE)), np.nan)
     for d in range(len(STATE)):
         finite = np.flatnonzero(np.isfinite(track.state[:, d]))
-        wide = np.flatnonzero(np.diff(track.time[finite]) > REACH * dt) + 1
+        wide = np.flatnonzero(np.diff(track.time[finite]) > gap) + 1
         for run in np.split(finite, wide):
             if not run.size:
                 continue
             time, values = track.time[run], track.state[run, d]
-            inside = (grid >= time[0] - _SAME * dt) & (grid <= time[-1] + _SAME * dt)
-            rate = track.state[run, d + 3] if d < 3 else None
+            inside = (grid >= time[0] - same) & (grid <= time[-1] + same)
+            rate = track.state[run, d + VELOCITY] if d < VELOCITY else None
             if d == THETA:
                 values = unwrapped(time, values, track.state[run, 5])
             result[inside, d] = _interpolated(time, values, rate, grid[inside])

@@ -1,7 +1,7 @@
 """Velocity columns that were computed from positions of the log, or lag them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import chain
 from math import comb
@@ -273,7 +273,7 @@ class Filter:
     weights: tuple[float, ...] = ()
     rates: tuple[tuple[int, ...], ...] = ()
     rows: float = 2.5
-    exact: float = 1e-12
+    exact: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -301,41 +301,30 @@ def known_filters() -> tuple[Filter, ...]:
         *((f"backward differences over {m} rows", m, 0) for m in range(2, 11)),
         *((f"central differences over {2 * m} rows", m, m) for m in range(2, 6)),
     )
-    filters = [Filter(name, (-m, n), (-1 / (m + n), 1 / (m + n))) for name, m, n in quotients]
-    for window in range(5, 22, 2):
-        half = window // 2
+    filters = [
+        Filter(name, (-m, n), (-1 / (m + n), 1 / (m + n)), exact=1e-12) for name, m, n in quotients
+    ]
+    for half in range(2, 11):
         for order, orders in ((2, "2"), (4, "3 or 4")):  # of odd windows, 3 and 4 are the same
-            weights = savgol_coeffs(window, order, deriv=1, use="dot")
-            name = f"a Savitzky-Golay filter of {window} rows, order {orders}"
-            places = tuple(range(-half, half + 1))
-            filters.append(Filter(name, places, tuple(weights.tolist())))
+            weights = tuple(savgol_coeffs(2 * half + 1, order, deriv=1, use="dot").tolist())
+            name = f"a Savitzky-Golay filter of {2 * half + 1} rows, order {orders}"
+            filters.append(Filter(name, tuple(range(-half, half + 1)), weights, exact=1e-12))
     return tuple(filters)
+
+
+def _fitted(name: str, before: int, after: int, *rates: tuple[int, ...]) -> Filter:
+    return Filter(name, tuple(range(-before, after + 1)), rates=rates)
 
 
 #: Filters with fitted coefficients, the fewest first: exponential smoothing and Butterworth
 #: low-passes of a difference, causal and forward-backward, and any finite filter.
 FITTED = (
-    Filter("a finite filter of 5 rows", (-2, -1, 0, 1, 2), exact=0.0),
-    Filter("a causal first-order low-pass of differences", (-2, -1, 0, 1), (), ((-1,),), exact=0.0),
-    Filter(
-        "a zero-phase first-order low-pass of differences",
-        (-2, -1, 0, 1, 2),
-        rates=((-1, 1),),
-        exact=0.0,
-    ),
-    Filter(
-        "a causal second-order low-pass of differences",
-        (-3, -2, -1, 0, 1),
-        rates=((-1,), (-2,)),
-        exact=0.0,
-    ),
-    Filter(
-        "a zero-phase second-order low-pass of differences",
-        (-3, -2, -1, 0, 1, 2, 3),
-        rates=((-1, 1), (-2, 2)),
-        exact=0.0,
-    ),
-    Filter("a finite filter of 17 rows", tuple(range(-8, 9)), rows=4.0, exact=1e-8),
+    _fitted("a finite filter of 5 rows", 2, 2),
+    _fitted("a causal first-order low-pass of differences", 2, 1, (-1,)),
+    _fitted("a zero-phase first-order low-pass of differences", 2, 2, (-1, 1)),
+    _fitted("a causal second-order low-pass of differences", 3, 1, (-1,), (-2,)),
+    _fitted("a zero-phase second-order low-pass of differences", 3, 3, (-1, 1), (-2, 2)),
+    replace(_fitted("a finite filter of 17 rows", 8, 8), rows=4.0, exact=1e-8),
 )
 
 

@@ -17,7 +17,6 @@ import numpy as np
 
 from pbrl_ppl.errors import ConversionWarning, SceneError
 from pbrl_ppl.history.mujoco import FLAT, FREE, HINGE, PLANES, SLIDE
-from pbrl_ppl.mjcf.numbers import pair, rotation, rounded
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene, Shape, Wall
 from pbrl_ppl.state import Floats
 
@@ -156,6 +155,23 @@ def _compiled(source: Any) -> Any:
     except ValueError as error:
         where = "MuJoCo model" if is_text else f"MuJoCo model {source}"
         raise SceneError(f"{where}: cannot be read: {' '.join(str(error).split())}") from None
+
+
+def rotation(angle: float) -> Floats:
+    """Return the matrix of a rotation in the plane (2, 2)."""
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[c, -s], [s, c]])
+
+
+def rounded(value: float) -> float:
+    """Return a number without the rounding errors of rotations."""
+    return float(f"{float(value):.9g}") if abs(value) > 1e-12 else 0.0
+
+
+def pair(point: Any) -> tuple[float, float]:
+    """Return a point of the plane, rounded."""
+    x, y = (rounded(round(float(value), 12)) for value in point)
+    return x, y
 
 
 @dataclass

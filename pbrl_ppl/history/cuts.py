@@ -1,0 +1,252 @@
+"""Where long takes are cut to trajectories, and the proposal of a recording's layout."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pandas as pd
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy.signal import find_peaks
+
+from pbrl_ppl.errors import HistoryError
+from pbrl_ppl.history.kinematics import column_noise
+from pbrl_ppl.history.resampling import LONGEST
+from pbrl_ppl.history.rows import TIME_TOLERANCE
+from pbrl_ppl.scene import Recording
+from pbrl_ppl.state import STATE, WRENCH, Bools, Floats, Ints
+
+#: Rows on each side of a jump whose slope is the velocity there.
+_SIDE = 5
+
+
+def cut(frame: pd.DataFrame, cuts: Mapping[str, float], source: str) -> pd.DataFrame:
+    """Return a table whose trajectories are cut to pieces."""
+    parts, single = [], frame["trajectory"].nunique() == 1
+    for label, rows in frame.groupby("trajectory", sort=False):
+        numeric = rows.assign(time=pd.to_numeric(rows["time"], errors="coerce"))
+        piece = _pieces(numeric, cuts)
+        for number in range(piece.max(initial=-1) + 1):
+            name = str(number) if single else f"{label}.{number}"
+            own = rows[piece == number].assign(trajectory=name)
+            parts.append(own.drop(columns="step", errors="ignore"))
+    if not parts:
+        raise HistoryError(
+            f"{source}: nothing is left between its cuts; make [recording] cut less strict"
+        )
+    joined: pd.DataFrame = pd.concat(parts).reset_index(drop=True)
+    return joined
+
+
+def _pieces(rows: pd.DataFrame, cuts: Mapping[str, float], least: int = 3) -> Ints:
+    """Return the piece that each row of a trajectory belongs to, -1 for none, shape (row,).
+
+    Pieces have at least so many times.
+    """
+    times, at = np.unique(rows["time"].to_numpy(float), return_inverse=True)
+    names = [name for name in STATE[:3] if name in rows]
+    table = rows.assign(time=at)[["time", "body", *names]]
+    places = table.set_index(["time", "body"])[names].apply(pd.to_numeric, errors="coerce")
+    states = places.unstack("body").to_numpy(float)  # (time, name * body)
+    kept, begins = np.ones(len(times), dtype=bool), np.zeros(len(times), dtype=bool)
+    if "gaps" in cuts:
+        seen = np.flatnonzero(np.isfinite(states).any(axis=1))
+        kept[: seen[0] if len(seen) else len(times)] = False
+        kept[seen[-1] + 1 if len(seen) else 0 :] = False
+        for first, last in pairwise(seen):
+            if times[last] - times[first] > cuts["gaps"]:
+                kept[first + 1 : last] = False
+                begins[last] = True
+    if "rests" in cuts:
+        kept &= ~_at_rest(times, states, cuts["rests"])
+    if "jumps" in cuts:
+        bodies = states.shape[1] // len(names)
+        planar = [i for i, name in enumerate(names) if name in ("x", "y")]
+        for body in range(bodies):
+            kept &= ~_jumps(times, states[:, [i * bodies + body for i in planar]], cuts["jumps"])
+    begins |= kept & ~np.concatenate([[False], kept[:-1]])
+    piece = np.where(kept, np.cumsum(begins) - 1, -1)
+    if "every" in cuts:
+        piece = _every(times, piece, cuts["every"])
+    sizes = np.bincount(piece[piece >= 0], minlength=max(piece.max(initial=-1) + 1, 1))
+    number = np.cumsum(sizes >= least) - 1
+    long = (piece >= 0) & (sizes[piece] >= least)
+    return np.asarray(np.where(long, number[piece], -1)[at])
+
+
+def _every(times: Floats, piece: Ints, length: float) -> Ints:
+    """Return pieces cut to equal parts of about this length (s)."""
+    out, begin = np.full(len(piece), -1), 0
+    for number in range(piece.max(initial=-1) + 1):
+        own = np.flatnonzero(piece == number)
+        spent = times[own] - times[own[0]]
+        parts = max(1, round(spent[-1] / length))
+        width = max(spent[-1] / parts, 1e-300)
+        out[own] = begin + np.minimum((spent / width + 1e-9).astype(int), parts - 1)
+        begin += parts
+    return out
+
+
+def _at_rest(times: Floats, states: Floats, seconds: float, still: float = 8.0) -> Bools:
+    """Return the rows that belong to a rest of all bodies of at least this long, shape (time,).
+
+    At rest a column stays within ``still`` measurement noises.
+    """
+    if len(times) < 3:
+        return np.zeros(len(times), dtype=bool)
+    n = max(2, int(np.ceil(seconds / np.median(np.diff(times)))) + 1)
+    rests = np.ones(len(times), dtype=bool)
+    for column in states.T:
+        change = np.abs(np.diff(column, 2))
+        change = change[np.isfinite(change)]
+        noise = column_noise([column], 2, robust=True)
+        steps = change[change > 0]
+        tolerance = max(still * noise, steps.min() if len(steps) else 0.0)
+        windows = pd.Series(column).rolling(n)
+        quiet = (windows.max() - windows.min() <= tolerance).to_numpy()
+        own = np.zeros(len(times), dtype=bool)
+        for end in np.flatnonzero(quiet):
+            own[end - n + 1 : end + 1] = True
+        rests &= own
+    return rests
+
+
+def _jumps(times: Floats, places: Floats, least: float) -> Bools:
+    """Return the rows beside changes of the velocity by more than so many m/s, shape (time,)."""
+    found = np.zeros(len(times), dtype=bool)
+    seen = np.flatnonzero(np.isfinite(places).all(axis=1))
+    for peak in _peaks(_velocity_changes(times[seen], places[seen]), least):
+        found[seen[max(peak - 1, 0) : peak + 2]] = True
+    return found
+
+
+def _velocity_changes(times: Floats, places: Floats) -> Floats:
+    """Return how much the velocity after each row differs from that before, shape (row,), m/s.
+
+    Each is the slope of a few rows on that side, so that noise is averaged; zero near the ends.
+
+    Parameters
+    ----------
+    times : ndarray
+        Rising, shape (row,), s.
+    places : ndarray
+        Finite positions, shape (row, coordinate), m.
+    """
+    changes = np.zeros(len(times))
+    if len(times) > 2 * _SIDE:
+        t = sliding_window_view(times, _SIDE)
+        p = sliding_window_view(places, _SIDE, axis=0)
+        off = t - t.mean(axis=1, keepdims=True)
+        slopes = np.einsum("kt,kct->kc", off, p) / (off**2).sum(axis=1)[:, None]
+        change = np.linalg.norm(slopes[_SIDE + 1 :] - slopes[: -_SIDE - 1], axis=1)
+        changes[_SIDE : len(times) - _SIDE] = change
+    return changes
+
+
+def _peaks(changes: Floats, least: float) -> Ints:
+    """Return the rows of the largest changes above ``least``, each the only one nearby."""
+    found, _ = find_peaks(changes, height=least, distance=_SIDE)
+    return np.asarray(found)
+
+
+def propose(
+    frame: pd.DataFrame,
+    layout: Recording,
+    time_step: float,
+    *,
+    trajectories: int = 4,
+    shortest: int = 30,
+    longest: int = 200,
+) -> tuple[Recording, list[str]]:
+    """Return a layout with what a recording's rows show, and a sentence on each.
+
+    Parameters
+    ----------
+    frame : pandas.DataFrame
+        The recording's rows as the layout reads them, in SI units, with ``time``.
+    layout : Recording
+        What is known; its entries are kept.
+    time_step : float
+        Median time between rows (s).
+    trajectories : int
+        Fewer long ones are cut: criticism needs so many.
+    shortest, longest : int
+        Rows of the pieces.
+    """
+    said = []
+    times = pd.to_numeric(frame["time"], errors="coerce").to_numpy(float)
+    indices = frame.groupby(["trajectory", "body"], sort=False).indices.values()
+    groups = [np.asarray(rows, dtype=np.int64) for rows in indices]
+    places = [name for name in ("x", "y") if name in frame]
+    states = frame[places].apply(pd.to_numeric, errors="coerce").to_numpy(float, copy=True)
+    unseen = _unseen(states, groups)
+    if unseen.any() and not layout.not_seen:
+        layout = replace(layout, not_seen=tuple((name, 0.0) for name in places))
+        said.append(f"{' = '.join(places)} = 0 in {unseen.sum()} rows: read as not seen")
+        states[unseen] = np.nan
+    spacing = np.concatenate([np.diff(times[rows]) for rows in groups])
+    if not layout.resample and (np.abs(spacing - time_step) > TIME_TOLERANCE * time_step).any():
+        layout = replace(layout, resample=True)
+        said.append(f"samples are uneven: interpolated every {time_step:g} s")
+    if layout.cut:
+        return layout, said
+    cuts: dict[str, float] = {}
+    gap = max(_longest_gap(times[rows], states[rows]) for rows in groups)
+    if gap > LONGEST * time_step:
+        cuts["gaps"] = float(f"{LONGEST * time_step:.6g}")
+        said.append(f"nothing was seen for up to {gap:.3g} s: cut at gaps")
+    pushed = frame[[name for name in WRENCH if name in frame]].apply(pd.to_numeric, errors="coerce")
+    if places and not pushed.fillna(0.0).to_numpy().any():
+        least = _jump([(times[rows], states[rows]) for rows in groups])
+        if least:
+            cuts["jumps"] = least
+            said.append(
+                "the velocity jumps, as at a wall, and none is declared: cut there"
+                f" (by more than {least:g} m/s)"
+            )
+    whole = frame.groupby("trajectory", sort=False)["time"].count().to_numpy()
+    rows = float(np.median(whole)) / frame["body"].nunique()
+    if len(whole) < trajectories and not cuts and rows >= 2 * shortest:
+        wanted = np.clip(rows * len(whole) / 12, shortest, longest)
+        cuts["every"] = float(f"{wanted * time_step:.2g}")
+        said.append(
+            f"{len(whole)} long trajectory: cut every {cuts['every']:g} s, so that there are"
+            " several"
+        )
+    return replace(layout, cut=tuple(cuts.items())), said
+
+
+def _unseen(states: Floats, groups: list[Ints], far: float = 5.0) -> Bools:
+    """Return the rows where all places are zero, ``far`` typical changes from those seen before."""
+    zero = np.all(states == 0.0, axis=1) if states.shape[1] > 1 else np.zeros(len(states), bool)
+    for rows in groups:
+        own, seen = zero[rows], np.flatnonzero(~zero[rows])
+        before = np.searchsorted(seen, np.flatnonzero(own)) - 1
+        steps = np.linalg.norm(np.diff(states[rows][seen], axis=0), axis=1)
+        away = np.linalg.norm(states[rows][seen[before[before >= 0]]], axis=1)
+        jumps = len(steps) and len(away) and np.median(away) > far * np.median(steps)
+        zero[rows] &= bool(jumps)
+    return zero
+
+
+def _longest_gap(times: Floats, states: Floats) -> float:
+    """Return the longest time in which nothing was seen (s)."""
+    seen = np.isfinite(states).any(axis=1) if states.shape[1] else np.ones(len(times), bool)
+    return float(np.diff(times[seen]).max(initial=0.0))
+
+
+def _jump(tracks: list[tuple[Floats, Floats]], abrupt: float = 10.0, rare: float = 0.1) -> float:
+    """Return a change of velocity between rows (m/s) beyond which it jumps; 0 if it never does.
+
+    Jumps are ``abrupt`` times the typical change, in the share ``rare`` of rows at most.
+    """
+    changes: list[Floats] = []
+    for times, states in tracks:
+        seen = np.isfinite(states).all(axis=1) & np.isfinite(times)
+        changes.append(_velocity_changes(times[seen], states[seen]))
+    every = np.concatenate([np.zeros(0), *changes])
+    least = abrupt * float(np.median(every)) if len(every) else 0.0
+    found = sum(len(_peaks(each, least)) for each in changes) if least > 0 else 0
+    return float(f"{least:.2g}") if 0 < found <= rare * len(every) else 0.0
