@@ -15,7 +15,6 @@ from pbrl_ppl.criticism.criteria import DEFAULT, PriorCriteria
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.history import (
     History,
-    column_noise,
     longest_gap,
     measured_alone,
     measurement_noise,
@@ -276,11 +275,9 @@ def telling_horizon(history: History, criteria: PriorCriteria = DEFAULT.prior) -
     steps = [longest_gap(history)]
     while steps[-1] < longest:
         steps.append(min(2 * steps[-1], longest))
-    noise = np.array(
-        [column_noise([place], angle=turns) for place, turns in zip(places, angle, strict=True)]
-    )
-    changes = np.array([_mean_square(places, angle, each) for each in steps])
-    telling = changes >= (criteria.signal * noise) ** 2
+    noise = _mean_square(places, angle, 1, 3) / 20.0
+    changes = np.array([_mean_square(places, angle, each, 1) for each in steps])
+    telling = changes >= criteria.signal**2 * noise
     moves = (telling & (changes > 0.0)).any(
         axis=0
     )  # what never moves beyond its noise does not decide
@@ -288,13 +285,15 @@ def telling_horizon(history: History, criteria: PriorCriteria = DEFAULT.prior) -
     return steps[int(enough.argmax())] if enough.any() else steps[-1]
 
 
-def _mean_square(values: Floats, angle: Bools, steps: int) -> Floats:
-    """Return mean squares of changes over some steps of series (series, time); 0 if none.
+def _mean_square(values: Floats, angle: Bools, steps: int, order: int) -> Floats:
+    """Return mean squares of differences over some steps of series (series, time); 0 if none.
 
-    Changes of angles, which the mask (series,) names, are wrapped.
+    Differences of angles, which the mask (series,) names, are wrapped.
     """
-    change = values[:, steps:] - values[:, :-steps]
-    change = np.where(angle[:, None], wrapped(change), change)
+    change = values
+    for _ in range(order):
+        change = change[:, steps:] - change[:, :-steps]
+        change = np.where(angle[:, None], wrapped(change), change)
     if not change.size:
         return np.zeros(len(values))
     with warnings.catch_warnings():
@@ -316,8 +315,8 @@ def _measurement_noise(history: History, stated: Mapping[str, float]) -> Floats:
         angle = np.full(len(observed), d == THETA)
         for body in range(len(found)):
             own = observed[:, :, body, d]
-            noise = float(np.mean([column_noise([one], angle=d == THETA) ** 2 for one in own]))
-            largest = max(float(_mean_square(own, angle, each).mean()) for each in steps)
+            noise = float(_mean_square(own, angle, 1, 3).mean()) / 20.0
+            largest = max(float(_mean_square(own, angle, each, 1).mean()) for each in steps)
             if half >= _STILL_INTERVALS and largest <= 2.0 * _STILL * noise:
                 found[body, d] = max(found[body, d], np.sqrt(noise))
             if name in stated and np.isfinite(own).any():
