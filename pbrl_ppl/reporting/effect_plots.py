@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -57,7 +57,7 @@ def plot_candidates(loop: Loop, width: float = WIDE, level: float = 0.01) -> Fig
     axes.set_xlim(left=0.0)
     axes.invert_yaxis()
     axes.set_xlabel("score statistic of the effect")
-    handles: list[Any] = [
+    handles: list[Artist] = [
         Patch(color=AFTER, label="added"),
         Patch(color=PLAIN, label="not added"),
         Patch(facecolor=PLAIN, edgecolor="white", hatch="////", label="hardly identifiable"),

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -69,7 +70,7 @@ def plot_residuals(loop: Loop, width: float = WIDE) -> Figure:
         axes.set_yticks([], minor=True)
     axes.set_xticks(range(len(names)), names)
     axes.set_ylabel("residual / noise")
-    handles: list[Any] = [Line2D([], [], color=c, linewidth=3, label=n) for n, _, c in models]
+    handles: list[Artist] = [Line2D([], [], color=c, linewidth=3, label=n) for n, _, c in models]
     handles.append(Patch(color=BAND, label=f"noise alone, {100 * HDI_PROB:.0f} %"))
     legend(figure, handles)
     return figure
@@ -147,8 +148,9 @@ def plot_rollout(loop: Loop, width: float = WIDE) -> Figure:
         axes.set_ylabel(f"{name} ({unit})")
         if place >= count - columns:
             axes.set_xlabel("time (s)")
-    dots: dict[str, Any] = {"marker": "o", "linestyle": "", "markersize": 3}
-    handles = [Line2D([], [], color="black", label="measured", **dots)]
+    handles = [
+        Line2D([], [], color="black", label="measured", marker="o", linestyle="", markersize=3)
+    ]
     handles += [
         Line2D([], [], color=colour, linestyle=style, label=name)
         for (name, _, colour), style in zip(models, styles, strict=True)

@@ -170,7 +170,7 @@ class Settings:
     time_step: float | None = None
     trim: bool = False
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the settings as JSON values."""
         effects = None
         if self.catalogue is not None:
@@ -178,6 +178,8 @@ class Settings:
         return vars(self) | {"catalogue": effects}
 
 
+#: Summary of one log, of values that JSON has.
+Row = Mapping[str, Any]
 #: Closes the loop on one log; its result has a ``save(folder)`` that writes a loop's files.
 Run = Callable[[Log, Settings], Any]
 
@@ -226,7 +228,7 @@ def inputs_sha256(log: Log, settings: Settings) -> str:
     return digest.hexdigest()
 
 
-def settle(log: Log, folder: Path, settings: Settings, inputs: str, run: Run) -> dict[str, Any]:
+def settle(log: Log, folder: Path, settings: Settings, inputs: str, run: Run) -> Row:
     """Close the loop on one log unless it is finished; write an error into a file.
 
     Files are written elsewhere and renamed into the log's folder, ``report.json`` last, so that a
@@ -275,7 +277,7 @@ def settle(log: Log, folder: Path, settings: Settings, inputs: str, run: Run) ->
     return row or failed(log, folder, OSError(f"{place / DONE}: missing after it was written"))
 
 
-def _keep(loop: Any, place: Path, about: dict[str, Any]) -> None:
+def _keep(loop: Any, place: Path, about: Row) -> None:
     """Write a loop's files into a log's folder, ``report.json`` last."""
     with tempfile.TemporaryDirectory(prefix=_MAKING, dir=place) as aside:
         made = Path(aside) / "result"
@@ -287,7 +289,7 @@ def _keep(loop: Any, place: Path, about: dict[str, Any]) -> None:
             (made / name).replace(place / name)
 
 
-def failed(log: Log, folder: Path, error: BaseException) -> dict[str, Any]:
+def failed(log: Log, folder: Path, error: BaseException) -> Row:
     """Return the row of a log that failed, and write the message into its folder if possible."""
     message = " ".join(str(error).split()) or type(error).__name__
     if not isinstance(error, PbrlError):
@@ -302,7 +304,7 @@ def failed(log: Log, folder: Path, error: BaseException) -> dict[str, Any]:
     return {"name": log.name, "kind": log.kind, "status": "failed", "message": message}
 
 
-def row_of(log: Log, folder: Path, inputs: str) -> dict[str, Any] | None:
+def row_of(log: Log, folder: Path, inputs: str) -> Row | None:
     """Return a summary of a finished log's ``report.json``; None if these inputs have none.
 
     Parameters

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from functools import cache
-from typing import Any
 
 import numpy as np
 
@@ -104,7 +103,7 @@ def error_tables(loop: Loop) -> list[Table]:
 
 
 def _row(
-    loop: Loop, name: str, errors: Sequence[Any], *unit: str, digits: int = 3
+    loop: Loop, name: str, errors: Sequence[float | None], *unit: str, digits: int = 3
 ) -> tuple[str, ...]:
     """Return the row of an error before, after and of the noise; without after if none is added."""
     shown = errors if loop.added else (errors[0], errors[2])

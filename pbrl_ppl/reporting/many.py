@@ -9,7 +9,6 @@ from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
@@ -22,6 +21,7 @@ from pbrl_ppl.posterior import load_posterior
 from pbrl_ppl.reporting.logs import (
     FAILED,
     Log,
+    Row,
     Run,
     Settings,
     close_log,
@@ -58,7 +58,7 @@ class ManyLoops:
     """
 
     folder: Path
-    rows: tuple[Mapping[str, Any], ...]
+    rows: tuple[Row, ...]
     pooled: Mapping[str, Pooled]
     not_pooled: Mapping[str, str]
 
@@ -168,7 +168,7 @@ def close_loop_many(
     )  # fmt: skip
     tell = progress or (lambda _: None)
     inputs = {log.name: inputs_sha256(log, settings) for log in logs}
-    rows: dict[str, dict[str, Any]] = {}
+    rows: dict[str, Row] = {}
     for log in logs:
         if again:
             (folder / log.name / "report.json").unlink(missing_ok=True)
@@ -195,14 +195,14 @@ def close_loop_many(
     return ManyLoops(folder, *found)
 
 
-def _row_in_words(row: Mapping[str, Any]) -> str:
+def _row_in_words(row: Row) -> str:
     if row["status"] == "failed":
         return f"{row['name']}: failed: {row['message']}"
     found = ", ".join(f"{each['effect']}[{each['body']}]" for each in row["effects"])
     return f"{row['name']}: {row['verdict']}{f' ({found})' if found else ''}, {row['seconds']:g} s"
 
 
-def _ordered(logs: Iterable[Log], rows: Mapping[str, Any]) -> tuple[Mapping[str, Any], ...]:
+def _ordered(logs: Iterable[Log], rows: Mapping[str, Row]) -> tuple[Row, ...]:
     """Return the rows in the manifest's order; logs without one are waiting."""
     waiting = {"status": "waiting"}
     return tuple(rows.get(log.name, {"name": log.name, "kind": log.kind} | waiting) for log in logs)
@@ -232,7 +232,7 @@ def _opened(folder: Path) -> Path:
 
 
 def _pooled(
-    logs: Iterable[Log], rows: Mapping[str, Mapping[str, Any]], folder: Path
+    logs: Iterable[Log], rows: Mapping[str, Row], folder: Path
 ) -> tuple[dict[str, Pooled], dict[str, str]]:
     """Return the hyper-parameters of each kind with at least two adequate models."""
     kinds: dict[str, list[str]] = {}
@@ -257,7 +257,7 @@ def _pooled(
 def _write_summary(
     folder: Path,
     source: Source,
-    rows: tuple[Mapping[str, Any], ...],
+    rows: tuple[Row, ...],
     pooled: Mapping[str, Pooled],
     not_pooled: Mapping[str, str],
 ) -> None:

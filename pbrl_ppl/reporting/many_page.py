@@ -12,11 +12,10 @@ import pandas as pd
 from markupsafe import Markup
 
 from pbrl_ppl.criticism import NOT_CONVERGED
+from pbrl_ppl.reporting.logs import Row
 from pbrl_ppl.reporting.page import Cell, Section, Source, Table, render_page
 from pbrl_ppl.reporting.words import chance, joined, number, plain, quantity
 from pbrl_ppl.sampling import Pooled
-
-Row = Mapping[str, Any]
 
 
 def summary_table(rows: Iterable[Row]) -> pd.DataFrame:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import along_trajectories
 from pbrl_ppl.posterior import Fit
 from pbrl_ppl.reporting.words import number
-from pbrl_ppl.scene import Scene
+from pbrl_ppl.scene import Scene, Shape
 from pbrl_ppl.state import Floats, wrapped
 
 
@@ -118,7 +117,7 @@ def _predicted(fit: Fit, history: History) -> dict[int, Floats]:
     return {trajectory: states[..., :3] for trajectory, states in whole.items()}
 
 
-def animation(loop: Loop, motions: Sequence[Motion]) -> dict[str, Any] | None:
+def animation(loop: Loop, motions: Sequence[Motion]) -> dict[str, object] | None:
     """Return what the page's script draws, as JSON values; None where there is no motion.
 
     Lengths are in m, to 1e-5 of the view, and angles in rad, to five decimals.
@@ -143,13 +142,13 @@ def animation(loop: Loop, motions: Sequence[Motion]) -> dict[str, Any] | None:
     }
 
 
-def _drawn(scene: Scene, motion: Motion, margin: float) -> dict[str, Any]:
+def _drawn(scene: Scene, motion: Motion, margin: float) -> dict[str, object]:
     """Return a motion, and the corners of its view, as JSON values."""
     box = _box(motion, margin)
     places = _decimals(1e-5 * float((box[1] - box[0]).max()))
     both = (motion.before, motion.after)
 
-    def poses(given: Floats) -> Any:
+    def poses(given: Floats) -> object:
         return _listed(np.concatenate([given[..., :2].round(places), given[..., 2:].round(5)], -1))
 
     return {
@@ -179,7 +178,7 @@ def _box(motion: Motion, margin: float) -> Floats:
     return np.array([low, high])
 
 
-def _outline(shape: Any) -> list[list[float]] | None:
+def _outline(shape: Shape) -> list[list[float]] | None:
     return None if shape.outline is None else [list(map(float, point)) for point in shape.outline]
 
 
@@ -188,6 +187,6 @@ def _decimals(size: float) -> int:
     return int(np.ceil(-np.log10(size)))
 
 
-def _listed(values: Floats) -> Any:
+def _listed(values: Floats) -> object:
     """Return nested lists, with None for NaN."""
     return np.where(np.isfinite(values), values.astype(object), np.array(None)).tolist()

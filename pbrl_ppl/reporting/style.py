@@ -6,6 +6,7 @@ import io
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
@@ -65,7 +66,7 @@ def blank_figure(
     return figure, panels
 
 
-def legend(figure: Figure, handles: Sequence[Any]) -> None:
+def legend(figure: Figure, handles: Sequence[Artist]) -> None:
     """Put a legend above all panels, in as many columns as there is room for."""
     wide = figure.get_figwidth() > NARROW
     figure.legend(
