@@ -63,6 +63,7 @@ class Engine:
         self.world = self._build()
         self.pointers = pointers(self.world)
         self.free = lockstep.free_world(self.world) if self._name != "chipmunk" else None
+        self._joints = lockstep.joints_of(self.world)
         #: Whether friction under bodies is solved for many transitions side by side.
         self.slides = self.free is not None and len(self.free.patch_body) > 0
 
@@ -102,7 +103,7 @@ class Engine:
             ratio = mass.max(axis=1) / mass.min(axis=1)
             items = items[np.argsort(ratio[items // len(batch.inputs)], kind="stable")]
         left = np.zeros(len(items), dtype=bool)
-        lockstep.rollout(world, batch, items, out, left)
+        lockstep.rollout(world, self._joints, batch, items, out, left)
         return np.sort(items[left])
 
 

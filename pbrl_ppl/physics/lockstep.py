@@ -33,7 +33,14 @@ from pbrl_ppl.physics.lockstep_bodies import (
     watch,
 )
 from pbrl_ppl.physics.lockstep_friction import POINT
-from pbrl_ppl.physics.lockstep_joints import JOINT, Block, set_constraints, substep
+from pbrl_ppl.physics.lockstep_joints import (
+    JOINT,
+    Block,
+    Joints,
+    set_constraints,
+    set_joints,
+    substep,
+)
 from pbrl_ppl.physics.world import RING, World
 
 
@@ -47,12 +54,6 @@ class FreeWorld(NamedTuple):
     size: float  # of the smallest moving body (m)
     fastest: float  # speed of divergence (m/s)
     wheel: NDArray[np.bool_]  # (body,)
-    joint_row: NDArray[np.int64]  # among all joints
-    joint_rod: NDArray[np.bool_]
-    joint_ends: NDArray[np.int64]  # (joint, 2): bodies; the first is -1 if it is fixed
-    joint_turned: NDArray[np.bool_]  # whether these are the joint's second and first
-    joint_pose: NDArray[np.float64]  # (joint, 4): x, y, cos and sin of the fixed body
-    joint_pivot: NDArray[np.int64]  # the body whose friction acts in it; -1 for none
     patch_body: NDArray[np.int64]
     ring: NDArray[np.float64]  # (point, 2)
     radii: NDArray[np.float64]  # (body,)
@@ -64,14 +65,6 @@ def free_world(world: World) -> FreeWorld | None:
     """Describe a world; None where a body follows a path, or a joint has no such arithmetic."""
     if world.kinematic.any() or not all(link.kind.contact_free for link in world.links):
         return None
-    ends, poses = [], []
-    for link in world.links:
-        pair = link.constraint.a, link.constraint.b
-        ends.append([world.bodies.index(body) if body in world.bodies else -1 for body in pair])
-        holder = pair[ends[-1].index(-1)] if -1 in ends[-1] else world.space.static_body
-        poses.append((*holder.position, math.cos(holder.angle), math.sin(holder.angle)))
-    pairs = np.array(ends, dtype=np.int64).reshape(-1, 2)
-    turned = pairs[:, 1] < 0
     wheels = [wheel.body for wheel in world.wheels]
     return FreeWorld(
         chained=world.chained,
@@ -81,12 +74,6 @@ def free_world(world: World) -> FreeWorld | None:
         size=world.size,
         fastest=world.fastest,
         wheel=np.isin(np.arange(len(world.bodies)), wheels),
-        joint_row=np.array([link.joint for link in world.links], dtype=np.int64),
-        joint_rod=np.array([link.kind is ROD for link in world.links], dtype=bool),
-        joint_ends=np.where(turned[:, None], pairs[:, ::-1], pairs),
-        joint_turned=turned,
-        joint_pose=np.array(poses, dtype=float).reshape(-1, 4),
-        joint_pivot=np.array([link.pivot for link in world.links], dtype=np.int64),
         patch_body=np.array([patch.body for patch in world.patches], dtype=np.int64),
         ring=np.array(RING),
         radii=world.radii,
@@ -95,12 +82,37 @@ def free_world(world: World) -> FreeWorld | None:
     )
 
 
+def joints_of(world: World) -> Joints | None:
+    """Describe the joints of a world; None where it has none."""
+    if not world.links:
+        return None
+    ends, poses = [], []
+    for link in world.links:
+        pair = link.constraint.a, link.constraint.b
+        ends.append([world.bodies.index(body) if body in world.bodies else -1 for body in pair])
+        holder = pair[ends[-1].index(-1)] if -1 in ends[-1] else world.space.static_body
+        poses.append((*holder.position, math.cos(holder.angle), math.sin(holder.angle)))
+    pairs = np.array(ends, dtype=np.int64)
+    turned = pairs[:, 1] < 0
+    return Joints(
+        values=np.zeros((len(pairs), BLOCK * len(JOINT))),
+        rough=np.zeros(len(pairs), dtype=bool),
+        row=np.array([link.joint for link in world.links], dtype=np.int64),
+        rod=np.array([link.kind is ROD for link in world.links], dtype=bool),
+        ends=np.where(turned[:, None], pairs[:, ::-1], pairs),
+        turned=turned,
+        pose=np.array(poses, dtype=float),
+        pivot=np.array([link.pivot for link in world.links], dtype=np.int64),
+    )
+
+
 @compiled
-def rollout(world, batch, items, out, left):  # type: ignore[no-untyped-def]
+def rollout(world, joints, batch, items, out, left):  # type: ignore[no-untyped-def]
     """Predict ``items`` as `compiled.rollout` does, and mark those that the engine must predict.
 
     ``left``, shape (item,), is set for items that come near an obstacle or diverge. A block takes
     as long as the transition of the most iterations: items of similar numbers should be neighbours.
+    ``joints`` is None where there are none: their arithmetic takes most of the compilation.
     """
     rows, _, discs, command_parameters, force_parameters = batch.given
     start, inputs = batch.start, batch.inputs
@@ -110,11 +122,9 @@ def rollout(world, batch, items, out, left):  # type: ignore[no-untyped-def]
     acting = len(commands[0]) + len(forces[0]) > 0
     watched = len(world.obstacles) + discs.shape[1] > 0 or world.can_touch.sum() > moving
     bodies = np.zeros((moving + 1, BLOCK * len(BODY)))  # the last is fixed
-    joints = np.zeros((len(world.joint_row), BLOCK * len(JOINT)))
     patches = np.zeros((len(world.patch_body), len(world.ring), BLOCK * len(POINT)))
     slowing, radius = np.zeros((2, len(patches), BLOCK))
-    rough, most = np.zeros(len(joints), dtype=np.bool_), np.full(BLOCK, world.iterations)
-    block = Block(bodies, joints, patches, slowing, radius, rough, most)
+    block = Block(bodies, patches, slowing, radius, np.full(BLOCK, world.iterations))
     own_discs = np.zeros((BLOCK, discs.shape[1], 3))
     touched = np.zeros(BLOCK, dtype=np.bool_)
     proposal, transition, interval = np.zeros((3, BLOCK), dtype=np.int64)
@@ -132,7 +142,9 @@ def rollout(world, batch, items, out, left):  # type: ignore[no-untyped-def]
         for level in range(len(batch.counts)):
             substeps, weight = batch.counts[level], batch.weights[level]
             step = batch.time_step / substeps
-            bodies[:], joints[:], patches[:] = 0.0, 0.0, 0.0
+            bodies[:], patches[:] = 0.0, 0.0
+            if joints is not None:
+                joints.values[:] = 0.0
             shifted = False
             for h in range(horizon):
                 if timed:
@@ -155,7 +167,9 @@ def rollout(world, batch, items, out, left):  # type: ignore[no-untyped-def]
                         force_x, force_y = inputs[t, h, k, 0], inputs[t, h, k, 1]
                         set_wrench(body, i, force_x, force_y, inputs[t, h, k, 2])
                 if timed or h == 0:
-                    set_constraints(block, world, batch, proposal, interval, step)
+                    set_constraints(block, world, batch, proposal, interval)
+                    if joints is not None:
+                        set_joints(block, joints, batch, proposal, interval, step)
                 for s in range(substeps):
                     if acting:
                         for i in range(width):
@@ -172,7 +186,7 @@ def rollout(world, batch, items, out, left):  # type: ignore[no-untyped-def]
                     if shifted:
                         for k in range(moving):
                             lever(bodies[k])
-                    substep(block, world, step)
+                    substep(block, joints, world, step)
                     for k in range(moving):
                         lose(bodies[k], world, touched)
                     if watched:

@@ -41,31 +41,54 @@ JOINT = row_of(
 )
 
 
+class Joints(NamedTuple):
+    """Joints of a world, and their numbers in a block of transitions."""
+
+    values: NDArray[np.float64]  # (joint, field)
+    rough: NDArray[np.bool_]  # whether there is friction in it
+    row: NDArray[np.int64]  # among all joints
+    rod: NDArray[np.bool_]
+    ends: NDArray[np.int64]  # (joint, 2): bodies; the first is -1 if it is fixed
+    turned: NDArray[np.bool_]  # whether these are the joint's second and first
+    pose: NDArray[np.float64]  # (joint, 4): x, y, cos and sin of the fixed body
+    pivot: NDArray[np.int64]  # the body whose friction acts in it; -1 for none
+
+
 class Block(NamedTuple):
-    """Numbers of the bodies, joints and patches of a block of transitions."""
+    """Numbers of the bodies and patches of a block of transitions."""
 
     bodies: NDArray[np.float64]  # (body + 1, field): the last is fixed
-    joints: NDArray[np.float64]  # (joint, field)
     patches: NDArray[np.float64]  # (patch, point, field)
     slowing: NDArray[np.float64]  # (patch, BLOCK): deceleration by friction (m/s^2)
     patch_radius: NDArray[np.float64]  # (patch, BLOCK), m
-    rough: NDArray[np.bool_]  # (joint,): whether there is friction in it
     iterations: NDArray[np.int64]  # (BLOCK,)
 
 
 @compiled
-def set_constraints(block, world, batch, proposal, interval, step):  # type: ignore[no-untyped-def]
-    """Set the numbers of joints, patches and iterations for an interval of each transition."""
-    rows, anchors, bodies = batch.given[0], batch.given[1], block.bodies
+def set_constraints(block, world, batch, proposal, interval):  # type: ignore[no-untyped-def]
+    """Set the numbers of patches and iterations for an interval of each transition."""
+    rows = batch.given[0]
     if world.chained.any():
         for i in range(BLOCK):
             row = rows[proposal[i], interval[i]]
             block.iterations[i] = iterations(world.iterations, world.chained, row)
-    for j in range(len(block.joints)):
-        joint, ends = block.joints[j], world.joint_ends[j]
+    for j in range(len(block.patches)):
+        k = world.patch_body[j]
+        for i in range(BLOCK):
+            p, r = proposal[i], interval[i]
+            block.slowing[j, i] = rows[p, r, k, COLUMN.patch_mu] * world.normal_gravity
+            block.patch_radius[j, i] = rows[p, r, k, COLUMN.patch_radius]
+
+
+@compiled
+def set_joints(block, joints, batch, proposal, interval, step):  # type: ignore[no-untyped-def]
+    """Set the numbers of joints for an interval of each transition."""
+    rows, anchors, bodies = batch.given[0], batch.given[1], block.bodies
+    for j in range(len(joints.values)):
+        joint, ends = joints.values[j], joints.ends[j]
         a, b = bodies[ends[0]], bodies[ends[1]]
-        number, owner, turned = world.joint_row[j], world.joint_pivot[j], world.joint_turned[j]
-        x, y, c, s = world.joint_pose[j]
+        number, owner, turned = joints.row[j], joints.pivot[j], joints.turned[j]
+        x, y, c, s = joints.pose[j]
         for i in range(BLOCK):
             p, r = proposal[i], interval[i]
             a_x, a_y = anchors[p, number, A_X], anchors[p, number, A_Y]
@@ -83,15 +106,9 @@ def set_constraints(block, world, batch, proposal, interval, step):  # type: ign
                 damping = rows[p, r, owner, COLUMN.pivot_damping]
                 damping *= a[BODY.inverse_moment + i] + b[BODY.inverse_moment + i]
                 joint[JOINT.damped + i] = 1.0 - math.exp(-damping * step) if damping else 0.0
-        block.rough[j] = False  # zero friction changes no number
+        joints.rough[j] = False  # zero friction changes no number
         for field in (JOINT.most_torque, JOINT.torque_impulse, JOINT.damped):
-            block.rough[j] |= joint[field : field + BLOCK].any()
-    for j in range(len(block.patches)):
-        k = world.patch_body[j]
-        for i in range(BLOCK):
-            p, r = proposal[i], interval[i]
-            block.slowing[j, i] = rows[p, r, k, COLUMN.patch_mu] * world.normal_gravity
-            block.patch_radius[j, i] = rows[p, r, k, COLUMN.patch_radius]
+            joints.rough[j] |= joint[field : field + BLOCK].any()
 
 
 @compiled
@@ -211,13 +228,14 @@ def solve_pivot(a, b, joint):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _finish(block, i):  # type: ignore[no-untyped-def]
+def _finish(block, joints, i):  # type: ignore[no-untyped-def]
     """Make further iterations change nothing in transition ``i``."""
     for body in block.bodies:
         body[BODY.mass_along + i] = body[BODY.mass_across + i] = 0.0
-    for joint in block.joints:
-        joint[JOINT.mass_xx + i] = joint[JOINT.mass_xy + i] = joint[JOINT.mass_yy + i] = 0.0
-        joint[JOINT.moment + i] = joint[JOINT.damped_now + i] = 0.0
+    if joints is not None:
+        for joint in joints.values:
+            joint[JOINT.mass_xx + i] = joint[JOINT.mass_xy + i] = joint[JOINT.mass_yy + i] = 0.0
+            joint[JOINT.moment + i] = joint[JOINT.damped_now + i] = 0.0
     for points in block.patches:
         for point in points:
             point[POINT.mass_xx + i] = point[POINT.mass_xy + i] = point[POINT.mass_yy + i] = 0.0
@@ -226,50 +244,54 @@ def _finish(block, i):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def substep(block, world, step):  # type: ignore[no-untyped-def]
+def substep(block, joints, world, step):  # type: ignore[no-untyped-def]
     """Do one step of the engine, with the iterations of each transition of the block."""
-    bodies, joints, patches, ends = block.bodies, block.joints, block.patches, world.joint_ends
+    bodies, patches = block.bodies, block.patches
+    if joints is not None:
+        values, rod, rough, ends = joints.values, joints.rod, joints.rough, joints.ends
     for k in range(len(world.wheel)):
         turn(bodies[k], step)
     for j in range(len(patches)):  # by the velocities before, at the heading after
         body, slowing, radius = bodies[world.patch_body[j]], block.slowing[j], block.patch_radius[j]
         place_patch(body, patches[j], world.ring, slowing, radius, step)
-    for j in range(len(joints)):
-        a, b = bodies[ends[j, 0]], bodies[ends[j, 1]]
-        if ends[j, 0] < 0:
-            place_joint(None, b, joints[j], world.joint_rod[j], step)
-        else:
-            place_joint(a, b, joints[j], world.joint_rod[j], step)
+    if joints is not None:
+        for j in range(len(values)):
+            if ends[j, 0] < 0:
+                place_joint(None, bodies[ends[j, 1]], values[j], rod[j], step)
+            else:
+                place_joint(bodies[ends[j, 0]], bodies[ends[j, 1]], values[j], rod[j], step)
     for k in range(len(world.wheel)):
         accelerate(bodies[k], world.gravity, step)
     for k in range(len(world.wheel)):
         if world.wheel[k]:
             begin_wheel(bodies[k])
-    for j in range(len(joints)):
-        a, b = bodies[ends[j, 0]], bodies[ends[j, 1]]
-        if ends[j, 0] < 0:
-            begin_joint(None, b, joints[j], world.joint_rod[j], block.rough[j])
-        else:
-            begin_joint(a, b, joints[j], world.joint_rod[j], block.rough[j])
+    if joints is not None:
+        for j in range(len(values)):
+            b = bodies[ends[j, 1]]
+            if ends[j, 0] < 0:
+                begin_joint(None, b, values[j], rod[j], rough[j])
+            else:
+                begin_joint(bodies[ends[j, 0]], b, values[j], rod[j], rough[j])
     for j in range(len(patches)):
         begin_patch(bodies[world.patch_body[j]], patches[j])
-    patches_alone = len(patches) > 0 and len(joints) == 0 and not world.wheel.any()
+    patches_alone = len(patches) > 0 and joints is None and not world.wheel.any()
     done, longest = 0, block.iterations.max()
     while done < longest:
         until = longest
         for i in range(BLOCK):
             if block.iterations[i] > done:
                 until = min(until, block.iterations[i])
-        for _ in range(until - done):  # in the engine's order
+        for _ in range(until - done):
             for k in range(len(world.wheel)):
                 if world.wheel[k]:
                     solve_wheel(bodies[k])
-            for j in range(len(joints)):
-                a, b = bodies[ends[j, 0]], bodies[ends[j, 1]]
-                if ends[j, 0] < 0:
-                    solve_joint(None, b, joints[j], world.joint_rod[j], block.rough[j])
-                else:
-                    solve_joint(a, b, joints[j], world.joint_rod[j], block.rough[j])
+            if joints is not None:
+                for j in range(len(values)):
+                    b = bodies[ends[j, 1]]
+                    if ends[j, 0] < 0:
+                        solve_joint(None, b, values[j], rod[j], rough[j])
+                    else:
+                        solve_joint(bodies[ends[j, 0]], b, values[j], rod[j], rough[j])
             changed = 0
             for j in range(len(patches)):
                 changed += solve_patch(bodies[world.patch_body[j]], patches[j])
@@ -278,5 +300,5 @@ def substep(block, world, step):  # type: ignore[no-untyped-def]
         if until < longest:
             for i in range(BLOCK):
                 if block.iterations[i] == until:
-                    _finish(block, i)
+                    _finish(block, joints, i)
         done = until

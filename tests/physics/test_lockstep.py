@@ -137,15 +137,18 @@ def test_transitions_of_a_block_do_not_depend_on_each_other(name) -> None:
 
 def test_arrays_of_every_layout_use_the_same_machine_code() -> None:
     """The rollouts take ten seconds to compile, and would again for another kind of array."""
-    for name in ("wheel", "walls", "sensor"):
+    for name in ("wheel", "walls", "sensor", "hinge"):
         simulator, phi, start, inputs = case(name)
         expected = simulator(phi, start, inputs)
+        compiled_once = [len(path.signatures) for path in (lockstep.rollout, compiled.rollout)]
         start.setflags(write=False)
         np.testing.assert_array_equal(simulator(phi, start, np.asfortranarray(inputs)), expected)
         coarse = Simulator(simulator.physics.changed(extrapolate=False))
         assert np.isfinite(coarse(phi, start, inputs)).all()
-    for compiled_once in (lockstep.rollout, compiled.rollout):
-        assert len(compiled_once.signatures) == 1
+        signatures = [len(path.signatures) for path in (lockstep.rollout, compiled.rollout)]
+        assert signatures == compiled_once
+    assert len(compiled.rollout.signatures) == 1
+    assert len(lockstep.rollout.signatures) == 2  # with joints and without
 
 
 def test_contacts_are_left_to_the_engine() -> None:
