@@ -8,6 +8,8 @@ from .configurations import index_law as index_law
 from .configurations import joint_probabilities as joint_probabilities
 from .configurations import stored as stored
 from .evidence import trajectory_evidence as trajectory_evidence
+from .importance import adaptive_importance as adaptive_importance
+from .importance import systematic as systematic
 from .joint_search import weigh as weigh
 from .ladder import Linear as Linear
 from .ladder import climb_ladder as climb_ladder

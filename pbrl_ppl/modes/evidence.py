@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.special import gammaln
 
 from pbrl_ppl.likelihood import log_posterior
+from pbrl_ppl.modes.importance import adaptive_importance
 from pbrl_ppl.modes.laplace import Mode
 from pbrl_ppl.modes.space import Space
 from pbrl_ppl.state import Floats
-
-#: Draws a round, rounds at most, and effective draws that are enough: the log-evidence is then
-#: known to within 0.07.
-_DRAWS, _ROUNDS, _ENOUGH = 1000, 12, 200
-#: Degrees of freedom of the proposal: tails heavier than a posterior's, at little cost.
-_NU = 8.0
 
 
 @dataclass(frozen=True)
@@ -82,12 +77,49 @@ def trajectory_evidence(mode: Mode, unit: Sequence[int] = ()) -> float:
     return value - float(prior) - 0.5 * float(own + len(places) * np.log(shown))
 
 
-def importance(mode: Mode, rng: np.random.Generator) -> Evidence:
+@dataclass(frozen=True, eq=False)
+class _StudentT:
+    """Student-t proposal of the informed coordinates; the others are drawn from their prior.
+
+    Its tails are heavier than a posterior's, at little cost.
+    """
+
+    space: Space
+    centre: Floats
+    factor: Floats
+    nu: float = 8.0
+
+    def draw(self, n: int, rng: np.random.Generator) -> Floats:
+        """Return n points, shape (n, d)."""
+        radius = np.sqrt(self.nu / rng.chisquare(self.nu, (n, 1)))
+        moved = radius * rng.standard_normal((n, len(self.centre))) @ self.factor.T
+        q = self.space.prior_draws(np.zeros((n, self.space.size)), rng)
+        q[:, self.space.loud] = self.centre + moved
+        return q
+
+    def log_density(self, q: Floats) -> Floats:
+        """Return the log-density at points (n, d), shape (n,)."""
+        d, nu = len(self.centre), self.nu
+        off = solve_triangular(self.factor, (q[:, self.space.loud] - self.centre).T, lower=True)
+        constant = gammaln((nu + d) / 2) - gammaln(nu / 2) - 0.5 * d * np.log(nu * np.pi)
+        log_det = np.log(np.diag(self.factor)).sum()
+        return np.asarray(constant - log_det - 0.5 * (nu + d) * np.log1p((off**2).sum(axis=0) / nu))
+
+    def learned(self, q: Floats, kept: float) -> _StudentT:
+        """Return the proposal of points (n, d); a share ``kept`` of the covariance stays."""
+        q = q[:, self.space.loud]
+        covariance = (1.0 - kept) * np.atleast_2d(np.cov(q, rowvar=False))
+        covariance += kept * self.factor @ self.factor.T
+        return replace(self, centre=q.mean(axis=0), factor=np.linalg.cholesky(covariance))
+
+
+def importance(
+    mode: Mode, rng: np.random.Generator, *, draws: int = 1000, rounds: int = 12, enough: int = 200
+) -> Evidence:
     """Return the evidence by adaptive importance sampling from a Student-t.
 
-    It begins with the Laplace approximation; each round's proposal is made from the rounds before
-    (Cappé et al., 2008), so that each round's estimate is unbiased by itself. It sees what is about
-    one mode: other modes, and a wheel's other equal descriptions, are left out.
+    It begins with the Laplace approximation. It sees what is about one mode: other modes, and a
+    wheel's other equal descriptions, are left out.
 
     Parameters
     ----------
@@ -95,42 +127,22 @@ def importance(mode: Mode, rng: np.random.Generator) -> Evidence:
         Of a problem of continuous parameters.
     rng : Generator
         Source of randomness.
+    draws, rounds : int
+        Draws a round, and rounds at most.
+    enough : int
+        Effective draws at which it ends: 200 give the log-evidence to within 0.07.
     """
     space = Space.of(mode)
     centre, covariance = space.laplace(mode)
     loud = space.loud
-    centre, covariance, d = centre[loud], covariance[np.ix_(loud, loud)], len(loud)
-    for _ in range(_ROUNDS):
-        factor = np.asarray(np.linalg.cholesky(covariance), dtype=float)
-        radius = np.sqrt(_NU / rng.chisquare(_NU, (_DRAWS, 1)))
-        moved: Floats = radius * rng.standard_normal((_DRAWS, d)) @ factor.T
-        z = centre + moved
-        q = space.prior_draws(np.zeros((_DRAWS, space.size)), rng)
-        q[:, loud] = z
-        log_weight = space.log_density(q) - _log_student(moved, factor)
-        top = log_weight.max()
-        weight = np.exp(log_weight - top)
-        ess = float(weight.sum() ** 2 / (weight**2).sum())
-        error = float(np.sqrt(max(1.0 / ess - 1.0 / _DRAWS, 0.0)))
-        found = Evidence(float(top + np.log(weight.mean())), error, ess)
-        if ess >= _ENOUGH:
-            break
-        # a few large weights must not decide alone (Ionides, 2008)
-        weight = np.minimum(weight, weight.mean() * np.sqrt(_DRAWS))
-        weight /= weight.sum()
-        kept = 1.0 / (weight**2).sum()
-        share = kept / (kept + 2.0 * d)
-        mean = weight @ z
-        spread = (z - mean).T @ (weight[:, None] * (z - mean))
-        centre = centre + share * (mean - centre)
-        covariance = covariance + share * (spread - covariance)
-    return found
+    factor = np.linalg.cholesky(covariance[np.ix_(loud, loud)])
 
+    def density(q: Floats) -> tuple[Floats, Floats]:
+        return space.log_density(q), np.zeros((len(q), 0))
 
-def _log_student(x: Floats, factor: Floats) -> Floats:
-    """Return the log-density of the proposal about its centre, shape (n,), at (n, d)."""
-    d = x.shape[1]
-    square = (solve_triangular(factor, x.T, lower=True) ** 2).sum(axis=0)
-    constant = gammaln((_NU + d) / 2) - gammaln(_NU / 2) - 0.5 * d * np.log(_NU * np.pi)
-    log_det = np.log(np.diag(factor)).sum()
-    return np.asarray(constant - log_det - 0.5 * (_NU + d) * np.log1p(square / _NU))
+    found, _ = adaptive_importance(
+        _StudentT(space, centre[loud], factor), density, len(loud), rng, batch=draws, enough=enough,
+        most_batches=rounds, trial_batches=rounds,
+    )  # fmt: skip
+    error = float(np.sqrt(max(1.0 / max(found.ess, 1.0) - 1.0 / len(found.q), 0.0)))
+    return Evidence(found.log_z, error, found.ess)

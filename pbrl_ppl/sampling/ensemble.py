@@ -15,12 +15,11 @@ from itertools import permutations
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.special import logsumexp
 
 from pbrl_ppl.errors import FitError
-from pbrl_ppl.modes import Mode, Space
+from pbrl_ppl.modes import Mode, Space, systematic
 from pbrl_ppl.posterior import MAX_PARETO_K, smoothed
 from pbrl_ppl.state import Bools, Floats, Ints
 
@@ -33,8 +32,6 @@ _JUMPS = 0.25
 #: Moves under a cheaper density that make one proposal, and moves of the noise for each of the
 #: parameters; along trajectories each runs the filter.
 _INNER, _NOISE, _NOISE_ALONG = 10, 5, 1
-#: Numbers held at once: particles move in groups whose predictions are fewer.
-_NUMBERS = 8_000_000
 #: Effective share of the particles that a rung leaves, and that a last weighting must leave.
 _RUNG, _WORTH = 0.5, 0.3
 #: Sweeps between two looks at whether particles have forgotten where they were, looks at most, and
@@ -300,6 +297,10 @@ class Reference:
         noise = sum(block.log_density(q[:, block.places]) for block in self.noise)
         return np.stack([*parts, noise + np.zeros(len(q))], axis=1)
 
+    def log_density(self, q: Floats) -> Floats:
+        """Return the log-density of particles (n, d), shape (n,)."""
+        return np.asarray(self.columns(q, None).sum(axis=1))
+
     def learned(self, q: Floats, kept: float = 0.0) -> Reference:
         """Return the product of Gaussians of particles; of several modes, this one.
 
@@ -339,12 +340,6 @@ class Ensemble:
         for block in self.blocks:
             block.learn(self.q[:, block.places])
 
-    def groups(self) -> Iterator[slice]:
-        """Yield groups of particles whose predictions fit into memory."""
-        width = max(8, _NUMBERS // max(self.space.problem.measured.size, 1))
-        for first in range(0, len(self.q), width):
-            yield slice(first, first + width)
-
     def move(
         self,
         target: Target,
@@ -373,7 +368,7 @@ class Ensemble:
         rates = []
         along = not self.space.problem.likelihood.independent
         moves = 0 if not noise else _NOISE_ALONG if along else _NOISE
-        for chosen in self.groups():
+        for chosen in groups(self.space, len(self.q)):
             self.q[chosen], rate = self._moved(self.q[chosen], target, sweeps, cheap, adapt, moves)
             rates.append(rate)
         self._sweeps += sweeps
@@ -527,19 +522,28 @@ class Ensemble:
         shared = (np.mean(correlation) if correlation else 0.0) ** lags @ (1.0 - lags / times)
         return np.concatenate(taken), 1.0 / float(1.0 + 2.0 * shared)
 
-    def heights(self, target: Target, each: bool = False) -> tuple[Floats, Floats]:
-        """Return the log-density of all particles, shape (n,), and their log-likelihoods.
 
-        Shape (n, transition) with ``each``, of a posterior; else (n, 0).
-        """
-        height, likelihood = np.empty(len(self.q)), []
-        for chosen in self.groups():
-            q = self.q[chosen]
-            look = target.look(q)
-            height[chosen] = target.columns(q, look).sum(axis=1)
-            known = each and isinstance(target, Posterior)
-            likelihood.append(self.space.each(q, look) if known else q[:, :0])
-        return height, np.concatenate(likelihood)
+def groups(space: Space, n: int, numbers: int = 8_000_000) -> Iterator[slice]:
+    """Yield groups of n particles whose predictions have at most so many numbers."""
+    width = max(8, numbers // max(space.problem.measured.size, 1))
+    for first in range(0, n, width):
+        yield slice(first, first + width)
+
+
+def heights(space: Space, target: Target, q: Floats) -> Floats:
+    """Return the log-density of all particles (n, d), shape (n,)."""
+    parts = (q[chosen] for chosen in groups(space, len(q)))
+    return np.concatenate([target.columns(x, target.look(x)).sum(axis=1) for x in parts])
+
+
+def log_densities(target: Posterior, q: Floats) -> tuple[Floats, Floats]:
+    """Return the log-density of particles (n, d), and their log-likelihoods (n, transition)."""
+    height, likelihood = [], []
+    for chosen in groups(target.space, len(q)):
+        look = target.look(q[chosen])
+        height.append(target.columns(q[chosen], look).sum(axis=1))
+        likelihood.append(target.space.each(q[chosen], look))
+    return np.concatenate(height), np.concatenate(likelihood)
 
 
 class Annealed(NamedTuple):
@@ -590,9 +594,9 @@ def anneal(
     beta, log_z, rungs, kept = 0.0, 0.0, 0, 1.0
     rates: list[float] = []
     while beta < 1.0:
-        height = ensemble.heights(end)[0]
+        space, q = ensemble.space, ensemble.q
         with np.errstate(invalid="ignore"):
-            gap = height - ensemble.heights(start)[0]
+            gap = heights(space, end, q) - heights(space, start, q)
         gap = np.where(np.isnan(gap), -np.inf, gap)
         if np.isneginf(gap).all():
             raise FitError(
@@ -653,10 +657,3 @@ def _correlation(before: Floats, after: Floats) -> float:
     a, b = before - before.mean(axis=0), after - after.mean(axis=0)
     size = np.sqrt((a**2).sum(axis=0) * (b**2).sum(axis=0))
     return float(((a * b).sum(axis=0) / np.maximum(size, 1e-300)).max(initial=0.0))
-
-
-def systematic(weights: Floats, n: int, rng: np.random.Generator) -> NDArray[np.intp]:
-    """Return ``n`` indices in increasing order by systematic resampling."""
-    ends = np.cumsum(weights)
-    indices = np.searchsorted(ends / ends[-1], (rng.uniform() + np.arange(n)) / n)
-    return np.minimum(indices, len(weights) - 1)

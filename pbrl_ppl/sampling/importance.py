@@ -1,33 +1,32 @@
 """Importance sampling: proposals from Gaussians about the modes, weighted by the engine in batches.
 
-Each batch of proposals is drawn from Gaussians that all before it taught. Where the weights are not
-good enough after some of them, particles are annealed: to the posterior of few engine steps if that
-is cheaper, from there to the engine's. Pareto k (Vehtari et al., Pareto smoothed importance
-sampling, 2024) says whether weights suffice.
+Where the weights are not good enough after some batches, particles are annealed: to the posterior
+of few engine steps if that is cheaper, from there to the engine's.
 """
 
 from __future__ import annotations
 
 import zlib
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import logsumexp
 
+from pbrl_ppl.modes import adaptive_importance, systematic
 from pbrl_ppl.posterior import MAX_PARETO_K, smoothed
-from pbrl_ppl.sampling.ensemble import Ensemble, Path, Posterior, Reference, anneal, systematic
+from pbrl_ppl.sampling.ensemble import (
+    Ensemble,
+    Path,
+    Posterior,
+    Reference,
+    anneal,
+    heights,
+    log_densities,
+)
 from pbrl_ppl.state import Floats
 
-#: Batches of the proposals asked for; while particles are annealed, they are one batch.
-_BATCHES = 4
-#: Effective share of the proposals asked for that suffices; after so many batches it falls with
-#: their number, and they end.
-_ENOUGH, _PATIENT, _MOST = 0.5, 16, 40
-#: Share of that which must be in sight after so many batches; otherwise annealing is faster.
-_IN_SIGHT, _TRIAL = 0.3, 6
-#: Log-likelihoods of transitions that proposals may hold.
-_NUMBERS = 100_000_000
+#: The density that was weighted, in words.
 _GAUSSIANS, _FEW_STEPS = "Gaussians at the modes", "few engine steps"
 
 
@@ -65,7 +64,16 @@ class Pool(NamedTuple):
     cheaper: str
 
 
-def draw_pool(reference: Reference, n: int, seed: Any) -> Pool:
+def draw_pool(
+    reference: Reference,
+    n: int,
+    seed: Any,
+    *,
+    batches: int = 4,
+    effective_share: float = 0.5,
+    most_batches: int = 40,
+    numbers: int = 100_000_000,
+) -> Pool:
     """Draw weighted proposals for a posterior.
 
     Parameters
@@ -76,72 +84,49 @@ def draw_pool(reference: Reference, n: int, seed: Any) -> Pool:
         Proposals that are asked for: about the number of the draws, of which half are independent.
     seed : int or sequence of int
         Source of the draws.
+    batches : int
+        Batches of the proposals asked for; while particles are annealed, they are one batch.
+    effective_share : float
+        Effective share of the proposals asked for that suffices.
+    most_batches : int
+        Batches at most.
+    numbers : int
+        Log-likelihoods of transitions that proposals may hold.
     """
-    rng, batch = np.random.default_rng(seed), -(-n // _BATCHES)
-    pool, reference = _adaptive(reference, _ENOUGH * n, batch, rng)
-    return _annealed(reference, batch, rng) if pool is None else pool
+    rng, batch = np.random.default_rng(seed), -(-n // batches)
+    space = reference.space
+    most = int(np.clip(numbers // (batch * space.problem.segments.n), batches, most_batches))
+    found, reference = adaptive_importance(
+        reference, partial(log_densities, Posterior(space)), len(space.loud), rng, batch=batch,
+        enough=effective_share * n, smooth=smoothed, most_batches=most, max_pareto_k=MAX_PARETO_K,
+    )  # fmt: skip
+    if not found.good:
+        return _annealed(reference, batch, batches, rng)
+    return Pool(
+        *space.split(found.q), found.log_weight, found.values, found.log_z, 0, 1.0, 1.0,
+        _GAUSSIANS,
+    )  # fmt: skip
 
 
-def _adaptive(
-    first: Reference, enough: float, batch: int, rng: np.random.Generator
-) -> tuple[Pool | None, Reference]:
-    """Return proposals from Gaussians, if enough are independent, and what they taught.
-
-    The weights are over the mixture of all batches (adaptive multiple importance sampling: Cornuet
-    et al., Scandinavian Journal of Statistics 39, 2012). A share of the first covariance stays, as
-    large as a prior worth a draw a coordinate has it.
-    """
-    space, references, q = first.space, [first], np.zeros((0, len(first.origin)))
-    exact, heights, likelihoods = Posterior(space), [], []
-    best = 0.0
-    most = int(np.clip(_NUMBERS // (batch * space.problem.segments.n), _BATCHES, _MOST))
-    for turn in range(1, most + 1):
-        particles = Ensemble(first, references[-1].draw(batch, rng), rng)
-        height, each = particles.heights(exact, each=True)
-        heights.append(height)
-        likelihoods.append(each)
-        q = np.concatenate([q, particles.q])
-        mixture = logsumexp([one.columns(q, None).sum(axis=1) for one in references], axis=0)
-        log_weight = np.concatenate(heights) - mixture + np.log(turn)
-        there = np.isfinite(log_weight)
-        if there.sum() < 3:
-            break
-        weight, k = smoothed(log_weight[there])
-        size = 1.0 / float((weight**2).sum())
-        if k <= MAX_PARETO_K and size >= enough * min(1.0, _PATIENT / turn):
-            evidence = float(logsumexp(log_weight) - np.log(len(q)))
-            pool = Pool(
-                *space.split(q), log_weight, np.concatenate(likelihoods), evidence, 0, 1.0, 1.0,
-                _GAUSSIANS,
-            )  # fmt: skip
-            return pool, references[-1]
-        best = max(best, size)
-        if turn >= _TRIAL and best * most < _IN_SIGHT * enough * turn:
-            break
-        chosen = q[there][systematic(weight, len(q), rng)]
-        references.append(first.learned(chosen, kept=len(space.loud) / (len(space.loud) + size)))
-    return None, references[-1]
-
-
-def _annealed(reference: Reference, batch: int, rng: np.random.Generator) -> Pool:
+def _annealed(reference: Reference, batch: int, batches: int, rng: np.random.Generator) -> Pool:
     """Return proposals that were taken from Gaussians towards the engine's posterior."""
     space = reference.space
     exact, cheap = Posterior(space), Posterior.of_few_steps(space)
     # the engine is cheap beside the filter of each particle's noise
     alone = space.problem.likelihood.independent
-    times = 1 if alone else _BATCHES
-    particles = Ensemble(reference, reference.draw(batch * _BATCHES // times, rng), rng)
+    times = 1 if alone else batches
+    particles = Ensemble(reference, reference.draw(batch * batches // times, rng), rng)
     first = None if cheap is None else anneal(particles, reference, cheap)
     start = cheap or reference
     reached = anneal(particles, start, exact, cheap=cheap, weigh=True)
     q, independent = particles.snapshots(Path(start, exact, reached.beta), cheap, times)
-    proposals = Ensemble(reference, space.prior_draws(q, rng), rng)
-    height, each = proposals.heights(exact, each=True)
+    q = space.prior_draws(q, rng)
+    height, each = log_densities(exact, q)
     with np.errstate(invalid="ignore"):
-        left = (1.0 - reached.beta) * (height - proposals.heights(start)[0])
+        left = (1.0 - reached.beta) * (height - heights(space, start, q))
     kept = independent * reached.kept * (1.0 if first is None else first.kept)
     return Pool(
-        *space.split(proposals.q), np.where(np.isnan(left), -np.inf, left), each,
+        *space.split(q), np.where(np.isnan(left), -np.inf, left), each,
         reached.log_z + (0.0 if first is None else first.log_z), reached.rungs, reached.accepted,
         kept, _GAUSSIANS if cheap is None else _FEW_STEPS,
     )  # fmt: skip

@@ -24,9 +24,9 @@ from pbrl_ppl.likelihood import (
     declared_problem,
     single_transitions,
 )
+from pbrl_ppl.modes import systematic
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.posterior import PosteriorRecord, from_groups, group, groups, parameter_draws
-from pbrl_ppl.sampling.ensemble import systematic
 from pbrl_ppl.sampling.fitting import sample
 from pbrl_ppl.sampling.update_checks import (
     as_recorded,

@@ -8,8 +8,9 @@ from scipy import stats
 from scipy.special import logsumexp
 
 from pbrl_ppl.likelihood import TransitionLikelihood
+from pbrl_ppl.modes import systematic
 from pbrl_ppl.modes.space import Independent
-from pbrl_ppl.sampling.ensemble import Ensemble, Path, Reference, anneal, systematic
+from pbrl_ppl.sampling.ensemble import Ensemble, Path, Reference, anneal, heights
 
 pytestmark = pytest.mark.one_stack
 
@@ -431,7 +432,7 @@ def test_weights_that_suffice_end_it_without_a_move() -> None:
     assert (reached.beta, reached.rungs, reached.accepted, reached.kept) == (0.0, 0, 1.0, 1.0)
     np.testing.assert_array_equal(ensemble.q, q)
     left = (1.0 - reached.beta) * (
-        ensemble.heights(Density(gaussian))[0] - ensemble.heights(reference)[0]
+        heights(space, Density(gaussian), q) - heights(space, reference, q)
     )
     weight = np.exp(left - logsumexp(left))
     size = 1.0 / (weight**2).sum()

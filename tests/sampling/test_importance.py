@@ -9,6 +9,7 @@ import time
 import warnings
 from dataclasses import replace
 from itertools import combinations
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -72,9 +73,14 @@ def quiet(function, *arguments, **options):
         return function(*arguments, **options)
 
 
+def no_weights(first, *_, **__):
+    """Adaptive importance sampling without success."""
+    return SimpleNamespace(good=False), first
+
+
 def test_proposals_along_trajectories_are_of_several_times(monkeypatch) -> None:
     """Annealed particles are taken where they are at each time, not where they end."""
-    monkeypatch.setattr("pbrl_ppl.sampling.importance._adaptive", lambda first, *_: (None, first))
+    monkeypatch.setattr("pbrl_ppl.sampling.importance.adaptive_importance", no_weights)
     scene = pucks()
     model = physics_model(scene, pushed(scene, trajectories=3, intervals=8), substeps=4)
     mode = trajectory_mode(model.problem, model.problem.layout.to_vector(TRUTH))
@@ -147,7 +153,7 @@ class Biased(Posterior):
 
 
 #: What particles go through, or how often the engine must move them, by patches.
-ANNEALED = {"importance._adaptive": lambda first, *_: (None, first)}
+ANNEALED = {"importance.adaptive_importance": no_weights}
 SURROGATE = ANNEALED | {"importance.Posterior.of_few_steps": Biased}
 WAYS = {
     "Gaussians": {},
@@ -519,7 +525,7 @@ def test_weights_with_a_heavy_tail_are_warned_of(model, mode, monkeypatch) -> No
 
 def test_engine_moves_are_counted(model, mode, monkeypatch) -> None:
     """Where weights do not suffice the engine moves the particles, which then weigh alike."""
-    monkeypatch.setattr("pbrl_ppl.sampling.importance._adaptive", lambda first, *_: (None, first))
+    monkeypatch.setattr("pbrl_ppl.sampling.importance.adaptive_importance", no_weights)
     monkeypatch.setattr("pbrl_ppl.sampling.ensemble._WORTH", 2.0)
     idata = quiet(fit, model, seed=1, start=mode, **QUICK)
     assert idata.attrs["rungs"] >= 1
