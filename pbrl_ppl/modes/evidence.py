@@ -110,7 +110,8 @@ class _StudentT:
         q = q[:, self.space.loud]
         covariance = (1.0 - kept) * np.atleast_2d(np.cov(q, rowvar=False))
         covariance += kept * self.factor @ self.factor.T
-        return replace(self, centre=q.mean(axis=0), factor=np.linalg.cholesky(covariance))
+        factor = np.asarray(np.linalg.cholesky(covariance), dtype=float)
+        return replace(self, centre=q.mean(axis=0), factor=factor)
 
 
 def importance(
@@ -135,7 +136,7 @@ def importance(
     space = Space.of(mode)
     centre, covariance = space.laplace(mode)
     loud = space.loud
-    factor = np.linalg.cholesky(covariance[np.ix_(loud, loud)])
+    factor = np.asarray(np.linalg.cholesky(covariance[np.ix_(loud, loud)]), dtype=float)
 
     def density(q: Floats) -> tuple[Floats, Floats]:
         return space.log_density(q), np.zeros((len(q), 0))

@@ -22,7 +22,7 @@ STALLED = 0.02
 _CIRCLE = 3.0 / np.pi**2
 
 
-class Peak(NamedTuple):
+class LocalMode(NamedTuple):
     """The end of a climb."""
 
     phi: Floats
@@ -118,7 +118,7 @@ def posterior_slopes(
 
 def climb(
     problem: Problem, phi: Floats, slope: PartedSimulator, rounds: int = 40, tries: int = 4
-) -> Peak:
+) -> LocalMode:
     """Return a mode by alternating least squares for phi with the most probable sigma.
 
     Derivatives are taken through the engine ``slope``.
@@ -127,7 +127,7 @@ def climb(
     lower, upper = box(priors)
     sigma, value = profiled(problem, phi)
     if not priors:
-        return Peak(phi, sigma, value)
+        return LocalMode(phi, sigma, value)
     # least squares over multiples of each parameter's scale, whatever its unit
     origin = problem.layout.origin
     scale = np.where(problem.layout.discrete, 1.0, problem.layout.scale(phi))
@@ -165,7 +165,7 @@ def climb(
             break
         size = np.sqrt((result.jac**2).sum(axis=0))
         steps = np.where(steps > 0, np.clip(1.0 / np.maximum(size, 1e-300), 1e-6, 0.1), 0.0)
-    return Peak(phi, sigma, value)
+    return LocalMode(phi, sigma, value)
 
 
 def profiled(problem: Problem, phi: Floats) -> tuple[Floats, float]:
@@ -176,14 +176,14 @@ def profiled(problem: Problem, phi: Floats) -> tuple[Floats, float]:
     return sigma, float(log_posterior(problem, phi, sigma, log_likelihood=likelihood))
 
 
-def described(problem: Problem, peak: Peak) -> Peak:
+def described(problem: Problem, peak: LocalMode) -> LocalMode:
     """Return a peak with each wheel in its most probable description; it predicts the same."""
     better = by_prior(problem.layout, peak.phi)
     gain = problem.layout.log_prior(better) - problem.layout.log_prior(peak.phi)
-    return Peak(better, peak.sigma, peak.log_posterior + float(gain.sum()))
+    return LocalMode(better, peak.sigma, peak.log_posterior + float(gain.sum()))
 
 
-def finish(problem: Problem, peak: Peak) -> Mode:
+def finish(problem: Problem, peak: LocalMode) -> Mode:
     """Return the mode at a peak, with the Jacobian taken at the posterior's scale."""
     phi, sigma, log_posterior = described(problem, peak)
     priors = problem.layout.priors

@@ -10,7 +10,7 @@ from scipy.optimize import differential_evolution
 
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import Problem, estimate_sigma
-from pbrl_ppl.modes.laplace import STALLED, Mode, Peak, climb, described, finish
+from pbrl_ppl.modes.laplace import STALLED, LocalMode, Mode, climb, described, finish
 from pbrl_ppl.modes.noise import FAR_OFF, finite, gaussian_profile
 from pbrl_ppl.parameters import box, by_prior, inside, prior_draws
 from pbrl_ppl.state import Floats
@@ -144,7 +144,7 @@ def _evolve(problem: Problem, rng: np.random.Generator) -> Floats:
     return inside(priors, found.population[best])
 
 
-def _distinct(problem: Problem, found: list[Peak]) -> list[Peak]:
+def _distinct(problem: Problem, found: list[LocalMode]) -> list[LocalMode]:
     """Drop peaks that predict the same as an earlier one and are connected to it.
 
     Equivalent wheels and uninformed directions are connected; mirror images are not: they predict
@@ -187,7 +187,7 @@ def find_mode(
     return replace(best, others=tuple(near))
 
 
-def _polish(problem: Problem, found: Peak) -> Peak:
+def _polish(problem: Problem, found: LocalMode) -> LocalMode:
     """Return a peak refined with the exact engine, if that raises the log-posterior."""
     if not problem.layout.size:
         return found

@@ -36,7 +36,7 @@ from pbrl_ppl.posterior import (
     parameter_draws,
     stored_mode,
 )
-from pbrl_ppl.sampling.methods import METHODS, OVER_LIBRARY, Job, Method
+from pbrl_ppl.sampling.methods import METHODS, OVER_LIBRARY, Method, SamplerRun
 from pbrl_ppl.sampling.mixture import mix, most_frequent, most_probable, summed
 from pbrl_ppl.state import Floats
 from pbrl_ppl.threads import one_blas_thread
@@ -204,7 +204,7 @@ def sample(
     # with one set there is no choice to walk over
     walks = library is not None and method in OVER_LIBRARY and len(library.names) > 1
     chosen = OVER_LIBRARY[method] if walks else METHODS[method]
-    job = Job(
+    job = SamplerRun(
         problem=_as_in(problem, resume),
         mode=None,
         resume=resume,
@@ -242,7 +242,9 @@ def sample(
     return Fit(job.problem, posterior)
 
 
-def _drawn(job: Job, chosen: Method, start: Mode | None, walks: bool) -> tuple[Job, Any, Point]:
+def _drawn(
+    job: SamplerRun, chosen: Method, start: Mode | None, walks: bool
+) -> tuple[SamplerRun, Any, Point]:
     """Return the job on the problem that was sampled, its draws, and its mode."""
     problem = job.problem
     if walks:
@@ -266,7 +268,7 @@ def _drawn(job: Job, chosen: Method, start: Mode | None, walks: bool) -> tuple[J
     return job, _run(chosen, job), Point(job.at_mode.phi, job.at_mode.sigma)
 
 
-def _at_mode(job: Job, start: Mode | None) -> Job:
+def _at_mode(job: SamplerRun, start: Mode | None) -> SamplerRun:
     """Return the job with a mode, in whose problem bodies that meet at it are in one part."""
     while True:
         problem = job.problem
@@ -283,7 +285,7 @@ def _at_mode(job: Job, start: Mode | None) -> Job:
 
 
 @one_blas_thread
-def _run(chosen: Method, job: Job) -> Any:
+def _run(chosen: Method, job: SamplerRun) -> Any:
     """Return draws by a method, without what its processes warn of."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*fork.*", category=DeprecationWarning)

@@ -30,7 +30,7 @@ from pbrl_ppl.state import Floats
 _GAUSSIANS, _FEW_STEPS = "Gaussians at the modes", "few engine steps"
 
 
-class Pool(NamedTuple):
+class Proposals(NamedTuple):
     """Proposals with the logarithm of their importance weights, and what they predict.
 
     Attributes
@@ -64,7 +64,7 @@ class Pool(NamedTuple):
     cheaper: str
 
 
-def draw_pool(
+def draw_proposals(
     reference: Reference,
     n: int,
     seed: Any,
@@ -73,7 +73,7 @@ def draw_pool(
     effective_share: float = 0.5,
     most_batches: int = 40,
     numbers: int = 100_000_000,
-) -> Pool:
+) -> Proposals:
     """Draw weighted proposals for a posterior.
 
     Parameters
@@ -102,13 +102,15 @@ def draw_pool(
     )  # fmt: skip
     if not found.good:
         return _annealed(reference, batch, batches, rng)
-    return Pool(
+    return Proposals(
         *space.split(found.q), found.log_weight, found.values, found.log_z, 0, 1.0, 1.0,
         _GAUSSIANS,
     )  # fmt: skip
 
 
-def _annealed(reference: Reference, batch: int, batches: int, rng: np.random.Generator) -> Pool:
+def _annealed(
+    reference: Reference, batch: int, batches: int, rng: np.random.Generator
+) -> Proposals:
     """Return proposals that were taken from Gaussians towards the engine's posterior."""
     space = reference.space
     exact, cheap = Posterior(space), Posterior.of_few_steps(space)
@@ -125,7 +127,7 @@ def _annealed(reference: Reference, batch: int, batches: int, rng: np.random.Gen
     with np.errstate(invalid="ignore"):
         left = (1.0 - reached.beta) * (height - heights(space, start, q))
     kept = independent * reached.kept * (1.0 if first is None else first.kept)
-    return Pool(
+    return Proposals(
         *space.split(q), np.where(np.isnan(left), -np.inf, left), each,
         reached.log_z + (0.0 if first is None else first.log_z), reached.rungs, reached.accepted,
         kept, _GAUSSIANS if cheap is None else _FEW_STEPS,

@@ -33,7 +33,7 @@ from pbrl_ppl.posterior import (
     parameter_draws,
 )
 from pbrl_ppl.sampling.ensemble import Ensemble, Posterior, Reference
-from pbrl_ppl.sampling.importance import draw_pool, resample, stream
+from pbrl_ppl.sampling.importance import draw_proposals, resample, stream
 from pbrl_ppl.sampling.starts import dispersed, last_draws, prior_starts
 from pbrl_ppl.state import Floats
 
@@ -62,7 +62,7 @@ class Method:
         Chains.
     """
 
-    run: Callable[[Job], Any]
+    run: Callable[[SamplerRun], Any]
     draws: int
     tune: int
     thin: int
@@ -70,7 +70,7 @@ class Method:
 
 
 @dataclass(frozen=True, eq=False)
-class Job:
+class SamplerRun:
     """What a sampler runs on.
 
     Parameters
@@ -173,12 +173,12 @@ class Job:
         return from_groups(data, {})
 
 
-def _importance(job: Job) -> Any:
+def _importance(job: SamplerRun) -> Any:
     """Weight proposals from a cheaper posterior; see `importance`."""
     chains = job.chains if job.resume is None else group(job.resume, "posterior").sizes["chain"]
     shape, seed = (chains, job.draws), stream(job.seed, job.starts())
     n = chains * job.draws
-    pool = draw_pool(job.reference(), int(_PROPOSALS * n), seed)
+    pool = draw_proposals(job.reference(), int(_PROPOSALS * n), seed)
     chosen, k, size = resample(pool.log_weight, n, np.random.default_rng([*seed, 1]))
     phi, sigma = pool.phi[chosen], pool.sigma[chosen]
     values = job.problem.named(phi.reshape(*shape, -1), sigma.reshape(*shape, -1))
@@ -191,7 +191,7 @@ def _importance(job: Job) -> Any:
     return trace
 
 
-def _metropolis(job: Job) -> Any:
+def _metropolis(job: SamplerRun) -> Any:
     """Run the ensemble as chains; see `ensemble`. A chain is its walkers, one after another."""
     reference, rng = job.reference(), np.random.default_rng(stream(job.seed, job.starts()))
     problem = reference.space.problem
@@ -239,7 +239,7 @@ def _metropolis(job: Job) -> Any:
     return as_trace(job.problem, values, {"accept": chained(accept[..., None])[..., 0]})
 
 
-def _paper(job: Job) -> Any:
+def _paper(job: SamplerRun) -> Any:
     """Run one random-walk Metropolis step a variable, as PyMC 2 did, and keep each n-th draw.
 
     The set of a library that each body has is proposed uniformly, body by body.
@@ -256,21 +256,21 @@ def _paper(job: Job) -> Any:
     return job.sample(steps, job.thin)
 
 
-def _demetropolisz(job: Job) -> Any:
+def _demetropolisz(job: SamplerRun) -> Any:
     """Run differential evolution from each chain's past (ter Braak and Vrugt, 2008)."""
     import pymc as pm
 
     return job.sample(pm.DEMetropolisZ(job.model.free_RVs, model=job.model), job.thin)
 
 
-def _nuts(job: Job) -> Any:
+def _nuts(job: SamplerRun) -> Any:
     """Run NUTS on the finite-difference gradient: where nothing slides to a stop or collides."""
     import pymc as pm
 
     return job.sample(pm.NUTS(job.model.free_RVs, model=job.model), job.thin)
 
 
-def _smc(job: Job) -> Any:
+def _smc(job: SamplerRun) -> Any:
     """Run sequential Monte Carlo from the prior: for several modes and few parameters."""
     import pymc as pm
 
@@ -285,7 +285,7 @@ def _smc(job: Job) -> Any:
     )
 
 
-def _map(job: Job) -> Any:
+def _map(job: SamplerRun) -> Any:
     """Return the mode alone, as a posterior of one draw."""
     mode = job.at_mode
     values = mode.problem.named(mode.phi, mode.sigma)
@@ -293,7 +293,7 @@ def _map(job: Job) -> Any:
     return as_trace(job.problem, draws, {"lp": np.array([[mode.log_posterior]])})
 
 
-def _laplace(job: Job) -> Any:
+def _laplace(job: SamplerRun) -> Any:
     """Draw independently from the Gaussian at the mode; that of the noise is of its logarithm."""
     rng, mode = np.random.default_rng(job.seed), job.at_mode
     shape = job.chains, job.draws

@@ -12,7 +12,7 @@ from pbrl_ppl.criticism.cross_validation import Change, folds, leave_out
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem, along_trajectories, log_prior
 from pbrl_ppl.modes import Mode, find_mode, trajectory_mode
-from pbrl_ppl.modes.laplace import Peak, finish
+from pbrl_ppl.modes.laplace import LocalMode, finish
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Scene
 from tests.helpers.free_puck import DISC, Disc
@@ -119,7 +119,7 @@ def test_where_a_climb_ended_near_the_top_changes_nothing() -> None:
     expected = leave_out(own, fold).density
     for direction in own.factor.T:
         moved = replace(own, phi=own.phi + direction)
-        peak = Peak(moved.phi, own.sigma, 0.0)
+        peak = LocalMode(moved.phi, own.sigma, 0.0)
         moved = replace(moved, jacobian=finish(own.problem, peak).jacobian)
         # the noise of other folds is estimated where the climb ended: 0.13 was measured
         np.testing.assert_allclose(leave_out(moved, fold).density, expected, atol=0.2)

@@ -42,7 +42,7 @@ def grid() -> np.ndarray:
     ],
 )
 def test_the_posterior_is_the_declared_one(prior, turns) -> None:
-    """Against a grid: up to four hills, of which a walk sees one; draws were folded onto one.
+    """Against a grid: up to four modes, of which a walk sees one; draws were folded onto one.
 
     Five means within 4 standard errors: false alarm 3e-4.
     """

@@ -38,7 +38,7 @@ from pbrl_ppl.posterior import (
 )
 from pbrl_ppl.sampling import fit, physics_model, update
 from pbrl_ppl.sampling.ensemble import Posterior, Reference
-from pbrl_ppl.sampling.importance import draw_pool, resample
+from pbrl_ppl.sampling.importance import draw_proposals, resample
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
@@ -84,7 +84,7 @@ def test_proposals_along_trajectories_are_of_several_times(monkeypatch) -> None:
     scene = pucks()
     model = physics_model(scene, pushed(scene, trajectories=3, intervals=8), substeps=4)
     mode = trajectory_mode(model.problem, model.problem.layout.to_vector(TRUTH))
-    pool = draw_pool(Reference.about(Space.of(mode), mode), 400, 1)
+    pool = draw_proposals(Reference.about(Space.of(mode), mode), 400, 1)
     assert pool.cheaper == "Gaussians at the modes"
     times = pool.phi.reshape(4, 100, -1)
     for a, b in combinations(times, 2):
@@ -178,7 +178,7 @@ def test_draws_have_the_moments_of_the_posterior(simple, monkeypatch, way) -> No
     problem, errors, widths, evidences = mode.problem, [], [], []
     reference = Reference.about(Space.of(mode), mode)
     for seed in range(10):
-        pool = draw_pool(reference, 750, [seed])
+        pool = draw_proposals(reference, 750, [seed])
         assert way == "a bad surrogate" or (pool.rungs > 0) == way.endswith("engine moves")
         assert (pool.cheaper == "few engine steps") == ("surrogate" in way)
         chosen, k, size = resample(pool.log_weight, 500, np.random.default_rng(seed))
@@ -517,7 +517,7 @@ def test_no_parameter_is_worth_more_than_the_weights(fitted) -> None:
 
 def test_weights_with_a_heavy_tail_are_warned_of(model, mode, monkeypatch) -> None:
     monkeypatch.setattr("pbrl_ppl.posterior.completion.MAX_PARETO_K", -10.0)
-    says = r"Pareto k of the proposals' weights is .* \(want <= -10.0\): .*method='metropolis'"
+    says = r"Pareto k of the proposals' weights is .* \(want <= -10.0\): .*'metropolis'"
     with pytest.warns(ConvergenceWarning, match=says):
         idata = fit(model, seed=1, start=mode, **QUICK)
     assert any("Pareto k" in each for each in json.loads(idata.attrs["warnings"]))
