@@ -10,31 +10,8 @@ from typing import Any
 
 from pbrl_ppl.criticism import Loop
 from pbrl_ppl.files import write_text
-from pbrl_ppl.reporting.effect_plots import (
-    HARDLY,
-    MOST_CANDIDATES,
-    plot_added,
-    plot_candidates,
-    plot_evidence,
-    plot_laws,
-)
-from pbrl_ppl.reporting.error_plots import (
-    plot_correlations,
-    plot_errors,
-    plot_growth,
-    plot_residuals,
-    plot_rollout,
-)
+from pbrl_ppl.reporting import effect_plots, error_plots, loop_tables
 from pbrl_ppl.reporting.evidence import Evidence, Law, find_evidence, find_laws
-from pbrl_ppl.reporting.loop_tables import (
-    acceleration_table,
-    candidate_table,
-    carrier_table,
-    error_tables,
-    loo_table,
-    models_of,
-    residual_test_table,
-)
 from pbrl_ppl.reporting.motion import Motion, animation, divergence_in_words, held_out_motions
 from pbrl_ppl.reporting.page import Draw, Section, Source, render_page
 from pbrl_ppl.reporting.posterior_report import render_posterior
@@ -191,14 +168,13 @@ class HeldOutMotions(LoopSection):
         }
 
 
-@dataclass(frozen=True, eq=False)
 class Rollout(LoopSection):
     """Curves of one held-out trajectory."""
 
     template = "rollout"
 
     def pictures(self) -> Mapping[str, Draw]:
-        return {"rollout": partial(plot_rollout, self.loop)}
+        return {"rollout": partial(error_plots.plot_rollout, self.loop)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,10 +188,10 @@ class EvidenceByTransition(Section):
     link = "Evidence"
 
     def context(self) -> Mapping[str, object]:
-        return vars(self) | {"carriers": carrier_table(self.evidence)}
+        return vars(self) | {"carriers": loop_tables.carrier_table(self.evidence)}
 
     def pictures(self) -> Mapping[str, Draw]:
-        return {"evidence": partial(plot_evidence, self.evidence)}
+        return {"evidence": partial(effect_plots.plot_evidence, self.evidence)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,10 +205,9 @@ class UnexplainedResidual(LoopSection):
     link = "Unexplained"
 
     def pictures(self) -> Mapping[str, Draw]:
-        return {"laws": partial(plot_laws, self.laws)} if self.laws else {}
+        return {"laws": partial(effect_plots.plot_laws, self.laws)} if self.laws else {}
 
 
-@dataclass(frozen=True, eq=False)
 class HeldOutErrors(LoopSection):
     """Held-out errors, as bars, numbers and residuals."""
 
@@ -244,18 +219,17 @@ class HeldOutErrors(LoopSection):
         loop = self.loop
         return {
             **super().context(),
-            "errors": error_tables(loop),
-            "loo": loop.loo and loo_table(loop.loo, models_of(loop)),
+            "errors": loop_tables.error_tables(loop),
+            "loo": loop.loo and loop_tables.loo_table(loop.loo, loop_tables.models_of(loop)),
         }
 
     def pictures(self) -> Mapping[str, Draw]:
         return {
-            "errors": partial(plot_errors, self.loop),
-            "residuals": partial(plot_residuals, self.loop),
+            "errors": partial(error_plots.plot_errors, self.loop),
+            "residuals": partial(error_plots.plot_residuals, self.loop),
         }
 
 
-@dataclass(frozen=True, eq=False)
 class ResidualTests(LoopSection):
     """Unexplained acceleration and tests of the residual."""
 
@@ -265,18 +239,17 @@ class ResidualTests(LoopSection):
 
     def context(self) -> Mapping[str, object]:
         return {
-            "acceleration": acceleration_table(self.loop),
-            "tests": residual_test_table(self.loop),
+            "acceleration": loop_tables.acceleration_table(self.loop),
+            "tests": loop_tables.residual_test_table(self.loop),
         }
 
     def pictures(self) -> Mapping[str, Draw]:
         return {
-            "correlations": partial(plot_correlations, self.loop),
-            "growth": partial(plot_growth, self.loop),
+            "correlations": partial(error_plots.plot_correlations, self.loop),
+            "growth": partial(error_plots.plot_growth, self.loop),
         }
 
 
-@dataclass(frozen=True, eq=False)
 class Candidates(LoopSection):
     """Scores, estimates and detection limits of all candidate effects."""
 
@@ -287,13 +260,14 @@ class Candidates(LoopSection):
     def context(self) -> Mapping[str, object]:
         return {
             **super().context(),
-            "candidates": candidate_table(self.loop),
-            "hardly": HARDLY,
-            "most": MOST_CANDIDATES,
+            "candidates": loop_tables.candidate_table(self.loop),
+            "hardly": effect_plots.HARDLY,
+            "most": effect_plots.MOST_CANDIDATES,
         }
 
     def pictures(self) -> Mapping[str, Draw]:
-        return {"candidates": partial(plot_candidates, self.loop)} if self.loop.candidates else {}
+        draw = partial(effect_plots.plot_candidates, self.loop)
+        return {"candidates": draw} if self.loop.candidates else {}
 
 
 @dataclass(frozen=True, eq=False)
@@ -313,10 +287,9 @@ class ModelParameters(LoopSection):
         return {**super().context(), "parameters": self.parameters.table()}
 
     def pictures(self) -> Mapping[str, Draw]:
-        return {"added": partial(plot_added, self.loop)} if accepted(self.loop) else {}
+        return {"added": partial(effect_plots.plot_added, self.loop)} if accepted(self.loop) else {}
 
 
-@dataclass(frozen=True, eq=False)
 class EngineAccuracy(LoopSection):
     """Numerical error of the engine beside the measurement noise."""
 
