@@ -10,7 +10,7 @@ from typing import Any
 import typer
 
 from pbrl_ppl.cli.app import app
-from pbrl_ppl.cli.commands import commands
+from pbrl_ppl.cli.options import commands
 from pbrl_ppl.effects import Effect, EffectParameter, catalogue
 from pbrl_ppl.effects.stages import STAGES
 

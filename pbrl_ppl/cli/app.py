@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from pbrl_ppl import __version__
-from pbrl_ppl.cli.commands import commands
+from pbrl_ppl.cli.options import commands
 from pbrl_ppl.cli.terminal import BAD_INPUT, in_a_line, interrupted, warnings_in_a_line
 from pbrl_ppl.errors import PbrlError
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pbrl_ppl.cli import options
-from pbrl_ppl.cli.commands import command
+from pbrl_ppl.cli.options import command
 from pbrl_ppl.cli.terminal import FAILED, check_can_make, interruptible, print_result
 from pbrl_ppl.errors import FitError, PbrlError
 

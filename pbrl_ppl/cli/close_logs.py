@@ -17,7 +17,7 @@ import typer
 
 from pbrl_ppl.cli import options
 from pbrl_ppl.cli.close_loop import Draws, Method, Sampler
-from pbrl_ppl.cli.commands import command
+from pbrl_ppl.cli.options import command
 from pbrl_ppl.cli.terminal import FAILED, check_can_make, interruptible, print_result, stages
 from pbrl_ppl.errors import OutputError
 

@@ -16,7 +16,7 @@ import numpy as np
 import typer
 
 from pbrl_ppl.cli import options
-from pbrl_ppl.cli.commands import command
+from pbrl_ppl.cli.options import command
 from pbrl_ppl.cli.terminal import check_file, interruptible, print_json
 from pbrl_ppl.errors import HistoryError, OutputError, RecordingWarning, SceneError
 from pbrl_ppl.files import write_text

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from pbrl_ppl.cli import effect_files, options
-from pbrl_ppl.cli.commands import command
+from pbrl_ppl.cli.options import command
 from pbrl_ppl.cli.terminal import FAILED, check_file, interruptible, print_result, stages
 from pbrl_ppl.errors import EffectError, GoalError
 

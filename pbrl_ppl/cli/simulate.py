@@ -10,7 +10,7 @@ import numpy as np
 import typer
 
 from pbrl_ppl.cli import options
-from pbrl_ppl.cli.commands import command
+from pbrl_ppl.cli.options import command
 from pbrl_ppl.cli.terminal import check_file, interruptible, print_result, stages
 from pbrl_ppl.errors import HistoryError, ParameterError, PosteriorError, SimulationError
 from pbrl_ppl.state import STATE, Floats
