@@ -29,7 +29,6 @@ from .history.mujoco import from_mujoco as from_mujoco
 from .mjcf import mjcf_ranges as mjcf_ranges
 from .mjcf import scene_from_mjcf as scene_from_mjcf
 from .model import SimulatorOp as SimulatorOp
-from .modes import joint_probabilities as joint_probabilities
 from .oomdp import LWR as LWR
 from .oomdp import OOLWR as OOLWR
 from .oomdp import Attributes as Attributes
@@ -53,6 +52,7 @@ from .posterior import Identifiability as Identifiability
 from .posterior import by_number as by_number
 from .posterior import by_trajectory as by_trajectory
 from .posterior import identify as identify
+from .posterior import joint_probabilities as joint_probabilities
 from .posterior import learned_library as learned_library
 from .posterior import library_probabilities as library_probabilities
 from .posterior import load_posterior as load_posterior

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import warnings
 from contextlib import redirect_stdout
@@ -104,7 +103,7 @@ def fit(
         progress("loading the sampler")
         from pbrl_ppl import sampling
         from pbrl_ppl.physics import check_history
-        from pbrl_ppl.posterior import group, load_posterior, save_posterior
+        from pbrl_ppl.posterior import PosteriorRecord, group, load_posterior, save_posterior
 
         check_history(declared, loaded, loaded.segments(1))
         earlier = None if resume is None else load_posterior(resume)
@@ -125,7 +124,8 @@ def fit(
                 resume=earlier, progress=not quiet,
             )  # fmt: skip
         save_posterior(idata, output)
-    cut = bool(interrupts) or "interrupted" in idata.attrs
+    record = PosteriorRecord.of(idata)
+    cut = bool(interrupts) or record.interrupted is not None
     for warning in caught:
         if not (cut and "was interrupted" in str(warning.message)):
             warnings.warn(warning.message, stacklevel=1)
@@ -135,11 +135,11 @@ def fit(
         print_json(
             {
                 "posterior": output,
-                "converged": converged if "max_rhat" in idata.attrs else None,
-                "max_rhat": idata.attrs.get("max_rhat"),
-                "min_ess": idata.attrs.get("min_ess"),
+                "converged": None if record.max_rhat is None else converged,
+                "max_rhat": record.max_rhat,
+                "min_ess": record.min_ess,
                 "parameters": {str(name): row.to_dict() for name, row in table.iterrows()},
-                "warnings": json.loads(idata.attrs["warnings"]),
+                "warnings": list(record.warnings or ()),
             }
         )
     else:
@@ -159,10 +159,10 @@ def fit(
 
 def _summary(idata: Any) -> pd.DataFrame:
     """Return a row for each parameter; for a mode, its value alone."""
-    from pbrl_ppl.posterior import scalars
+    from pbrl_ppl.posterior import PosteriorRecord, scalars
     from pbrl_ppl.reporting import summary
 
-    if "max_rhat" not in idata.attrs:
+    if PosteriorRecord.of(idata).max_rhat is None:
         import pandas as pd
 
         places = {str(name): float(value) for name, value in scalars(idata).mean().items()}
@@ -206,7 +206,12 @@ def update(
         check_file(output, (".nc",), overwrite)
         catalogue = reading.catalogue()
         progress("reading the posterior and the history")
-        from pbrl_ppl.posterior import load_posterior, save_posterior, scene_of
+        from pbrl_ppl.posterior import (
+            PosteriorRecord,
+            load_posterior,
+            save_posterior,
+            scene_of,
+        )  # fmt: skip
 
         idata = load_posterior(posterior)
         new = reading.recording(history, scene_of(idata))
@@ -225,15 +230,16 @@ def update(
 
             warnings.showwarning = shown
             idata = updating.update(idata, new, effects=catalogue, seed=seed, progress=False)
-        if "interrupted" in idata.attrs:  # half a posterior is no prior for the next update
+        record = PosteriorRecord.of(idata)
+        if record.interrupted is not None:  # half a posterior is no prior for the next update
             raise KeyboardInterrupt
         save_posterior(idata, output)
-        (*_, last) = json.loads(idata.attrs["updates"])
+        (*_, last) = record.updates or ()
     converged = not any(issubclass(category, ConvergenceWarning) for category in caught)
     share = last["share"]
     print_result(
         as_json,
-        last | {"posterior": output, "converged": converged},
+        {**last, "posterior": output, "converged": converged},
         [
             f"{last['did']}: {last['transitions']} transitions"
             + (f", the weights worth {share:.0%} of the draws" if share is not None else ""),

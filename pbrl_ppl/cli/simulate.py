@@ -96,11 +96,11 @@ def _parameters(
 
     if source.suffix == ".nc":
         from pbrl_ppl.planning import Dynamics
-        from pbrl_ppl.posterior import load_posterior
+        from pbrl_ppl.posterior import PosteriorRecord, load_posterior
 
         idata = load_posterior(source)
         dynamics = Dynamics.of(idata, draws, seed=seed, effects=catalogue)
-        scene, substeps = dynamics.scene, int(idata.attrs["substeps"])
+        scene, substeps = dynamics.scene, PosteriorRecord.of(idata).substeps
     elif draws is not None:
         raise PosteriorError(f"--draws: {source} is no posterior file (.nc), and has no draws")
     else:

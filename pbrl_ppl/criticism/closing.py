@@ -59,7 +59,7 @@ from pbrl_ppl.history import History, with_units, without_measurements
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.physics import Physics, try_effect
-from pbrl_ppl.posterior import MAX_PARETO_K, PARETO_K, Fit, compare, identify, interval, versions
+from pbrl_ppl.posterior import MAX_PARETO_K, Fit, compare, identify, interval, versions
 from pbrl_ppl.posterior import draws as posterior_draws
 from pbrl_ppl.sampling import sample
 from pbrl_ppl.scene import Scene
@@ -388,7 +388,7 @@ def _fit(task: _Task, mode: Mode) -> tuple[Fit, list[Warning], list[str]]:
             fitted = sample(
                 mode.problem, method=method, seed=task.seed, draws=n, tune=tune, start=mode, cores=1
             )
-        if "interrupted" in fitted.posterior.attrs:  # half a posterior gives no verdict
+        if fitted.record.interrupted:  # half a posterior gives no verdict
             raise KeyboardInterrupt
         if _converged(fitted, task.criteria):
             break
@@ -401,10 +401,12 @@ def _fit(task: _Task, mode: Mode) -> tuple[Fit, list[Warning], list[str]]:
 
 def _converged(fit: Fit, criteria: Criteria) -> bool:
     """Return whether draws are good enough for a verdict; warnings begin earlier."""
-    attributes = fit.posterior.attrs
-    r_hat, ess = attributes.get("max_rhat", np.inf), attributes.get("min_ess", 0.0)
-    weights = attributes.get(PARETO_K, 0.0) <= MAX_PARETO_K
-    return bool(weights and r_hat <= criteria.worst_rhat and ess >= criteria.least_ess)
+    record = fit.record
+    if record.max_rhat is None or record.min_ess is None:
+        return False
+    if record.pareto_k is not None and not record.pareto_k <= MAX_PARETO_K:
+        return False
+    return record.max_rhat <= criteria.worst_rhat and record.min_ess >= criteria.least_ess
 
 
 def _put_together(

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import difflib
-import json
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,12 +16,10 @@ from pbrl_ppl.criticism.selection import refitted
 from pbrl_ppl.effects import Attached, Effect, Noise
 from pbrl_ppl.errors import EffectError, PosteriorError
 from pbrl_ppl.modes import Mode, trajectory_mode
-from pbrl_ppl.posterior import Fit
+from pbrl_ppl.posterior import Fit, PosteriorRecord, stored_fields
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats
 
-#: Attribute of a posterior with its groups of inseparable effects.
-_GROUPS = "not_separable"
 _ON = " on "
 
 
@@ -55,20 +52,20 @@ class Rival:
 
 def keep_groups(posterior: Any, added: Iterable[Added]) -> None:
     """Record in a posterior's attributes which effects its recording cannot separate."""
-    groups = [
-        [
+    groups = tuple(
+        tuple(
             name if _ON in name else f"{name}{_ON}{one.body}"
             for name in (one.effect, *one.not_separable_from)
-        ]
+        )
         for one in added
         if one.not_separable_from
-    ]
-    posterior.attrs[_GROUPS] = json.dumps(groups)
+    )
+    replace(PosteriorRecord.of(posterior), not_separable=groups).write(posterior)
 
 
 def kept_groups(posterior: Any) -> list[tuple[str, ...]]:
     """Return the groups of effects that a posterior's recording cannot separate."""
-    return [tuple(names) for names in json.loads(str(posterior.attrs.get(_GROUPS, "[]")))]
+    return list(stored_fields(posterior, ("not_separable",)).get("not_separable", ()))
 
 
 def named_effects(

@@ -1,11 +1,10 @@
 """Modes of the posterior: climb, search, evidence, and joints of unknown bodies."""
 
-from .configurations import ATTRIBUTE as ATTRIBUTE
+from .configurations import NONE as NONE
 from .configurations import Pair as Pair
 from .configurations import Weighed as Weighed
 from .configurations import doubts as doubts
 from .configurations import index_law as index_law
-from .configurations import joint_probabilities as joint_probabilities
 from .configurations import stored as stored
 from .evidence import trajectory_evidence as trajectory_evidence
 from .importance import adaptive_importance as adaptive_importance

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, combinations_with_replacement, product
 from typing import Any
 
 import numpy as np
 
-from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes.evidence import Evidence
 from pbrl_ppl.modes.laplace import Mode
@@ -28,8 +26,6 @@ Pair = tuple[str, str] | None
 MOST = 300
 #: A joint that joins nothing, in the tables that people read.
 NONE = "none"
-#: Where a posterior's attributes hold the configurations.
-ATTRIBUTE = "configurations"
 #: Two standard errors of the evidence may move a probability by so much.
 _MATERIAL = 0.02
 #: With fewer effective draws, the standard error itself says little.
@@ -238,9 +234,9 @@ def _configuration(groups: Sequence[Alike], held: Sequence[Sequence[Pair]]) -> C
     return Configuration(tuple(chosen.items()), math.log(weight) if weight else -math.inf)
 
 
-def stored(found: Sequence[Weighed]) -> str:
-    """Return configurations as a posterior's attribute, most probable first."""
-    rows = [
+def stored(found: Sequence[Weighed]) -> list[dict[str, Any]]:
+    """Return configurations for a posterior's record, most probable first."""
+    return [
         {
             "joints": dict(weighed.configuration.pairs),
             "probability": weighed.probability,
@@ -250,55 +246,11 @@ def stored(found: Sequence[Weighed]) -> str:
         }
         for weighed in sorted(found, key=lambda weighed: -weighed.probability)
     ]
-    return json.dumps(rows)
 
 
-def joint_probabilities(idata: Any) -> dict[str, dict[str, float]]:
-    """Return the posterior probabilities of the pairs that each joint connects.
-
-    Parameters
-    ----------
-    idata : InferenceData or DataTree
-        A posterior as made by :func:`pbrl_ppl.fit`, or as loaded from its file, of a scene with a
-        joint whose bodies are unknown.
-
-    Returns
-    -------
-    dict of str to dict of str to float
-        For each such joint, the probability of each pair of bodies and of ``none``, the most
-        probable first. They come from the evidences, and are finer than the draws can show.
-
-    Raises
-    ------
-    PosteriorError
-        If no joint of the posterior has unknown bodies.
-
-    Examples
-    --------
-    ::
-
-        idata = pp.fit(pp.physics_model(scene, history), seed=1)
-        pp.joint_probabilities(idata)  # {'joint1': {'cart-trailer': 0.998, 'none': 0.002, ...}}
-    """
-    if ATTRIBUTE not in idata.attrs:
-        raise PosteriorError(
-            "posterior: the bodies of all its joints were named in the scene; leave out bodies of a"
-            " [[joint]], with known = false, and fit again"
-        )
-    table: dict[str, dict[str, float]] = {}
-    for row in json.loads(str(idata.attrs[ATTRIBUTE])):
-        for joint, pair in row["joints"].items():
-            own = table.setdefault(joint, {})
-            name = NONE if pair is None else "-".join(pair)
-            own[name] = own.get(name, 0.0) + row["probability"]
-    return {
-        joint: dict(sorted(own.items(), key=lambda item: -item[1])) for joint, own in table.items()
-    }
-
-
-def doubts(idata: Any) -> str | None:
-    """Return a warning if evidences are too uncertain for their probabilities, or None."""
-    for row in json.loads(str(idata.attrs.get(ATTRIBUTE, "[]"))):
+def doubts(rows: Iterable[Mapping[str, Any]]) -> str | None:
+    """Return a warning if the evidences of :func:`stored` rows are too uncertain, or None."""
+    for row in rows:
         probability, error, ess = row["probability"], row["error"], row["ess"]
         if error is None:
             continue

@@ -4,6 +4,7 @@ from .completion import LIKELIHOOD as LIKELIHOOD
 from .completion import MAX_PARETO_K as MAX_PARETO_K
 from .completion import MIN_ESS as MIN_ESS
 from .completion import PARETO_K as PARETO_K
+from .completion import SAMPLED as SAMPLED
 from .completion import checked as checked
 from .completion import complete as complete
 from .completion import evaluate as evaluate
@@ -20,7 +21,6 @@ from .cross_validation import separate as separate
 from .data import CELLS as CELLS
 from .data import both_places as both_places
 from .data import both_recordings as both_recordings
-from .data import likelihood_name as likelihood_name
 from .data import linearised_as as linearised_as
 from .data import placed as placed
 from .data import problem_of as problem_of
@@ -35,9 +35,12 @@ from .identifiability import uninformed as uninformed
 from .mode import Point as Point
 from .mode import stored_mode as stored_mode
 from .mode import updated_mode as updated_mode
+from .record import Linearisation as Linearisation
 from .record import PosteriorRecord as PosteriorRecord
+from .record import StoredMode as StoredMode
 from .record import layout_of as layout_of
 from .record import scene_of as scene_of
+from .record import stored_fields as stored_fields
 from .record import vectors as vectors
 from .store import DATATREE as DATATREE
 from .store import HDI_PROB as HDI_PROB
@@ -54,6 +57,7 @@ from .store import load_posterior as load_posterior
 from .store import save_posterior as save_posterior
 from .store import scalars as scalars
 from .store import smoothed as smoothed
+from .updated_prior import joint_probabilities as joint_probabilities
 from .updated_prior import learned_library as learned_library
 from .updated_prior import library_probabilities as library_probabilities
 from .updated_prior import moment_matched as moment_matched

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -26,37 +24,32 @@ from pbrl_ppl.likelihood import (
     noise_law,
     smoothed,
 )
-from pbrl_ppl.modes import ATTRIBUTE, doubts
+from pbrl_ppl.modes import doubts
 from pbrl_ppl.parameters import Prior, by_prior, nearest, prior_draws
 from pbrl_ppl.posterior.data import CELLS, placed, places, record_of, recording
 from pbrl_ppl.posterior.identifiability import uninformed
 from pbrl_ppl.posterior.mode import Point, packed_mode
-from pbrl_ppl.posterior.record import vectors
+from pbrl_ppl.posterior.record import Linearisation, PosteriorRecord, vectors
 from pbrl_ppl.posterior.store import SIZE, convergence, from_groups, group, groups
 from pbrl_ppl.state import Floats, Ints
 
 #: Attributes of a trace of weighted proposals: their Pareto k, and log-likelihoods of transitions,
 #: shape (draw, transition), chains joined, which need not be evaluated anew.
 PARETO_K, LIKELIHOOD = "pareto_k", "log_likelihood"
-#: Further attributes of a trace that the posterior keeps.
-_SAMPLED = ("proposals", "rungs", "acceptance", "log_evidence", "updates")
+#: Attributes of a trace that are fields of the posterior's record.
+SAMPLED = (
+    "configurations", PARETO_K, SIZE, "proposals", "rungs", "acceptance", "log_evidence",
+    "updates",
+)  # fmt: skip
 #: Pareto k of weights above which they miss a part of the posterior (Vehtari et al., 2024).
 MAX_PARETO_K = 0.7
 #: Largest R-hat and least effective sample size of reliable summaries (Vehtari et al., 2021).
 MAX_RHAT, MIN_ESS = 1.01, 400
-#: Draws are simulated in groups of this many, or of more with at most this many transitions.
-_DRAWS_AT_ONCE, _TRANSITIONS_AT_ONCE = 64, 20_000
-#: Fewest draws a chain for which R-hat is defined.
-_LEAST_DRAWS = 4
-#: A parameter is stuck if this share of its draws is within this share of its support's end.
-_STUCK, _NEAR = 0.5, 0.01
-#: Draws with stored predictions, at most and at least; predicted numbers in all.
-_MOST_PREDICTED, _LEAST_PREDICTED, _NUMBERS = 200, 50, 2_000_000
-#: Draws at which the states are smoothed again to check the linearisation.
-_CHECKED_DRAWS = 16
 #: Standard deviation of the differences (nats) above which the linearisation does not hold:
 #: draws weighted by exp(difference) would be worth exp(-4), 2 %, of their number.
 MOST = 2.0
+#: Category and text of a warning.
+_Warned = tuple[type[Warning], str]
 
 
 def complete(
@@ -119,16 +112,14 @@ def complete(
         "observed_data": _next_state(CELLS, problem.measured, coords),
         "constant_data": data["constant_data"].merge(recording(problem)),
     }
-    record = record_of(problem, seed, method)
+    sampled = {name: trace.attrs[name] for name in SAMPLED if name in trace.attrs}
+    record = replace(record_of(problem, seed, method), **sampled)
     if mode is not None:
         stored = packed_mode(problem, mode, phi, sigma, likelihood.sum(axis=1))
         record = replace(record, mode=stored)
     if problem.likelihood.filtered and len(phi) > 1:
         record = replace(record, linearisation=linearisation(problem, phi, sigma))
     idata = placed(from_groups(result, record.attributes()), places(problem.segments))
-    for name in (ATTRIBUTE, PARETO_K, SIZE, *_SAMPLED):
-        if name in trace.attrs:
-            idata.attrs[name] = trace.attrs[name]
     return checked(problem, idata, asked)
 
 
@@ -143,6 +134,9 @@ def evaluate(
     rows: Any,
     rng: np.random.Generator,
     known: Floats | None = None,
+    *,
+    group_size: int = 64,
+    group_transitions: int = 20_000,
 ) -> tuple[Floats, Floats]:
     """Return log-likelihoods of the transitions at draws, and next states drawn from some of them.
 
@@ -158,6 +152,8 @@ def evaluate(
         Of the predictions.
     known : ndarray, optional
         Log-likelihoods where the sampler has them already.
+    group_size, group_transitions : int
+        Draws are simulated in groups of this many, or of more with at most so many transitions.
 
     Returns
     -------
@@ -170,7 +166,7 @@ def evaluate(
     predictive = []
     wide = problem.with_physics(threads=max(problem.physics.threads, 2))
     rows = np.asarray(rows, dtype=int)
-    size = max(_DRAWS_AT_ONCE, _TRANSITIONS_AT_ONCE // problem.segments.n)
+    size = max(group_size, group_transitions // problem.segments.n)
     for begin in range(0, len(phi), size):
         part = slice(begin, begin + size)
         if known is None:
@@ -190,7 +186,15 @@ def parameter_draws(problem: Problem, trace: Any) -> tuple[Floats, Floats]:
     return vectors(trace, problem.layout, problem.noise_variables)
 
 
-def predictive_rows(chains: int, draws: int, cells: int) -> Ints:
+def predictive_rows(
+    chains: int,
+    draws: int,
+    cells: int,
+    *,
+    most: int = 200,
+    least: int = 50,
+    most_numbers: int = 2_000_000,
+) -> Ints:
     """Return draws to predict with: equally many of each chain, evenly spread, the last included.
 
     Parameters
@@ -199,13 +203,17 @@ def predictive_rows(chains: int, draws: int, cells: int) -> Ints:
         Of the posterior; draws of each chain.
     cells : int
         Numbers that one prediction has.
+    most, least : int
+        Draws with stored predictions.
+    most_numbers : int
+        Predicted numbers in all, unless that leaves fewer than ``least`` draws.
 
     Returns
     -------
     ndarray
         Shape (chain, draw): indices of the draws, chains joined.
     """
-    wanted = int(np.clip(_NUMBERS // max(cells, 1), _LEAST_PREDICTED, _MOST_PREDICTED))
+    wanted = int(np.clip(most_numbers // max(cells, 1), least, most))
     each = min(draws, -(-wanted // chains))
     chosen = np.linspace(draws - 1, 0, each).astype(int)[::-1]
     return np.asarray(draws * np.arange(chains)[:, None] + chosen)
@@ -291,7 +299,9 @@ def linearisation_errors(problem: Problem, phi: Floats, sigma: Floats) -> Floats
     return errors
 
 
-def linearisation(problem: Problem, phi: Floats, sigma: Floats) -> dict[str, Any]:
+def linearisation(
+    problem: Problem, phi: Floats, sigma: Floats, *, most_draws: int = 16
+) -> Linearisation:
     """Return a summary of :func:`linearisation_errors` at some of a posterior's draws.
 
     Parameters
@@ -300,123 +310,144 @@ def linearisation(problem: Problem, phi: Floats, sigma: Floats) -> dict[str, Any
         Of whole trajectories.
     phi, sigma : ndarray
         All draws, at least two, shapes (draw, p) and (draw, parameter).
-
-    Returns
-    -------
-    dict
-        ``draws``, how many; ``sd`` and ``largest``, standard deviation of the differences and the
-        largest from their mean (nats); ``trajectory``, the one, from 0, whose differences vary
-        most.
+    most_draws : int
+        Draws to smooth the states at, at most.
     """
-    rows = np.unique(np.linspace(0, len(phi) - 1, _CHECKED_DRAWS).astype(int))
+    rows = np.unique(np.linspace(0, len(phi) - 1, most_draws).astype(int))
     errors = linearisation_errors(problem, phi[rows], sigma[rows])
     total = errors.sum(axis=1)
-    return {
-        "draws": len(rows),
-        "sd": float(total.std(ddof=1)),
-        "largest": float(np.abs(total - total.mean()).max()),
-        "trajectory": int(errors.std(axis=0).argmax()),
-    }
+    sd, largest = float(total.std(ddof=1)), float(np.abs(total - total.mean()).max())
+    return Linearisation(len(rows), sd, largest, int(errors.std(axis=0).argmax()))
 
 
-def checked(problem: Problem, idata: Any, asked: tuple[int, int] | None = None) -> Any:
-    """Store the warnings of a posterior in its attributes, and issue them."""
-    found = list(_warnings(problem, idata, asked))
-    idata.attrs["warnings"] = json.dumps([message for _, message in found])
-    for kind, message in found:
-        warn(message, kind)
-    return idata
+def checked(
+    problem: Problem, idata: Any, asked: tuple[int, int] | None = None, *, least_draws: int = 4
+) -> Any:
+    """Enter convergence and warnings in a posterior's record, and issue the warnings.
 
-
-def _warnings(
-    problem: Problem, idata: Any, asked: tuple[int, int] | None
-) -> Iterator[tuple[type[Warning], str]]:
-    """Yield category and message of each warning, with the cure."""
+    Parameters
+    ----------
+    problem : Problem
+        What was fitted.
+    idata : InferenceData or DataTree
+        The posterior.
+    asked : tuple of int, optional
+        Draws a chain, and chains, that were asked for, where an interrupt left fewer.
+    least_draws : int
+        Fewest draws a chain for which R-hat is defined.
+    """
+    record, sizes = PosteriorRecord.of(idata), group(idata, "posterior").sizes
     on = "resume this posterior"
     if problem.layout.discrete.any():  # fit does not go on over joints of unknown bodies
         on = "name the bodies that were found in the scene, fit that and resume it"
-    weighted = SIZE in idata.attrs
+    weighted = record.importance_ess is not None
     more = f"raise draws, or {on}" if weighted else f"raise draws or thin, or {on}"
-    if "updates" in idata.attrs:  # resampled draws are no chain that could go on
+    if record.updates is not None:  # resampled draws are no chain that could go on
         more = "these draws were reweighted by update; fit all data anew"
-    found = json.loads(str(idata.attrs.get("linearisation", '{"sd": 0}')))
-    if not found["sd"] <= MOST:
-        yield (
-            LinearisationWarning,
-            f"the likelihood is linearised where it does not hold: at {found['draws']} draws with"
-            f" the states smoothed anew it differs by {found['sd']:.2g} nats (standard deviation;"
-            f" want <= {MOST:g}), most in trajectory {found['trajectory']}; cut that where"
-            " bodies meet or wheels begin to slip, or compare with a fit of single transitions",
-        )
-    sizes = group(idata, "posterior").sizes
+    found: list[_Warned] = []
     if asked is not None:
-        idata.attrs["interrupted"] = 1
-        yield (
-            ConvergenceWarning,
+        record = replace(record, interrupted=True)
+        text = (
             f"sampling was interrupted after {sizes['draw']} of {asked[0]} draws in"
-            f" {sizes['chain']} of {asked[1]} chains, which are kept; for more, {on}",
+            f" {sizes['chain']} of {asked[1]} chains, which are kept; for more, {on}"
         )
-    if not idata.attrs.get(PARETO_K, 0.0) <= MAX_PARETO_K:
-        yield (
-            ConvergenceWarning,
-            f"Pareto k of the proposals' weights is {idata.attrs[PARETO_K]:.2g} (want <="
-            f" {MAX_PARETO_K}): they may miss a part of the posterior; raise draws, or compare"
-            " with the method 'metropolis'",
+        found.append((ConvergenceWarning, text))
+    found += _of_approximations(record)
+    if sizes["draw"] >= least_draws:
+        r_hat, ess = convergence(idata)
+        worst = max(r_hat, key=lambda k: r_hat[k]), min(ess, key=lambda k: ess[k])
+        record = replace(record, max_rhat=r_hat[worst[0]], min_ess=ess[worst[1]])
+        if short := _unconverged(record, sizes["chain"], worst, more):
+            found.append((ConvergenceWarning, short))
+        if problem.library is None:  # what follows compares with Table 1
+            found += _of_parameters(problem, idata)
+    elif record.method != "map":  # a mode alone is one draw
+        text = (
+            f"with {sizes['draw']} draws a chain there is no R-hat (it takes at least"
+            f" {least_draws}), so whether the chains have converged is not known; {more}"
         )
-    rough = doubts(idata)
-    if rough is not None:
-        yield ConvergenceWarning, rough
-    if sizes["draw"] < _LEAST_DRAWS:
-        if idata.attrs.get("method") != "map":  # a mode alone is one draw
-            yield (
-                ConvergenceWarning,
-                f"with {sizes['draw']} draws a chain there is no R-hat (it takes at least"
-                f" {_LEAST_DRAWS}), so whether the chains have converged is not known; {more}",
-            )
-        return
-    r_hat, ess = convergence(idata)
-    worst_hat, worst_ess = max(r_hat, key=lambda k: r_hat[k]), min(ess, key=lambda k: ess[k])
-    idata.attrs["max_rhat"], idata.attrs["min_ess"] = r_hat[worst_hat], ess[worst_ess]
-    if sizes["chain"] == 1:
-        yield (
-            ConvergenceWarning,
+        found.append((ConvergenceWarning, text))
+    replace(record, warnings=tuple(text for _, text in found)).write(idata)
+    for kind, text in found:
+        warn(text, kind)
+    return idata
+
+
+def _of_approximations(record: PosteriorRecord) -> list[_Warned]:
+    """Return warnings on linearised states, importance weights and evidences."""
+    found: list[_Warned] = []
+    held = record.linearisation
+    if held is not None and not held.sd <= MOST:
+        text = (
+            f"the likelihood is linearised where it does not hold: at {held.draws} draws with"
+            f" the states smoothed anew it differs by {held.sd:.2g} nats (standard deviation;"
+            f" want <= {MOST:g}), most in trajectory {held.trajectory}; cut that where"
+            " bodies meet or wheels begin to slip, or compare with a fit of single transitions"
+        )
+        found.append((LinearisationWarning, text))
+    k = record.pareto_k
+    if k is not None and not k <= MAX_PARETO_K:
+        text = (
+            f"Pareto k of the proposals' weights is {k:.2g} (want <= {MAX_PARETO_K}): they may miss"
+            " a part of the posterior; raise draws, or compare with the method 'metropolis'"
+        )
+        found.append((ConvergenceWarning, text))
+    if rough := doubts(record.configurations or ()):
+        found.append((ConvergenceWarning, rough))
+    return found
+
+
+def _unconverged(
+    record: PosteriorRecord, chains: int, worst: tuple[str, str], more: str
+) -> str | None:
+    """Return a warning on the chains; ``worst`` names the parameters of R-hat and ESS."""
+    if chains == 1:
+        return (
             "one chain alone cannot show whether it has converged: R-hat compares chains; raise"
-            " chains to 4",
+            " chains to 4"
         )
-    else:
-        short = []
-        # rounded as in the message: 1.0104 passes; weighted draws are independent, and that of few
-        # of them is often above the limit
-        if not weighted and not round(r_hat[worst_hat], 3) <= MAX_RHAT:
-            short.append(f"R-hat is {r_hat[worst_hat]:.3f} for {worst_hat} (want <= {MAX_RHAT})")
-        if not ess[worst_ess] >= MIN_ESS:
-            size = f"{np.floor(ess[worst_ess]):.0f} for {worst_ess} (want >= {MIN_ESS})"
-            short.append(f"effective sample size is {size}")
-        if short:
-            failed = "the draws are too few" if weighted else "the chains have not converged"
-            yield ConvergenceWarning, f"{failed}: {', '.join(short)}; {more}"
-    if problem.library is not None:  # what follows compares with Table 1
-        return
+    weighted, short = record.importance_ess is not None, []
+    # rounded as in the message: 1.0104 passes; weighted draws are independent, and that of few
+    # of them is often above the limit
+    if not weighted and not round(record.max_rhat or 0.0, 3) <= MAX_RHAT:
+        short.append(f"R-hat is {record.max_rhat:.3f} for {worst[0]} (want <= {MAX_RHAT})")
+    if not (record.min_ess or 0.0) >= MIN_ESS:
+        size = f"{np.floor(record.min_ess or 0.0):.0f} for {worst[1]} (want >= {MIN_ESS})"
+        short.append(f"effective sample size is {size}")
+    failed = "the draws are too few" if weighted else "the chains have not converged"
+    return f"{failed}: {', '.join(short)}; {more}" if short else None
+
+
+def _of_parameters(
+    problem: Problem, idata: Any, *, stuck: float = 0.5, near: float = 0.01
+) -> list[_Warned]:
+    """Return warnings on parameters at a bound, and on those that the data say nothing about.
+
+    A parameter is at its bound if a share ``stuck`` of its draws is within a share ``near`` of its
+    support from there.
+    """
+    found: list[_Warned] = []
     phi, _ = parameter_draws(problem, idata)
     ends = problem.layout.supports(phi)
-    margin = _NEAR * (ends[1] - ends[0])
+    margin = near * (ends[1] - ends[0])
     watched = np.isfinite(margin).all(axis=0) & ~problem.layout.discrete
     for bound in ends:
         share = (np.abs(phi - bound) < margin).mean(axis=0)
-        for i in np.flatnonzero(watched & (share > _STUCK)):
-            yield (
-                BoundWarning,
+        for i in np.flatnonzero(watched & (share > stuck)):
+            text = (
                 f"{problem.layout.labels[i]} is at its bound,"
                 f" {np.median(bound[:, i]):g}: {share[i]:.0%} of the draws are there; check the"
-                " shape and the frame of the body; an effect that the model lacks may press too",
+                " shape and the frame of the body; an effect that the model lacks may press too"
             )
+            found.append((BoundWarning, text))
     silent = uninformed(idata, effects={attached.effect for attached in problem.physics.effects})
     if silent:
-        yield (
-            UninformedWarning,
+        text = (
             f"the data say nothing about {', '.join(silent)}: the posterior is the prior; record"
-            " motions that depend on it, or give it in the scene (known = ...)",
+            " motions that depend on it, or give it in the scene (known = ...)"
         )
+        found.append((UninformedWarning, text))
+    return found
 
 
 def _folded(problem: Problem, trace: Any, seed: int | None) -> xr.Dataset:

@@ -17,7 +17,6 @@ from pbrl_ppl.history import History, Segments, from_segments
 from pbrl_ppl.likelihood import (
     Problem,
     Sensitivity,
-    TrajectoryLikelihood,
     TransitionLikelihood,
     along_trajectories,
     in_pieces,
@@ -171,13 +170,13 @@ def linearised_as(problem: Problem, idata: Any) -> Problem:
         If the likelihood, the data or the parameters are others.
     """
     given, posterior = group(idata, "constant_data"), group(idata, "posterior")
-    held, kind = likelihood_name(idata), problem.likelihood.name
+    record = PosteriorRecord.of(idata)
+    held, kind = record.likelihood_name, problem.likelihood.name
     if held != kind:
         raise PosteriorError(
             f"posterior: its likelihood is of {held}, the model's of {kind}; make the model with"
             f" the likelihood {held!r}"
         )
-    record = PosteriorRecord.of(idata)
     if problem.likelihood.simulated:
         problem = in_pieces(problem, record.horizon, problem.data.smoothed_states)
     measured = group(idata, "observed_data")["next_state"].transpose(*CELLS).to_numpy()
@@ -193,13 +192,6 @@ def linearised_as(problem: Problem, idata: Any) -> Problem:
         return problem
     problem = with_recording(problem, given, problem.data.history.data_sha256)
     return problem.with_likelihood(prior=record.sigma_prior)
-
-
-def likelihood_name(idata: Any) -> str:
-    """Return the name of a posterior's likelihood, of files that do not say it too."""
-    record = PosteriorRecord.of(idata)
-    named = TransitionLikelihood if record.cells is None else TrajectoryLikelihood
-    return record.likelihood or named.name
 
 
 def recording(problem: Problem) -> xr.Dataset:

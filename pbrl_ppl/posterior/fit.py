@@ -11,6 +11,7 @@ from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.posterior.completion import parameter_draws
 from pbrl_ppl.posterior.data import problem_of
+from pbrl_ppl.posterior.record import PosteriorRecord
 from pbrl_ppl.posterior.store import best_draw
 from pbrl_ppl.state import Floats
 
@@ -51,6 +52,11 @@ class Fit:
         if isinstance(posterior, Fit):
             return posterior
         return cls(problem_of(posterior, effects), posterior)
+
+    @cached_property
+    def record(self) -> PosteriorRecord:
+        """The record of the fit: model, data, method and diagnostics."""
+        return PosteriorRecord.of(self.posterior)
 
     @cached_property
     def draws(self) -> tuple[Floats, Floats]:

@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 import json
-import re
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, fields
-from typing import Any
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, fields, is_dataclass
+from functools import cache
+from typing import Any, get_args, get_origin, get_type_hints
 
 import numpy as np
 
 from pbrl_ppl.effects import Attached, Effect, attach, catalogue, learned_remainder
 from pbrl_ppl.errors import PosteriorError
-from pbrl_ppl.likelihood import Coordinates, noise_labels
+from pbrl_ppl.likelihood import (
+    Coordinates,
+    TrajectoryLikelihood,
+    TransitionLikelihood,
+    noise_labels,
+)
 from pbrl_ppl.parameters import Layout, ParameterLibrary
 from pbrl_ppl.physics import build_layout
 from pbrl_ppl.posterior.store import SCHEMA, check_schema, draws
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import Floats
+from pbrl_ppl.state import Floats, Ints
 
 
 @dataclass(frozen=True)
@@ -40,6 +45,27 @@ class StoredMode:
     noise: Mapping[str, float]
     log_posterior: float
     sets: Mapping[str, str] | None = None
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """Check of the smoothed states' linearisation, at some draws.
+
+    Parameters
+    ----------
+    draws : int
+        How many.
+    sd, largest : float
+        Standard deviation of the differences of the log-likelihood from that with the states
+        smoothed at the draw, and the largest from their mean (nats).
+    trajectory : int
+        The one, from 0, whose differences vary most.
+    """
+
+    draws: int
+    sd: float
+    largest: float
+    trajectory: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,9 +113,8 @@ class PosteriorRecord:
         Which noise parameter each coordinate is subject to, where the fit is of whole trajectories.
     mode : StoredMode, optional
         The posterior's mode.
-    linearisation : mapping, optional
-        Check of the smoothed states' linearisation: ``draws``, ``sd`` and ``largest`` (nats) and
-        ``trajectory``, the worst one.
+    linearisation : Linearisation, optional
+        Check of the smoothed states' linearisation.
     configurations : tuple of mapping, optional
         Which bodies the joints may join, and the probability of each choice.
     updates : tuple of mapping, optional
@@ -111,6 +136,8 @@ class PosteriorRecord:
         Share of those moves that were accepted; 1 without any.
     log_evidence : float, optional
         Of the model, about the modes that were found.
+    not_separable : tuple of tuple of str, optional
+        Groups of effects, such as ``spring on cart``, that the recording cannot separate.
     """
 
     scene: Scene
@@ -131,7 +158,7 @@ class PosteriorRecord:
     learned_remainder: str | None = None
     cells: Coordinates | None = None
     mode: StoredMode | None = None
-    linearisation: Mapping[str, Any] | None = None
+    linearisation: Linearisation | None = None
     configurations: tuple[Mapping[str, Any], ...] | None = None
     updates: tuple[Mapping[str, Any], ...] | None = None
     max_rhat: float | None = None
@@ -144,6 +171,7 @@ class PosteriorRecord:
     rungs: int | None = None
     acceptance: float | None = None
     log_evidence: float | None = None
+    not_separable: tuple[tuple[str, ...], ...] | None = None
 
     @classmethod
     def of(cls, idata: Any) -> PosteriorRecord:
@@ -154,23 +182,29 @@ class PosteriorRecord:
         PosteriorError
             If the posterior has another schema version or lacks a field.
         """
-        attrs = idata.attrs
-        check_schema(attrs, "posterior")
+        check_schema(idata.attrs, "posterior")
         needed = [field.name for field in fields(cls) if field.default is not None]
-        if missing := [name for name in needed if name not in attrs]:
+        if missing := [name for name in needed if name not in idata.attrs]:
             raise PosteriorError(
                 f"posterior: it does not say its {', '.join(missing)}; make it with pbrl_ppl.fit"
             )
-        given = [field for field in fields(cls) if field.name in attrs]
-        # the type's first word: "tuple[str, ...] | None" is "tuple"
-        kinds = {field.name: re.split(r"\W", str(field.type))[0] for field in given}
-        return cls(**{name: _READ[kind](attrs[name]) for name, kind in kinds.items()})
+        return cls(**stored_fields(idata))
 
     def attributes(self) -> dict[str, Any]:
         """Return the attributes of the file: plain text, numbers and JSON."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         written = {name: _written(value) for name, value in values.items() if value is not None}
         return {"pbrl_ppl": "posterior", "schema": SCHEMA, **written}
+
+    def write(self, idata: Any) -> None:
+        """Write the record into the attributes of a posterior."""
+        idata.attrs.update(self.attributes())
+
+    @property
+    def likelihood_name(self) -> str:
+        """Name of the likelihood, of files that do not say it too."""
+        named = TransitionLikelihood if self.cells is None else TrajectoryLikelihood
+        return self.likelihood or named.name
 
     @property
     def noise_variables(self) -> dict[str, tuple[str, ...]]:
@@ -236,15 +270,64 @@ def scene_of(idata: Any) -> Scene:
     PosteriorError
         If there is none.
     """
-    if "scene" not in idata.attrs:
+    held = stored_fields(idata, ("scene",))
+    if not held:
         raise PosteriorError("posterior: it holds no scene; make it with pbrl_ppl.fit")
-    return Scene.from_toml(str(idata.attrs["scene"]))
+    scene: Scene = held["scene"]
+    return scene
 
 
 def layout_of(idata: Any, effects: Iterable[Effect] = catalogue) -> Layout:
     """Return the layout of a posterior's parameters."""
-    scene, table = scene_of(idata), idata.attrs.get("learned_remainder")
-    return build_layout(scene, _attached(scene, table, effects))
+    scene, held = scene_of(idata), stored_fields(idata, ("learned_remainder",))
+    return build_layout(scene, _attached(scene, held.get("learned_remainder"), effects))
+
+
+def stored_fields(idata: Any, names: Iterable[str] | None = None) -> dict[str, Any]:
+    """Return fields of the record that a posterior's attributes hold, all or some, by name."""
+    kinds = _kinds(PosteriorRecord)
+    return {
+        name: _read(kinds[name], idata.attrs[name])
+        for name in (kinds if names is None else names)
+        if name in idata.attrs
+    }
+
+
+@cache
+def _kinds(record: type) -> dict[str, Any]:
+    """Return the types of a dataclass's fields, without the None of an optional one."""
+    hints = {field.name: get_type_hints(record)[field.name] for field in fields(record)}
+    optional = {name: set(get_args(kind)) - {type(None)} for name, kind in hints.items()}
+    return {
+        name: optional[name].pop() if type(None) in get_args(kind) else kind
+        for name, kind in hints.items()
+    }
+
+
+def _read(kind: Any, value: Any) -> Any:
+    """Return a field from its attribute, by its type."""
+    if kind is Scene:
+        return Scene.from_toml(str(value))
+    if kind is ParameterLibrary:
+        return ParameterLibrary.from_json(str(value))
+    if kind in (bool, int, float, str):
+        return kind(value)
+    return _from_json(kind, json.loads(str(value)))
+
+
+def _from_json(kind: Any, value: Any) -> Any:
+    """Return a value of a type from what JSON holds of it."""
+    if is_dataclass(kind):
+        kinds = _kinds(kind)  # type: ignore[arg-type]  # a type, not an instance
+        held = {name: _from_json(kinds[name], own) for name, own in value.items()}
+        if kind is Coordinates:  # no row has no columns in JSON
+            held["push"] = held["push"].reshape(-1, len(held["places"]))
+        return kind(**held)  # type: ignore[operator]
+    if kind in (Ints, Floats):
+        return np.array(value, dtype=np.int64 if kind == Ints else float)
+    if get_origin(kind) is tuple:
+        return tuple(tuple(item) if isinstance(item, list) else item for item in value)
+    return value
 
 
 def _written(value: Any) -> Any:
@@ -253,42 +336,10 @@ def _written(value: Any) -> Any:
         return value.to_toml()
     if isinstance(value, ParameterLibrary):
         return value.to_json()
-    if isinstance(value, StoredMode):
-        return json.dumps({name: v for name, v in asdict(value).items() if v is not None})
-    if isinstance(value, Coordinates):
-        return json.dumps({name: np.asarray(v).tolist() for name, v in asdict(value).items()})
     if isinstance(value, bool):  # NetCDF has no such attribute
         return int(value)
-    return value if isinstance(value, int | float | str) else json.dumps(value)
-
-
-def _cells(text: Any) -> Coordinates:
-    held: dict[str, Any] = json.loads(str(text))
-    kinds = {"places": np.intp, "sensor": np.intp, "pushed": np.intp, "fixed": float}
-    arrays: dict[str, Any] = {
-        name: np.array(held.pop(name), dtype=kind) for name, kind in kinds.items()
-    }
-    push = np.array(held.pop("push"), dtype=float).reshape(-1, len(arrays["places"]))
-    memory = held.pop("memory")
-    tuples: dict[str, Any] = {name: tuple(value) for name, value in held.items()}
-    return Coordinates(**arrays, push=push, memory=memory, **tuples)
-
-
-def _tuple(text: Any) -> Any:
-    items = json.loads(str(text))
-    return tuple(tuple(item) if isinstance(item, list) else item for item in items)
-
-
-#: How attributes are read, by the type of the field.
-_READ: Mapping[str, Callable[[Any], Any]] = {
-    "Scene": lambda text: Scene.from_toml(str(text)),
-    "ParameterLibrary": lambda text: ParameterLibrary.from_json(str(text)),
-    "Coordinates": _cells,
-    "StoredMode": lambda text: StoredMode(**json.loads(str(text))),
-    "Mapping": lambda text: json.loads(str(text)),
-    "tuple": _tuple,
-    "bool": bool,
-    "int": int,
-    "float": float,
-    "str": str,
-}
+    if isinstance(value, int | float | str):
+        return value
+    if is_dataclass(value):
+        value = {name: v for name, v in asdict(value).items() if v is not None}  # type: ignore[arg-type]
+    return json.dumps(value, default=np.ndarray.tolist)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -16,10 +15,10 @@ from scipy.stats import truncnorm
 
 from pbrl_ppl.effects import LEARNED_REMAINDER, Effect, catalogue
 from pbrl_ppl.errors import PosteriorError
-from pbrl_ppl.modes import ATTRIBUTE, index_law
+from pbrl_ppl.modes import NONE, index_law
 from pbrl_ppl.parameters import JOINT_INDICES, ParameterLibrary, Prior, nearest
 from pbrl_ppl.physics import index_priors
-from pbrl_ppl.posterior.record import layout_of, scene_of
+from pbrl_ppl.posterior.record import layout_of, scene_of, stored_fields
 from pbrl_ppl.posterior.store import group, labelled_draws, scalars
 from pbrl_ppl.scene import Joint, Scene
 from pbrl_ppl.state import Floats
@@ -98,7 +97,7 @@ def updated_scene(idata: Any, *, effects: Iterable[Effect] = catalogue) -> Scene
 
 def _joints(idata: Any, scene: Scene) -> tuple[Joint, ...]:
     """Return the joints, those of unknown bodies with their indices' posterior probabilities."""
-    rows = json.loads(str(idata.attrs.get(ATTRIBUTE, "[]")))
+    rows = stored_fields(idata, ("configurations",)).get("configurations", ())
     joints = []
     for name, joint in zip(scene.joint_names, scene.joints, strict=True):
         if joint.bodies is None:
@@ -119,6 +118,50 @@ def _joints(idata: Any, scene: Scene) -> tuple[Joint, ...]:
             joint = replace(joint, prior=found)
         joints.append(joint)
     return tuple(joints)
+
+
+def joint_probabilities(idata: Any) -> dict[str, dict[str, float]]:
+    """Return the posterior probabilities of the pairs that each joint connects.
+
+    Parameters
+    ----------
+    idata : InferenceData or DataTree
+        A posterior as made by :func:`pbrl_ppl.fit`, or as loaded from its file, of a scene with a
+        joint whose bodies are unknown.
+
+    Returns
+    -------
+    dict of str to dict of str to float
+        For each such joint, the probability of each pair of bodies and of ``none``, the most
+        probable first. They come from the evidences, and are finer than the draws can show.
+
+    Raises
+    ------
+    PosteriorError
+        If no joint of the posterior has unknown bodies.
+
+    Examples
+    --------
+    ::
+
+        idata = pp.fit(pp.physics_model(scene, history), seed=1)
+        pp.joint_probabilities(idata)  # {'joint1': {'cart-trailer': 0.998, 'none': 0.002, ...}}
+    """
+    rows = stored_fields(idata, ("configurations",)).get("configurations")
+    if rows is None:
+        raise PosteriorError(
+            "posterior: the bodies of all its joints were named in the scene; leave out bodies of a"
+            " [[joint]], with known = false, and fit again"
+        )
+    table: dict[str, dict[str, float]] = {}
+    for row in rows:
+        for joint, pair in row["joints"].items():
+            own = table.setdefault(joint, {})
+            name = NONE if pair is None else "-".join(pair)
+            own[name] = own.get(name, 0.0) + row["probability"]
+    return {
+        joint: dict(sorted(own.items(), key=lambda item: -item[1])) for joint, own in table.items()
+    }
 
 
 def moment_matched(prior: Prior, draws: Floats) -> Prior:
@@ -239,11 +282,12 @@ def library_probabilities(idata: Any) -> pd.DataFrame:
     PosteriorError
         If it is of a model without a library.
     """
-    if "library" not in idata.attrs:
+    library = stored_fields(idata, ("library",)).get("library")
+    if library is None:
         raise PosteriorError(
             "posterior: its model has no library; pass its library to physics_model"
         )
-    names = ParameterLibrary.from_json(str(idata.attrs["library"])).names
+    names = library.names
     index = group(idata, "posterior")["library_index"].transpose("chain", "draw", ...)
     (dim,) = index.dims[2:]
     share = {name: (index == i).mean(("chain", "draw")) for i, name in enumerate(names)}

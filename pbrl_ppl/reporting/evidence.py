@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.criticism import QUANTITIES, Loop, recorded_quantities
 from pbrl_ppl.likelihood import Problem
-from pbrl_ppl.posterior import Fit
+from pbrl_ppl.posterior import Fit, stored_fields
 from pbrl_ppl.reporting.style import acceleration_unit
 from pbrl_ppl.reporting.words import depends_on_records
 from pbrl_ppl.state import STATE, Bools, Floats, Ints
@@ -122,9 +122,7 @@ def find_evidence(loop: Loop) -> Evidence | None:
 
 def recorded(*posteriors: Any) -> bool:
     """Return whether posteriors hold their recording, of whole trajectories."""
-    return all(
-        "scene" in posterior.attrs and "cells" in posterior.attrs for posterior in posteriors
-    )
+    return all("cells" in stored_fields(posterior, ("cells",)) for posterior in posteriors)
 
 
 def _log_density(fit: Fit) -> Floats:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -15,11 +14,11 @@ from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import PbrlError, PosteriorError
 from pbrl_ppl.posterior import (
     Identifiability,
+    PosteriorRecord,
     compare,
     group,
     groups,
     identify,
-    likelihood_name,
     scalars,
     scene_of,
 )
@@ -228,15 +227,16 @@ class Origin(Section):
     link = "Source"
 
     def context(self) -> Mapping[str, object]:
-        attrs = self.posterior.attrs
+        record = PosteriorRecord.of(self.posterior)
+        attributes = record.attributes()
         names = ("seed", "data_sha256", "method", "substeps", "horizon", "updates")
-        versions = json.loads(str(attrs.get("versions", "{}")))
+        versions = ", ".join(f"{name} {number}" for name, number in record.versions.items())
         return {
             "source": self.source,
             "refit": _refit(self.posterior),
-            "origin": {name: str(attrs[name]) for name in names if name in attrs}
-            | {"versions": ", ".join(f"{name} {number}" for name, number in versions.items())},
-            "scene_toml": scene_of(self.posterior).to_toml(),
+            "origin": {name: str(attributes[name]) for name in names if name in attributes}
+            | {"versions": versions},
+            "scene_toml": record.scene.to_toml(),
         }
 
 
@@ -264,10 +264,9 @@ class PosteriorHeader(Section):
 
 
 def _headline(posterior: Any, informed_by: Identifiability | None) -> str:
-    scene, attrs = scene_of(posterior), posterior.attrs
-    bodies = ", ".join(body.name for body in scene.dynamic)
-    effects = json.loads(str(attrs.get("effects", "[]")))
-    effects = [f"{plain(name)} of {body}" for name, body in effects]
+    record = PosteriorRecord.of(posterior)
+    bodies = ", ".join(body.name for body in record.scene.dynamic)
+    effects = [f"{plain(name)} of {body}" for name, body in record.effects]
     text = f"Posterior of {bodies}{' with ' + ', '.join(effects) if effects else ''}"
     if informed_by is None:
         return f"{text}: {len(scalars(posterior).data_vars)} parameters"
@@ -283,7 +282,7 @@ def _headline(posterior: Any, informed_by: Identifiability | None) -> str:
 
 def _warned(posterior: Any, identified: bool) -> list[str]:
     """Return the warnings of the fit, without those that other parts of the page cover."""
-    every = json.loads(str(posterior.attrs.get("warnings", "[]")))
+    every = PosteriorRecord.of(posterior).warnings or ()
     covered = (
         "have not converged",
         "draws are too few",
@@ -293,44 +292,43 @@ def _warned(posterior: Any, identified: bool) -> list[str]:
 
 
 def _about(posterior: Any) -> str:
-    attrs, sizes = posterior.attrs, group(posterior, "posterior").sizes
+    record, sizes = PosteriorRecord.of(posterior), group(posterior, "posterior").sizes
     transitions = group(posterior, "observed_data").sizes["transition"]
-    horizon = int(attrs.get("horizon", 1))
     names = {"trajectories": "whole trajectories", "transitions": "transitions, Eq. 11"}
-    likelihood = names.get(likelihood_name(posterior), "simulations")
-    if horizon > 1:
+    likelihood = names.get(record.likelihood_name, "simulations")
+    if record.horizon > 1:
         kind = "simulations" if likelihood == "simulations" else "segments"
-        likelihood = f"{kind} of {horizon} intervals"
+        likelihood = f"{kind} of {record.horizon} intervals"
     return (
         f"{transitions} transitions; likelihood of {likelihood}; sampler"
-        f" {attrs.get('method', 'unknown')}, {sizes['chain']} chains of {sizes['draw']} draws."
+        f" {record.method}, {sizes['chain']} chains of {sizes['draw']} draws."
     )
 
 
 def _refit(posterior: Any) -> str:
     """Return the lines of Python that make the posterior again from its recording."""
-    attrs, draws = posterior.attrs, group(posterior, "posterior")
+    record, sizes = PosteriorRecord.of(posterior), group(posterior, "posterior").sizes
     options = []
-    name = likelihood_name(posterior)
+    name = record.likelihood_name
     if name != "transitions":
         options.append(f'likelihood="{name}"')
-    elif int(attrs.get("horizon", 1)) > 1:
-        options.append(f"horizon={int(attrs['horizon'])}")
-    if attrs.get("scalar_sigma"):
+    elif record.horizon > 1:
+        options.append(f"horizon={record.horizon}")
+    if record.scalar_sigma:
         options.append('sigma="scalar"')
-    if "nu" in attrs:
-        options.append(f"nu={float(attrs['nu']):g}")
-    if "library" in attrs:
+    if record.nu is not None:
+        options.append(f"nu={record.nu:g}")
+    if record.library is not None:
         options.append("library=...")
-    options.append(f"substeps={int(attrs['substeps'])}")
+    options.append(f"substeps={record.substeps}")
     lines = [
         "import pbrl_ppl as pp",
         "scene = pp.Scene.load(...)  # as below",
         "history = pp.History.load(..., scene)",
         f"model = pp.physics_model(scene, history, {', '.join(options)})",
-        f"idata = pp.fit(model, method={str(attrs.get('method', 'metropolis'))!r},"
-        f" seed={int(attrs['seed'])}, draws={draws.sizes['draw']}, chains={draws.sizes['chain']})",
+        f"idata = pp.fit(model, method={record.method!r}, seed={record.seed},"
+        f" draws={sizes['draw']}, chains={sizes['chain']})",
     ]
-    if "updates" in attrs:
+    if record.updates is not None:
         lines.append("# and updates since, which attrs['updates'] lists")
     return "\n".join(lines)

@@ -12,7 +12,14 @@ import pandas as pd
 
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.parameters import BODY_PARAMETERS, JOINT_ANCHORS
-from pbrl_ppl.posterior import PARETO_K, SIZE, Identifiability, group, interval, scalars
+from pbrl_ppl.posterior import (
+    Identifiability,
+    PosteriorRecord,
+    group,
+    interval,
+    scalars,
+    stored_fields,
+)
 from pbrl_ppl.reporting.page import Draw, Section, Table
 from pbrl_ppl.reporting.posterior_plots import (
     most_interesting,
@@ -111,6 +118,11 @@ class Parameters:
     rough_ess: float = 100.0
 
     @cached_property
+    def record(self) -> PosteriorRecord:
+        """The record of the fit."""
+        return PosteriorRecord.of(self.posterior)
+
+    @cached_property
     def summary(self) -> pd.DataFrame:
         """Summary by parameter, with ``unit``, ``meaning``, ``wrong`` (words) and ``failed``."""
         table = summary(self.posterior)
@@ -132,12 +144,12 @@ class Parameters:
     @property
     def chains(self) -> bool:
         """Whether there are chains to compare: draws of Laplace's approximation are independent."""
-        return bool(self.posterior.attrs.get("method") != "laplace")
+        return self.record.method != "laplace"
 
     @property
     def weighted(self) -> bool:
         """Whether the draws are of importance sampling: R-hat of few of them is often too large."""
-        return SIZE in self.posterior.attrs
+        return self.record.importance_ess is not None
 
     @property
     def failed(self) -> pd.DataFrame:
@@ -196,7 +208,7 @@ class Parameters:
             f"The largest R-hat of {count} parameters is {number(hats.max(), 4)} (at most"
             f" {self.good_r_hat} is wanted), the smallest effective sample size"
             f" {number(ess.min())} (at least {self.good_ess:.0f})."
-            f"{_weights_in_words(self.posterior.attrs)}"
+            f"{_weights_in_words(self.record)}"
         )
         agree = "The draws suffice" if self.weighted else "The chains agree"
         if failed:
@@ -217,22 +229,21 @@ def _span(low: float, high: float) -> str:
     return f"{number(low, digits)} to {number(high, digits)}"
 
 
-def _weights_in_words(attributes: Mapping[str, Any]) -> str:
+def _weights_in_words(record: PosteriorRecord) -> str:
     """Return the quality of importance weights; empty for chains."""
-    if PARETO_K not in attributes:
+    k, size = record.pareto_k, record.importance_ess
+    if k is None or size is None:
         return ""
     return (
-        f" The draws are resampled proposals of {attributes.get('proposals', 'another density')}:"
-        f" Pareto k of their weights is"
-        f" {number(attributes[PARETO_K])} (above 0.7 the proposals would miss a part of the"
-        f" posterior), and by their weights the draws are worth {number(attributes[SIZE])}"
-        " independent ones."
+        f" The draws are resampled proposals of {record.proposals or 'another density'}: Pareto k"
+        f" of their weights is {number(k)} (above 0.7 the proposals would miss a part of the"
+        f" posterior), and by their weights the draws are worth {number(size)} independent ones."
     )
 
 
 def recorded_poses(posterior: Any) -> Floats | None:
     """Return the recorded poses that a posterior holds, shape (trajectory, time, body, 3)."""
-    if "scene" not in posterior.attrs:
+    if not stored_fields(posterior, ("scene",)):
         return None
     given = group(posterior, "constant_data")
     if "recorded_start" in given:

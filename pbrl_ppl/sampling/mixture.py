@@ -11,7 +11,6 @@ import xarray as xr
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import (
-    ATTRIBUTE,
     Mode,
     Pair,
     Weighed,
@@ -85,7 +84,7 @@ def mix(
         "observed_data": rest["observed_data"],
         "constant_data": rest["constant_data"],
     }
-    return from_groups(data, {ATTRIBUTE: stored(found)})
+    return from_groups(data, {"configurations": stored(found)})
 
 
 def most_probable(problem: Problem, found: Sequence[Weighed]) -> Point:

@@ -26,7 +26,14 @@ from pbrl_ppl.likelihood import (
     with_measurements,
 )
 from pbrl_ppl.parameters import by_prior
-from pbrl_ppl.posterior import convergence, from_groups, group, parameter_draws, problem_of
+from pbrl_ppl.posterior import (
+    PosteriorRecord,
+    convergence,
+    from_groups,
+    group,
+    parameter_draws,
+    problem_of,
+)
 from pbrl_ppl.sampling.fitting import sample
 from pbrl_ppl.sampling.ranks import MOST_DRAWS, rank
 from pbrl_ppl.state import STATE, Floats
@@ -235,7 +242,7 @@ def replicate(design: Problem, truth: Truth, seed: int, settings: Mapping[str, A
             for kind in _KNOWN:
                 warnings.simplefilter("ignore", kind)
             idata = sample(problem, seed=seed, **settings).posterior
-        if "interrupted" in idata.attrs:
+        if PosteriorRecord.of(idata).interrupted:
             raise KeyboardInterrupt
         sizes = group(idata, "posterior").sizes
         likelihood = group(idata, "log_likelihood")["next_state"].sum("transition").values

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -145,7 +144,7 @@ def _entered(result: Any, record: PosteriorRecord, history: History, entry: dict
         updates=(*(record.updates or ()), {**entry, **hashes}),
         data_sha256=hashlib.sha256(chained.encode()).hexdigest(),
     )
-    result.attrs.update(updated.attributes())
+    updated.write(result)
     return result
 
 
@@ -258,9 +257,9 @@ def _reweighted(idata: Any, record: PosteriorRecord, new: _Weighted, seed: int) 
     drawn = posterior.isel(chain=xr.DataArray(np.arange(chains), dims="chain"), draw=where)
     labels = {"chain": posterior["chain"], "draw": posterior["draw"]}
     likelihood = np.concatenate([new.earlier, new.likelihood], axis=1)
-    attributes = dict(idata.attrs) | {
+    attributes = files.stored_fields(idata, files.SAMPLED) | {
         files.LIKELIHOOD: likelihood[(n * np.arange(chains)[:, None] + ancestor).ravel()],
-        "updates": json.dumps(record.updates or ()),
+        "updates": record.updates or (),
     }
     if "log_evidence" in attributes:
         mean_weight = logsumexp(new.likelihood.sum(axis=1)) - np.log(chains * n)
@@ -288,7 +287,7 @@ def _reweighted(idata: Any, record: PosteriorRecord, new: _Weighted, seed: int) 
         (*parameter_draws(new.problem, result), choice),
         sums.transpose("chain", "draw").to_numpy().ravel(),
     )
-    result.attrs.update(replace(PosteriorRecord.of(result), mode=mode).attributes())
+    replace(PosteriorRecord.of(result), mode=mode).write(result)
     return files.placed(result, new.data["observed_data"].coords)
 
 

@@ -27,7 +27,6 @@ from pbrl_ppl.errors import (
     PosteriorError,
     PriorWarning,
 )
-from pbrl_ppl.posterior import Fit
 from pbrl_ppl.state import STATE, WRENCH
 from tests.helpers.free_puck import BOX, DISC, MASS, Disc, box2d, fitted
 from tests.helpers.places import load
@@ -405,7 +404,8 @@ def test_only_chains_are_said_not_to_converge(method, said, monkeypatch) -> None
 
     def rough(*args: Any, **options: Any) -> Any:
         warnings.warn("the chains have not converged", ConvergenceWarning, stacklevel=1)
-        return Fit(None, SimpleNamespace(attrs={"max_rhat": 1.02, "min_ess": 350.0}))
+        held = {"interrupted": None, "pareto_k": None, "max_rhat": 1.02, "min_ess": 350.0}
+        return SimpleNamespace(record=SimpleNamespace(**held))
 
     monkeypatch.setattr("pbrl_ppl.criticism.closing.sample", rough)
     mode = _Mode(SimpleNamespace(with_physics=lambda threads: None))

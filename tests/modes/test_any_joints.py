@@ -3,7 +3,7 @@
 import pytest
 
 from pbrl_ppl.errors import SceneError
-from pbrl_ppl.modes import joint_probabilities
+from pbrl_ppl.posterior import joint_probabilities
 from pbrl_ppl.sampling import fit, physics_model
 from pbrl_ppl.scene import Body, Joint, Scene, Shape
 from tests.helpers.histories import simulated_history

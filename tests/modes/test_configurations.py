@@ -18,12 +18,10 @@ from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import Mode, find_mode, weigh
 from pbrl_ppl.modes.configurations import (
-    ATTRIBUTE,
     Configuration,
     Weighed,
     configurations,
     doubts,
-    joint_probabilities,
     number,
     stored,
 )
@@ -36,6 +34,7 @@ from pbrl_ppl.posterior import (
     from_groups,
     group,
     identify,
+    joint_probabilities,
     load_posterior,
     save_posterior,
     updated_scene,
@@ -413,7 +412,8 @@ def test_no_joint_is_any_equal_pair_with_anchors_from_the_prior(rod) -> None:
 
 def test_probabilities_are_finer_than_the_draws(rod) -> None:
     """Where nothing is drawn of a pair, its weight is there all the same."""
-    table = joint_probabilities(mixed(rod))
+    held = {"configurations": json.dumps(mixed(rod).attrs["configurations"])}
+    table = joint_probabilities(SimpleNamespace(attrs=held))
     expected = {"a-b": 0.6, "c-world": 0.2501, "none": 0.1495, "a-c": 0.0004}
     assert list(table) == ["joint1"]
     assert {k: v for k, v in table["joint1"].items() if v} == pytest.approx(expected)
@@ -437,11 +437,11 @@ def test_an_interrupt_with_others_to_come_ends_the_fit(rod) -> None:
 def test_rough_evidence_is_said(rod, error, ess, rough) -> None:
     """A standard error of 0.2 moves a probability of 0.6 by a tenth; one of 0.01 by nothing."""
     found = [replace(each, evidence=Evidence(0.0, error, ess)) for each in weighed(rod)]
-    said = doubts(SimpleNamespace(attrs={ATTRIBUTE: stored(found)}))
+    said = doubts(stored(found))
     assert (said is not None) == rough
     if rough:
         assert "the probability 0.6 of joint1: a-b may be off by" in said
-    assert doubts(SimpleNamespace(attrs={})) is None
+    assert doubts(()) is None
 
 
 # -- fitting ---------------------------------------------------------------------------------------

@@ -9,7 +9,6 @@ import pytest
 from pbrl_ppl.errors import PosteriorError, SceneError
 from pbrl_ppl.modes import Mode, Weighed
 from pbrl_ppl.modes.configurations import (
-    ATTRIBUTE,
     configurations,
     index_law,
     nothing,
@@ -190,7 +189,7 @@ def test_draws_have_each_order_s_share() -> None:
         4000 * share, abs=5 * np.sqrt(4000 * share * (1 - share))
     )
     # and they are the next prior
-    attrs = {"scene": hooked().to_toml(), ATTRIBUTE: stored(found)}
+    attrs = {"scene": hooked().to_toml(), "configurations": json.dumps(stored(found))}
     posterior = group(trace, "posterior")
     new = updated_scene(from_groups({"posterior": posterior}, attrs))
     one, other = index_priors(new, new.joints[0])
@@ -222,7 +221,7 @@ def test_certain_indices_stay_certain() -> None:
         {"joints": {"joint1": pair}, "probability": p}
         for pair, p in ((["c", WORLD], 1.0), (None, 0.0))
     ]
-    attrs = {"scene": free.to_toml(), ATTRIBUTE: json.dumps(rows)}
+    attrs = {"scene": free.to_toml(), "configurations": json.dumps(rows)}
     new = updated_scene(from_groups({"posterior": group(_blank(), "posterior")}, attrs))
     assert new.joints == (replace(free.joints[0], prior={"i_a": {"c": 1.0}, "i_b": {WORLD: 1.0}}),)
     assert [each.pairs[0][1] for each in configurations(new)] == [None, ("c", WORLD)]

@@ -45,7 +45,7 @@ def test_a_fit_says_where_it_does_not_hold() -> None:
     assert found["sd"] <= found["largest"] and 0 <= found["trajectory"] < 6
     centre = declared_problem(Physics.declare(scene), history, kind="trajectories")
     phi, sigma = parameter_draws(model.problem, idata)
-    assert linearisation(centre, phi, sigma)["sd"] > 10 * MOST
+    assert linearisation(centre, phi, sigma).sd > 10 * MOST
     data = groups(idata)
     data["constant_data"] = data["constant_data"][["start", "actions"]]
     with pytest.warns(LinearisationWarning, match=r"differs by \S+ nats .* most in trajectory \d"):

@@ -13,9 +13,8 @@ from scipy import stats
 from pbrl_ppl.errors import OutputError, PosteriorError
 from pbrl_ppl.likelihood import Coordinates
 from pbrl_ppl.parameters import ParameterLibrary
-from pbrl_ppl.posterior import PosteriorRecord, scene_of
+from pbrl_ppl.posterior import Linearisation, PosteriorRecord, StoredMode, scene_of
 from pbrl_ppl.posterior import store as posterior
-from pbrl_ppl.posterior.record import StoredMode
 from pbrl_ppl.posterior.store import (
     DATATREE,
     convergence,
@@ -298,7 +297,7 @@ OPTIONAL = {
     "learned_remainder": "{}",
     "cells": CELLS,
     "mode": StoredMode({"mass[cart]": 0.1 + 0.2}, {"sigma[x]": 0.1}, -1.5, {"cart": "light"}),
-    "linearisation": {"draws": 16, "sd": 0.1, "largest": 0.2, "trajectory": 0},
+    "linearisation": Linearisation(16, 0.1, 0.2, 0),
     "configurations": ({"joints": {"joint1": None}, "probability": 1.0},),
     "updates": ({"did": "reweighted", "share": 0.3},),
     "max_rhat": 1.002,
