@@ -5,8 +5,8 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable
 from dataclasses import replace
-from itertools import combinations
-from typing import Any, ClassVar, final
+from itertools import combinations, compress
+from typing import TYPE_CHECKING, Any, ClassVar, final
 
 import numpy as np
 
@@ -23,7 +23,10 @@ from pbrl_ppl.planning import Dynamics
 from pbrl_ppl.posterior import group
 from pbrl_ppl.sampling import fit, physics_model
 from pbrl_ppl.scene import body_sizes
-from pbrl_ppl.state import Floats
+from pbrl_ppl.state import Bools, Floats
+
+if TYPE_CHECKING:
+    import pymc as pm
 
 #: Prediction errors up to this share of the natural sizes carry no information: they are the
 #: engine's.
@@ -147,12 +150,26 @@ class PBRLAgent(PhysicsAgent):
         clock = np.repeat(clock[:, None], action.shape[1], axis=1)
         return state, np.concatenate([action, before, clock], axis=2), after
 
-    def _model(self, effects: tuple[Attached, ...], chosen: Any = slice(None)) -> Any:
-        """Return the PyMC model of chosen transitions."""
-        state, inputs, after = (each[chosen] for each in self._data())
-        history = from_segments(self.task.scene, state, inputs[:, None], after[:, None])
-        extra = effects[len(attach(self.task.scene, (), self._catalogue)) :]
-        return physics_model(self.task.scene, history, extra, sigma=self._noise)
+    def _model(
+        self,
+        effects: tuple[Attached, ...],
+        rows: Bools | slice = slice(None),
+        bodies: Bools | None = None,
+    ) -> pm.Model:
+        """Return the PyMC model of some transitions, and of some bodies alone."""
+        scene = self.task.scene
+        state, inputs, after = (values[rows] for values in self._data())
+        if bodies is not None:
+            scene = scene.subset([body.name for body in compress(scene.moving, bodies)])
+            state, inputs, after = (values[:, bodies] for values in (state, inputs, after))
+        history = from_segments(scene, state, inputs[:, None], after[:, None])
+        declared = {body.name: body.effects for body in scene.moving}
+        beside = [
+            attached
+            for attached in effects
+            if attached.body in declared and attached.effect.name not in declared[attached.body]
+        ]
+        return physics_model(scene, history, beside, sigma=self._noise)
 
     def _revised(self) -> Mode | None:
         """Criticise the declared model; return the mode found if it is of all data."""
@@ -182,29 +199,22 @@ class PBRLAgent(PhysicsAgent):
         the transitions without contact, whose likelihood is smooth, then to all.
         """
         scene, (state, inputs, after) = self.task.scene, self._data()
-        every = [body.name for body in scene.moving]
+        names = [body.name for body in scene.moving]
         moved = (state != state[0]).any(axis=(0, 2)) | state[0, :, 3:].any(axis=1)
         moved |= inputs[..., :3].any(axis=(0, 2))
-        for i, j in combinations(range(len(every)), 2):
-            pair = scene.subset([every[i], every[j]]).replace(walls=())
+        for i, j in combinations(range(len(names)), 2):
+            pair = scene.subset([names[i], names[j]]).replace(walls=())
             if moved[[i, j]].any() and touching(pair, state[:, [i, j]], after[:, [i, j]]).any():
                 moved[[i, j]] = True
         if moved.all() or not moved.any():
             return None
-        part = scene.subset([name for name, each in zip(every, moved, strict=True) if each])
-        inside = {body.name for body in part.moving}
-        extra = tuple(each for each in effects if each.body in inside)
-        extra = extra[len(attach(part, (), self._catalogue)) :]
-
-        def fitted(rows: Any, initial: Floats | None = None) -> Mode:
-            start, acting, end = (each[rows][:, moved] for each in (state, inputs, after))
-            history = from_segments(part, start, acting[:, None], end[:, None])
-            problem = physics_model(part, history, extra, sigma=self._noise).problem
-            return find_mode(problem, seed=self.seed, initial=initial)
-
-        free = ~touching(scene, state, after)
-        mode = fitted(slice(None), fitted(free).phi if free.any() else None)
-        return find_mode(whole, initial=whole.layout.from_layout(mode.problem.layout, mode.phi))
+        initial, free = None, ~touching(scene, state, after)
+        if free.any():
+            apart = self._model(effects, free, moved).problem
+            initial = find_mode(apart, seed=self.seed).phi
+        part = self._model(effects, bodies=moved).problem
+        mode = find_mode(part, seed=self.seed, initial=initial)
+        return find_mode(whole, initial=whole.layout.from_layout(part.layout, mode.phi))
 
     def _fit(self) -> None:
         start = self._revised() if self.revise else None

@@ -1,10 +1,15 @@
-"""Criticism during an episode: stepwise selection of effects from few transitions."""
+"""Criticism during an episode: stepwise selection of effects from few transitions.
+
+The selection of :mod:`pbrl_ppl.criticism` needs whole trajectories: it filters, smooths and
+forecasts along them, and knows the noise from hundreds of transitions. An agent has three to some
+tens of separate ones, at first without noise, so that here the noise is unknown in each test, the
+engine's error bounds it, and candidates are refitted where scores are far from the mode.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import beta
@@ -21,23 +26,12 @@ from pbrl_ppl.criticism import (
     with_effects,
 )
 from pbrl_ppl.effects import Attached, Effect, Noise, Structure, candidates
-from pbrl_ppl.modes import Mode, find_mode
+from pbrl_ppl.modes import Mode, find_mode, laplace_covariance
 from pbrl_ppl.parameters import prior_slopes
 from pbrl_ppl.state import Floats
 
 #: Returns the mode of a model with these effects.
 Search = Callable[[tuple[Attached, ...]], Mode]
-
-#: Largest number of added effects: an episode is short.
-_MOST_ADDED = 3
-#: Log-likelihoods of few transitions that differ by less do not decide between effects; the
-#: catalogue's order does, simpler effects first (nats; a score of 10, as in `inseparable`).
-_TIE = 5.0
-#: Up to this many transitions all candidates are refitted, whatever their scores, because the
-#: declared model may fit badly; a refit counts if it explains this share of the squared residuals.
-_FEW, _DECISIVE = 16, 0.99
-#: Precision of a uniform angle, as if it were normal (1/rad^2).
-_CIRCLE = 3.0 / np.pi**2
 
 
 @dataclass(frozen=True)
@@ -85,6 +79,7 @@ def select_effects(
     *,
     level: float,
     floor: Floats,
+    most_added: int = 3,
 ) -> tuple[tuple[Revision, ...], Mode]:
     """Return the effects that a declared model lacks, and the mode with them.
 
@@ -106,6 +101,8 @@ def select_effects(
         Significance level, corrected for the candidates.
     floor : ndarray
         Errors up to this are the engine's, and carry no information, shape (body, 6), SI units.
+    most_added : int
+        Largest number of added effects: an episode is short.
 
     Returns
     -------
@@ -115,81 +112,75 @@ def select_effects(
         Mode of the model with them.
     """
     tried = tuple(each for each in catalogue if not isinstance(each.stage, Structure | Noise))
-    step = _Step(search, tried, level, floor)
-    mode, found = search((*declared, *(each.attached for each in added))), added
-    for each in added:
-        others = tuple(other for other in found if other is not each)
-        kept = tuple(one for one in mode.problem.physics.effects if one != each.attached)
-        problem, phi = with_effects(mode, kept)
-        lacking = find_mode(problem, initial=phi)
-        better = step.addition(lacking, {each.attached: mode})
-        if better is not None and better.revision.attached != each.attached:
-            found, mode = (*others, better.revision), better.mode
-        elif not _is_worth_adding(step.gain(mode, lacking)):
-            found, mode = others, search((*declared, *(other.attached for other in others)))
-    while len(found) < _MOST_ADDED and not _is_exact(mode, floor):
-        more = step.addition(mode, {})
+    selection = _Selection(search, tried, level, floor)
+    mode, chosen = search((*declared, *(revision.attached for revision in added))), added
+    for revision in added:
+        others = tuple(other for other in chosen if other is not revision)
+        kept = (one for one in mode.problem.physics.effects if one != revision.attached)
+        problem, phi = with_effects(mode, tuple(kept))
+        without = find_mode(problem, initial=phi)
+        better = selection.addition(without, {revision.attached: mode})
+        if better is not None and better[0].attached != revision.attached:
+            chosen, mode = (*others, better[0]), better[1]
+        elif not _is_worth_adding(selection.gain(mode, without)):
+            chosen, mode = others, search((*declared, *(other.attached for other in others)))
+    while len(chosen) < most_added and not selection.is_exact(mode):
+        more = selection.addition(mode, {})
         if more is None:
             break
-        found, mode = (*found, more.revision), more.mode
-    return found, mode
-
-
-def _is_exact(mode: Mode, floor: Floats) -> bool:
-    """Return whether a model predicts its data up to the engine's error."""
-    columns = list(mode.problem.observations.columns)
-    residual = mode.problem.residual(mode.phi)[..., columns]
-    return bool((np.nan_to_num(abs(residual), nan=np.inf) <= floor[:, columns]).all())
-
-
-class _Addition(NamedTuple):
-    """An effect added, and the mode with it."""
-
-    revision: Revision
-    mode: Mode
-
-
-class _Refit(NamedTuple):
-    """A mode with a candidate, and the p-value of the share of the misfit that it explains."""
-
-    mode: Mode
-    p_value: float
+        chosen, mode = (*chosen, more[0]), more[1]
+    return chosen, mode
 
 
 @dataclass(frozen=True)
-class _Step:
-    """Step of the selection; fields as the arguments of :func:`select_effects`."""
+class _Selection:
+    """Selection of effects from few transitions; fields as arguments of :func:`select_effects`.
+
+    Parameters
+    ----------
+    tie : float
+        Log-likelihoods of few transitions that differ by less do not decide between effects; the
+        catalogue's order does, simpler effects first (nats; a score of 10, as in `inseparable`).
+    few : int
+        Up to this many transitions all candidates are refitted, whatever their scores, because the
+        declared model may fit badly.
+    decisive : float
+        Such a refit counts if it explains this share of the squared residuals.
+    """
 
     search: Search
     catalogue: tuple[Effect, ...]
     level: float
     floor: Floats
+    tie: float = 5.0
+    few: int = 16
+    decisive: float = 0.99
 
-    def addition(self, mode: Mode, known: Mapping[Attached, Mode]) -> _Addition | None:
-        """Return the best candidate that cross-validation confirms, or None.
+    def addition(self, mode: Mode, known: Mapping[Attached, Mode]) -> tuple[Revision, Mode] | None:
+        """Return the best candidate that cross-validation confirms, and the mode with it.
 
         ``known`` has modes with a candidate from earlier searches.
         """
         missing = candidates(mode.problem.scene, mode.problem.physics.effects, self.catalogue)
         ranked = rank_candidates(mode, missing)
-        order = {each: missing.index(each.attached) for each in ranked}
+        order = {signature: missing.index(signature.attached) for signature in ranked}
         by_name = sorted(ranked, key=order.__getitem__)
-        p_values = {each: _p_value(mode, each) for each in ranked}
-        significant: list[Signature] = []  # the first of a tie in the catalogue
-        for each in by_name:
-            p_value = p_values[each] * len(ranked)
-            if p_value < self.level and not any(twins(each, other) for other in significant):
-                significant.append(each)
+        p_values = {signature: _p_value(mode, signature) for signature in ranked}
+        significant: list[Signature] = []  # the first of indistinguishable ones in the catalogue
+        for signature in by_name:
+            p_value = p_values[signature] * len(ranked)
+            if p_value < self.level and not any(twins(signature, one) for one in significant):
+                significant.append(signature)
         leading = sorted(significant, key=ranked.index)[:TRIED]
-        fits = {each: known.get(each.attached) or _fit_with(mode, each) for each in leading}
-        if mode.problem.segments.n <= _FEW:  # scores far from the mode are unreliable
-            for each, refit in self._decisive_refits(mode, by_name).items():
-                p_values[each] = min(p_values[each], refit.p_value)
-                fits[each] = _higher(fits.get(each, refit.mode), refit.mode)
-            leading = sorted(fits, key=lambda each: -fits[each].log_posterior)[:TRIED]
+        fits = {one: known.get(one.attached) or _fit_with(mode, one) for one in leading}
+        if mode.problem.segments.n <= self.few:  # scores far from the mode are unreliable
+            for signature, (refit, p_value) in self._decisive_refits(mode, by_name).items():
+                p_values[signature] = min(p_values[signature], p_value)
+                fits[signature] = _higher(fits.get(signature, refit), refit)
+            leading = sorted(fits, key=lambda one: -fits[one].log_posterior)[:TRIED]
         if not leading:
             return None
-        searched = {each for each in leading if each.attached in known}
+        searched = {signature for signature in leading if signature.attached in known}
 
         def search(signature: Signature) -> None:
             """Search for a higher mode than the one found from the score's estimate."""
@@ -203,43 +194,71 @@ class _Step:
         alike = {leading[0].attached.effect.name, *inseparable(leading[0], leading)}
         search(leading[0])
         search(min((x for x in leading if x.attached.effect.name in alike), key=order.__getitem__))
-        scores = {each: _score(fits[each], each, self.floor) for each in leading}
+        scores = {signature: self._score(fits[signature], signature) for signature in leading}
         while scores:
             top = max(scores.values())
-            tied = [each for each, score in scores.items() if score > top - _TIE]
+            tied = [signature for signature, score in scores.items() if score > top - self.tie]
             best = min(tied, key=order.__getitem__)
             del scores[best]
             gained = self.gain(fits[best], mode)
             if _is_worth_adding(gained):
+                p_value = min(1.0, p_values[best] * len(missing))
                 revision = Revision(
-                    best.attached,
-                    mode.problem.segments.n,
-                    min(1.0, p_values[best] * len(missing)),
-                    gained.total,
-                    gained.error,
+                    best.attached, mode.problem.segments.n, p_value, gained.total, gained.error,
                     inseparable(best, ranked),
-                )
+                )  # fmt: skip
                 search(best)
-                return _Addition(revision, fits[best])
+                return revision, fits[best]
         return None
-
-    def _decisive_refits(self, mode: Mode, by_name: list[Signature]) -> dict[Signature, _Refit]:
-        """Return significant refits that explain nearly all of the misfit, without duplicates."""
-        before = float((mode.whitened_residual**2).sum())
-        found: dict[Signature, _Refit] = {}
-        for signature in by_name:
-            if not any(twins(signature, earlier) for earlier in found):
-                refit = _fit_with(mode, signature, estimate=False)
-                after = float((refit.problem.whitened(refit.phi, mode.sigma) ** 2).sum())
-                share = 1.0 - after / before
-                p_value = _p_value_of_share(mode, signature, share)
-                if share > _DECISIVE and p_value * len(by_name) < self.level:
-                    found[signature] = _Refit(refit, p_value)
-        return found
 
     def gain(self, mode: Mode, without: Mode) -> Change:
         """Return the gain in cross-validated log predictive density."""
-        return gain(_floored(without, self.floor), _floored(mode, self.floor))
+        return gain(self._floored(without), self._floored(mode))
+
+    def is_exact(self, mode: Mode) -> bool:
+        """Return whether a model predicts its data up to the engine's error."""
+        columns = list(mode.problem.observations.columns)
+        residual = mode.problem.residual(mode.phi)[..., columns]
+        return bool((np.nan_to_num(abs(residual), nan=np.inf) <= self.floor[:, columns]).all())
+
+    def _decisive_refits(
+        self, mode: Mode, by_name: list[Signature]
+    ) -> dict[Signature, tuple[Mode, float]]:
+        """Return significant refits that explain nearly all of the misfit, with their p-values."""
+        before = float((mode.whitened_residual**2).sum())
+        refits: dict[Signature, tuple[Mode, float]] = {}
+        for signature in by_name:
+            if not any(twins(signature, earlier) for earlier in refits):
+                refit = _fit_with(mode, signature, estimate=False)
+                after = float((refit.problem.whitened(refit.phi, mode.sigma) ** 2).sum())
+                p_value = _p_value(mode, signature, share := 1.0 - after / before)
+                if share > self.decisive and p_value * len(by_name) < self.level:
+                    refits[signature] = refit, p_value
+        return refits
+
+    def _score(self, mode: Mode, signature: Signature) -> float:
+        """Return the log-likelihood less half the log number of transitions per parameter (BIC)."""
+        problem = mode.problem
+        residual, sigma = problem.residual(mode.phi), self._noise(mode)
+        likelihood = problem.log_density(residual, sigma, mode.phi).sum()
+        return float(likelihood - 0.5 * signature.candidate.dof * np.log(problem.segments.n))
+
+    def _noise(self, mode: Mode) -> Floats:
+        """Return the noise of each measured dimension, at least the engine's error of any body."""
+        columns = list(mode.problem.observations.columns)
+        return np.asarray(np.maximum(mode.sigma, self.floor.min(axis=0)[columns]))
+
+    def _floored(self, mode: Mode) -> Mode:
+        """Return a mode whose noise is at least the engine's error, which bounds its certainty."""
+        sigma = self._noise(mode)
+        if (sigma == mode.sigma).all():
+            return mode
+        scaled = mode.jacobian.reshape(-1, len(sigma), len(mode.phi))
+        jacobian = (scaled * (mode.sigma / sigma)[:, None]).reshape(mode.jacobian.shape)
+        priors = mode.problem.layout.priors
+        precision = jacobian.T @ jacobian + np.diag(prior_slopes(priors, mode.phi) ** 2)
+        covariance = laplace_covariance(priors, precision)
+        return replace(mode, sigma=sigma, jacobian=jacobian, covariance=covariance)
 
 
 def _higher(first: Mode, second: Mode) -> Mode:
@@ -247,14 +266,14 @@ def _higher(first: Mode, second: Mode) -> Mode:
     return max(first, second, key=lambda mode: mode.log_posterior)
 
 
-def _p_value(mode: Mode, signature: Signature) -> float:
-    """Return the p-value of a score statistic."""
-    total = float((mode.whitened_residual**2).sum())
-    return _p_value_of_share(mode, signature, min(signature.candidate.statistic / total, 1.0))
+def _p_value(mode: Mode, signature: Signature, share: float | None = None) -> float:
+    """Return the p-value of an explained share of squares (beta distribution: noise is unknown).
 
-
-def _p_value_of_share(mode: Mode, signature: Signature, share: float) -> float:
-    """Return the p-value of an explained share of squares (beta distribution: noise is unknown)."""
+    The share of the score statistic by default.
+    """
+    if share is None:
+        total = float((mode.whitened_residual**2).sum())
+        share = min(signature.candidate.statistic / total, 1.0)
     q = signature.basis.shape[1]
     size = np.linalg.norm(mode.jacobian, axis=0)  # by a parameter's unit
     rank = np.linalg.matrix_rank(mode.jacobian / np.where(size > 0, size, 1.0))
@@ -272,36 +291,5 @@ def _fit_with(mode: Mode, signature: Signature, *, estimate: bool = True) -> Mod
     return find_mode(problem, initial=phi)
 
 
-def _score(mode: Mode, signature: Signature, floor: Floats) -> float:
-    """Return the log-likelihood minus half the log number of transitions per parameter (BIC)."""
-    problem, sigma = mode.problem, _floored_noise(mode, floor)
-    likelihood = problem.log_density(problem.residual(mode.phi), sigma, mode.phi).sum()
-    return float(likelihood - 0.5 * signature.candidate.dof * np.log(problem.segments.n))
-
-
 def _is_worth_adding(gained: Change) -> bool:
     return gained.total >= DEFAULT.min_elpd and gained.certain(DEFAULT.min_elpd_se)
-
-
-def _floored_noise(mode: Mode, floor: Floats) -> Floats:
-    """Return the noise of each measured dimension, at least the engine's error of any body."""
-    columns = list(mode.problem.observations.columns)
-    return np.asarray(np.maximum(mode.sigma, floor.min(axis=0)[columns]))
-
-
-def _floored(mode: Mode, floor: Floats) -> Mode:
-    """Return a mode whose noise is at least the engine's error, which bounds its certainty."""
-    sigma = _floored_noise(mode, floor)
-    if (sigma == mode.sigma).all():
-        return mode
-    priors, p = mode.problem.layout.priors, len(mode.phi)
-    jacobian = mode.jacobian.reshape(-1, len(sigma), p) * (mode.sigma / sigma)[:, None]
-    jacobian = jacobian.reshape(-1, p)
-    precision = jacobian.T @ jacobian + np.diag(prior_slopes(priors, mode.phi) ** 2)
-    angles = [i for i, prior in enumerate(priors) if prior.family == "von_mises"]
-    precision[angles, angles] += _CIRCLE
-    size = np.sqrt(np.diag(precision))
-    size = np.where(size > 0, size, 1.0)  # by a parameter's unit
-    scaled = precision / np.outer(size, size)
-    covariance = np.linalg.pinv(scaled, hermitian=True) / np.outer(size, size)
-    return replace(mode, sigma=sigma, jacobian=jacobian, covariance=covariance)

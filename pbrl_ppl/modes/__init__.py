@@ -19,6 +19,7 @@ from .ladder import ladder as ladder
 from .ladder import refined as refined
 from .ladder import with_robust_covariance as with_robust_covariance
 from .laplace import Mode as Mode
+from .laplace import laplace_covariance as laplace_covariance
 from .laplace import posterior_slopes as posterior_slopes
 from .library_choice import choose_from_library as choose_from_library
 from .noise import NOTHING as NOTHING

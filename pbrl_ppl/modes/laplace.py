@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import NamedTuple
@@ -12,7 +12,14 @@ from scipy.optimize import least_squares
 
 from pbrl_ppl.likelihood import Problem, log_posterior
 from pbrl_ppl.modes.noise import FAR_OFF, best_tails, noise_gaussian, profile_sigma, tail_precision
-from pbrl_ppl.parameters import box, by_prior, differentiate, inside, prior_residual
+from pbrl_ppl.parameters import (
+    Prior,
+    box,
+    by_prior,
+    differentiate,
+    inside,
+    prior_residual,
+)
 from pbrl_ppl.physics import PartedSimulator
 from pbrl_ppl.state import Floats
 
@@ -205,11 +212,17 @@ def finish(problem: Problem, peak: LocalMode) -> Mode:
     precision = jacobian.T @ jacobian
     if tails:
         precision[tails, tails] = tail_precision(problem, phi, sigma)
-    angles = [i for i, prior in enumerate(priors) if prior.family == "von_mises"]
-    precision[angles, angles] += _CIRCLE  # no angle is wider than its circle
-    covariance = covariance_of(precision)
+    covariance = laplace_covariance(priors, precision)
     n_cells = len(jacobian) - len(phi)
     return Mode(problem, phi, sigma, jacobian[:n_cells], covariance, log_posterior)
+
+
+def laplace_covariance(priors: Sequence[Prior], precision: Floats) -> Floats:
+    """Return the covariance of parameters, shape (p, p); no angle is wider than its circle."""
+    angles = [i for i, prior in enumerate(priors) if prior.family == "von_mises"]
+    precision = precision.copy()
+    precision[angles, angles] += _CIRCLE
+    return covariance_of(precision)
 
 
 def covariance_of(precision: Floats) -> Floats:
