@@ -14,7 +14,6 @@ from pbrl_ppl.effects import Effect
 from pbrl_ppl.parameters import BODY_PARAMETERS, JOINT_ANCHORS
 from pbrl_ppl.posterior import (
     Identifiability,
-    PosteriorRecord,
     group,
     interval,
     scalars,
@@ -118,9 +117,9 @@ class Parameters:
     rough_ess: float = 100.0
 
     @cached_property
-    def record(self) -> PosteriorRecord:
-        """The record of the fit."""
-        return PosteriorRecord.of(self.posterior)
+    def sampler(self) -> dict[str, Any]:
+        """What the posterior's record says of its draws: method, weights and proposals."""
+        return stored_fields(self.posterior, ("method", "pareto_k", "importance_ess", "proposals"))
 
     @cached_property
     def summary(self) -> pd.DataFrame:
@@ -144,12 +143,12 @@ class Parameters:
     @property
     def chains(self) -> bool:
         """Whether there are chains to compare: draws of Laplace's approximation are independent."""
-        return self.record.method != "laplace"
+        return self.sampler.get("method") != "laplace"
 
     @property
     def weighted(self) -> bool:
         """Whether the draws are of importance sampling: R-hat of few of them is often too large."""
-        return self.record.importance_ess is not None
+        return "importance_ess" in self.sampler
 
     @property
     def failed(self) -> pd.DataFrame:
@@ -208,7 +207,7 @@ class Parameters:
             f"The largest R-hat of {count} parameters is {number(hats.max(), 4)} (at most"
             f" {self.good_r_hat} is wanted), the smallest effective sample size"
             f" {number(ess.min())} (at least {self.good_ess:.0f})."
-            f"{_weights_in_words(self.record)}"
+            f"{_weights_in_words(self.sampler)}"
         )
         agree = "The draws suffice" if self.weighted else "The chains agree"
         if failed:
@@ -229,14 +228,14 @@ def _span(low: float, high: float) -> str:
     return f"{number(low, digits)} to {number(high, digits)}"
 
 
-def _weights_in_words(record: PosteriorRecord) -> str:
+def _weights_in_words(sampler: Mapping[str, Any]) -> str:
     """Return the quality of importance weights; empty for chains."""
-    k, size = record.pareto_k, record.importance_ess
+    k, size = sampler.get("pareto_k"), sampler.get("importance_ess")
     if k is None or size is None:
         return ""
     return (
-        f" The draws are resampled proposals of {record.proposals or 'another density'}: Pareto k"
-        f" of their weights is {number(k)} (above 0.7 the proposals would miss a part of the"
+        f" The draws are resampled proposals of {sampler.get('proposals') or 'another density'}:"
+        f" Pareto k of their weights is {number(k)} (above 0.7 the proposals would miss a part of the"
         f" posterior), and by their weights the draws are worth {number(size)} independent ones."
     )
 
