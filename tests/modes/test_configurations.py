@@ -582,7 +582,7 @@ def test_other_samplers_go_by_the_same_way(model, method) -> None:
 def test_what_cannot_be_done_is_refused(model, fitted) -> None:
     with pytest.raises(FitError, match=r"method is 'smc' and which bodies .* is unknown.*use"):
         fit(model, method="smc")
-    with pytest.raises(FitError, match=r"resume= was given and which bodies.*leave resume out"):
+    with pytest.raises(FitError, match=r"resume was given and which bodies.*leave resume out"):
         fit(model, resume=fitted)
     with pytest.raises(FitError, match=r"a mode is one of continuous.*pbrl_ppl.fit finds them"):
         find_mode(model.problem)

@@ -536,7 +536,7 @@ def test_engine_moves_are_counted(model, mode, monkeypatch) -> None:
 
 
 def test_too_few_draws(model, mode) -> None:
-    cure = r"the draws are too few: .*effective.*; raise draws=, or go on with resume="
+    cure = r"the draws are too few: .*effective.*; raise draws, or resume this posterior"
     with pytest.warns(ConvergenceWarning, match=cure) as caught:
         few = fit(model, seed=1, start=mode, **(QUICK | {"draws": 40}))
     assert few.attrs["max_rhat"] > 1.01  # as that of a few independent draws is
