@@ -236,7 +236,8 @@ def _weights_in_words(sampler: Mapping[str, Any]) -> str:
     return (
         f" The draws are resampled proposals of {sampler.get('proposals') or 'another density'}:"
         f" Pareto k of their weights is {number(k)} (above 0.7 the proposals would miss a part"
-        f" of the posterior), and by their weights the draws are worth {number(size)} independent ones."
+        f" of the posterior), and by their weights the draws are worth {number(size)} independent"
+        " ones."
     )
 
 
