@@ -83,7 +83,7 @@ def moments(model: pm.Model, idata: Any) -> dict[str, Moments]:
     """
     layout = model.problem.layout
     phi, sigma = parameter_draws(model.problem, idata)
-    phi = by_prior(layout, phi)
+    phi = by_prior(layout, phi, equal_alone=True)
     columns: dict[str, Any] = {}
     for label, prior, x in zip(layout.labels, layout.priors, phi.T, strict=True):
         columns[label] = np.log(x) if prior.family == "log_normal" else x

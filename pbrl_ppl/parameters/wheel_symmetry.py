@@ -165,7 +165,13 @@ def _about_own_mean(points: Floats, rounds: int = 20) -> NDArray[np.intp]:
     return chosen
 
 
-def by_prior(layout: Layout, phi: Floats, rng: np.random.Generator | None = None) -> Floats:
+def by_prior(
+    layout: Layout,
+    phi: Floats,
+    rng: np.random.Generator | None = None,
+    *,
+    equal_alone: bool = False,
+) -> Floats:
     """Return each wheel in its most probable description, or in one drawn by the prior.
 
     The likelihood being the same for all, drawing is a Gibbs step of the posterior: draws of it
@@ -180,6 +186,8 @@ def by_prior(layout: Layout, phi: Floats, rng: np.random.Generator | None = None
     rng : Generator, optional
         Of the draws, which leave descriptions alone that the prior cannot tell apart. Without it,
         of those the one with mu_x <= mu_y and w_theta in (-pi/2, pi/2] is taken.
+    equal_alone : bool
+        Whether descriptions stay as they are that the prior tells apart.
 
     Returns
     -------
@@ -188,7 +196,7 @@ def by_prior(layout: Layout, phi: Floats, rng: np.random.Generator | None = None
     """
     phi = phi.copy()
     for wheel in wheels(layout):
-        if wheel.period > 1:
+        if wheel.period > 1 and not equal_alone:
             score = wheel.log_priors(phi, wheel.period)
             # the largest of log-probabilities with Gumbel noise is a draw
             score = score if rng is None else score + rng.gumbel(size=score.shape)

@@ -277,7 +277,7 @@ def replicate(design: Problem, truth: Truth, seed: int, settings: Mapping[str, A
 def _quantities(problem: Problem, phi: Floats, sigma: Floats, likelihood: Floats) -> Floats:
     """Return the ranked quantities: folded phi, sigma, log-likelihood, shape (draw, quantity)."""
     sigma = problem.likelihood.free(sigma)
-    return np.hstack([by_prior(problem.layout, phi), sigma, likelihood[:, None]])
+    return np.hstack([by_prior(problem.layout, phi, equal_alone=True), sigma, likelihood[:, None]])
 
 
 def labels(problem: Problem) -> tuple[str, ...]:
