@@ -15,7 +15,7 @@ from pbrl_ppl.likelihood import ACCELERATION, Problem, TrajectoryLikelihood, alo
 from pbrl_ppl.model import build_model
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.physics import Physics, Simulator
-from pbrl_ppl.posterior import evaluate, from_groups, group, problem_of
+from pbrl_ppl.posterior import Fit, evaluate, from_groups, group, problem_of
 from pbrl_ppl.sampling import fit, physics_model
 from pbrl_ppl.sampling.replication import draw_truths
 from pbrl_ppl.scene import Body, Scene, Shape
@@ -134,9 +134,8 @@ def test_held_out_errors_are_of_one_world(model) -> None:
     assert shown.body == "a"  # which the other stops
     np.testing.assert_allclose(shown.before[1], expected[0, 0, A], atol=1e-9)
     off = model.problem.observations.residual(expected)[:, -1]
-    errors = held.errors(
-        held, posterior_of(build_model(whole), phi), rollout=1, seed=1, noise=held.mode.sigma
-    )
+    fitted = Fit(whole, posterior_of(build_model(whole), phi))
+    errors = held.errors(held, fitted, rollout=1, seed=1, noise=held.mode.sigma)
     for i, name in enumerate(STATE):
         found = errors.one_step_rmse[name]
         assert found == pytest.approx(np.sqrt((off[..., i] ** 2).mean()), rel=1e-6), name
