@@ -1,12 +1,12 @@
 """Single bad frames of a recording: rows off the smooth curve through their neighbours."""
 
-import warnings
 from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
+from pbrl_ppl.errors import warn
 from pbrl_ppl.history.history import History
 from pbrl_ppl.history.kinematics import GAUSSIAN, RATE_REACH, finest_step
 from pbrl_ppl.state import STATE, STATE_UNITS, THETA, VELOCITY, Bools, Floats, wrapped
@@ -127,11 +127,11 @@ def without_bad_frames(history: History, *, most: float = 0.05) -> tuple[History
     rows = int(dataset["n_rows"].sum())
     many = (count > 1) & (count > most * rows)
     for body, d in np.argwhere(many):
-        warnings.warn(
+        warn(
             f"{STATE[d]} of {history.bodies[body]}: {100 * count[body, d] / rows:.2g} % of the rows"
             f" are far off their neighbours, more than {100 * most:g} %: heavy-tailed noise rather"
             " than single bad frames, so all rows are kept",
-            stacklevel=2,
+            UserWarning,
         )
     return without_measurements(history, np.where(many, np.nan, off))
 

@@ -1,6 +1,5 @@
 """Tables of other programs: columns renamed, units converted."""
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import TypedDict, Unpack
@@ -8,7 +7,7 @@ from typing import TypedDict, Unpack
 import numpy as np
 import pandas as pd
 
-from pbrl_ppl.errors import HistoryError, RecordingWarning
+from pbrl_ppl.errors import HistoryError, RecordingWarning, warn
 from pbrl_ppl.history.cuts import cut
 from pbrl_ppl.history.files import COLUMNS
 from pbrl_ppl.history.rows import with_clean_names
@@ -299,5 +298,5 @@ def _completed(frame: pd.DataFrame, scene: Scene, layout: Recording, source: str
         pieces = frame["trajectory"].nunique()
         said.append(f"cut into {pieces} trajectories, {before - len(frame)} rows between them")
     if said:
-        warnings.warn(f"{source}: {'; '.join(said)}", RecordingWarning, stacklevel=5)
+        warn(f"{source}: {'; '.join(said)}", RecordingWarning)
     return frame

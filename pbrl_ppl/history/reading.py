@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Unpack
 
+from pbrl_ppl.errors import warn
 from pbrl_ppl.history.conversion import Reading
 from pbrl_ppl.history.ends import strange_ends, trimmed
 from pbrl_ppl.history.history import History
@@ -47,7 +47,7 @@ def read_recording(
     """
     history = History.load(path, scene, estimate_velocities=estimate_velocities, **reading)
     for sentence in unit_mismatches(history):
-        warnings.warn(f"history {path}: {sentence}", stacklevel=2)
+        warn(f"history {path}: {sentence}", UserWarning)
     ends = strange_ends(history, scene)
     if not ends:
         return history
@@ -55,5 +55,5 @@ def read_recording(
     named = "; ".join(map(str, ends[:most_ends]))
     more = f"; and {len(ends) - most_ends} more" if len(ends) > most_ends else ""
     cure = "left out" if trim else "no command or contact explains it: --trim leaves the rows out"
-    warnings.warn(f"history {path}: {named}{more}: {cure}", stacklevel=2)
+    warn(f"history {path}: {named}{more}: {cure}", UserWarning)
     return trimmed(history, ends) if trim else history

@@ -1,12 +1,11 @@
 """Rows at uneven times, interpolated to the scene's time step."""
 
-import warnings
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
-from pbrl_ppl.errors import HistoryError, ResamplingWarning
+from pbrl_ppl.errors import HistoryError, ResamplingWarning, warn
 from pbrl_ppl.history.kinematics import unwrapped
 from pbrl_ppl.history.rows import TIME_TOLERANCE, Rows, rows_of_arrays
 from pbrl_ppl.scene import Scene
@@ -104,7 +103,7 @@ def resampled(rows: Rows, scene: Scene, source: str, *, reach: float = 1.9) -> R
             f"; {lost}: difference quotients of the positions, no measurements, and left empty"
             " (estimate_velocities, --estimate-velocities)"
         )
-    warnings.warn(message, ResamplingWarning, stacklevel=3)
+    warn(message, ResamplingWarning)
     return result
 
 

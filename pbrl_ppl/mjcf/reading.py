@@ -7,7 +7,6 @@ arrays of its rollouts, see :func:`pbrl_ppl.from_mujoco`.
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from pbrl_ppl.errors import ConversionWarning, SceneError
+from pbrl_ppl.errors import ConversionWarning, SceneError, warn
 from pbrl_ppl.history.mujoco import FLAT, FREE, HINGE, PLANES, SLIDE
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene, Shape, Wall
 from pbrl_ppl.state import Floats
@@ -121,11 +120,8 @@ def scene_from_mjcf(
         joints=tuple(joints),
     )
     if seen.left_out:
-        warnings.warn(
-            "the scene of the MuJoCo model leaves out: " + "; ".join(seen.left_out),
-            ConversionWarning,
-            stacklevel=2,
-        )
+        left_out = "; ".join(seen.left_out)
+        warn(f"the scene of the MuJoCo model leaves out: {left_out}", ConversionWarning)
     return scene
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable
 from typing import Any
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from pbrl_ppl.effects import Effect, catalogue
-from pbrl_ppl.errors import ConversionWarning, SceneError
+from pbrl_ppl.errors import ConversionWarning, SceneError, warn
 from pbrl_ppl.history.mujoco import PLANES
 from pbrl_ppl.mjcf.reading import rotation, rounded
 from pbrl_ppl.posterior import labelled_draws, layout_of, scene_of
@@ -109,11 +108,7 @@ def mjcf_ranges(
     }
     text, left_out = _Writer(scene, means, PLANES[plane], depth).write()
     if left_out:
-        warnings.warn(
-            "the MJCF of the scene leaves out: " + "; ".join(left_out),
-            ConversionWarning,
-            stacklevel=2,
-        )
+        warn("the MJCF of the scene leaves out: " + "; ".join(left_out), ConversionWarning)
     return text, ranges
 
 

@@ -9,7 +9,6 @@ uniform.
 from __future__ import annotations
 
 import json
-import warnings
 from collections.abc import Iterable, Mapping
 from concurrent.futures import Executor
 from contextlib import closing
@@ -23,7 +22,7 @@ from rich.progress import track
 
 from pbrl_ppl.background import as_ended
 from pbrl_ppl.effects import Attached, Effect
-from pbrl_ppl.errors import FitError, OutputError
+from pbrl_ppl.errors import FitError, OutputError, warn
 from pbrl_ppl.files import write_text
 from pbrl_ppl.history import History, with_units
 from pbrl_ppl.likelihood import (
@@ -203,9 +202,7 @@ def calibrate(
     if not done:
         raise FitError(f"calibrate: all {replications} replications failed; {failed[0]}")
     if failed:
-        warnings.warn(
-            f"{len(failed)} of {replications} replications failed; {failed[0]}", stacklevel=2
-        )
+        warn(f"{len(failed)} of {replications} replications failed; {failed[0]}", UserWarning)
     numbers = sorted(done)
     columns = {name: np.array([done[i][name] for i in numbers]) for name in done[numbers[0]]}
     return Calibration.of(
