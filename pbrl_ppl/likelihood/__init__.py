@@ -29,11 +29,6 @@ from .log_posterior import log_posterior as log_posterior
 from .log_posterior import log_prior as log_prior
 from .log_posterior import noise_law as noise_law
 from .log_posterior import noise_prior_slope as noise_prior_slope
-from .names import ACTION_DIMS as ACTION_DIMS
-from .names import NEXT_STATE_DIMS as NEXT_STATE_DIMS
-from .names import START_DIMS as START_DIMS
-from .names import variable_coords as variable_coords
-from .names import variable_dims as variable_dims
 from .noise_scales import bodies_acceleration as bodies_acceleration
 from .noise_scales import noise_medians as noise_medians
 from .noise_scales import ranges as ranges
@@ -43,7 +38,12 @@ from .output_error import least_errors as least_errors
 from .output_error import linearised_about as linearised_about
 from .output_error import linearised_pieces as linearised_pieces
 from .output_error import output_error as output_error
+from .problem import ACTION_DIMS as ACTION_DIMS
+from .problem import NEXT_STATE_DIMS as NEXT_STATE_DIMS
+from .problem import START_DIMS as START_DIMS
 from .problem import Problem as Problem
+from .problem import variable_coords as variable_coords
+from .problem import variable_dims as variable_dims
 from .sensitivity import Sensitivity as Sensitivity
 from .simulation import simulated_trajectories as simulated_trajectories
 from .simulation import with_measurements as with_measurements

@@ -11,6 +11,7 @@ import numpy as np
 
 from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.history import History, Segments
+from pbrl_ppl.likelihood.coordinates import ACCELERATION, CONTACT, DRIFT
 from pbrl_ppl.likelihood.data import Data, Observations, sigma_prior
 from pbrl_ppl.likelihood.likelihood import (
     Likelihood,
@@ -20,11 +21,19 @@ from pbrl_ppl.likelihood.likelihood import (
 )
 from pbrl_ppl.likelihood.tails import degrees_of_freedom, tail_places
 from pbrl_ppl.likelihood.trajectory_noise import TrajectoryNoise
-from pbrl_ppl.parameters import Layout, ParameterLibrary
+from pbrl_ppl.parameters import Block, Layout, ParameterLibrary
 from pbrl_ppl.physics import OneWorld, PartedSimulator, Physics
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import STATE, Floats
+from pbrl_ppl.state import INPUT, STATE, Floats
 
+#: Dimensions of the noise variables along trajectories.
+_NOISE_DIMS = {
+    "sigma": "sensor", ACCELERATION: "velocity", CONTACT: "velocity", DRIFT: "position",
+}  # fmt: skip
+#: Dimensions of measured next states, and of the data that they are predicted from.
+NEXT_STATE_DIMS = ("transition", "step", "body", "state")
+START_DIMS = ("transition", "body", "full_state")
+ACTION_DIMS = ("transition", "step", "body", "wrench")
 #: Phi, start states and wrenches in, next states out.
 Engine = Callable[[Floats, Floats, Floats], Floats]
 #: Ratio of engine steps from which a correction saves time.
@@ -139,16 +148,20 @@ class Problem:
         """Return the problem with predictions corrected to those of more engine steps at phi."""
         return replace(self, defect=np.nan_to_num(exact.predict(phi) - self.predict(phi)))
 
-    def joined(self, phi: Floats, sigma: Floats) -> Problem:
+    def joined(self, phi: Floats, sigma: Floats, most: int = 50) -> Problem:
         """Return the problem with bodies that meet at these draws in one part; itself if none do.
 
         Parameters
         ----------
         phi, sigma : ndarray
             Draws, shapes (n, p) and (n, parameter).
+        most : int
+            Of more draws so many are simulated, evenly spread.
         """
         if len(self.simulator.parts) == 1:
             return self
+        rows = np.linspace(0, len(phi) - 1, min(most, len(phi))).astype(int)
+        phi, sigma = phi[rows], sigma[rows]
         segments, columns = self.segments, list(self.observations.columns)
         states, met = self.one_world.meetings(phi, segments.start, self.inputs)
         if not met.any():
@@ -338,3 +351,51 @@ class Problem:
         predicted = states[..., self.observations.columns]
         values = self.observations.values
         return self.likelihood.random(predicted, values, sigma, rng, self.nu(phi))
+
+
+def variable_dims(problem: Problem) -> dict[str, tuple[str, ...]]:
+    """Return the dimensions of each parameter and noise variable by name."""
+    dims: dict[str, tuple[str, ...]] = {
+        block.name: (_block_dim(problem, block),) for block in problem.layout.blocks
+    }
+    if problem.library is not None:
+        dims["library_index"] = (_owner_dim(problem, tuple(problem.scene.owners), "library"),)
+    for name in problem.noise_variables:
+        if problem.scalar_sigma:
+            dims[name] = ()
+        else:
+            dims[name] = (_NOISE_DIMS[name] if problem.likelihood.filtered else "state",)
+    return dims
+
+
+def variable_coords(problem: Problem) -> dict[str, list[Any]]:
+    """Return the labels of each dimension by name."""
+    coords: dict[str, list[Any]] = {
+        "body": [body.name for body in problem.scene.moving],
+        "full_state": list(STATE),
+        "state": list(problem.observations.names),
+        "wrench": list(INPUT[: problem.inputs.shape[-1]]),
+        "transition": list(range(problem.segments.n)),
+        "step": list(range(1, problem.data.horizon + 1)),
+    }
+    if problem.likelihood.filtered:
+        coords |= {_NOISE_DIMS[name]: list(own) for name, own in problem.noise_variables.items()}
+    owners = tuple(problem.scene.owners)
+    coords.setdefault(_owner_dim(problem, owners, ""), list(owners))
+    for block in problem.layout.blocks:
+        coords.setdefault(_block_dim(problem, block), list(block.owners))
+    return coords
+
+
+def _block_dim(problem: Problem, block: Block) -> str:
+    """Return the dimension of a parameter: joints, or the bodies or classes that have it."""
+    if block.of == "joint":
+        return "joint" if not block.name.startswith("i_") else "free_joint"
+    return _owner_dim(problem, block.owners, block.effect or block.name)
+
+
+def _owner_dim(problem: Problem, owners: tuple[str, ...], name: str) -> str:
+    """Return ``body`` for all moving bodies, ``owner`` for all owners, or a name of its own."""
+    if set(owners) == {body.name for body in problem.scene.moving}:
+        return "body"
+    return "owner" if owners == tuple(problem.scene.owners) else f"{name}_body"

@@ -18,7 +18,6 @@ from .cross_validation import left_out as left_out
 from .cross_validation import loo_pit as loo_pit
 from .cross_validation import predicted_rows as predicted_rows
 from .cross_validation import separate as separate
-from .data import CELLS as CELLS
 from .data import both_places as both_places
 from .data import both_recordings as both_recordings
 from .data import linearised_as as linearised_as

@@ -19,6 +19,7 @@ from pbrl_ppl.likelihood import (
     ACCELERATION,
     CONTACT,
     DRIFT,
+    NEXT_STATE_DIMS,
     Problem,
     exponential,
     noise_law,
@@ -26,7 +27,7 @@ from pbrl_ppl.likelihood import (
 )
 from pbrl_ppl.modes import doubts
 from pbrl_ppl.parameters import Prior, by_prior, nearest, prior_draws
-from pbrl_ppl.posterior.data import CELLS, placed, places, record_of, recording
+from pbrl_ppl.posterior.data import placed, places, record_of, recording
 from pbrl_ppl.posterior.identifiability import uninformed
 from pbrl_ppl.posterior.mode import Point, packed_mode
 from pbrl_ppl.posterior.record import Linearisation, PosteriorRecord, vectors
@@ -92,7 +93,7 @@ def complete(
     likelihood, predictive = evaluate(problem, phi, sigma, rows.ravel(), rng, known)
     data = groups(trace)
     posterior = _with_units(problem, posterior)
-    coords = {dim: data["observed_data"][dim].values for dim in CELLS}
+    coords = {dim: data["observed_data"][dim].values for dim in NEXT_STATE_DIMS}
     per_draw = {"chain": posterior["chain"], "draw": posterior["draw"]}
     predicted = {"chain": posterior["chain"], "draw": posterior["draw"][rows[0]], **coords}
     result = {
@@ -104,12 +105,12 @@ def complete(
             per_draw | {"transition": coords["transition"]},
         ),
         "posterior_predictive": _next_state(
-            ("chain", "draw", *CELLS),
+            ("chain", "draw", *NEXT_STATE_DIMS),
             predictive.reshape(*rows.shape, *predictive.shape[1:]),
             predicted,
         ),
         **prior_groups(problem, posterior, phi, sigma, seed),
-        "observed_data": _next_state(CELLS, problem.measured, coords),
+        "observed_data": _next_state(NEXT_STATE_DIMS, problem.measured, coords),
         "constant_data": data["constant_data"].merge(recording(problem)),
     }
     sampled = {name: trace.attrs[name] for name in SAMPLED if name in trace.attrs}
@@ -120,7 +121,7 @@ def complete(
     if problem.likelihood.filtered and len(phi) > 1:
         record = replace(record, linearisation=linearisation(problem, phi, sigma))
     idata = placed(from_groups(result, record.attributes()), places(problem.segments))
-    return checked(problem, idata, asked)
+    return checked(problem, record, idata, asked)
 
 
 def _next_state(dims: tuple[str, ...], values: Floats, coords: Any) -> xr.Dataset:
@@ -253,7 +254,7 @@ def prior_groups(
     scale = np.exp(centre) / np.log(2.0)
     # independent of the generator of the predictions
     rng = np.random.default_rng([seed, 1])
-    drawn = prior_draws(layout.priors, rng, len(phi)) if layout.size else phi
+    drawn = prior_draws(layout.priors, rng, len(phi))
     noise_drawn = prior_draws(noise, rng, len(phi))
     noise_drawn = np.where(steps, rng.exponential(scale, noise_drawn.shape), noise_drawn)
     density = np.stack([prior.log_density(sigma[:, i]) for i, prior in enumerate(noise)], axis=1)
@@ -321,7 +322,12 @@ def linearisation(
 
 
 def checked(
-    problem: Problem, idata: Any, asked: tuple[int, int] | None = None, *, least_draws: int = 4
+    problem: Problem,
+    record: PosteriorRecord,
+    idata: Any,
+    asked: tuple[int, int] | None = None,
+    *,
+    least_draws: int = 4,
 ) -> Any:
     """Enter convergence and warnings in a posterior's record, and issue the warnings.
 
@@ -329,14 +335,16 @@ def checked(
     ----------
     problem : Problem
         What was fitted.
+    record : PosteriorRecord
+        Of the fit.
     idata : InferenceData or DataTree
-        The posterior.
+        The posterior, with the record in its attributes.
     asked : tuple of int, optional
         Draws a chain, and chains, that were asked for, where an interrupt left fewer.
     least_draws : int
         Fewest draws a chain for which R-hat is defined.
     """
-    record, sizes = PosteriorRecord.of(idata), group(idata, "posterior").sizes
+    sizes = group(idata, "posterior").sizes
     on = "resume this posterior"
     if problem.layout.discrete.any():  # fit does not go on over joints of unknown bodies
         on = "name the bodies that were found in the scene, fit that and resume it"

@@ -10,7 +10,8 @@ import numpy as np
 import xarray as xr
 
 from pbrl_ppl.errors import PosteriorError
-from pbrl_ppl.posterior.data import CELLS, SMOOTHED
+from pbrl_ppl.likelihood import NEXT_STATE_DIMS
+from pbrl_ppl.posterior.data import SMOOTHED
 from pbrl_ppl.posterior.store import DATATREE, arviz, from_groups, group, groups, smoothed
 from pbrl_ppl.state import STATE, THETA, Floats, Ints, wrapped
 
@@ -221,12 +222,12 @@ def by_number(idata: Any) -> Any:
             " the one left out; fit single transitions, or take az.loo of by_trajectory"
         )
     predictive = group(idata, "posterior_predictive")["next_state"]
-    predictive = predictive.transpose("chain", "draw", *CELLS)
+    predictive = predictive.transpose("chain", "draw", *NEXT_STATE_DIMS)
     some = {"draw": predictive["draw"].to_numpy()}
     posterior = group(idata, "posterior").sel(some).drop_vars(["chain", "draw"])
     likelihood = group(idata, "log_likelihood")["next_state"].sel(some)
     each = likelihood.transpose("chain", "draw", "transition").to_numpy()
-    measured = group(idata, "observed_data")["next_state"].transpose(*CELLS)
+    measured = group(idata, "observed_data")["next_state"].transpose(*NEXT_STATE_DIMS)
     values = measured.to_numpy()
     seen = np.flatnonzero(np.isfinite(values))
     places = np.unravel_index(seen, values.shape)
@@ -234,7 +235,7 @@ def by_number(idata: Any) -> Any:
     predicted = predicted.reshape(*predicted.shape[:2], -1)[..., seen]
     labels = {
         dim: (_NUMBER, np.asarray(measured[dim])[place])
-        for dim, place in zip(CELLS, places, strict=True)
+        for dim, place in zip(NEXT_STATE_DIMS, places, strict=True)
     }
     sampled = ("chain", "draw", _NUMBER)
     return from_groups(
@@ -275,10 +276,10 @@ def loo_pit(idata: Any) -> xr.DataArray:
     predictive = group(idata, "posterior_predictive")
     rows = predicted_rows(group(idata, "posterior"), predictive)
     samples = {"sample": ("chain", "draw")}
-    predicted = predictive["next_state"].stack(samples).transpose("sample", *CELLS)
+    predicted = predictive["next_state"].stack(samples).transpose("sample", *NEXT_STATE_DIMS)
     likelihood = group(idata, "log_likelihood")["next_state"].stack(samples)
     likelihood = likelihood.transpose("transition", "sample")
-    measured = group(idata, "observed_data")["next_state"].transpose(*CELLS)
+    measured = group(idata, "observed_data")["next_state"].transpose(*NEXT_STATE_DIMS)
     # smoothed over all draws, for a better estimate of the tail
     weights = np.stack([smoothed(-each)[0][rows] for each in likelihood.to_numpy()], axis=1)
     weights /= weights.sum(axis=0)

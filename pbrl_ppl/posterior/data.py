@@ -15,6 +15,7 @@ from pbrl_ppl.effects import Effect, LearnedRemainder, catalogue
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.history import History, Segments, from_segments
 from pbrl_ppl.likelihood import (
+    NEXT_STATE_DIMS,
     Problem,
     Sensitivity,
     TransitionLikelihood,
@@ -33,8 +34,6 @@ from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import INPUT, STATE
 
 PACKAGES = ("pbrl_ppl", "pymc", "pytensor", "arviz", "pymunk", "numpy", "numba", "xarray")
-#: Dimensions of measured next states.
-CELLS = ("transition", "step", "body", "state")
 #: Name of the smoothed or simulated states; a posterior of single transitions has none.
 SMOOTHED = "smoothed"
 #: Names of the derivative of simulated states by their start, and of autocorrelation times.
@@ -120,7 +119,7 @@ def problem_of(
     start, actions = given["start"].to_numpy(), given["actions"].to_numpy()
     other = history is not None
     if history is None:
-        values = measured.transpose(*CELLS).to_numpy()
+        values = measured.transpose(*NEXT_STATE_DIMS).to_numpy()
         observed = np.full((*values.shape[:3], len(STATE)), np.nan)
         observed[..., columns] = values
         history = from_segments(record.scene, start, actions, observed)
@@ -179,7 +178,7 @@ def linearised_as(problem: Problem, idata: Any) -> Problem:
         )
     if problem.likelihood.simulated:
         problem = in_pieces(problem, record.horizon, problem.data.smoothed_states)
-    measured = group(idata, "observed_data")["next_state"].transpose(*CELLS).to_numpy()
+    measured = group(idata, "observed_data")["next_state"].transpose(*NEXT_STATE_DIMS).to_numpy()
     if not np.array_equal(measured, problem.measured, equal_nan=True):
         raise PosteriorError(
             f"posterior: it is of {len(measured)} transitions that are not the model's"
@@ -206,7 +205,7 @@ def recording(problem: Problem) -> xr.Dataset:
     dims = tuple(f"{_PREFIX}{name}" for name in ("trajectory", "time", "body", "state"))
     kept[SMOOTHED] = (dims, problem.data.smoothed_states)
     if problem.likelihood.simulated:
-        kept[_BY_START] = ((*CELLS, "cell_before"), output_error(problem).starts.slope)
+        kept[_BY_START] = ((*NEXT_STATE_DIMS, "cell_before"), output_error(problem).starts.slope)
         kept[_TAU] = (("state",), np.array(output_error(problem).tau), {"units": "rows"})
         return kept.assign_attrs({})
     noise = problem.trajectory_noise

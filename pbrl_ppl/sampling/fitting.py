@@ -52,8 +52,6 @@ _SEARCHES: Mapping[str, Callable[..., Mode]] = {
 }
 #: The default sampler.
 DEFAULT = "importance"
-#: Draws of a trace at which contacts between parts are looked for, at most.
-_CHECKED_DRAWS = 50
 
 
 def fit(
@@ -223,7 +221,7 @@ def sample(
         sizes = group(trace, "posterior").sizes
         all_chains = job.chains if resume is None else group(resume, "posterior").sizes["chain"]
         cut = sizes["draw"] < job.draws or sizes["chain"] < all_chains
-        joined = job.problem if cut else _joined_of_draws(job.problem, trace)
+        joined = job.problem if cut else _joined(job.problem, *parameter_draws(job.problem, trace))
         if joined is job.problem:
             break
         job, start, resume = replace(job, problem=joined, resume=None), None, None
@@ -353,13 +351,6 @@ def _joined(problem: Problem, phi: Floats, sigma: Floats) -> Problem:
         MeetingWarning,
     )
     return joined
-
-
-def _joined_of_draws(problem: Problem, trace: Any) -> Problem:
-    """Return the problem of `_joined` at some of a trace's draws."""
-    phi, sigma = parameter_draws(problem, trace)
-    rows = np.linspace(0, len(phi) - 1, min(_CHECKED_DRAWS, len(phi))).astype(int)
-    return _joined(problem, phi[rows], sigma[rows])
 
 
 def _as_in(problem: Problem, idata: Any) -> Problem:

@@ -221,8 +221,7 @@ def _weighted(
     problem = files.problem_of(idata, effects, history)
     check_engine(idata, problem)
     phi, sigma = parameter_draws(problem, idata)
-    rows = np.linspace(0, len(phi) - 1, min(50, len(phi))).astype(int)
-    problem = problem.joined(phi[rows], sigma[rows])
+    problem = problem.joined(phi, sigma)
     likelihood, _ = files.evaluate(problem, phi, sigma, (), np.random.default_rng(0))
     log_weights = likelihood.sum(axis=1)
     weights, k = np.zeros(len(phi)), np.inf
