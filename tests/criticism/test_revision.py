@@ -26,6 +26,7 @@ from pbrl_ppl.errors import (
     HistoryError,
     PosteriorError,
     PriorWarning,
+    RefitWarning,
 )
 from pbrl_ppl.state import STATE, WRENCH
 from tests.helpers.free_puck import BOX, DISC, MASS, Disc, box2d, fitted
@@ -99,7 +100,8 @@ def test_its_posterior_goes_on_with_what_is_recorded_after(adequate, clean) -> N
     """What a loop gives is what an update takes: whole trajectories, both noises."""
     more = histories(clean)[1].select([0])
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)  # of so few draws
+        for kind in (ConvergenceWarning, RefitWarning):  # of so few draws
+            warnings.simplefilter("ignore", kind)
         updated = pp.update(adequate.posterior_after, more, seed=1)
     (entry,) = json.loads(updated.attrs["updates"])
     assert entry["did"] in ("reweighted", "refitted")
