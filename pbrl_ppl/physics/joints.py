@@ -18,10 +18,6 @@ from pbrl_ppl.state import Floats
 #: Columns of a joint's numbers: its anchors and its length (m).
 JOINT_COLUMNS = (*JOINT_ANCHORS, "length")
 A_X, A_Y, B_X, B_Y, LENGTH = range(len(JOINT_COLUMNS))
-#: A distance joint shorter than this share of the smallest moving body is a hinge in the engine.
-_NO_LENGTH = 1e-9
-#: Newton steps of :func:`on_rod`; each squares the remaining relative error.
-_STEPS = 3
 
 
 class Setting(NamedTuple):
@@ -125,9 +121,7 @@ class SceneJoints:
         #: Kind of each joint in the engine.
         self.kinds = tuple(
             HINGE
-            if joint.kind == "distance"
-            and joint.known
-            and length < _NO_LENGTH * smallest_radius(scene)
+            if joint.kind == "distance" and joint.known and length < 1e-9 * smallest_radius(scene)
             else JOINT_KINDS[joint.kind]
             for joint, length in zip(scene.joints, lengths, strict=True)
         )
@@ -230,7 +224,7 @@ def on_rod(states: Floats, rod: Floats, unit_moment: float) -> Floats:
         held[..., first + 1] += impulse * n_y
         held[..., first + 2] += impulse * lever / unit_moment
 
-    for _ in range(_STEPS):
+    for _ in range(3):  # Newton steps: each squares the remaining relative error
         distance, n_x, n_y, lever, inverse_mass = geometry()
         push((length - distance) / inverse_mass, 0, n_x, n_y, lever)
     _, n_x, n_y, lever, inverse_mass = geometry()

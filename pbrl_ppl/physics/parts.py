@@ -21,9 +21,6 @@ if TYPE_CHECKING:
     from pbrl_ppl.physics.physics import Physics
 
 R = TypeVar("R")
-#: Largest difference of one world's prediction from a part's that counts as rounding, in radii of
-#: the smallest body, rad and sampling intervals.
-_ROUNDING = 1e-6
 
 
 class Memory:
@@ -170,13 +167,16 @@ class OneWorld:
     ----------
     physics : Physics
         Scene, effects, settings and parts.
+    rounding : float
+        Largest difference of one world's prediction from a part's that counts as none, in radii of
+        the smallest body, rad and sampling intervals.
     """
 
-    def __init__(self, physics: Physics) -> None:
+    def __init__(self, physics: Physics, rounding: float = 1e-6) -> None:
         self.parted = physics.simulator
         # contacts are not extrapolated, nor is anything else in a transition that has one
         self._apart = physics.changed(extrapolate=False).simulator
-        self._rounding = _ROUNDING * body_sizes(physics.scene).min(axis=0)
+        self._rounding = rounding * body_sizes(physics.scene).min(axis=0)
         self._reach = [body.shape.bounding_radius for body in physics.scene.moving]
         self._whole = Simulator(physics.changed(extrapolate=False, parts=None))
 

@@ -18,14 +18,6 @@ from pbrl_ppl.physics.table1 import build_layout
 from pbrl_ppl.scene import Scene, motion_time
 from pbrl_ppl.state import Floats
 
-#: Engine steps of an interval for rough answers, and the longest of these steps as a share of the
-#: scene's motion time.
-COARSE, LONGEST_COARSE = 4, 0.105
-#: Engine steps for derivatives and for what an effect changes, and the longest of these steps as a
-#: share of the scene's motion time: where rows are far apart, dry friction at a turning point shows
-#: with short steps alone.
-ROUGH, LONGEST = 10, 0.021
-
 
 @dataclass(frozen=True)
 class Physics:
@@ -149,21 +141,24 @@ class Physics:
     @cached_property
     def coarse(self) -> Physics:
         """The same with few substeps: cheap, and its derivative is nearly right."""
-        enough = max(COARSE, self._steps_of(LONGEST_COARSE))
+        enough = max(4, self._steps_of(0.105))
         return self.changed(substeps=min(enough, self.substeps), extrapolate=False)
 
     @property
     def rough(self) -> Physics:
-        """The same with few substeps where it has more."""
-        return self.changed(substeps=min(max(ROUGH, self.fine_enough), self.substeps))
+        """The same with few substeps where it has more: for derivatives, and an effect's change."""
+        return self.changed(substeps=min(max(10, self.fine_enough), self.substeps))
 
     @property
     def fine_enough(self) -> int:
-        """Substeps that are short enough to begin with."""
-        return self._steps_of(LONGEST)
+        """Substeps that are short enough to begin with.
+
+        Where rows are far apart, dry friction at a turning point shows with short steps alone.
+        """
+        return self._steps_of(0.021)
 
     def _steps_of(self, longest: float) -> int:
-        """Return the substeps that are no longer than a share of the motion time."""
+        """Return the substeps that are no longer than a share of the scene's motion time."""
         return math.ceil(self.scene.time_step / (longest * motion_time(self.scene)))
 
     def changed(self, **changes: object) -> Physics:

@@ -9,18 +9,21 @@ import numpy as np
 from pbrl_ppl.physics.calls import call1, call2, call_pointer
 from pbrl_ppl.physics.compilation import compiled
 from pbrl_ppl.physics.properties import COLUMN
-from pbrl_ppl.physics.world import ITERATIONS_A_RATIO, MOST_ITERATIONS, STICKING
+from pbrl_ppl.physics.world import STICKING
 
 
 @compiled
-def iterations(fewest, chained, bodies):  # type: ignore[no-untyped-def]
-    """Return the solver iterations for the masses of these bodies."""
+def iterations(fewest, chained, bodies, a_ratio=2, most=2000):  # type: ignore[no-untyped-def]
+    """Return the solver iterations for the masses of these bodies: in proportion to their ratio.
+
+    With fewer, a heavy link below a light one gains energy.
+    """
     lightest, heaviest = np.inf, 0.0
     for i in range(len(chained)):
         if chained[i]:
             lightest = min(lightest, bodies[i, COLUMN.mass])
             heaviest = max(heaviest, bodies[i, COLUMN.mass])
-    enough = min(ITERATIONS_A_RATIO * (heaviest / lightest), MOST_ITERATIONS)
+    enough = min(a_ratio * (heaviest / lightest), most)
     return max(fewest, int(enough))
 
 

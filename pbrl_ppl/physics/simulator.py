@@ -30,13 +30,6 @@ if TYPE_CHECKING:
 
 #: Engines by name; see :class:`Physics`.
 ENGINES = ("auto", "chipmunk", "contact-free", "python")
-#: Step of a finite difference as a share of a parameter's scale: about the cube root of the
-#: engine's rounding error. And what stands for an infinite bound.
-_STEP, _FAR = 1e-5, 1e300
-#: Worlds kept, of different choices of the bodies that inferred joints hold.
-_KEPT = 64
-#: Engine steps worth a thread of their own.
-_A_THREAD = 1000
 #: For each joint of unknown bodies, which of ``scene.joinable`` it holds.
 Joined = tuple[tuple[int, int], ...]
 #: And whether there is friction under bodies, and which rods there are: what worlds differ in.
@@ -199,7 +192,7 @@ class Simulator:
             states[:, :, i] = on_rod(states[:, :, i], joints[:, position], moment)
         return states
 
-    def jacobian(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
+    def jacobian(self, phi: Floats, start: Floats, actions: Floats, step: float = 1e-5) -> Floats:
         """Derivative of the predictions by phi, by central differences in one batched call.
 
         Parameters
@@ -208,6 +201,9 @@ class Simulator:
             Where to differentiate, shape (p,).
         start, actions : ndarray
             As in a call.
+        step : float
+            Of the differences, as a share of a parameter's scale: about the cube root of the
+            engine's rounding error.
 
         Returns
         -------
@@ -217,12 +213,12 @@ class Simulator:
         """
         phi = np.asarray(phi, dtype=float)
         lower, upper = self.physics.layout.bounds
-        # never on a bound: a body has no mass of zero
-        lower = np.where(phi > lower, 0.5 * (phi + np.maximum(lower, -_FAR)), lower)
-        upper = np.where(phi < upper, 0.5 * (phi + np.minimum(upper, _FAR)), upper)
+        # never on a bound, which may be infinite: a body has no mass of zero
+        lower = np.where(phi > lower, 0.5 * (phi + np.maximum(lower, -1e300)), lower)
+        upper = np.where(phi < upper, 0.5 * (phi + np.minimum(upper, 1e300)), upper)
         return differentiate(
             lambda points: self(points, start, actions),
-            phi, _STEP * self.physics.layout.scale(phi), lower, upper,
+            phi, step * self.physics.layout.scale(phi), lower, upper,
         )  # fmt: skip
 
     @cached_property
@@ -301,17 +297,28 @@ class Simulator:
                 out[item] = total
 
     def _run_compiled(
-        self, choice: Choice, given: EngineInput, starts: Floats, inputs: Floats, out: Floats
+        self,
+        choice: Choice,
+        given: EngineInput,
+        starts: Floats,
+        inputs: Floats,
+        out: Floats,
+        a_thread: int = 1000,
+        kept: int = 64,
     ) -> None:
+        """Run items in worlds of a choice, of which so many are kept.
+
+        So many engine steps are worth a thread of their own.
+        """
         batch = Batch(
             tuple(given[:-1]), self._commands, self._forces, starts, inputs,
             self.physics.scene.time_step, *self.levels,
         )  # fmt: skip
         steps = len(out) * inputs.shape[1] * int(self.levels[0].sum())
-        workers = max(1, min(self.physics.threads, len(out), steps // _A_THREAD))
+        workers = max(1, min(self.physics.threads, len(out), steps // a_thread))
         with self._lock:
             self._worlds[choice] = engines = self._worlds.pop(choice, [])
-            while len(self._worlds) > _KEPT:
+            while len(self._worlds) > kept:
                 self._worlds.popitem(last=False)
             while len(engines) < workers:
                 engines.append(Engine(partial(self._new_world, choice), self.physics.engine))

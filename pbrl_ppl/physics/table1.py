@@ -20,10 +20,6 @@ from pbrl_ppl.parameters import (
 )
 from pbrl_ppl.scene import CONTACT_NAMES, MASS_PRIOR, WORLD, Body, Joint, Scene, nearest, units_of
 
-#: Half the side of the square about a body's mean place in which a joint's anchor in the world is
-#: sought where the scene has neither walls nor poses, in ranges of the body.
-_UNBOUNDED = 2.0
-
 
 def table1(body: Body) -> dict[str, Prior]:
     """Table 1 for one body, uninformative by default; ``body.prior`` replaces hyper-parameters.
@@ -118,11 +114,14 @@ def anchor_prior(scene: Scene, holder: str, axis: int, centre: float | None = No
     return Prior("truncated_normal", mu=mu, sigma=upper - lower, lower=lower, upper=upper)
 
 
-def _neighbourhood(scene: Scene) -> tuple[float, float, float, float]:
-    """Return bounds of the places of dynamic bodies: ``x_min, x_max, y_min, y_max`` (m)."""
+def _neighbourhood(scene: Scene, ranges: float = 2.0) -> tuple[float, float, float, float]:
+    """Return bounds of the places of dynamic bodies: ``x_min, x_max, y_min, y_max`` (m).
+
+    They are so many ranges of a body away from its mean place.
+    """
     units = [units_of(scene, body.name) for body in scene.dynamic]
-    reach = np.array([_UNBOUNDED * each.range for each in units])
-    x, y = np.array([(each.x, each.y) for each in units]).T
+    reach = np.array([ranges * unit.range for unit in units])
+    x, y = np.array([(unit.x, unit.y) for unit in units]).T
     low_x, high_x, low_y, high_y = x - reach, x + reach, y - reach, y + reach
     return float(low_x.min()), float(high_x.max()), float(low_y.min()), float(high_y.max())
 

@@ -26,9 +26,6 @@ from pbrl_ppl.physics.properties import COLUMNS, SEEN
 from pbrl_ppl.scene import Body, Scene, Units, units_of
 from pbrl_ppl.state import STATE, STATE_UNITS, Floats
 
-#: Wrench of a trial, in the body's natural units.
-_TRIAL = np.array([1.0, -0.5, 0.2])
-
 
 def try_effect(effect: Effect, scene: Scene, history: History, patience: float = 10.0) -> None:
     """Evaluate an effect's functions at a measured state and at parameters from its prior.
@@ -195,7 +192,7 @@ def _applied(effect: Effect, state: Floats, parameters: Floats, body: Body, unit
     stage: Any = effect.stage
     named = _named(effect, parameters)
     if isinstance(stage, Force | Command):
-        wrench = _TRIAL * (units.force, units.force, units.torque)
+        wrench = np.array([1.0, -0.5, 0.2]) * (units.force, units.force, units.torque)
         command = wrench.copy()
         if isinstance(stage, Command):
             command = np.concatenate([wrench, 0.5 * wrench, [0.4, 0.5]])

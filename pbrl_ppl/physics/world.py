@@ -15,35 +15,20 @@ from pbrl_ppl.physics.joints import HINGE, JOINT_KINDS, ROD, JointKind, Setting
 from pbrl_ppl.physics.properties import COLUMN
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene, smallest_radius
 
-#: Solver iterations. A single body without obstacles needs few, since its wheel or hinge then
-#: converges to rounding; several bodies need the engine's default, and a chain of joints more, in
-#: proportion to its mass ratio (with fewer, a heavy link below a light one gains energy).
-ITERATIONS_ALONE, ITERATIONS, ITERATIONS_CHAINED = 5, 10, 30
-ITERATIONS_A_RATIO, MOST_ITERATIONS = 2, 2000
 #: Points of a ring that carry a body's weight, in units of the ring's radius.
 RING = tuple((math.cos(0.25 * i * math.pi), math.sin(0.25 * i * math.pi)) for i in range(8))
 #: A point may stick if its speed is below this multiple of what friction takes away in a substep.
 #: (With 0.1, slow points stick across their direction of motion now and then: predictions jump.)
 STICKING = 1.0
-#: Bounding radius (m) and engine time (s) of the shopping cart, for which the next two were chosen.
+#: Bounding radius (m) and engine time (s) of the shopping cart, for which the engine's treatment of
+#: overlaps was chosen.
 _CART = math.hypot(0.45, 0.275)
 _CART_TIME = math.sqrt(_CART / 9.81)
-#: Allowed overlap of shapes as a share of the smallest moving body's bounding radius; the engine's
-#: default is meant for pixels.
-COLLISION_SLOP = 1e-4 / _CART
-#: Share of an overlap that the engine leaves after the engine time; its default for the cart.
-OVERLAP_LEFT = pymunk.Space().collision_bias ** _CART_TIME
-#: Least share of an overlap that is left after 1 s: the power underflows where the engine time is
-#: below a hundredth of the cart's, and overlaps are then corrected more slowly.
-LEAST_LEFT = 1e-300
-#: Place where bodies are parked, in units of the scene's extent, and the duration of that step, in
-#: sampling intervals.
-FAR, TINY = 1e9, 1e-9
+#: Duration of the step that forgets contacts, in sampling intervals.
+TINY = 1e-9
 #: Refinement of the substeps near contacts in a scene with hidden discs: a disc's inferred place
 #: must not depend on the substep in which a body stops.
 FINER = 8
-#: Speed from which the engine counts as diverged, in radii of the smallest body an interval.
-DIVERGED = 1e5
 
 
 class ConstraintKind(NamedTuple):
@@ -163,12 +148,17 @@ class World:
         self.scene = scene
         self.space = pymunk.Space()
         self.space.gravity = scene.gravity
-        #: Bounding radius of the smallest moving body (m), and the speed of divergence (m/s).
+        #: Bounding radius of the smallest moving body (m).
         self.size = smallest_radius(scene)
-        self.fastest = DIVERGED * self.size / scene.time_step
-        self.far = FAR * _extent(scene)
-        self.space.collision_slop = COLLISION_SLOP * self.size
-        self.space.collision_bias = max(OVERLAP_LEFT ** (1.0 / engine_time(scene)), LEAST_LEFT)
+        #: Speed from which the engine counts as diverged (m/s).
+        self.fastest = 1e5 * self.size / scene.time_step
+        #: Distance of the places where bodies are parked (m).
+        self.far = 1e9 * _extent(scene)
+        # overlaps scale with the scene; the engine's defaults are meant for pixels
+        self.space.collision_slop = 1e-4 / _CART * self.size
+        left = self.space.collision_bias**_CART_TIME
+        # the power underflows where the engine time is below a hundredth of the cart's
+        self.space.collision_bias = max(left ** (1.0 / engine_time(scene)), 1e-300)
         self.bodies: list[pymunk.Body] = []
         self.shapes: list[tuple[int, pymunk.Shape]] = []
         self.wheels: list[OnBody] = []
@@ -210,9 +200,10 @@ class World:
         #: Which dynamic bodies are joined to other moving ones.
         self.chained = np.logical_not(self.can_touch.all(axis=1)) & ~self.kinematic
         alone = len(scene.bodies) == 1 and not scene.walls and not (discs or patches)
-        self.iterations = (
-            ITERATIONS_CHAINED if self.chained.any() else ITERATIONS_ALONE if alone else ITERATIONS
-        )
+        #: Solver iterations. The wheel or hinge of a single body without obstacles soon converges
+        #: to rounding; several bodies need the engine's default, and a chain of joints more (see
+        #: `setters.iterations`).
+        self.iterations = 30 if self.chained.any() else 5 if alone else 10
         #: For the near-contact test: radii of bounding circles, and segments with a radius.
         self.radii = np.array([body.shape.bounding_radius for body in scene.moving])
         fixed = [(*wall.start, *wall.end, 0.0) for wall in scene.walls]
