@@ -151,10 +151,10 @@ def without_measurements(history: History, off: Floats) -> tuple[History, list[B
         return history, []
     rows = int(dataset["n_rows"].sum())
     labels, clock = dataset["trajectory"].to_numpy().tolist(), dataset["clock"].to_numpy()
-    found = []
+    frames = []
     for t, i, body, d in np.argwhere(bad):
         where = (labels[t], int(i), float(clock[t, i]), history.bodies[body], STATE[d])
-        found.append(BadFrame(*where, float(off[t, i, body, d]), STATE_UNITS[d], rows))
+        frames.append(BadFrame(*where, float(off[t, i, body, d]), STATE_UNITS[d], rows))
     observed = dataset["observed"].where(~bad)
     # start states lose what was computed from bad frames
     computed: Bools = ~np.isfinite(observed.to_numpy())
@@ -162,7 +162,7 @@ def without_measurements(history: History, off: Floats) -> tuple[History, list[B
     near = maximum_filter1d(bad.any(axis=-1).astype(np.uint8), 2 * RATE_REACH + 1, axis=1) > 0
     never = computed.all(axis=(0, 1)) & (np.arange(len(STATE)) >= VELOCITY)
     lost |= near[..., None] & never
-    return History(dataset.assign(observed=observed, start=dataset["start"].where(~lost))), found
+    return History(dataset.assign(observed=observed, start=dataset["start"].where(~lost))), frames
 
 
 def _deviations(history: History, widths: tuple[int, ...] = (3, 4, 5), longest: int = 2) -> Floats:
@@ -177,11 +177,11 @@ def _deviations(history: History, widths: tuple[int, ...] = (3, 4, 5), longest: 
     bodies = np.flatnonzero(~history.dataset["kinematic"].to_numpy())
     for body, velocities in product(bodies, (False, True)):
         columns = range(VELOCITY, len(STATE)) if velocities else range(VELOCITY)
-        found = result[:, :, body, columns.start : columns.stop]
+        part = result[:, :, body, columns.start : columns.stop]
         for gap, width in product(range(1, longest + 1), widths):
             kept = np.where(np.isfinite(result[:, :, body]), np.nan, observed[:, :, body])
-            each = [_off(kept[..., d], width, gap, angle=d == THETA) for d in columns]
-            first, rough = (np.stack(one, axis=2) for one in zip(*each, strict=True))
+            deviations = [_off(kept[..., d], width, gap, angle=d == THETA) for d in columns]
+            first, rough = (np.stack(one, axis=2) for one in zip(*deviations, strict=True))
             # a contact changes several coordinates at once
             first[rough.sum(axis=2, keepdims=True) > rough] = np.nan
             off = first[..., 0]
@@ -189,7 +189,7 @@ def _deviations(history: History, widths: tuple[int, ...] = (3, 4, 5), longest: 
                 off = np.where(np.isfinite(off), off, np.roll(first[..., k], k, axis=1))
             if velocities:
                 off[_happened(kept, off, dt)] = np.nan
-            found[...] = np.where(np.isfinite(found), found, off)
+            part[...] = np.where(np.isfinite(part), part, off)
     return result
 
 

@@ -133,7 +133,7 @@ def read_bag(
             f"bag {path}: the bodies' messages have no time in common: {spans}; record them"
             " together, with the stamps of one clock"
         )
-    whole = [first.loc[stamps], *(_interpolated(each, stamps, longest_gap) for each in others)]
+    whole = [first.loc[stamps], *(_interpolated(other, stamps, longest_gap) for other in others)]
     time = _NANO * (stamps - stamps[0]).to_numpy()
     for body, table in zip(bodies, whole, strict=True):
         table.insert(0, "time", time)
@@ -147,14 +147,14 @@ def read_bag(
 
 def _listed(topics: Any, path: Path) -> dict[str, list[str]]:
     """Return each body's topics, of which there is at least one."""
-    given = topics if isinstance(topics, Mapping) else {}
+    by_body = topics if isinstance(topics, Mapping) else {}
     listed = {
         body: [names] if isinstance(names, str) else list(names)
-        for body, names in given.items()
+        for body, names in by_body.items()
         if isinstance(names, str | Sequence)
     }
     right = all(names and all(isinstance(n, str) for n in names) for names in listed.values())
-    if not listed or len(listed) < len(given) or not right:
+    if not listed or len(listed) < len(by_body) or not right:
         raise HistoryError(
             f"bag {path}: topics is {topics!r}, expected a topic for each body, such as"
             ' {"cart": "/odom"}'
@@ -199,17 +199,17 @@ def _opened(path: Path) -> Iterator[Any]:
 
 def _types(reader: Any) -> dict[str, str]:
     """Return the message type of each topic; several of one topic with "or" between them."""
-    found: dict[str, dict[str, None]] = {}
+    kinds_of: dict[str, dict[str, None]] = {}
     for connection in sorted(reader.connections, key=lambda each: each.topic):
-        found.setdefault(connection.topic, {})[connection.msgtype] = None
-    return {topic: " or ".join(kinds) for topic, kinds in found.items()}
+        kinds_of.setdefault(connection.topic, {})[connection.msgtype] = None
+    return {topic: " or ".join(kinds) for topic, kinds in kinds_of.items()}
 
 
 def _messages(reader: Any, topic: str, kind: str, path: Path, longest: int) -> pd.DataFrame:
     """Return the numbers of a topic's messages by their stamps (ns)."""
     rows: list[dict[str, float]] = []
     received, stamped = [], []
-    connections = [each for each in reader.connections if each.topic == topic]
+    connections = [candidate for candidate in reader.connections if candidate.topic == topic]
     for connection, time, content in reader.messages(connections=connections):
         message = reader.deserialize(content, connection.msgtype)
         stamp = getattr(getattr(message, "header", None), "stamp", None)
@@ -237,8 +237,8 @@ def _messages(reader: Any, topic: str, kind: str, path: Path, longest: int) -> p
 def _flatten(message: Any, path: str, row: dict[str, float], longest: int) -> None:
     """Add the numbers of a message under their paths, and ``yaw``."""
     values = {field.name: getattr(message, field.name) for field in fields(message)}
-    given = (values.get(name) for name in ("name", "names", "joint_names"))
-    labels = next((each for each in given if isinstance(each, list) and each), None)
+    lists = (values.get(name) for name in ("name", "names", "joint_names"))
+    labels = next((keys for keys in lists if isinstance(keys, list) and keys), None)
     for name, value in values.items():
         if is_dataclass(value):
             if name != "header":
@@ -246,11 +246,11 @@ def _flatten(message: Any, path: str, row: dict[str, float], longest: int) -> No
         elif isinstance(value, Real) and not isinstance(value, bool):
             row[path + name] = float(value)
         elif isinstance(value, np.ndarray) and value.dtype.kind in "iuf":
-            each = range(len(value)) if labels is None else labels
-            if len(value) <= longest and len(value) == len(each):
+            keys = range(len(value)) if labels is None else labels
+            if len(value) <= longest and len(value) == len(keys):
                 row |= {
                     f"{path}{name}[{label}]": float(number)
-                    for label, number in zip(each, value, strict=True)
+                    for label, number in zip(keys, value, strict=True)
                 }
     if {*values} - {"__msgtype__"} == {*"xyzw"} and "yaw" not in row:
         x, y, z, w = (values[name] for name in "xyzw")
@@ -270,9 +270,9 @@ def _held(tables: list[pd.DataFrame], topics: list[str], path: Path) -> pd.DataF
                 f'bag {path}: "{topic}" begins after the last message of "{topics[0]}"; record them'
                 " together, with the stamps of one clock"
             )
-        held = table.reindex(whole.index, method="ffill")
-        there = {name: f"{name} ({topic})" for name in held if name in whole}
-        whole = whole.join(held.rename(columns=there))
+        last = table.reindex(whole.index, method="ffill")
+        there = {name: f"{name} ({topic})" for name in last if name in whole}
+        whole = whole.join(last.rename(columns=there))
     return whole
 
 

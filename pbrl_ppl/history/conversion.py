@@ -140,7 +140,7 @@ def in_si(frame: pd.DataFrame, units: Mapping[str, str]) -> pd.DataFrame:
         if name not in _UNITS:
             raise HistoryError(f'units: "{name}" has none{nearest(name, _UNITS)}')
         if unit not in _UNITS[name]:
-            known = [each for each in _UNITS[name] if "*" not in each]
+            known = [known_unit for known_unit in _UNITS[name] if "*" not in known_unit]
             raise HistoryError(
                 f'units: "{unit}" is none of {name}; expected one of {", ".join(known[:12])}'
             )
@@ -226,7 +226,7 @@ def _numbered(
             f"{source}: it has no header; say which of its {len(frame.columns)} columns is which,"
             f" from 0 (--columns time=0,x=1, or columns = {{ time = 0, x = 1 }} in [recording])"
         )
-    found: dict[str, str | float] = {}
+    names: dict[str, str | float] = {}
     for name, column in columns.items():
         text = f"{column:g}" if isinstance(column, int | float) else column
         if text not in frame:
@@ -234,8 +234,8 @@ def _numbered(
                 f"{source}: it has no header and {len(frame.columns)} columns, numbered from 0; got"
                 f" {text} for {name}"
             )
-        found[name] = text
-    return found
+        names[name] = text
+    return names
 
 
 def _unseen_emptied(frame: pd.DataFrame, layout: Recording, source: str) -> pd.DataFrame:
@@ -245,7 +245,7 @@ def _unseen_emptied(frame: pd.DataFrame, layout: Recording, source: str) -> pd.D
         if name not in frame or name not in STATE:
             raise HistoryError(
                 f'{source}: not_seen names "{name}", which is no state column of it'
-                f"{nearest(name, [each for each in STATE if each in frame])}"
+                f"{nearest(name, [column for column in STATE if column in frame])}"
             )
     if not values:
         return frame

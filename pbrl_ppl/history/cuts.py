@@ -30,8 +30,8 @@ def cut(frame: pd.DataFrame, cuts: Mapping[str, float], source: str) -> pd.DataF
         piece = _pieces(numeric, cuts)
         for number in range(piece.max(initial=-1) + 1):
             name = str(number) if single else f"{label}.{number}"
-            own = rows[piece == number].assign(trajectory=name)
-            parts.append(own.drop(columns="step", errors="ignore"))
+            part = rows[piece == number].assign(trajectory=name)
+            parts.append(part.drop(columns="step", errors="ignore"))
     if not parts:
         raise HistoryError(
             f"{source}: nothing is left between its cuts; make [recording] cut less strict"
@@ -80,11 +80,11 @@ def _every(times: Floats, piece: Ints, length: float) -> Ints:
     """Return pieces cut to equal parts of about this length (s)."""
     out, begin = np.full(len(piece), -1), 0
     for number in range(piece.max(initial=-1) + 1):
-        own = np.flatnonzero(piece == number)
-        spent = times[own] - times[own[0]]
+        members = np.flatnonzero(piece == number)
+        spent = times[members] - times[members[0]]
         parts = max(1, round(spent[-1] / length))
         width = max(spent[-1] / parts, 1e-300)
-        out[own] = begin + np.minimum((spent / width + 1e-9).astype(int), parts - 1)
+        out[members] = begin + np.minimum((spent / width + 1e-9).astype(int), parts - 1)
         begin += parts
     return out
 
@@ -106,20 +106,20 @@ def _at_rest(times: Floats, states: Floats, seconds: float, still: float = 8.0) 
         tolerance = max(still * noise, steps.min() if len(steps) else 0.0)
         windows = pd.Series(column).rolling(n)
         quiet = (windows.max() - windows.min() <= tolerance).to_numpy()
-        own = np.zeros(len(times), dtype=bool)
+        rest = np.zeros(len(times), dtype=bool)
         for end in np.flatnonzero(quiet):
-            own[end - n + 1 : end + 1] = True
-        rests &= own
+            rest[end - n + 1 : end + 1] = True
+        rests &= rest
     return rests
 
 
 def _jumps(times: Floats, places: Floats, least: float) -> Bools:
     """Return the rows beside changes of the velocity by more than so many m/s, shape (time,)."""
-    found = np.zeros(len(times), dtype=bool)
+    beside = np.zeros(len(times), dtype=bool)
     seen = np.flatnonzero(np.isfinite(places).all(axis=1))
     for peak in _peaks(_velocity_changes(times[seen], places[seen]), least):
-        found[seen[max(peak - 1, 0) : peak + 2]] = True
-    return found
+        beside[seen[max(peak - 1, 0) : peak + 2]] = True
+    return beside
 
 
 def _velocity_changes(times: Floats, places: Floats) -> Floats:
@@ -147,8 +147,8 @@ def _velocity_changes(times: Floats, places: Floats) -> Floats:
 
 def _peaks(changes: Floats, least: float) -> Ints:
     """Return the rows of the largest changes above ``least``, each the only one nearby."""
-    found, _ = find_peaks(changes, height=least, distance=_SIDE)
-    return np.asarray(found)
+    peaks, _ = find_peaks(changes, height=least, distance=_SIDE)
+    return np.asarray(peaks)
 
 
 def propose(
@@ -222,8 +222,8 @@ def _unseen(states: Floats, groups: list[Ints], far: float = 5.0) -> Bools:
     """Return the rows where all places are zero, ``far`` typical changes from those seen before."""
     zero = np.all(states == 0.0, axis=1) if states.shape[1] > 1 else np.zeros(len(states), bool)
     for rows in groups:
-        own, seen = zero[rows], np.flatnonzero(~zero[rows])
-        before = np.searchsorted(seen, np.flatnonzero(own)) - 1
+        here, seen = zero[rows], np.flatnonzero(~zero[rows])
+        before = np.searchsorted(seen, np.flatnonzero(here)) - 1
         steps = np.linalg.norm(np.diff(states[rows][seen], axis=0), axis=1)
         away = np.linalg.norm(states[rows][seen[before[before >= 0]]], axis=1)
         jumps = len(steps) and len(away) and np.median(away) > far * np.median(steps)
@@ -248,5 +248,5 @@ def _jump(tracks: list[tuple[Floats, Floats]], abrupt: float = 10.0, rare: float
         changes.append(_velocity_changes(times[seen], states[seen]))
     every = np.concatenate([np.zeros(0), *changes])
     least = abrupt * float(np.median(every)) if len(every) else 0.0
-    found = sum(len(_peaks(each, least)) for each in changes) if least > 0 else 0
-    return float(f"{least:.2g}") if 0 < found <= rare * len(every) else 0.0
+    jumps = sum(len(_peaks(one, least)) for one in changes) if least > 0 else 0
+    return float(f"{least:.2g}") if 0 < jumps <= rare * len(every) else 0.0

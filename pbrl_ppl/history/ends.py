@@ -266,10 +266,10 @@ def strange_ends(history: History, scene: Scene) -> list[End]:
     action = np.nan_to_num(dataset["action"].to_numpy())
     follows = dataset["kinematic"].to_numpy()
     labels, n_rows = dataset["trajectory"].to_numpy().tolist(), dataset["n_rows"].to_numpy()
-    found: dict[tuple[int, bool], End] = {}
+    ends: dict[tuple[int, bool], End] = {}
     for body, d in product(np.flatnonzero(~follows), range(3)):
         series = [_filled(observed[t, :n, body, d], d == THETA) for t, n in enumerate(n_rows)]
-        column = Column.of([each for each in series if each is not None])
+        column = Column.of([complete for complete in series if complete is not None])
         for t, values in enumerate(series):
             if values is None or column is None:
                 continue
@@ -278,7 +278,7 @@ def strange_ends(history: History, scene: Scene) -> list[End]:
             others = np.delete(observed[t, :n], body, axis=1)[..., :3]
             for first in (True, False):
                 rows = column.held(values, push) if first else column.stopped(values, push)
-                if rows <= (found[t, first].rows if (t, first) in found else 0):
+                if rows <= (ends[t, first].rows if (t, first) in ends else 0):
                     continue
                 if first:
                     explained = _moves(others[: 2 * rows + BESIDE])
@@ -287,9 +287,9 @@ def strange_ends(history: History, scene: Scene) -> list[End]:
                 if not explained:
                     times = clock[t, :rows] if first else clock[t, n - rows : n]
                     begin, end = float(times[0]), float(times[-1])
-                    what, name = "held" if first else "stopped", history.bodies[body]
-                    found[t, first] = End(labels[t], first, rows, begin, end, name, what)
-    return [found[key] for key in sorted(found, key=lambda key: (key[0], not key[1]))]
+                    why, name = "held" if first else "stopped", history.bodies[body]
+                    ends[t, first] = End(labels[t], first, rows, begin, end, name, why)
+    return [ends[key] for key in sorted(ends, key=lambda key: (key[0], not key[1]))]
 
 
 def trimmed(history: History, ends: Iterable[End]) -> History:
@@ -317,12 +317,12 @@ def trimmed(history: History, ends: Iterable[End]) -> History:
     dataset = history.dataset
     labels, n_rows = dataset["trajectory"].to_numpy().tolist(), dataset["n_rows"].to_numpy()
     begin, end = np.zeros(len(labels), dtype=np.int64), n_rows.astype(np.int64)
-    for each in ends:
-        t = labels.index(each.trajectory)
-        if each.first:
-            begin[t] = max(begin[t], each.rows)
+    for bad in ends:
+        t = labels.index(bad.trajectory)
+        if bad.first:
+            begin[t] = max(begin[t], bad.rows)
         else:
-            end[t] = min(end[t], n_rows[t] - each.rows)
+            end[t] = min(end[t], n_rows[t] - bad.rows)
     for t in np.flatnonzero(end - begin < LEAST):
         raise HistoryError(
             f"history: trajectory {labels[t]} has {max(end[t] - begin[t], 0)} rows without its"
@@ -398,8 +398,10 @@ def _near(scene: Scene, body: int, states: Floats, row: int, slack: float = 0.25
         )
         if (np.linalg.norm(values - start - along[:, None] * way, axis=1) < reach).any():
             return True
-    others = [(each, places[:, i]) for i, each in enumerate(moving) if i != body]
-    others += [(each, np.array(each.pose)[:2]) for each in scene.bodies if each.static]
+    others = [(neighbour, places[:, i]) for i, neighbour in enumerate(moving) if i != body]
+    others += [
+        (neighbour, np.array(neighbour.pose)[:2]) for neighbour in scene.bodies if neighbour.static
+    ]
     for other, place in others:
         far = np.linalg.norm(values - place, axis=1)
         if not (far > reach + (1 + slack) * other.shape.bounding_radius).all():

@@ -61,7 +61,7 @@ def read_table(
         if suffix in _TEXTS:
             columns = {**dict(layout.columns), **(names or {})}
             return _read_text(
-                path, [each for each in columns.values() if isinstance(each, str)], layout
+                path, [column for column in columns.values() if isinstance(column, str)], layout
             )
         return _read_parquet(path) if suffix == ".parquet" else _read_netcdf(path)
     except FileNotFoundError:
@@ -85,10 +85,10 @@ def _read_text(path: Path, others: list[str], layout: Recording) -> pd.DataFrame
     lines = content.removeprefix(b"\xef\xbb\xbf").splitlines()
     if not any(line.strip() for line in lines):
         raise HistoryError(f"history {path}: the file is empty; expected a header and rows")
-    given = SEPARATORS.get(layout.separator, layout.separator).encode()
+    declared = SEPARATORS.get(layout.separator, layout.separator).encode()
     # a spreadsheet may write "1,5;2,0"
-    found = next((mark for mark in (b",", b";", b"\t") if mark in lines[0]), b"")
-    separator = given or found or (b"," if len(lines[0].split()) < 2 else _BLANKS)
+    guessed = next((mark for mark in (b",", b";", b"\t") if mark in lines[0]), b"")
+    separator = declared or guessed or (b"," if len(lines[0].split()) < 2 else _BLANKS)
     decimal = "," if separator in (b";", b"\t") and b"," in content else "."
     first = _cells(lines[0], separator)
     header = layout.header if layout.header is not None else not all(map(_is_number, first))

@@ -228,7 +228,7 @@ class History:
             assumed[:, 3:] &= assumed[:, :3]
         n, k = len(table.n_rows), len(scene.moving)
         dims = ("trajectory", "time", "body")
-        states, wrenches = ({"units": ", ".join(each)} for each in (STATE_UNITS, WRENCH_UNITS))
+        states, wrenches = ({"units": ", ".join(units)} for units in (STATE_UNITS, WRENCH_UNITS))
         before = np.zeros((n, k, len(WRENCH)))
         dataset = xr.Dataset(
             {
@@ -309,7 +309,7 @@ class History:
         begins = [
             [b for b in range(0, n, horizon) if b == 0 or 3 * (n - b) >= horizon] for n in intervals
         ]
-        trajectory = np.repeat(np.arange(len(begins)), [len(own) for own in begins])
+        trajectory = np.repeat(np.arange(len(begins)), [len(rows) for rows in begins])
         return self._segments(states, trajectory, np.concatenate(begins).astype(int), horizon)
 
     def _segments(self, start: Floats, trajectory: Ints, step: Ints, horizon: int) -> Segments:
@@ -455,7 +455,7 @@ def longest_gap(history: History) -> int:
     complete = np.asarray(~unseen(history).any(axis=-1))
     rows = history.dataset["n_rows"].to_numpy()
     gaps = np.concatenate(
-        [np.diff(np.flatnonzero(each[:n])) for each, n in zip(complete, rows, strict=True)]
+        [np.diff(np.flatnonzero(seen[:n])) for seen, n in zip(complete, rows, strict=True)]
     )
     return int(gaps.max()) if len(gaps) and np.median(gaps) > 1 else 1
 

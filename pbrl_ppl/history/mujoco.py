@@ -122,9 +122,9 @@ def from_mujoco(
     }
     k = len(joints)
     state = np.full((n, rows, k, len(STATE)), np.nan)
-    for i, (name, held) in enumerate(joints.items()):
+    for i, (name, body_joints) in enumerate(joints.items()):
         origin = axes[:2] @ np.asarray(model.body(name).pos)
-        if not _fill(state[:, :, i], held, positions, velocities, origin, axes, reach[i]):
+        if not _fill(state[:, :, i], body_joints, positions, velocities, origin, axes, reach[i]):
             raise HistoryError(
                 f'body "{name}" leaves the plane; expected one that moves in it alone'
             )
@@ -178,7 +178,7 @@ def _joints(model: Any, name: str, axes: Floats, reach: float) -> list[_Joint]:
     first, count, parent = (int(np.ravel(number)[0]) for number in numbers)
     holder = int(model.body_weldid[parent])
     above = str(model.body(holder).name) if holder else None
-    found = []
+    joints = []
     for number in range(first, first + count):
         kind = int(model.jnt_type[number])
         axis = axes @ np.asarray(model.jnt_axis[number])
@@ -195,10 +195,10 @@ def _joints(model: Any, name: str, axes: Floats, reach: float) -> list[_Joint]:
             )
         place, rate = int(model.jnt_qposadr[number]), int(model.jnt_dofadr[number])
         reference = float(model.qpos0[place])
-        found.append(_Joint(number, kind, axis, place, rate, reference, above))
-    slides = [joint for joint in found if joint.kind == SLIDE]
+        joints.append(_Joint(number, kind, axis, place, rate, reference, above))
+    slides = [joint for joint in joints if joint.kind == SLIDE]
     turns = np.abs(np.asarray(body.quat)[1:]).max()
-    if len(slides) == 1 or (found and found[0].kind != FREE and turns > FLAT):
+    if len(slides) == 1 or (joints and joints[0].kind != FREE and turns > FLAT):
         raise HistoryError(
             f'body "{name}": expected slides along both axes or none, and a body that is not'
             " turned in the model; a free joint has all"
@@ -207,7 +207,7 @@ def _joints(model: Any, name: str, axes: Floats, reach: float) -> list[_Joint]:
         raise HistoryError(
             f'body "{name}" slides on another body; expected one that slides in the world'
         )
-    return found
+    return joints
 
 
 def _fill(
@@ -262,7 +262,11 @@ def _add_parents_angles(model: Any, state: Floats, joints: dict[str, list[_Joint
 
 def _motor_wrenches(model: Any, joints: dict[str, list[_Joint]], ctrl: Floats) -> Floats:
     """Return the wrenches of motors at joints, shape (trajectory, row, body, 3)."""
-    holder = {joint.number: (i, joint) for i, held in enumerate(joints.values()) for joint in held}
+    holder = {
+        joint.number: (i, joint)
+        for i, body_joints in enumerate(joints.values())
+        for joint in body_joints
+    }
     wrench = np.zeros((*ctrl.shape[:2], len(joints), len(WRENCH)))
     # a motor has a fixed gain, no bias, no dynamics, and acts on a joint
     kinds = (model.actuator_gaintype, model.actuator_biastype, model.actuator_dyntype)

@@ -62,7 +62,7 @@ def resampled(rows: Rows, scene: Scene, source: str, *, reach: float = 1.9) -> R
     if not spacing.size or (np.abs(spacing - dt) <= TIME_TOLERANCE * dt).all():
         return rows
     _check_spacing(rows, tracks, dt)
-    quotients = np.array([_quotients(each) for each in zip(*tracks, strict=True)])
+    quotients = np.array([_quotients(samples) for samples in zip(*tracks, strict=True)])
     grids = []
     for label, bodies in zip(rows.labels, tracks, strict=True):
         begin = max(track.time[0] for track in bodies)
@@ -170,7 +170,7 @@ def _quotients(tracks: tuple[_Track, ...], near: float = 1e-3) -> Bools:
     They are as near to one as the share ``near`` of their spread. After interpolation at uneven
     times they would look like independent measurements.
     """
-    found = np.zeros(len(STATE), dtype=bool)
+    computed = np.zeros(len(STATE), dtype=bool)
     for d in range(VELOCITY, len(STATE)):
         off: list[list[Floats]] = [[], [], []]
         rates = []
@@ -186,9 +186,11 @@ def _quotients(tracks: tuple[_Track, ...], near: float = 1e-3) -> Bools:
             rates.append(rate[1:-1])
         if rates and (spread := float(np.concatenate(rates).std())) > 0:
             # at the ends and in gaps they may be anything
-            misfit = min(float(np.quantile(np.abs(np.concatenate(each)), 0.95)) for each in off)
-            found[d] = misfit < near * spread
-    return found
+            misfit = min(
+                float(np.quantile(np.abs(np.concatenate(misfits)), 0.95)) for misfits in off
+            )
+            computed[d] = misfit < near * spread
+    return computed
 
 
 def _states(track: _Track, grid: Floats, gap: float, same: float) -> Floats:
@@ -246,12 +248,12 @@ def _weights(time: Floats, grid: Floats, dt: float) -> tuple[Floats, Ints]:
 
 def _noise_in_words(weights: list[tuple[Floats, Ints]]) -> str:
     """Return what interpolation does to the noise, in words."""
-    share = np.concatenate([each for each, _ in weights])
+    share = np.concatenate([later for later, _ in weights])
     between = (share > 0) & (share < 1)
     remaining = np.sqrt(((1 - share) ** 2 + share**2).mean())
     shared, pairs = 0, 0
-    for each, before in weights:
-        first, last = before + (each == 1), before + (each > 0)
+    for later, before in weights:
+        first, last = before + (later == 1), before + (later > 0)
         shared += int((last[:-1] >= first[1:]).sum())
         pairs += len(before) - 1
     text = ""

@@ -80,14 +80,14 @@ def rows_of_arrays(
     n, length = state.shape[:2]
     action = np.zeros((n, length, k, len(WRENCH)))
     if actions is not None:
-        given = np.array(actions, dtype=np.float64)
+        wrenches = np.array(actions, dtype=np.float64)
         whole, intervals = action.shape, (n, length - 1, *action.shape[2:])
-        if given.shape not in (whole, intervals):
+        if wrenches.shape not in (whole, intervals):
             raise HistoryError(
-                f"history: actions have shape {given.shape}, expected {whole}, as the states have,"
-                f" or {intervals}: {', '.join(WRENCH)} from each row to the next"
+                f"history: actions have shape {wrenches.shape}, expected {whole}, as the states"
+                f" have, or {intervals}: {', '.join(WRENCH)} from each row to the next"
             )
-        action[:, : given.shape[1]] = given
+        action[:, : wrenches.shape[1]] = wrenches
     clock = scene.time_step * np.arange(length) if times is None else np.asarray(times, np.float64)
     if clock.shape not in ((length,), (n, length)):
         raise HistoryError(

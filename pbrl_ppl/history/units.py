@@ -66,14 +66,14 @@ def _measured(
         units["force"], units["mass"] * acceleration, _size(wrench[..., : WRENCH.index("torque")])
     )
     torque = max(force * units["length"], _size(wrench[..., WRENCH.index("torque") :]))
-    found = dict(speed=speed, turn_rate=turn_rate or speed / units["length"])
+    rates = dict(speed=speed, turn_rate=turn_rate or speed / units["length"])
     return {
         "force": force,
         "torque": torque,
         "range": max(reach, units["length"]),
         "x": float(centre[0]),
         "y": float(centre[1]),
-        **{name: value for name, value in found.items() if value > 0},
+        **{name: value for name, value in rates.items() if value > 0},
     }
 
 
@@ -177,15 +177,15 @@ def unit_mismatches(history: History) -> tuple[str, ...]:
         Empty where all agree.
     """
     observed = history.dataset["observed"].to_numpy()
-    found = []
+    sentences = []
     for i, body in enumerate(history.bodies):
         for d in range(3):
             position, rate = observed[:, :, i, d], observed[:, :, i, d + VELOCITY]
             dt = float(history.dataset.attrs["time_step"])
             factor = _unit_factor(position, rate, dt, angle=d == THETA)
             if factor is not None and (words := _unit_sentence(body, d, factor)):
-                found.append(words)
-    return tuple(found)
+                sentences.append(words)
+    return tuple(sentences)
 
 
 def _unit_factor(

@@ -94,17 +94,17 @@ def unused_velocities(history: History) -> tuple[UnusedVelocity, ...]:
     vx of puck was computed from x (central differences) and is not used
     """
     dt = float(history.dataset.attrs["time_step"])
-    found: list[UnusedVelocity] = []
+    unused: list[UnusedVelocity] = []
     for body in np.flatnonzero(~history.dataset["kinematic"].to_numpy()):
         for d in range(3):
             runs = _runs(history, int(body), d)
             names = (history.bodies[body], STATE[d + VELOCITY], STATE[d])
             if match := computed_by(runs, dt):
                 late = match.lag if abs(match.lag) > 0.05 * dt else 0.0
-                found.append(UnusedVelocity(*names, match.name, late))
+                unused.append(UnusedVelocity(*names, match.name, late))
             elif lag := velocity_lag(runs, dt):
-                found.append(UnusedVelocity(*names, None, lag))
-    return tuple(found)
+                unused.append(UnusedVelocity(*names, None, lag))
+    return tuple(unused)
 
 
 def measured_alone(history: History, unused: Sequence[UnusedVelocity] | None = None) -> History:
@@ -121,8 +121,8 @@ def measured_alone(history: History, unused: Sequence[UnusedVelocity] | None = N
     if not unused:
         return history
     columns = np.zeros((len(history.bodies), len(STATE)), dtype=bool)
-    for each in unused:
-        columns[history.bodies.index(each.body), STATE.index(each.state)] = True
+    for velocity in unused:
+        columns[history.bodies.index(velocity.body), STATE.index(velocity.state)] = True
     observed = history.dataset["observed"]
     return History(history.dataset.assign(observed=observed.where(~columns)))
 
@@ -153,8 +153,8 @@ def velocity_lag(runs: Runs, dt: float, *, material: float = 0.05) -> float:
     >>> velocity_lag([(np.sin(5 * t), 5 * np.cos(5 * t))], 0.02)
     0.0
     """
-    lag, found = _shifted(runs, dt, 0, material)
-    if not found:
+    lag, differs = _shifted(runs, dt, 0, material)
+    if not differs:
         return 0.0
     shift = 0
     for _ in range(20):  # it is linear in the lag only near it
@@ -186,7 +186,7 @@ def _shifted(
         return np.nan, False
     y, mean, curve, x, z = np.concatenate(parts, axis=1)
     basis = np.linalg.svd(np.stack([np.ones(len(y)), mean, curve], axis=1), full_matrices=False)[0]
-    y, x, z = (each - basis @ (basis.T @ each) for each in (y, x, z))
+    y, x, z = (column - basis @ (basis.T @ column) for column in (y, x, z))
     slope, square, dof = float(z @ x), float(z @ z), len(y) - 4
     if not slope > 0 or not square > 0:
         return np.nan, False
@@ -198,8 +198,8 @@ def _shifted(
     )
     bound = float(t_distribution.isf(alarm / 2, dof)) * np.sqrt(2 * spread)
     # rounding alone leaves a millionth of a row, without any noise
-    found = abs(lag) > material and abs(float(z @ rest)) > max(bound, 1e-6 * slope)
-    return lag + shift, bool(found)
+    differs = abs(lag) > material and abs(float(z @ rest)) > max(bound, 1e-6 * slope)
+    return lag + shift, bool(differs)
 
 
 def measurement_noise(history: History) -> Floats:
@@ -235,8 +235,8 @@ def _runs(history: History, body: int, d: int, shortest: int = 5) -> Runs:
     observed = history.dataset["observed"].to_numpy()[:, :, body]
     dt = float(history.dataset.attrs["time_step"])
     runs: Runs = []
-    for own, n in zip(observed, history.dataset["n_rows"].to_numpy(), strict=True):
-        both = own[:n, [d, d + VELOCITY]]
+    for trajectory, n in zip(observed, history.dataset["n_rows"].to_numpy(), strict=True):
+        both = trajectory[:n, [d, d + VELOCITY]]
         seen = np.flatnonzero(np.isfinite(both).all(axis=1))
         for rows in np.split(seen, np.flatnonzero(np.diff(seen) > 1) + 1):
             if len(rows) < shortest:
@@ -388,11 +388,11 @@ def computed_by(runs: Runs, dt: float) -> Match | None:
     least, most = _noise_bounds(runs)
     noise = min(max(position_noise(runs, dt)[0], least), most)
     shown = sum(max(len(position) - 3, 0) for position, _ in runs) / _correlation([-1, 3, -3, 1])
-    found = [_tested(each, runs, dt, noise, shown, total) for each in known_filters()]
-    if matches := [match for match in found if match is not None]:
+    exact = [_tested(candidate, runs, dt, noise, shown, total) for candidate in known_filters()]
+    if matches := [match for match in exact if match is not None]:
         return min(matches, key=lambda match: match.misfit)
-    for each in FITTED:
-        if match := _tested(each, runs, dt, noise, shown, total):
+    for candidate in FITTED:
+        if match := _tested(candidate, runs, dt, noise, shown, total):
             return match
     return None
 
@@ -478,5 +478,5 @@ def _lag(candidate: Filter, a: Floats, b: Floats) -> float:
     row = np.array(candidate.places, dtype=float)
     lag = -float(b @ row**2) / (2 * float(b @ row))
     for weight, group in zip(a, candidate.rates, strict=True):
-        lag -= float(weight) * sum(group) / (1 - sum(a * [len(each) for each in candidate.rates]))
+        lag -= float(weight) * sum(group) / (1 - sum(a * [len(rates) for rates in candidate.rates]))
     return round(float(lag), 6) + 0.0

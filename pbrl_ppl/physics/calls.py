@@ -10,7 +10,7 @@ from __future__ import annotations
 import platform
 import sys
 from collections import namedtuple
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import chain
 from typing import Any, NamedTuple
 
@@ -66,10 +66,10 @@ AVAILABLE = bool(_FOUND)
 FUNCTIONS = Functions(*map(_FOUND.get, Functions._fields)) if AVAILABLE else None
 
 
-def _calling(result: Any, *kinds: Any) -> Any:
+def _calling(result: object, *kinds: object) -> Callable[..., object]:
     """Return numba's code generator for a call by address of a C function of such arguments."""
 
-    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def codegen(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         function, *values = arguments
         kind = ir.FunctionType(result, kinds).as_pointer()
         returned = builder.call(builder.inttoptr(function, kind), values)
@@ -79,45 +79,45 @@ def _calling(result: Any, *kinds: Any) -> Any:
 
 
 @intrinsic
-def call1(typing: Any, function: Any, pointer: Any, a: Any) -> Any:
+def call1(typing, function, pointer, a):  # type: ignore[no-untyped-def]
     """Call a C function of a pointer and a double that returns nothing."""
     signature = types.void(types.int64, types.int64, types.float64)
     return signature, _calling(ir.VoidType(), _PLACE, _DOUBLE)
 
 
 @intrinsic
-def call2(typing: Any, function: Any, pointer: Any, a: Any, b: Any) -> Any:
+def call2(typing, function, pointer, a, b):  # type: ignore[no-untyped-def]
     """Call a C function of a pointer and a vector that returns nothing."""
     signature = types.void(types.int64, types.int64, types.float64, types.float64)
     return signature, _calling(ir.VoidType(), _PLACE, _DOUBLE, _DOUBLE)
 
 
 @intrinsic
-def call_int(typing: Any, function: Any, pointer: Any, value: Any) -> Any:
+def call_int(typing, function, pointer, value):  # type: ignore[no-untyped-def]
     """Call a C function of a pointer and an int that returns nothing."""
     signature = types.void(types.int64, types.int64, types.int32)
     return signature, _calling(ir.VoidType(), _PLACE, ir.IntType(32))
 
 
 @intrinsic
-def call_pointer(typing: Any, function: Any, pointer: Any, other: Any) -> Any:
+def call_pointer(typing, function, pointer, other):  # type: ignore[no-untyped-def]
     """Call a C function of two pointers, whatever it returns."""
     signature = types.void(types.int64, types.int64, types.int64)
     return signature, _calling(ir.VoidType(), _PLACE, _PLACE)
 
 
 @intrinsic
-def get1(typing: Any, function: Any, pointer: Any) -> Any:
+def get1(typing, function, pointer):  # type: ignore[no-untyped-def]
     """Call a C function of a pointer that returns a double."""
     return types.float64(types.int64, types.int64), _calling(_DOUBLE, _PLACE)
 
 
 @intrinsic
-def get2(typing: Any, function: Any, pointer: Any) -> Any:
+def get2(typing, function, pointer):  # type: ignore[no-untyped-def]
     """Call a C function of a pointer that returns a vector."""
     call = _calling(ir.LiteralStructType([_DOUBLE, _DOUBLE]), _PLACE)
 
-    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def codegen(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         value = call(context, builder, signature, arguments)
         parts = [builder.extract_value(value, i) for i in range(2)]
         return context.make_tuple(builder, signature.return_type, parts)
@@ -126,7 +126,7 @@ def get2(typing: Any, function: Any, pointer: Any) -> Any:
 
 
 @intrinsic
-def call_law(typing: Any, function: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
+def call_law(typing, function, a, b, c, d):  # type: ignore[no-untyped-def]
     """Call an effect's law: four pointers to doubles."""
     return types.void(*[types.int64] * 5), _calling(ir.VoidType(), *[_PLACE] * 4)
 

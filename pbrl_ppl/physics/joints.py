@@ -126,9 +126,9 @@ class SceneJoints:
             for joint, length in zip(scene.joints, lengths, strict=True)
         )
 
-    def _lengths(self, anchors: Floats, held: NDArray[np.int64]) -> Floats:
+    def _lengths(self, anchors: Floats, holders: NDArray[np.int64]) -> Floats:
         """Return the distances of anchors (..., 4) in the reference poses, shape (...,)."""
-        poses = self._poses[held]
+        poses = self._poses[holders]
         c, s = np.cos(poses[..., 2]), np.sin(poses[..., 2])
         x, y = anchors[..., 0::2], anchors[..., 1::2]
         at_x = poses[..., 0] + c * x - s * y
@@ -171,9 +171,9 @@ class SceneJoints:
                 f"joint index is {indices[wrong][0]:g}, expected a whole number from 0 to"
                 f" {choices - 1}: {', '.join(self._scene.joinable)}"
             )
-        held = np.repeat(self._held[None], n, axis=0)
-        held[:, self._free[:, 0]] = indices
-        joints[..., LENGTH] = self._lengths(joints[..., :4], held)
+        holders = np.repeat(self._held[None], n, axis=0)
+        holders[:, self._free[:, 0]] = indices
+        joints[..., LENGTH] = self._lengths(joints[..., :4], holders)
         return joints, indices.astype(np.int64)
 
 
@@ -206,13 +206,13 @@ def on_rod(states: Floats, rod: Floats, unit_moment: float) -> Floats:
     exists = rod[:, LENGTH] > 0
     if not exists.any():
         return states
-    held, (a_x, a_y, b_x, b_y, length) = states[exists], rod[exists].T[..., None]
+    moved, (a_x, a_y, b_x, b_y, length) = states[exists], rod[exists].T[..., None]
 
     def geometry() -> tuple[Floats, Floats, Floats, Floats, Floats]:
         """Return length, direction (x, y), lever arm, and the inverse mass along the rod."""
-        c, s = np.cos(held[..., 2]), np.sin(held[..., 2])
+        c, s = np.cos(moved[..., 2]), np.sin(moved[..., 2])
         arm_x, arm_y = c * a_x - s * a_y, s * a_x + c * a_y
-        x, y = held[..., 0] + arm_x - b_x, held[..., 1] + arm_y - b_y
+        x, y = moved[..., 0] + arm_x - b_x, moved[..., 1] + arm_y - b_y
         distance = np.maximum(np.hypot(x, y), np.finfo(float).tiny)
         n_x, n_y = x / distance, y / distance
         lever = arm_x * n_y - arm_y * n_x
@@ -220,16 +220,16 @@ def on_rod(states: Floats, rod: Floats, unit_moment: float) -> Floats:
 
     def push(impulse: Floats, first: int, n_x: Floats, n_y: Floats, lever: Floats) -> None:
         """Apply an impulse per unit of mass along the rod to poses (0) or velocities (3)."""
-        held[..., first] += impulse * n_x
-        held[..., first + 1] += impulse * n_y
-        held[..., first + 2] += impulse * lever / unit_moment
+        moved[..., first] += impulse * n_x
+        moved[..., first + 1] += impulse * n_y
+        moved[..., first + 2] += impulse * lever / unit_moment
 
     for _ in range(3):  # Newton steps: each squares the remaining relative error
         distance, n_x, n_y, lever, inverse_mass = geometry()
         push((length - distance) / inverse_mass, 0, n_x, n_y, lever)
     _, n_x, n_y, lever, inverse_mass = geometry()
-    speed = held[..., 3] * n_x + held[..., 4] * n_y + held[..., 5] * lever
+    speed = moved[..., 3] * n_x + moved[..., 4] * n_y + moved[..., 5] * lever
     push(-speed / inverse_mass, 3, n_x, n_y, lever)
     result = states.copy()
-    result[exists] = held
+    result[exists] = moved
     return result

@@ -49,7 +49,7 @@ class Memory:
         True
         """
         parameters, *data = arguments  # of what is large, a hash will do
-        key = (parameters.tobytes(), *((own.shape, hash(own.tobytes())) for own in data))
+        key = (parameters.tobytes(), *((array.shape, hash(array.tobytes())) for array in data))
         if key in self._known:
             self._known.move_to_end(key)
         else:
@@ -96,18 +96,23 @@ class PartedSimulator:
     def __init__(self, physics: Physics) -> None:
         names = tuple(body.name for body in physics.scene.moving)
         parts = (names,) if physics.parts is None else physics.parts
-        given = [name for part in parts for name in part]
-        if sorted(given) != sorted(names):
+        listed = [name for part in parts for name in part]
+        if sorted(listed) != sorted(names):
             raise SimulationError(
-                f"parts hold {', '.join(given)}, expected each moving body once: {', '.join(names)}"
+                f"parts hold {', '.join(listed)}, expected each moving body once:"
+                f" {', '.join(names)}"
             )
         labels = self._labels = physics.layout.labels
         self.parts = []
         for part in parts:
-            own = physics if len(parts) == 1 else physics.part(part)
-            places = np.array([labels.index(label) for label in own.layout.labels], dtype=int)
-            bodies = np.array([names.index(body.name) for body in own.scene.moving], dtype=int)
-            self.parts.append(Part(Simulator(own), places, bodies))
+            part_physics = physics if len(parts) == 1 else physics.part(part)
+            places = np.array(
+                [labels.index(label) for label in part_physics.layout.labels], dtype=int
+            )
+            bodies = np.array(
+                [names.index(body.name) for body in part_physics.scene.moving], dtype=int
+            )
+            self.parts.append(Part(Simulator(part_physics), places, bodies))
 
     @property
     def steps(self) -> int:
@@ -122,12 +127,16 @@ class PartedSimulator:
         proposals = np.atleast_2d(phi)
         out = np.empty((len(proposals), *actions.shape[:-1], 6))
         for part in self.parts:
-            own = proposals[:, part.places]
+            parameters = proposals[:, part.places]
             begin, acted = _of(part, start, actions)
-            keys = own if start.ndim == 3 else np.hstack([own, begin.reshape(len(own), -1)])
+            keys = (
+                parameters
+                if start.ndim == 3
+                else np.hstack([parameters, begin.reshape(len(parameters), -1)])
+            )
             _, first, which = np.unique(keys, axis=0, return_index=True, return_inverse=True)
             begin = begin if start.ndim == 3 else begin[first]
-            states = part.simulator(own[first], begin, acted)
+            states = part.simulator(parameters[first], begin, acted)
             out[..., part.bodies, :] = states[which.ravel()]
         return out if phi.ndim == 2 else out[0]
 
@@ -140,16 +149,16 @@ class PartedSimulator:
             )
         out = np.empty((*actions.shape[:-1], 6))
         for part in self.parts:
-            asked = phi[part.places], *_of(part, start, actions)
-            out[..., part.bodies, :] = part.memory.recall(asked, part.simulator)
+            inputs = phi[part.places], *_of(part, start, actions)
+            out[..., part.bodies, :] = part.memory.recall(inputs, part.simulator)
         return out
 
     def jacobian(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
         """Derivative by phi, shape (transition, H, body, 6, p); see :meth:`Simulator.jacobian`."""
         out = np.zeros((*actions.shape[:-1], 6, len(phi)))
         for part in self.parts:
-            own = part.simulator.jacobian(phi[part.places], *_of(part, start, actions))
-            out[:, :, part.bodies[:, None, None], np.arange(6)[:, None], part.places] = own
+            derivative = part.simulator.jacobian(phi[part.places], *_of(part, start, actions))
+            out[:, :, part.bodies[:, None, None], np.arange(6)[:, None], part.places] = derivative
         return out
 
 
@@ -210,12 +219,12 @@ class OneWorld:
         begin = start[..., :, None, :, :2]
         first = np.broadcast_to(begin, (*states.shape[:-4], *begin.shape[-4:]))
         places = np.concatenate([first, states[..., :2]], axis=-3)
-        found = np.zeros(states.shape[:-3], dtype=bool)
+        near = np.zeros(states.shape[:-3], dtype=bool)
         for i, j in product(bodies_a, bodies_b):
             way = places[..., i, :] - places[..., j, :]
             least = (1.0 + SHARE) * (self._reach[i] + self._reach[j])
-            found |= come_near(way[..., :-1, :], way[..., 1:, :], least).any(axis=-1)
-        return found
+            near |= come_near(way[..., :-1, :], way[..., 1:, :], least).any(axis=-1)
+        return near
 
 
 def _same(a: Floats, b: Floats, rounding: Floats) -> Bools:

@@ -117,10 +117,10 @@ def overlap(scene: Scene, poses: Floats) -> Floats:
     bound = circles(world.solids, pairs, poses)
     for pair, (i, j) in enumerate(pairs):
         rows = np.flatnonzero(bound[:, pair] > 0)
-        found = bound[:, pair].copy()
+        deep = bound[:, pair].copy()
         if len(rows):
-            found[rows] = depth(world.solids[i], poses[rows, i], world.solids[j], poses[rows, j])
-        deepest = np.maximum(deepest, found)
+            deep[rows] = depth(world.solids[i], poses[rows, i], world.solids[j], poses[rows, j])
+        deepest = np.maximum(deepest, deep)
     return deepest
 
 
@@ -137,14 +137,14 @@ def _apart(scene: Scene, poses: Floats) -> Iterator[tuple[int, str]]:
             for name, pose in zip(joint.bodies, fixed, strict=True)
         ]
         length = JOINT_KINDS[joint.kind].gap(_anchor_distance(joint, fixed)[0])
-        found = _anchor_distance(joint, now)
+        distance = _anchor_distance(joint, now)
         smaller = min(scene.body(n).shape.bounding_radius for n in joint.bodies if n in moving)
-        off = np.flatnonzero(np.abs(found - length) > ALLOWED * smaller)
+        off = np.flatnonzero(np.abs(distance - length) > ALLOWED * smaller)
         if len(off):
             a, b = (name if name == WORLD else f'"{name}"' for name in joint.bodies)
             yield (
                 int(off[0]),
-                f"the anchors of the {joint.kind} joint of {a} and {b} are {found[off[0]]:.3g} m"
+                f"the anchors of the {joint.kind} joint of {a} and {b} are {distance[off[0]]:.3g} m"
                 f" apart, expected {length:.3g} m to within {ALLOWED * smaller:.3g} m (a quarter of"
                 " the smaller moving body's bounding radius); correct the poses or the anchors",
             )
@@ -179,16 +179,16 @@ def _overlaps(scene: Scene, poses: Floats) -> Iterator[tuple[int, str]]:
         i, j = pairs[pair]
         a, b, allowed = solids[i], solids[j], smaller[pair]
         rows = np.flatnonzero(near[:, pair])
-        found = depth(a, poses[rows, i], b, poses[rows, j])
-        deep = np.flatnonzero(found > allowed)
+        depths = depth(a, poses[rows, i], b, poses[rows, j])
+        deep = np.flatnonzero(depths > allowed)
         if len(deep):
-            what, whose = f'bodies "{a.name}" and "{b.name}"', "the smaller one's"
+            which, whose = f'bodies "{a.name}" and "{b.name}"', "the smaller one's"
             if b.name == WORLD:
                 (x, y), (to_x, to_y) = b.core
-                what = f'body "{a.name}" and the wall from ({x:g}, {y:g}) to ({to_x:g}, {to_y:g})'
+                which = f'body "{a.name}" and the wall from ({x:g}, {y:g}) to ({to_x:g}, {to_y:g})'
                 whose = "the body's"
             yield (
                 int(rows[deep[0]]),
-                f"{what} overlap by {found[deep[0]]:.3g} m, allowed is {allowed:.3g} m (a quarter"
+                f"{which} overlap by {depths[deep[0]]:.3g} m, allowed is {allowed:.3g} m (a quarter"
                 f" of {whose} width); correct the poses, the shapes or the walls",
             )

@@ -22,7 +22,7 @@ _EXTRA = [COLUMN.extra_gravity_x, COLUMN.extra_gravity_y]
 def rollout(
     world: World,
     effects: tuple[Attached, ...],
-    given: EngineInput,
+    numbers: EngineInput,
     proposal: int,
     item: int,
     start: Floats,
@@ -37,7 +37,7 @@ def rollout(
         A new one.
     effects : tuple of Attached
         Effects, whose command and force laws act every substep.
-    given : EngineInput
+    numbers : EngineInput
         The engine's numbers of all proposals.
     proposal, item : int
         Indices of the proposal and of the transition.
@@ -56,15 +56,15 @@ def rollout(
     touched : bool
         Whether shapes came into contact.
     """
-    properties, joints = given.bodies[proposal], given.joints[proposal]
+    properties, joints = numbers.bodies[proposal], numbers.joints[proposal]
     timed = len(properties) > 1
     bodies = properties[item * len(inputs) if timed else 0]
     set_properties(world, bodies, joints)
-    set_discs(world, given.discs[proposal])
+    set_discs(world, numbers.discs[proposal])
     _place_bodies(world, start)
     names = [body.name for body in world.scene.moving]
-    commands = list(_laws(effects, Command, given.commands[proposal], names))
-    forces = list(_laws(effects, Force, given.forces[proposal], names))
+    commands = list(_laws(effects, Command, numbers.commands[proposal], names))
+    forces = list(_laws(effects, Force, numbers.forces[proposal], names))
     step = world.scene.time_step / substeps
     states = np.empty((len(inputs), len(names), 6))
     touched, nearness = False, (world.radii, world.obstacles, world.can_touch)

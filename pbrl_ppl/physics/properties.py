@@ -159,11 +159,11 @@ class EngineProperties:
 
     def slides(self, bodies: Floats) -> NDArray[np.bool_]:
         """Return which proposals have floor friction from effects, shape (proposal,)."""
-        found = np.zeros(len(bodies), dtype=bool)
+        sliding = np.zeros(len(bodies), dtype=bool)
         for under, names in zip(self.under, (_PATCH, _WHEEL), strict=True):
             columns = [COLUMNS.index(name) for name in names]
-            found |= (bodies[:, :, list(under)][..., columns] > 0).any(axis=(1, 2, 3))
-        return found
+            sliding |= (bodies[:, :, list(under)][..., columns] > 0).any(axis=(1, 2, 3))
+        return sliding
 
     def values(self, attached: Attached, phi: Floats, axes: int = 0) -> dict[str, Floats]:
         """Return an effect's parameters by name, shape (proposal, 1, ...) with ``axes`` ones.
@@ -292,9 +292,9 @@ class EngineProperties:
             return
         first = tuple(np.argwhere(~possible)[0])
         *_, body, column = first
-        found, name = bodies[first], COLUMNS[column]
+        value, name = bodies[first], COLUMNS[column]
         where = f"body {self._scene.moving[body].name!r}: {name}"
-        if not np.isfinite(found):
+        if not np.isfinite(value):
             raise ParameterError(f"{where} is not finite; give a finite number")
         expected = "a positive number" if name in _POSITIVE else "zero or more"
-        raise ParameterError(f"{where} is {found:g}, expected {expected}")
+        raise ParameterError(f"{where} is {value:g}, expected {expected}")

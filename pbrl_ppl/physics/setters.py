@@ -162,8 +162,8 @@ def set_discs(fn, world, discs):  # type: ignore[no-untyped-def]
 def place_wheels(fn, world, bodies, state, axes, step):  # type: ignore[no-untyped-def]
     """Put the rods' ends on the wheels' axes as predicted for the end of the substep."""
     for j in range(len(world.wheel_body)):
-        row, own = bodies[world.wheel_body[j]], state[world.wheel_body[j]]
-        x_1, y_1, x_2, y_2 = wheel_ends(row, glide(row, own, step), axes[j, 0], axes[j, 1])
+        row, body = bodies[world.wheel_body[j]], state[world.wheel_body[j]]
+        x_1, y_1, x_2, y_2 = wheel_ends(row, glide(row, body, step), axes[j, 0], axes[j, 1])
         call2(fn.cpPinJointSetAnchorB, world.wheels[0, j], x_1, y_1)
         call2(fn.cpPinJointSetAnchorB, world.wheels[1, j], x_2, y_2)
 
@@ -172,11 +172,11 @@ def place_wheels(fn, world, bodies, state, axes, step):  # type: ignore[no-untyp
 def place_patches(fn, world, bodies, state, step):  # type: ignore[no-untyped-def]
     """Put each point's rod along its velocity; split its friction with the pivot joint."""
     for j in range(len(world.patch_body)):
-        row, own = bodies[world.patch_body[j]], state[world.patch_body[j]]
-        slowing, after = row[COLUMN.patch_mu] * world.normal_gravity, glide(row, own, step)
+        row, body = bodies[world.patch_body[j]], state[world.patch_body[j]]
+        slowing, after = row[COLUMN.patch_mu] * world.normal_gravity, glide(row, body, step)
         most = slowing * row[COLUMN.mass] / len(world.ring)
         for i in range(len(world.ring)):
-            x, y, share = patch_point(row, after, own[5], world.ring[i], step, slowing)
+            x, y, share = patch_point(row, after, body[5], world.ring[i], step, slowing)
             call2(fn.cpPinJointSetAnchorB, world.patches[1, j, i], x, y)
             call1(fn.cpConstraintSetMaxForce, world.patches[0, j, i], (1.0 - share) * most)
             call1(fn.cpConstraintSetMaxForce, world.patches[1, j, i], share * most)

@@ -117,37 +117,37 @@ class Simulator:
         check_shapes(self.physics.scene, self.physics.layout, phi, start, actions)
         proposals = np.atleast_2d(phi)
         inputs, clock = self._inputs(actions)
-        given = self._properties(proposals, clock)
-        starts = self._on_rods(self._states(proposals, start), given.joints)
+        numbers = self._properties(proposals, clock)
+        starts = self._on_rods(self._states(proposals, start), numbers.joints)
         n, horizon, k = actions.shape[:3]
         out = np.full((len(proposals), n, horizon, k, 6), np.nan)
         plain = self.physics.engine == "python" or not calls.AVAILABLE
         run = self._run_plain if plain else self._run_compiled
         extra = (*self._properties.under, self._properties.tied)
-        if not (any(extra) or given.indices.shape[1]):
-            run(_ONE_WORLD, given, starts, inputs, out.reshape(-1, horizon, k, 6))
+        if not (any(extra) or numbers.indices.shape[1]):
+            run(_ONE_WORLD, numbers, starts, inputs, out.reshape(-1, horizon, k, 6))
         else:
-            for choice, rows in self._choices(given):
-                own = starts[rows] if len(starts) > 1 else starts
+            for choice, rows in self._choices(numbers):
+                begin = starts[rows] if len(starts) > 1 else starts
                 count = int(rows.sum())
                 part = np.full((count * n, horizon, k, 6), np.nan)
-                run(choice, EngineInput(*(array[rows] for array in given)), own, inputs, part)
+                run(choice, EngineInput(*(array[rows] for array in numbers)), begin, inputs, part)
                 out[rows] = part.reshape(count, n, horizon, k, 6)
         for i, sensor, values in self._properties.sensors(proposals):
             out[..., i, :] = sensor.measure(out[..., i, :], values)
         return out if phi.ndim == 2 else out[0]
 
-    def _choices(self, given: EngineInput) -> Iterator[tuple[Choice, Any]]:
+    def _choices(self, numbers: EngineInput) -> Iterator[tuple[Choice, Any]]:
         """The worlds that proposals need, and which of them each is for.
 
         What bodies an inferred joint holds makes another world; and so does friction under bodies,
         whose joints would cost ten times as much as all else where the coefficient is zero, as it
         is when candidates are scored.
         """
-        sliding = self._properties.slides(given.bodies)
-        tied = given.joints[:, len(self.physics.scene.joints) :, -1] > 0
-        proposals, joints, _ = given.indices.shape
-        indices = given.indices.reshape(proposals, 2 * joints)
+        sliding = self._properties.slides(numbers.bodies)
+        tied = numbers.joints[:, len(self.physics.scene.joints) :, -1] > 0
+        proposals, joints, _ = numbers.indices.shape
+        indices = numbers.indices.reshape(proposals, 2 * joints)
         keys = np.column_stack([sliding, tied, indices])
         choices, which = np.unique(keys, axis=0, return_inverse=True)
         for i, (slides, *others) in enumerate(choices.astype(int).tolist()):
@@ -264,27 +264,27 @@ class Simulator:
 
     def _new_world(self, choice: Choice) -> World:
         joined, slides, there = choice
-        own = self._properties
-        patches, wheels = own.under if slides else ((), ())
-        rods = tuple(compress(own.tied, there))
-        scene, kinds = self.physics.scene, own.joints.kinds
-        return World(scene, kinds, joined, own.n_discs, patches, wheels, rods)
+        properties = self._properties
+        patches, wheels = properties.under if slides else ((), ())
+        rods = tuple(compress(properties.tied, there))
+        scene, kinds = self.physics.scene, properties.joints.kinds
+        return World(scene, kinds, joined, properties.n_discs, patches, wheels, rods)
 
     def _run_plain(
-        self, choice: Choice, given: EngineInput, starts: Floats, inputs: Floats, out: Floats
+        self, choice: Choice, numbers: EngineInput, starts: Floats, inputs: Floats, out: Floats
     ) -> None:
         for item in range(len(out)):
             p, t = divmod(item, len(inputs))
             start = starts[p if len(starts) > 1 else 0, t]
             total = np.zeros_like(out[item])
             stepped = partial(
-                plain.rollout, effects=self.physics.effects, given=given, proposal=p, item=t,
+                plain.rollout, effects=self.physics.effects, numbers=numbers, proposal=p, item=t,
                 start=start, inputs=inputs[t],
             )  # fmt: skip
             for level, (count, weight) in enumerate(zip(*self.levels, strict=True)):
                 states, touched = stepped(self._new_world(choice), substeps=int(count))
                 lost = np.isnan(states).any()
-                if touched and not lost and (given.discs[p, :, 2] > 0).any():
+                if touched and not lost and (numbers.discs[p, :, 2] > 0).any():
                     states, _ = stepped(self._new_world(choice), substeps=int(count) * FINER)
                 if level == 0 or np.isnan(states).any():  # diverged
                     out[item] = states
@@ -299,7 +299,7 @@ class Simulator:
     def _run_compiled(
         self,
         choice: Choice,
-        given: EngineInput,
+        numbers: EngineInput,
         starts: Floats,
         inputs: Floats,
         out: Floats,
@@ -311,7 +311,7 @@ class Simulator:
         So many engine steps are worth a thread of their own.
         """
         batch = Batch(
-            tuple(given[:-1]), self._commands, self._forces, starts, inputs,
+            tuple(numbers[:-1]), self._commands, self._forces, starts, inputs,
             self.physics.scene.time_step, *self.levels,
         )  # fmt: skip
         steps = len(out) * inputs.shape[1] * int(self.levels[0].sum())
@@ -322,17 +322,17 @@ class Simulator:
                 self._worlds.popitem(last=False)
             while len(engines) < workers:
                 engines.append(Engine(partial(self._new_world, choice), self.physics.engine))
-            found, slides = out, engines[0].slides and len(out) > 0
+            states, slides = out, engines[0].slides and len(out) > 0
             if slides:
-                found, (batch, order) = np.empty_like(out), batch.by_speed()
+                states, (batch, order) = np.empty_like(out), batch.by_speed()
 
             def run(engine: Engine, first: int, last: int) -> None:
-                engine.rollout(batch, first, last, found)
+                engine.rollout(batch, first, last, states)
 
             share_out(run, engines[:workers], len(out))
         if slides:
             shape = (-1, len(order), *out.shape[1:])
-            out.reshape(shape)[:, order] = found.reshape(shape)
+            out.reshape(shape)[:, order] = states.reshape(shape)
 
 
 def _each(states: Floats, proposals: int) -> Floats:
@@ -377,8 +377,8 @@ def check_shapes(scene: Scene, layout: Layout, phi: Floats, start: Floats, actio
             f"phi has shape {phi.shape}, expected ({p},) or (proposal, {p}):"
             f" {', '.join(layout.labels)}"
         )
-    own = start.ndim == 4 and phi.ndim == 2 and len(start) == len(phi)
-    if not (own or start.ndim == 3) or start.shape[-2:] != (k, 6):
+    per_proposal = start.ndim == 4 and phi.ndim == 2 and len(start) == len(phi)
+    if not (per_proposal or start.ndim == 3) or start.shape[-2:] != (k, 6):
         raise SimulationError(
             f"start has shape {start.shape}, expected (transition, {k}, 6), or with as many"
             " proposals first as phi has, in the order x, y, theta, vx, vy, omega"

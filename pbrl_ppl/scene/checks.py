@@ -104,10 +104,10 @@ def names(value: object, where: str) -> tuple[str, ...]:
     """Return a tuple of different names."""
     if isinstance(value, str) or not isinstance(value, Iterable):
         raise SceneError(f"{where} is {value!r}, expected a list of names")
-    found = tuple(label(name, where) for name in value)
-    if len(set(found)) < len(found):
-        raise SceneError(f"{where} {list(found)} names one twice; drop it")
-    return found
+    labels = tuple(label(name, where) for name in value)
+    if len(set(labels)) < len(labels):
+        raise SceneError(f"{where} {list(labels)} names one twice; drop it")
+    return labels
 
 
 def vector(value: object, length: int, where: str) -> Any:
@@ -185,10 +185,12 @@ def index_probabilities(value: object, where: str) -> tuple[tuple[str, Named], .
     """Return the probabilities of a joint's first and second body by name."""
 
     def check(_: str, item: object, at: str) -> Named:
-        given = {label(n, at): not_negative(p, f"{at} {n}") for n, p in _items(item, at).items()}
-        if not sum(given.values()) > 0:
+        probabilities = {
+            label(n, at): not_negative(p, f"{at} {n}") for n, p in _items(item, at).items()
+        }
+        if not sum(probabilities.values()) > 0:
             raise SceneError(f"{at} has no name of a probability above 0; add one")
-        return tuple(given.items())
+        return tuple(probabilities.items())
 
     return table(value, f"prior of {where}", ("i_a", "i_b"), check, "index")
 
@@ -203,8 +205,8 @@ def hyper_parameters(
         return table(item, at, checks, lambda key, number, place: checks[key](number, place))
 
     # which parameters an effect has is known where the catalogue is: `prior.build_layout`
-    given = {str(name) for name in _items(value, f"prior of {where}")} - set(PARAMETER_NAMES)
-    declared = sorted(name for name in given if name.startswith(tuple(f"{e}_" for e in effects)))
+    unknown = {str(name) for name in _items(value, f"prior of {where}")} - set(PARAMETER_NAMES)
+    declared = sorted(name for name in unknown if name.startswith(tuple(f"{e}_" for e in effects)))
     hint = " (an effect's parameter needs the effect among the body's effects)"
     return table(
         value, f"prior of {where}", (*PARAMETER_NAMES, *declared), check, "parameter", hint

@@ -118,11 +118,11 @@ class Joint:
         return JOINT_KINDS[self.kind]
 
 
-def _two_names(given: object) -> tuple[str, ...]:
+def _two_names(value: object) -> tuple[str, ...]:
     """Return the names of a joint's bodies."""
-    if isinstance(given, str) or not isinstance(given, Iterable):
-        raise SceneError(f"joint: bodies is {given!r}, expected two names")
-    bodies = tuple(label(name, "joint: bodies") for name in given)
+    if isinstance(value, str) or not isinstance(value, Iterable):
+        raise SceneError(f"joint: bodies is {value!r}, expected two names")
+    bodies = tuple(label(name, "joint: bodies") for name in value)
     if len(bodies) != 2:
         raise SceneError(f"joint: bodies is {list(bodies)}, expected two names")
     if bodies[0] == bodies[1]:

@@ -91,8 +91,8 @@ class Recording:
         object.__setattr__(self, "topics", topics)
         for key in ("units", "topics"):
             for name, value in getattr(self, key):
-                each = value if key == "topics" and isinstance(value, tuple) else (value,)
-                if not all(isinstance(text, str) for text in each):
+                texts = value if key == "topics" and isinstance(value, tuple) else (value,)
+                if not all(isinstance(text, str) for text in texts):
                     raise SceneError(f"[recording]: {key} of {name} is {value!r}, expected text")
         known = (*SEPARATORS, "")
         if self.separator not in known and len(self.separator) != 1:

@@ -197,8 +197,8 @@ class Scene:
         bodies, walls, joints = [], [], []
         for where, table in arrays["body"]:
             with located(where):
-                given = {("object_class" if k == "class" else k): v for k, v in table.items()}
-                bodies.append(Body(**given | {"shape": Shape(**table["shape"])}))
+                entries = {("object_class" if k == "class" else k): v for k, v in table.items()}
+                bodies.append(Body(**entries | {"shape": Shape(**table["shape"])}))
         for where, table in arrays["wall"]:
             with located(where):
                 walls.append(Wall(table["from"], table["to"]))
@@ -247,10 +247,10 @@ class Scene:
     @property
     def owners(self) -> dict[str, tuple[str, ...]]:
         """Names of the moving bodies by the owner of their parameters: `Body.owner`."""
-        found: dict[str, tuple[str, ...]] = {}
+        names: dict[str, tuple[str, ...]] = {}
         for body in self.moving:
-            found[body.owner] = (*found.get(body.owner, ()), body.name)
-        return found
+            names[body.owner] = (*names.get(body.owner, ()), body.name)
+        return names
 
     @property
     def joinable(self) -> tuple[str, ...]:

@@ -53,10 +53,10 @@ class Shape:
                 f"{nearest(self.kind, needs)}"
             )
         for kind, key in needs.items():
-            given = getattr(self, key) is not None
-            if given and kind != self.kind:
+            present = getattr(self, key) is not None
+            if present and kind != self.kind:
                 raise SceneError(f'shape: a {self.kind} has no "{key}"; drop it')
-            if not given and kind == self.kind:
+            if not present and kind == self.kind:
                 raise SceneError(f'shape: a {self.kind} needs "{key}"; add it')
         if self.size is not None:
             size = vector(self.size, 2, "shape: size")
@@ -194,8 +194,8 @@ def _self_intersection(a: Floats) -> tuple[int, int] | None:
                 return i, j
             continue
         ends = ((o, u, v), (o, u, w), (v, w, o), (v, w, u))
-        d = [side(*each) for each in ends]
+        d = [side(*corners) for corners in ends]
         crosses = d[0] * d[1] < 0 and d[2] * d[3] < 0
-        if crosses or any(s == 0 and between(*each) for s, each in zip(d, ends, strict=True)):
+        if crosses or any(s == 0 and between(*corners) for s, corners in zip(d, ends, strict=True)):
             return i, j
     return None
