@@ -42,7 +42,7 @@ def check(
     prior: Annotated[
         bool, typer.Option(help="Whether to compare the data with draws from the prior.")
     ] = True,
-    draws: Annotated[int, typer.Option(min=50, help="Draws from the prior.")] = 100,
+    draws: Annotated[int, typer.Option(min=50, help="Draws from the prior.")] = 400,
     seed: options.Seed = 0,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,

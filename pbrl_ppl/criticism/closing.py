@@ -345,7 +345,7 @@ def _prior_test(
     horizon = telling_horizon(train, task.criteria.prior)
     problem = Problem.of(Physics(task.scene, effects, threads=2), train, horizon=horizon)
     checked = prior_predictive_check(
-        problem, draws=100, seed=task.seed, held=held, criteria=task.criteria.prior
+        problem, seed=task.seed, held=held, criteria=task.criteria.prior
     )
     share = float(checked.dataset["share_beyond"].max())
     sentence, *more = checked.summary
