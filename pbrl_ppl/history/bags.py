@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from numbers import Real
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -20,10 +20,11 @@ from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.scene import nearest
 from pbrl_ppl.state import Bools, Floats
 
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+
 #: Suffixes of single files; a ROS 2 bag may also be a folder.
 SUFFIXES = (".bag", ".db3", ".mcap")
-
-_NANO = 1e-9
 
 
 def bag_topics(path: str | Path) -> dict[str, str]:
@@ -126,7 +127,7 @@ def read_bag(
     stamps = first.index[(first.index >= begin) & (first.index <= end)]
     if not len(stamps):
         spans = ", ".join(
-            f"{_NANO * table.index[0]:.3f} to {_NANO * table.index[-1]:.3f} s ({body})"
+            f"{1e-9 * table.index[0]:.3f} to {1e-9 * table.index[-1]:.3f} s ({body})"
             for body, table in bodies.items()
         )
         raise HistoryError(
@@ -134,7 +135,7 @@ def read_bag(
             " together, with the stamps of one clock"
         )
     whole = [first.loc[stamps], *(_interpolated(other, stamps, longest_gap) for other in others)]
-    time = _NANO * (stamps - stamps[0]).to_numpy()
+    time = 1e-9 * (stamps - stamps[0]).to_numpy()
     for body, table in zip(bodies, whole, strict=True):
         table.insert(0, "time", time)
         if body:
@@ -145,7 +146,7 @@ def read_bag(
     return rows
 
 
-def _listed(topics: Any, path: Path) -> dict[str, list[str]]:
+def _listed(topics: object, path: Path) -> dict[str, list[str]]:
     """Return each body's topics, of which there is at least one."""
     by_body = topics if isinstance(topics, Mapping) else {}
     listed = {
@@ -168,7 +169,7 @@ def _listed(topics: Any, path: Path) -> dict[str, list[str]]:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def _opened(path: Path) -> Iterator[AnyReader]:
     """Open a bag; raise what fails in reading as a `HistoryError`."""
     try:
         from rosbags.highlevel import AnyReader
@@ -197,7 +198,7 @@ def _opened(path: Path) -> Iterator[Any]:
         ) from None
 
 
-def _types(reader: Any) -> dict[str, str]:
+def _types(reader: AnyReader) -> dict[str, str]:
     """Return the message type of each topic; several of one topic with "or" between them."""
     kinds_of: dict[str, dict[str, None]] = {}
     for connection in sorted(reader.connections, key=lambda each: each.topic):
@@ -205,7 +206,7 @@ def _types(reader: Any) -> dict[str, str]:
     return {topic: " or ".join(kinds) for topic, kinds in kinds_of.items()}
 
 
-def _messages(reader: Any, topic: str, kind: str, path: Path, longest: int) -> pd.DataFrame:
+def _messages(reader: AnyReader, topic: str, kind: str, path: Path, longest: int) -> pd.DataFrame:
     """Return the numbers of a topic's messages by their stamps (ns)."""
     rows: list[dict[str, float]] = []
     received, stamped = [], []
@@ -234,7 +235,7 @@ def _messages(reader: Any, topic: str, kind: str, path: Path, longest: int) -> p
     return table
 
 
-def _flatten(message: Any, path: str, row: dict[str, float], longest: int) -> None:
+def _flatten(message: object, path: str, row: dict[str, float], longest: int) -> None:
     """Add the numbers of a message under their paths, and ``yaw``."""
     values = {field.name: getattr(message, field.name) for field in fields(message)}
     lists = (values.get(name) for name in ("name", "names", "joint_names"))

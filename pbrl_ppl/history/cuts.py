@@ -12,7 +12,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.signal import find_peaks
 
 from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.history.kinematics import column_noise
+from pbrl_ppl.history.kinematics import column_noise, finest_step
 from pbrl_ppl.history.resampling import LONGEST
 from pbrl_ppl.history.rows import TIME_TOLERANCE
 from pbrl_ppl.scene import Recording
@@ -99,11 +99,7 @@ def _at_rest(times: Floats, states: Floats, seconds: float, still: float = 8.0) 
     n = max(2, int(np.ceil(seconds / np.median(np.diff(times)))) + 1)
     rests = np.ones(len(times), dtype=bool)
     for column in states.T:
-        change = np.abs(np.diff(column, 2))
-        change = change[np.isfinite(change)]
-        noise = column_noise([column], 2, robust=True)
-        steps = change[change > 0]
-        tolerance = max(still * noise, steps.min() if len(steps) else 0.0)
+        tolerance = max(still * column_noise([column], 2, robust=True), finest_step(column))
         windows = pd.Series(column).rolling(n)
         quiet = (windows.max() - windows.min() <= tolerance).to_numpy()
         rest = np.zeros(len(times), dtype=bool)

@@ -3,8 +3,10 @@
 MuJoCo itself is not imported: a model's arrays are enough.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +15,9 @@ from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history.history import History
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE, WRENCH, Floats
+
+if TYPE_CHECKING:
+    import mujoco
 
 #: A plane's axes in MuJoCo's world, and its normal: a top view, and a side view.
 PLANES = {"xy": np.eye(3), "xz": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])}
@@ -39,7 +44,7 @@ class _Joint:
 
 
 def from_mujoco(
-    model: Any,
+    model: mujoco.MjModel,
     scene: Scene,
     qpos: npt.ArrayLike,
     qvel: npt.ArrayLike,
@@ -166,7 +171,7 @@ def _batched(values: npt.ArrayLike, width: int, name: str, symbol: str) -> Float
     return array
 
 
-def _joints(model: Any, name: str, axes: Floats, reach: float) -> list[_Joint]:
+def _joints(model: mujoco.MjModel, name: str, axes: Floats, reach: float) -> list[_Joint]:
     """Return a body's joints, each along one of the plane's axes."""
     try:
         body = model.body(name)
@@ -244,7 +249,9 @@ def _fill(
     return True
 
 
-def _add_parents_angles(model: Any, state: Floats, joints: dict[str, list[_Joint]]) -> None:
+def _add_parents_angles(
+    model: mujoco.MjModel, state: Floats, joints: dict[str, list[_Joint]]
+) -> None:
     """Add to angles and rates in a chain of hinges those of the bodies above, in place."""
     order = list(joints)
     for name in sorted(order, key=lambda each: int(model.body(each).id)):  # parents come first
@@ -260,7 +267,7 @@ def _add_parents_angles(model: Any, state: Floats, joints: dict[str, list[_Joint
             body[..., [2, 5]] += above[..., [2, 5]]
 
 
-def _motor_wrenches(model: Any, joints: dict[str, list[_Joint]], ctrl: Floats) -> Floats:
+def _motor_wrenches(model: mujoco.MjModel, joints: dict[str, list[_Joint]], ctrl: Floats) -> Floats:
     """Return the wrenches of motors at joints, shape (trajectory, row, body, 3)."""
     holder = {
         joint.number: (i, joint)
