@@ -350,7 +350,7 @@ def op_sides(
 
     return (
         timed(lambda: function(moved())),
-        timed(lambda: op.simulator(moved(), start, actions)),
+        timed(lambda: op.physics.predict(moved(), start, actions)),
     )
 
 
