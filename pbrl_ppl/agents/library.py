@@ -23,11 +23,6 @@ from pbrl_ppl.sampling import fit
 from pbrl_ppl.scene import Scene, body_sizes
 from pbrl_ppl.state import Floats
 
-#: Draws of the paper's schedule: 5000 iterations, 1000 burn-in, thinning 10, one chain.
-_DRAWS = 400
-#: Share by which a body's data grow before its choice is updated.
-_GROWTH = 0.2
-
 
 @final
 class LibraryAgent(PhysicsAgent):
@@ -125,12 +120,15 @@ class LibraryAgent(PhysicsAgent):
                 push, after = used * action[rows], np.where(used, next_state[rows], np.nan)
                 self._seen[owner].append((begin, push, after))
 
-    def update(self) -> None:
-        """Update the choice of bodies and classes whose data grew and were not predicted."""
+    def update(self, *, growth: float = 0.2) -> None:
+        """Update the choice of bodies and classes whose data grew and were not predicted.
+
+        ``growth``: share by which a body's data grow before its choice is updated.
+        """
         before = self.fits
         for name, seen in self._seen.items():
             fitted = self._fitted[name]
-            grown = len(seen) > fitted and len(seen) >= (1.0 + _GROWTH) * fitted
+            grown = len(seen) > fitted and len(seen) >= (1.0 + growth) * fitted
             if grown and (not fitted or self._surprised(name)):
                 self._choose(name)
         if self._dynamics is None or self.fits > before:
@@ -167,8 +165,9 @@ class LibraryAgent(PhysicsAgent):
                 idata = fit(build_model(problem), method="paper", seed=self.seed, progress=False)
             index = group(idata, "posterior")["library_index"].to_numpy()
         else:
-            _, _, index, _, _ = choose_from_library(problem, _DRAWS, 1, self.seed)
-        share = np.bincount(index[..., 0].ravel(), minlength=len(among.names)) / _DRAWS
+            # as many draws as the paper's schedule gives
+            _, _, index, _, _ = choose_from_library(problem, 400, 1, self.seed)
+        share = np.bincount(index[..., 0].ravel(), minlength=len(among.names)) / index[..., 0].size
         found = dict(zip(among.names, share.tolist(), strict=True))
         self._probability[name] = np.array([found.get(each, 0.0) for each in self.library.names])
         self._choice[name] = int(self._probability[name].argmax())

@@ -31,10 +31,6 @@ if TYPE_CHECKING:
 #: Prediction errors up to this share of the natural sizes carry no information: they are the
 #: engine's.
 NEGLIGIBLE = 1e-4
-#: Prediction errors above this many sigma cause a refit.
-_SURPRISE = 4.0
-#: Fewest transitions for criticism, and the significance level over a whole episode.
-_LEAST, _LEVEL = 3, 0.01
 
 
 @final
@@ -127,7 +123,8 @@ class PBRLAgent(PhysicsAgent):
         if self._is_informed():
             self._fit()
 
-    def _is_informed(self) -> bool:
+    def _is_informed(self, surprise: float = 4.0) -> bool:
+        """Return whether new transitions inform: there are many, or errors above so many sigma."""
         if len(self._transitions) == self._fitted or self._dynamics is None:
             return len(self._transitions) > self._fitted
         state, inputs, after = (each[self._fitted :] for each in self._data())
@@ -135,7 +132,7 @@ class PBRLAgent(PhysicsAgent):
         error = prediction_errors(self._dynamics, state, action, after, previous)
         if (error <= self._negligible).all():
             return False
-        surprised = not (error <= np.maximum(_SURPRISE * self._sigma, self._negligible)).all()
+        surprised = not (error <= np.maximum(surprise * self._sigma, self._negligible)).all()
         return self._grown(self._fitted) or surprised
 
     def _grown(self, since: int) -> bool:
@@ -171,18 +168,22 @@ class PBRLAgent(PhysicsAgent):
         ]
         return physics_model(scene, history, beside, sigma=self._noise)
 
-    def _revised(self) -> Mode | None:
-        """Criticise the declared model; return the mode found if it is of all data."""
+    def _revised(self, *, least: int = 3, false_alarm: float = 0.01) -> Mode | None:
+        """Criticise the declared model; return the mode found if it is of all data.
+
+        ``least``: fewest transitions for criticism.
+        ``false_alarm``: significance level over a whole episode.
+        """
         state, _, after = self._data()
         free = ~touching(self.task.scene, state, after)
-        if free.sum() < _LEAST or not self._grown(self._looked):
+        if free.sum() < least or not self._grown(self._looked):
             return None
 
         def search(effects: tuple[Attached, ...]) -> Mode:
             return find_mode(self._model(effects, free).problem, seed=self.seed)
 
         self.looks, self._looked = self.looks + 1, len(free)
-        level = _LEVEL / (self.looks * (self.looks + 1))
+        level = false_alarm / (self.looks * (self.looks + 1))
         found, mode = select_effects(
             search, self._declared, self.added, self._catalogue, level=level, floor=self._negligible
         )

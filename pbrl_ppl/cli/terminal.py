@@ -116,9 +116,6 @@ def warnings_in_a_line() -> Iterator[None]:
         yield
 
 
-_WIDE = 160
-
-
 def print_json(contents: Mapping[str, Any]) -> None:
     """Print one JSON object; numbers that are not finite become null."""
     typer.echo(json.dumps(json_values(contents), indent=1, allow_nan=False))
@@ -132,8 +129,13 @@ def print_result(as_json: bool, contents: Mapping[str, Any], lines: Iterable[str
         typer.echo("\n".join(lines))
 
 
-def print_table(title: str | None, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Print a table; its first column, and those whose name begins with <, are text."""
+def print_table(
+    title: str | None, columns: Sequence[str], rows: Iterable[Sequence[str]], *, wide: int = 160
+) -> None:
+    """Print a table; its first column, and those whose name begins with <, are text.
+
+    ``wide``: width of a page where there is no terminal.
+    """
     table = Table(title=title, title_justify="left", box=None, pad_edge=False)
     for i, name in enumerate(columns):
         left = i == 0 or name.startswith("<")
@@ -143,7 +145,7 @@ def print_table(title: str | None, columns: Sequence[str], rows: Iterable[Sequen
     for row in rows:
         table.add_row(*row)
     # a file or a pipe has no width
-    width = None if sys.stdout.isatty() else _WIDE
+    width = None if sys.stdout.isatty() else wide
     Console(highlight=False, markup=False, width=width).print(table)
 
 

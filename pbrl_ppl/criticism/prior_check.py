@@ -26,10 +26,6 @@ from pbrl_ppl.state import POSE, STATE, STATE_UNITS, THETA, Bools, Floats, Ints,
 
 #: Quantiles: the ends of the interval, its quartiles and the median.
 QUANTILES = (0.5 - HDI_PROB / 2, 0.25, 0.5, 0.75, 0.5 + HDI_PROB / 2)
-_CHUNK = 16
-#: A coordinate that never moves has mean square changes of at most this many times those of its
-#: noise, over all times and up to this many intervals or more.
-_STILL, _STILL_INTERVALS = 2.0, 4
 #: Factors of wrong units: m and mm or N and mN; degrees; kg for the weight of a kg.
 _UNITS = {1000.0: "1000", 180 / np.pi: "57.3", 9.81: "9.81"}
 
@@ -111,6 +107,7 @@ def prior_predictive_check(
     seed: int = 0,
     held: Mapping[str, float] | None = None,
     criteria: PriorCriteria = DEFAULT.prior,
+    chunk: int = 16,
 ) -> PriorCheck:
     """Compare measured changes over a segment with predictions under the prior.
 
@@ -132,6 +129,8 @@ def prior_predictive_check(
         Parameters that have these values in every draw, by their labels.
     criteria : PriorCriteria
         When the prior could not have made the data.
+    chunk : int
+        Draws simulated at once.
 
     Returns
     -------
@@ -179,8 +178,8 @@ def prior_predictive_check(
         phi[:, problem.layout.labels.index(label)] = value
     ends = np.concatenate(
         [
-            _at(problem.predict(phi[i : i + _CHUNK], problem.one_world)[..., columns], last)
-            for i in range(0, len(phi), _CHUNK)
+            _at(problem.predict(phi[i : i + chunk], problem.one_world)[..., columns], last)
+            for i in range(0, len(phi), chunk)
         ]
     )
     good = np.isfinite(ends).all(axis=(1, 2, 3))
@@ -302,11 +301,18 @@ def _mean_square(values: Floats, angle: Bools, steps: int, order: int) -> Floats
         return np.asarray(np.nan_to_num(np.nanmean(change**2, axis=1)))
 
 
-def _measurement_noise(history: History, stated: Mapping[str, float]) -> Floats:
+def _measurement_noise(
+    history: History, stated: Mapping[str, float], *, still: float = 2.0, least_intervals: int = 4
+) -> Floats:
     """Return the measurement noise of each state, shape (body, state); 0 where it is unknown.
 
     It is the stated one, or an estimate; of a coordinate that never moves beyond its noise the one
     that third differences show.
+
+    ``still``: a coordinate that never moves has mean square changes of at most this many times
+    those of its noise.
+
+    ``least_intervals``: over all times and up to this many intervals or more.
     """
     found = measurement_noise(history)
     observed = history.dataset["observed"].to_numpy()
@@ -318,7 +324,7 @@ def _measurement_noise(history: History, stated: Mapping[str, float]) -> Floats:
             own = observed[:, :, body, d]
             noise = float(_mean_square(own, angle, 1, 3).mean()) / 20.0
             largest = max(float(_mean_square(own, angle, each, 1).mean()) for each in steps)
-            if half >= _STILL_INTERVALS and largest <= 2.0 * _STILL * noise:
+            if half >= least_intervals and largest <= 2.0 * still * noise:
                 found[body, d] = max(found[body, d], np.sqrt(noise))
             if name in stated and np.isfinite(own).any():
                 if name in POSE and np.isnan(observed[:, :, body, d + len(POSE)]).all():

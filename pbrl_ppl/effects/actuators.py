@@ -13,9 +13,8 @@ from pbrl_ppl.state import Floats
 
 _GAIN = Prior("log_normal", mu=0.0, sigma=0.5)
 _THRESHOLD = EffectParameter("threshold", "N", Prior("half_normal", sigma=0.5), scale="force")
-#: Force levels that a scan tries. The likelihood jumps where the cut-off passes a commanded force,
-#: and an optimiser cannot follow it: more levels there.
-_LEVELS, _CUTOFF_LEVELS = 20, 200
+#: Force levels that a scan tries.
+_LEVELS = 20
 #: No actuator reaches this force, in typical forces.
 _UNREACHED = 1e9
 
@@ -140,9 +139,13 @@ def _cut_off(state: Floats, command: Floats, parameters: Floats, wrench: Floats)
         wrench[1] = 0.0
 
 
-def _scan_cutoffs(scene: Scene, history: History, body: Body) -> Floats:
-    """Return thresholds to try."""
-    return _force_levels(history, body, _CUTOFF_LEVELS)
+def _scan_cutoffs(scene: Scene, history: History, body: Body, *, levels: int = 200) -> Floats:
+    """Return thresholds to try.
+
+    ``levels``: the likelihood jumps where the cut-off passes a commanded force, and an optimiser
+    cannot follow it: many levels.
+    """
+    return _force_levels(history, body, levels)
 
 
 force_cutoff = Effect(

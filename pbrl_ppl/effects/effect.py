@@ -231,10 +231,6 @@ def needs_inputs(effects: tuple[Attached, ...]) -> bool:
     )
 
 
-#: Points tried on a body, as shares of its half extent.
-_POINTS = np.array([(0.0, 0.0), (0.7, 0.0), (-0.7, 0.0), (0.0, 0.7), (0.0, -0.7)])
-
-
 def is_pivoted(scene: Scene, body: Body) -> bool:
     """Return whether the body hangs in a hinge: the hinge's friction acts on this body."""
     hinges = (joint for joint in scene.joints if joint.kind == "hinge" and joint.bodies)
@@ -271,4 +267,5 @@ def hanging_body(scene: Scene, joint: Joint) -> str:
 def body_points(body: Body) -> Floats:
     """Return the middle of a body and a point towards each side, in its frame, shape (5, 2), m."""
     x_min, x_max, y_min, y_max = body.shape.bounds
-    return np.asarray(0.5 * np.array([x_max - x_min, y_max - y_min]) * _POINTS)
+    shares = np.array([(0.0, 0.0), (0.7, 0.0), (-0.7, 0.0), (0.0, 0.7), (0.0, -0.7)])
+    return np.asarray(0.5 * np.array([x_max - x_min, y_max - y_min]) * shares)

@@ -11,10 +11,6 @@ from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene
 from pbrl_ppl.state import Floats
 
-#: Radii that a scan tries, as shares of the body's: of even pressure under a disc, and others.
-_RADII = (2.0 / 3.0, 0.2, 0.4, 1.0)
-#: Directions of a wheel that a scan tries, over a right angle.
-_TURNS = 3
 _FRICTION = Prior("half_normal", sigma=0.5)
 
 
@@ -65,7 +61,9 @@ def _scan_radii(scene: Scene, history: History, body: Body) -> Floats:
     More friction would hold the body still now and then, where the derivative is meaningless.
     """
     theta = history.dataset["start"].sel(body=body.name, state="theta").to_numpy()
-    shares = _RADII if np.nanmax(theta) > np.nanmin(theta) else _RADII[:1]
+    shares = [2.0 / 3.0]  # even pressure under a disc
+    if np.nanmax(theta) > np.nanmin(theta):
+        shares += [0.2, 0.4, 1.0]
     return np.array([(np.nan, share * body.shape.bounding_radius) for share in shares])
 
 
@@ -95,9 +93,12 @@ def _lacks_wheel(scene: Scene, body: Body) -> bool:
     return scene.normal_gravity > 0 and not body.wheel
 
 
-def _scan_wheels(scene: Scene, history: History, body: Body) -> Floats:
-    """Return places and directions to try; the derivative is taken by both frictions."""
-    turns = np.arange(_TURNS) * (0.5 * np.pi / _TURNS)
+def _scan_wheels(scene: Scene, history: History, body: Body, *, n_turns: int = 3) -> Floats:
+    """Return places and directions to try; the derivative is taken by both frictions.
+
+    ``n_turns``: directions of a wheel, over a right angle.
+    """
+    turns = np.arange(n_turns) * (0.5 * np.pi / n_turns)
     grid = product(body_points(body), turns)
     return np.array([(*place, turn, np.nan, np.nan) for place, turn in grid])
 

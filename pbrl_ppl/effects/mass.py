@@ -11,8 +11,6 @@ from pbrl_ppl.state import Floats
 
 _OFFSET = Prior("normal", sigma=0.2)
 _SCALE = Prior("log_normal", mu=0.0, sigma=0.5)
-#: Trajectories, and times, of a change of mass that a scan tries at most.
-_BEGINS = 20
 
 
 def _scale_moment(properties: dict[str, Floats], parameters: Values, clock: Clock) -> None:
@@ -51,15 +49,18 @@ def _scale_mass(properties: dict[str, Floats], parameters: Values, clock: Clock)
     properties["mass"] = properties["mass"] * (1.0 + (parameters["factor"] - 1.0) * loaded)
 
 
-def _scan_begins(scene: Scene, history: History, body: Body) -> Floats:
-    """Return changes from some trajectory on, then in every trajectory from some time on."""
+def _scan_begins(scene: Scene, history: History, body: Body, *, most: int = 20) -> Floats:
+    """Return changes from some trajectory on, then in every trajectory from some time on.
+
+    ``most``: trajectories, and times, of a change of mass, at most.
+    """
     data = history.dataset
     numbers = data["number"].to_numpy()
     last = float(np.nanmax(data["clock"].to_numpy()))
-    grid = np.linspace(0, 1, _BEGINS)
+    grid = np.linspace(0, 1, most)
     between = numbers[1:] - 0.5
     begins = np.unique(np.quantile(between, grid, method="nearest")) if len(between) else between
-    times = np.linspace(0, last, _BEGINS + 2)[1:-1]
+    times = np.linspace(0, last, most + 2)[1:-1]
     changes = [(np.nan, begin, 0.0) for begin in begins] + [(np.nan, 0.0, time) for time in times]
     return np.array(changes).reshape(-1, 3)
 

@@ -11,38 +11,49 @@ from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene, Shape
 from pbrl_ppl.state import Floats
 
-#: Intervals with the largest velocity changes that are taken for hits, and discs tried at most.
-_HITS, _DISCS = 16, 60
-#: A hinge changes velocities all the time: there a hit exceeds this multiple of the median change.
-_STANDS_OUT = 3.0
-#: Radii of discs tried for a single hit, as shares of the body's radius.
-_SIZES = (0.25, 0.75, 2.0)
 #: Friction turns an impulse off the outline's normal: cosine and sine of the angles tried.
 _TURNS = tuple((np.cos(turn), np.sin(turn)) for turn in (0.0, 0.3, -0.3))
-#: Distance from a disc within which a hit agrees with it, as a share of the body's radius.
-_NEAR = 0.1
 
 
 def _discs(parameters: Values) -> tuple[Disc, ...]:
     return (Disc(parameters["x"], parameters["y"], parameters["radius"]),)
 
 
-def _scan(scene: Scene, history: History, body: Body) -> Floats:
+def _scan(
+    scene: Scene,
+    history: History,
+    body: Body,
+    *,
+    hits: int = 16,
+    most_discs: int = 60,
+    stands_out: float = 3.0,
+    sizes: tuple[float, ...] = (0.25, 0.75, 2.0),
+    near: float = 0.1,
+) -> Floats:
     """Return discs that several hits agree on, then discs of single hits.
 
     Where the velocity changed by ``dv``, the obstacle lies along ``-dv``. The change of the angular
     velocity gives the distance of the impulse's line from the centre, and with it the point of the
     outline that was hit; the disc's centre is one radius beyond.
+
+    ``hits``: intervals with the largest velocity changes that are taken for hits.
+    ``most_discs``: discs tried at most.
+    ``stands_out``: a hinge changes velocities all the time: there a hit exceeds this multiple of
+    the median change.
+
+    ``sizes``: radii of discs tried for a single hit, as shares of the body's radius.
+    ``near``: distance from a disc within which a hit agrees with it, as a share of the body's
+    radius.
     """
     start = history.dataset["start"].sel(body=body.name).to_numpy()
     begin, end = start[:, :-1].reshape(-1, 6), start[:, 1:].reshape(-1, 6)
     seen = np.isfinite(begin).all(axis=1) & np.isfinite(end).all(axis=1)
     begin, end = begin[seen], end[seen]
     change = np.linalg.norm(end[:, 3:5] - begin[:, 3:5], axis=1)
-    order = np.argsort(-change)[:_HITS]
+    order = np.argsort(-change)[:hits]
     least = 1e-9 * np.abs(begin[:, 3:5]).max(initial=0.0)
     if is_pivoted(scene, body) and len(change):
-        least = max(least, _STANDS_OUT * float(np.median(change)))
+        least = max(least, stands_out * float(np.median(change)))
     order = order[change[order] > least]
     point, inward = _hits(body.shape, begin[order], end[order], scene.time_step)
     reach = body.shape.bounding_radius
@@ -56,14 +67,14 @@ def _scan(scene: Scene, history: History, body: Body) -> Floats:
             continue
         centre = 0.5 * (point[i] + point[j] + radius * (inward[i] + inward[j]))
         off = np.linalg.norm(point + radius * inward - centre, axis=1)
-        found.append((int((off < _NEAR * reach).sum()), (*centre, radius)))
+        found.append((int((off < near * reach).sum()), (*centre, radius)))
     found.sort(key=lambda agreed: -agreed[0])
-    discs = [disc for count, disc in found[: _DISCS // 4] if count > 1]
+    discs = [disc for count, disc in found[: most_discs // 4] if count > 1]
     for at, way in zip(point, inward, strict=True):
-        for size in _SIZES:
+        for size in sizes:
             for c, s in _TURNS:
                 discs.append((*(at + size * reach * _turned(way, c, s)), size * reach))
-    return np.array(discs[:_DISCS]).reshape(-1, 3)
+    return np.array(discs[:most_discs]).reshape(-1, 3)
 
 
 def _hits(shape: Shape, begin: Floats, end: Floats, time_step: float) -> tuple[Floats, Floats]:

@@ -14,19 +14,6 @@ from pbrl_ppl.scene import Body, Scene
 from pbrl_ppl.state import Floats, wrapped
 
 _PLACE = Prior("normal", sigma=1.0)
-#: Anchors of a spring that a scan tries along each axis: quantiles of the measured positions.
-_QUANTILES = (0.1, 0.5, 0.9)
-#: Angles of rest that a scan tries.
-_ANGLES = 8
-#: Attractors that a scan tries along each axis, how far beyond the measured positions (share of
-#: their range), and their depths in radii of the body.
-_PLACES, _BEYOND, _DEPTHS = 9, 0.15, (0.15, 0.45)
-#: Largest standard deviation of a rod's length, and largest length, as shares of the standard
-#: deviation of the positions: a longer rod cannot be told from a straight line.
-_HELD, _LONGEST = 0.03, 20.0
-#: Length of a rod below which the data do not inform its direction, and distance of ends that are
-#: the same, in radii of the body.
-_SHORTEST, _SAME = 0.04, 0.02
 
 
 def _poses(history: History, body: Body, width: int) -> Floats:
@@ -40,12 +27,17 @@ def _spring(state: Floats, command: Floats, parameters: Floats, wrench: Floats) 
     wrench[1] -= parameters[0] * (state[1] - parameters[2])
 
 
-def _scan_anchors(scene: Scene, history: History, body: Body) -> Floats:
-    """Return anchors among the measured positions; the derivative is taken by the stiffness."""
+def _scan_anchors(
+    scene: Scene, history: History, body: Body, *, quantiles: tuple[float, ...] = (0.1, 0.5, 0.9)
+) -> Floats:
+    """Return anchors among the measured positions; the derivative is taken by the stiffness.
+
+    ``quantiles``: anchors of a spring along each axis, as quantiles of the measured positions.
+    """
     places = _poses(history, body, 2)
     if not len(places):
         return np.empty((0, 3))
-    x, y = np.quantile(places, _QUANTILES, axis=0).T
+    x, y = np.quantile(places, quantiles, axis=0).T
     return np.array([(np.nan, *anchor) for anchor in product(np.unique(x), np.unique(y))])
 
 
@@ -71,16 +63,18 @@ def _torsion_spring(state: Floats, command: Floats, parameters: Floats, wrench: 
     wrench[2] -= parameters[0] * off
 
 
-def _scan_angles(scene: Scene, history: History, body: Body) -> Floats:
+def _scan_angles(scene: Scene, history: History, body: Body, *, n_angles: int = 8) -> Floats:
     """Return angles of rest whose opposite the body never reaches; all if it reaches each.
 
     The torque jumps at the opposite angle, and such a saw-tooth fits any residual. The derivative
     is taken by the stiffness.
+
+    ``n_angles``: angles of rest.
     """
-    angles = np.linspace(-np.pi, np.pi, _ANGLES, endpoint=False)
+    angles = np.linspace(-np.pi, np.pi, n_angles, endpoint=False)
     theta = history.dataset["start"].sel(body=body.name, state="theta").to_numpy().ravel()
     off = np.abs(wrapped(theta[np.isfinite(theta), None] - angles))
-    smooth = off.max(axis=0, initial=0.0) < np.pi - np.pi / _ANGLES
+    smooth = off.max(axis=0, initial=0.0) < np.pi - np.pi / n_angles
     return np.array([(np.nan, angle) for angle in (angles[smooth] if smooth.any() else angles)])
 
 
@@ -104,15 +98,28 @@ def _attraction(state: Floats, command: Floats, parameters: Floats, wrench: Floa
     wrench[1] += strength * y
 
 
-def _scan_places(scene: Scene, history: History, body: Body) -> Floats:
-    """Return places about the measured positions; the derivative is taken by the strength."""
+def _scan_places(
+    scene: Scene,
+    history: History,
+    body: Body,
+    *,
+    n_places: int = 9,
+    beyond: float = 0.15,
+    shares: tuple[float, ...] = (0.15, 0.45),
+) -> Floats:
+    """Return places about the measured positions; the derivative is taken by the strength.
+
+    ``n_places``: attractors along each axis.
+    ``beyond``: how far beyond the measured positions they are, as a share of their range.
+    ``shares``: their depths in radii of the body.
+    """
     places = _poses(history, body, 2)
     if not len(places):
         return np.empty((0, 4))
     low, high = places.min(axis=0), places.max(axis=0)
-    wider = _BEYOND * (high - low)
-    x, y = np.linspace(low - wider, high + wider, _PLACES).T
-    depths = [share * body.shape.bounding_radius for share in _DEPTHS]
+    wider = beyond * (high - low)
+    x, y = np.linspace(low - wider, high + wider, n_places).T
+    depths = [share * body.shape.bounding_radius for share in shares]
     return np.array([(np.nan, *at) for at in product(np.unique(x), np.unique(y), depths)])
 
 
@@ -138,8 +145,27 @@ def _rod(parameters: Values) -> Rod:
     return Rod(*(parameters[name] for name in Rod._fields))
 
 
-def _scan_rods(scene: Scene, history: History, body: Body) -> Floats:
-    """Return rods whose length is constant over the measured poses, by least squares."""
+def _scan_rods(
+    scene: Scene,
+    history: History,
+    body: Body,
+    *,
+    most_deviation: float = 0.03,
+    longest: float = 20.0,
+    shortest: float = 0.04,
+    same: float = 0.02,
+) -> Floats:
+    """Return rods whose length is constant over the measured poses, by least squares.
+
+    ``most_deviation``: largest standard deviation of a rod's length, as a share of that of the
+    positions.
+
+    ``longest``: largest length as a multiple of the positions' standard deviation: a longer rod
+    cannot be told from a straight line.
+
+    ``shortest``: length of a rod below which the data do not inform its direction.
+    ``same``: distance of ends that are the same, in radii of the body.
+    """
     radius = body.shape.bounding_radius
     poses = _poses(history, body, 3) / [radius, radius, 1.0]  # in radii of the body
     if len(poses) < 6:
@@ -155,9 +181,12 @@ def _scan_rods(scene: Scene, history: History, body: Body) -> Floats:
         ends = np.array([*begin, *_centre(begin, poses)])
         fitted = least_squares(deviation, ends, x_scale="jac").x
         length = float(_length(fitted, poses).mean())
-        if deviation(fitted).std() > _HELD * spread or not _SHORTEST < length < _LONGEST * spread:
+        if (
+            deviation(fitted).std() > most_deviation * spread
+            or not shortest < length < longest * spread
+        ):
             continue
-        if all(np.abs(fitted - other[:4]).max() > _SAME for other in found):
+        if all(np.abs(fitted - other[:4]).max() > same for other in found):
             found.append(np.array([*fitted, length]))
     return radius * np.array(found).reshape(-1, 5)
 

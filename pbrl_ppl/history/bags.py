@@ -237,7 +237,8 @@ def _messages(reader: AnyReader, topic: str, kind: str, path: Path, longest: int
 
 def _flatten(message: object, path: str, row: dict[str, float], longest: int) -> None:
     """Add the numbers of a message under their paths, and ``yaw``."""
-    values = {field.name: getattr(message, field.name) for field in fields(message)}
+    names = [field.name for field in fields(message)]  # type: ignore[arg-type]
+    values = {name: getattr(message, name) for name in names}
     lists = (values.get(name) for name in ("name", "names", "joint_names"))
     labels = next((keys for keys in lists if isinstance(keys, list) and keys), None)
     for name, value in values.items():

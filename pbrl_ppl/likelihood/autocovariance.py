@@ -11,21 +11,19 @@ import numpy as np
 
 from pbrl_ppl.state import Bools, Floats
 
-#: Time constants of correlated errors (rows): the least, and how many up to a piece's length.
-_SHORTEST, _TIMES = 0.5, 12
-#: Shares of correlated errors in the variance.
-_SHARES = (0.0, 0.02, 0.1, 0.3, 0.6, 0.9, 1.0)
-#: Directions with a smaller singular value, relative to the largest, change no residual.
-_RANK = 1e-6
-#: Fewer degrees of freedom do not show a correlation.
-_LEAST_FREEDOM = 5
-#: Share of the variance that is white in any case.
-_NUGGET = 1e-9
-#: Numbers that an array over grid points may hold.
-_CHUNK = 4e6
 
-
-def autocovariance(residual: Floats, seen: Bools, by_start: Floats, by_phi: Floats) -> Floats:
+def autocovariance(
+    residual: Floats,
+    seen: Bools,
+    by_start: Floats,
+    by_phi: Floats,
+    *,
+    shortest: float = 0.5,
+    n_times: int = 12,
+    shares: tuple[float, ...] = (0.0, 0.02, 0.1, 0.3, 0.6, 0.9, 1.0),
+    least_freedom: int = 5,
+    chunk: float = 4e6,
+) -> Floats:
     """Return the expected autocovariance of the errors of a dimension by lag, shape (row,).
 
     Errors are white noise plus an AR(1) process. The memory and the share of the latter are
@@ -39,6 +37,16 @@ def autocovariance(residual: Floats, seen: Bools, by_start: Floats, by_phi: Floa
         What was measured, shape (piece, row, body).
     by_start, by_phi : ndarray
         Derivatives by the start states and by the parameters, shape (piece, row, body, column).
+    shortest : float
+        Least time constant of correlated errors (rows).
+    n_times : int
+        Time constants up to a piece's length.
+    shares : tuple of float
+        Shares of correlated errors in the variance.
+    least_freedom : int
+        Degrees of freedom that show a correlation, at least.
+    chunk : float
+        Numbers that an array over grid points may hold.
     """
     pieces, rows, bodies = residual.shape
     start, phi, last = (
@@ -49,12 +57,12 @@ def autocovariance(residual: Floats, seen: Bools, by_start: Floats, by_phi: Floa
     phi, last = (own - start @ (np.swapaxes(start, 1, 2) @ own) for own in (phi, last))
     phi = _orthonormal(phi.reshape(1, pieces * rows * bodies, -1)).reshape(*last.shape[:2], -1)
     freedom = seen.sum() - (start**2).sum() - (phi**2).sum()
-    if freedom < _LEAST_FREEDOM:
+    if freedom < least_freedom:
         return np.append((residual[seen] ** 2).mean(), np.zeros(rows - 1))
     columns = np.concatenate([start, phi, last], axis=2).reshape(*residual.shape, -1)
-    times = np.geomspace(_SHORTEST, max(rows, 1.0), _TIMES)
-    grid = np.array([(np.exp(-1 / t), share) for t in times for share in _SHARES])
-    chunks = np.ceil(len(grid) * pieces * columns.shape[-1] ** 2 / _CHUNK)
+    times = np.geomspace(shortest, max(rows, 1.0), n_times)
+    grid = np.array([(np.exp(-1 / t), share) for t in times for share in shares])
+    chunks = np.ceil(len(grid) * pieces * columns.shape[-1] ** 2 / chunk)
     found = [
         _restricted(columns, seen, start.shape[2], *own.T)
         for own in np.array_split(grid, min(int(chunks), len(grid)))
@@ -68,10 +76,13 @@ def autocovariance(residual: Floats, seen: Bools, by_start: Floats, by_phi: Floa
     return np.asarray(weight * square @ correlation / weight.sum() / (freedom - 2))
 
 
-def _orthonormal(columns: Floats) -> Floats:
-    """Return orthonormal columns of the same span, shape (piece, row, rank); spare ones are 0."""
+def _orthonormal(columns: Floats, *, rank: float = 1e-6) -> Floats:
+    """Return orthonormal columns of the same span, shape (piece, row, rank); spare ones are 0.
+
+    ``rank``: directions with a smaller singular value, relative to the largest, change no residual.
+    """
     u, s, _ = np.linalg.svd(columns, full_matrices=False)
-    kept = s > _RANK * s.max(axis=1, keepdims=True, initial=1e-300)
+    kept = s > rank * s.max(axis=1, keepdims=True, initial=1e-300)
     return np.asarray((u * kept[:, None])[:, :, kept.any(axis=0)])
 
 
@@ -94,11 +105,15 @@ def _restricted(
     return left[:, -1, -1] - taken, log_det + np.linalg.slogdet(own)[1]
 
 
-def _whitened(columns: Floats, seen: Bools, memory: Floats, share: Floats) -> tuple[Floats, Floats]:
+def _whitened(
+    columns: Floats, seen: Bools, memory: Floats, share: Floats, *, nugget: float = 1e-9
+) -> tuple[Floats, Floats]:
     """Return inner products of whitened columns and log-determinants of the errors' correlation.
 
     Shapes (grid, piece, column, column) and (grid,). A Kalman filter of the AR(1) process, of all
     pieces, columns and grid points at once.
+
+    ``nugget``: share of the variance that is white in any case.
     """
     pieces, rows, bodies, n = columns.shape
     mean = np.zeros((len(share), pieces, bodies, n))
@@ -106,7 +121,7 @@ def _whitened(columns: Floats, seen: Bools, memory: Floats, share: Floats) -> tu
     gram, log_det = np.zeros((len(share), pieces, n, n)), np.zeros(len(share))
     for row in range(rows):
         there = seen[:, row]
-        total = np.where(there, variance + 1.0 - share + _NUGGET, 1.0)
+        total = np.where(there, variance + 1.0 - share + nugget, 1.0)
         off = np.where(there[..., None], columns[:, row] - mean, 0.0)
         gram += np.swapaxes(off, 2, 3) @ (off / total[..., None])
         log_det += np.log(total).sum((1, 2))

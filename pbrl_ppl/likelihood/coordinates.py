@@ -235,12 +235,12 @@ def check_moves(coordinates: Coordinates, scene: Scene) -> None:
         )
 
 
-#: Error of measuring what does not move at all, as a share of the coordinate's typical size.
-_EXACT = 1e-6
+def observed_coordinates(scene: Scene, history: History, *, exactness: float = 1e-6) -> Coordinates:
+    """Return the unknown coordinates of a scene's bodies with the noise of a recording.
 
-
-def observed_coordinates(scene: Scene, history: History) -> Coordinates:
-    """Return the unknown coordinates of a scene's bodies with the noise of a recording."""
+    ``exactness``: error of measuring what does not move at all, as a share of the coordinate's
+    typical size.
+    """
     observed = history.dataset["observed"].to_numpy()
     # what was measured of first states alone is given with them
     measured = np.isfinite(observed[:, 1:]).any(axis=(0, 1))
@@ -259,7 +259,7 @@ def observed_coordinates(scene: Scene, history: History) -> Coordinates:
     places = np.flatnonzero(free)
     body, dimension = np.divmod(places, len(STATE))
     stated = dict(scene.noise)
-    exact = _EXACT * state_sizes(scene)
+    exact = exactness * state_sizes(scene)
     given = np.array([name in stated for name in STATE])
     sensed = free & measured & ~still & ~given
     sensors = np.flatnonzero(sensed.any(axis=0))

@@ -86,13 +86,12 @@ class Observations:
         return np.asarray(difference)
 
 
-#: Least noise of a coordinate, for recordings without any, as a share of its typical size.
-LEAST_NOISE = 1e-9
+def least_noise(scene: Scene, *, share: float = 1e-9) -> Floats:
+    """Return the least noise of each coordinate of a state, shape (6,).
 
-
-def least_noise(scene: Scene) -> Floats:
-    """Return the least noise of each coordinate of a state, shape (6,)."""
-    return LEAST_NOISE * state_sizes(scene)
+    ``share``: of the coordinate's typical size; for recordings without any noise.
+    """
+    return share * state_sizes(scene)
 
 
 def sigma_prior(

@@ -11,23 +11,36 @@ from pbrl_ppl.likelihood.problem import Problem
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE, THETA, VELOCITY, Floats
 
-#: Medians of the log-normal priors of errors of measuring and of contact accelerations, as shares
-#: of what the states do in a step, and their log-scale.
-SENSOR_SHARE, CONTACT_SHARE, SPREAD = 0.1, 0.1, 2.0
-#: An unexplained acceleration is larger than this share of the bodies' acceleration with so much
-#: probability: physics is nearly deterministic, and a random force follows whatever is smooth.
-ACCELERATION_SHARE, ACCELERATION_CHANCE = 0.1, 0.01
-#: A correlated error of measuring is larger than this share of the range of what it measures with
-#: the same probability: an error that lasts follows whatever is smooth, too.
-DRIFT_SHARE = 0.01
-#: Median of an exponential law, as a share of what it exceeds with that probability.
-_MEDIAN = np.log(2.0) / -np.log(ACCELERATION_CHANCE)
+#: Log-scale of the log-normal priors of errors of measuring and of contact accelerations.
+SPREAD = 2.0
+#: Median of an exponential law, as a share of what it exceeds with a probability of 1 %.
+_MEDIAN = np.log(2.0) / -np.log(0.01)
 
 
 def noise_medians(
-    coordinates: Coordinates, scene: Scene, history: History, states: Floats
+    coordinates: Coordinates,
+    scene: Scene,
+    history: History,
+    states: Floats,
+    *,
+    sensor_share: float = 0.1,
+    contact_share: float = 0.1,
+    drift_share: float = 0.01,
+    acceleration_share: float = 0.1,
 ) -> Floats:
-    """Return the medians of the noise priors, shape (parameter,), from changes of the states."""
+    """Return the medians of the noise priors, shape (parameter,), from changes of the states.
+
+    ``sensor_share``: median of the prior of errors of measuring, as a share of what states do in a
+    step.
+
+    ``contact_share``: the same of contact accelerations.
+    ``drift_share``: a correlated error is larger than this share of the range of what it measures
+    with the same probability: an error that lasts follows whatever is smooth, too.
+
+    ``acceleration_share``: an unexplained acceleration is larger than this share of the bodies'
+    with a probability of 1 %: physics is nearly deterministic, and a random force follows whatever
+    is smooth.
+    """
     least = least_noise(scene)
     real = np.isfinite(history.dataset["clock"].to_numpy())
     shown = real & ~unseen(history).any(axis=-1)
@@ -38,10 +51,10 @@ def noise_medians(
         for rows in (real, shown)
     )
     dt = float(history.dataset.attrs["time_step"])
-    sensors = SENSOR_SHARE * seen[list(coordinates.sensors)]
-    steps = ACCELERATION_SHARE * _MEDIAN * _vectors(each, coordinates.rates) / dt
-    contacts = CONTACT_SHARE * each[list(coordinates.contacts)] / dt
-    drifts = DRIFT_SHARE * _MEDIAN * ranges(coordinates, history, states)
+    sensors = sensor_share * seen[list(coordinates.sensors)]
+    steps = acceleration_share * _MEDIAN * _vectors(each, coordinates.rates) / dt
+    contacts = contact_share * each[list(coordinates.contacts)] / dt
+    drifts = drift_share * _MEDIAN * ranges(coordinates, history, states)
     medians = [
         np.maximum(sensors, least[list(coordinates.sensors)]),
         np.maximum(steps, least[list(coordinates.rates)] / dt),

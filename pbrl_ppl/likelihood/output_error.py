@@ -22,17 +22,6 @@ from pbrl_ppl.likelihood.problem import Problem
 from pbrl_ppl.physics import Memory
 from pbrl_ppl.state import STATE, THETA, Bools, Floats, Ints, wrapped
 
-#: Directions of a start state with a smaller singular value move nothing that was measured.
-_SEEN = 1e-5
-#: Weight of a given start coordinate, over that of all measurements that depend on it.
-_FIRM = 1e6
-#: Rounds of sigma and projection, which depend on each other.
-_ROUNDS = 6
-#: Correlations below this end the sum of an integrated autocorrelation time.
-_UNCORRELATED = 0.05
-#: Pairs of residuals that an autocorrelation is taken over, at least.
-_LEAST_PAIRS = 10
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Starts:
@@ -109,18 +98,25 @@ class Starts:
         u, back = self.memory.recall((weight / unit,), self._basis)
         return u, back / unit
 
-    def _basis(self, weight: Floats) -> tuple[Floats, Floats]:
+    def _basis(
+        self, weight: Floats, firm: float = 1e6, seen: float = 1e-5
+    ) -> tuple[Floats, Floats]:
+        """Return the basis for weights of which the largest is 1.
+
+        A given start coordinate has ``firm`` times the weight of all measurements that depend on
+        it. Directions with a singular value below ``seen`` move nothing that was measured.
+        """
         pieces, coordinates = self.begin.shape
         moved = np.where(self.seen[..., None], self.slope, 0.0) * weight[:, None]
         moved = moved.reshape(pieces, -1, coordinates)
         own = np.isfinite(self.begin) * self._weights(weight)
-        own += self.given * _FIRM * np.linalg.norm(moved, axis=1)
+        own += self.given * firm * np.linalg.norm(moved, axis=1)
         rows = np.concatenate([moved, own[:, :, None] * np.eye(coordinates)], axis=1)
         scale = np.linalg.norm(rows, axis=1)
         scale = np.where(scale > 0, scale, 1.0)
         rows = rows / scale[:, None]
         square, v = np.linalg.eigh(np.swapaxes(rows, 1, 2) @ rows)
-        kept = square > _SEEN**2 * square.max(axis=1, keepdims=True, initial=1e-300)
+        kept = square > seen**2 * square.max(axis=1, keepdims=True, initial=1e-300)
         inverse = np.where(kept, 1.0 / np.sqrt(np.where(kept, square, 1.0)), 0.0)
         return rows @ v * inverse[:, None], v * inverse[:, None] / scale[:, :, None]
 
@@ -228,13 +224,14 @@ class OutputErrorLikelihood(Likelihood):
         own = z[..., :cut].reshape(residual.shape) * sigma
         return own, z[..., cut:] * np.where(self.starts.column >= 0, sigma[self.starts.column], 0.0)
 
-    def profile(self, residual: Floats, least: Floats) -> Floats:
+    def profile(self, residual: Floats, least: Floats, *, rounds: int = 6) -> Floats:
         """Return the maximum-likelihood sigma of each dimension, shape (state,).
 
         ``least`` are the least that they may be, shape (state,), SI units.
+        ``rounds``: of sigma and projection, which depend on each other.
         """
         sigma = np.maximum(np.sqrt((residual**2).sum((0, 1, 2)) / self.starts.counts), least)
-        for _ in range(_ROUNDS):
+        for _ in range(rounds):
             own, begin = self.unwhitened(residual, sigma)
             square = (own**2).sum((0, 1, 2))
             seen = self.starts.column >= 0
@@ -246,10 +243,15 @@ class OutputErrorLikelihood(Likelihood):
                 break
         return np.asarray(sigma)
 
-    def correlation_times(self, residual: Floats, sigma: Floats) -> Floats:
+    def correlation_times(
+        self, residual: Floats, sigma: Floats, *, uncorrelated: float = 0.05, least_pairs: int = 10
+    ) -> Floats:
         """Return the integrated autocorrelation time of each dimension in rows, shape (state,).
 
         Of the projected residuals, without pairs from different pieces (Geyer's initial sequence).
+
+        ``uncorrelated``: correlations below this end the sum.
+        ``least_pairs``: pairs of residuals that an autocorrelation is taken over, at least.
         """
         own, _ = self.unwhitened(residual, sigma)
         seen, tau = self.starts.seen, np.ones(own.shape[-1])
@@ -258,10 +260,10 @@ class OutputErrorLikelihood(Likelihood):
             variance = (x**2).sum() / max(there.sum(), 1)
             for lag in range(1, x.shape[1]):
                 pair = there[:, lag:] & there[:, :-lag]
-                if pair.sum() < _LEAST_PAIRS or not variance > 0:
+                if pair.sum() < least_pairs or not variance > 0:
                     break
                 correlation = (x[:, lag:] * x[:, :-lag])[pair].mean() / variance
-                if correlation < _UNCORRELATED:
+                if correlation < uncorrelated:
                     break
                 tau[d] += 2 * correlation
         return tau

@@ -36,10 +36,6 @@ START_DIMS = ("transition", "body", "full_state")
 ACTION_DIMS = ("transition", "step", "body", "wrench")
 #: Phi, start states and wrenches in, next states out.
 Engine = Callable[[Floats, Floats, Floats], Floats]
-#: Ratio of engine steps from which a correction saves time.
-_WORTH_CORRECTING = 3
-#: How far predictions may differ and be the same to the likelihood, in units of the noise.
-_SAME = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,15 +128,17 @@ class Problem:
         """The same problem with fewer engine steps, for derivatives and changes."""
         return replace(self, physics=self.physics.rough, defect=None)
 
-    def corrected(self, phi: Floats) -> Problem:
+    def corrected(self, phi: Floats, *, worth: int = 3) -> Problem:
         """Return the problem with few engine steps, its predictions corrected at phi, shape (p,).
 
         The error of few steps hardly depends on the parameters: the difference between both engines
         at phi is added to every prediction (defect correction: P. Zadunaisky, On the estimation of
         errors propagated in the numerical integration of differential equations, 1976).
+
+        ``worth``: ratio of engine steps from which a correction saves time.
         """
         rough = self.rough
-        if rough.physics.substeps * _WORTH_CORRECTING > self.physics.substeps:
+        if rough.physics.substeps * worth > self.physics.substeps:
             return self
         return rough.corrected_to(self, phi)
 
@@ -148,7 +146,7 @@ class Problem:
         """Return the problem with predictions corrected to those of more engine steps at phi."""
         return replace(self, defect=np.nan_to_num(exact.predict(phi) - self.predict(phi)))
 
-    def joined(self, phi: Floats, sigma: Floats, most: int = 50) -> Problem:
+    def joined(self, phi: Floats, sigma: Floats, most: int = 50, *, same: float = 0.01) -> Problem:
         """Return the problem with bodies that meet at these draws in one part; itself if none do.
 
         Parameters
@@ -157,6 +155,8 @@ class Problem:
             Draws, shapes (n, p) and (n, parameter).
         most : int
             Of more draws so many are simulated, evenly spread.
+        same : float
+            How far predictions may differ and be the same to the likelihood, in units of the noise.
         """
         if len(self.simulator.parts) == 1:
             return self
@@ -176,7 +176,7 @@ class Problem:
                 sigma[:, i] = stated.get(STATE[d], np.inf)
                 if d in sensors:
                     sigma[:, i] = every[:, sensors.index(d)]
-        matters = np.any(~(off <= _SAME * sigma[:, None, None, None]), axis=(2, 3, 4))
+        matters = np.any(~(off <= same * sigma[:, None, None, None]), axis=(2, 3, 4))
         names = [body.name for body in self.scene.moving]
         own = [
             names[i] for i in np.flatnonzero((met & np.expand_dims(matters, -1)).any(axis=(0, 1)))

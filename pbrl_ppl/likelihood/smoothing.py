@@ -23,23 +23,14 @@ from pbrl_ppl.likelihood.trajectory_noise import TrajectoryNoise
 from pbrl_ppl.physics import touching
 from pbrl_ppl.state import STATE, VELOCITY, Bools, Floats
 
-#: Prior scale of an unmeasured state, as a multiple of its range, beside its typical size.
-_FAR = 10.0
-#: Largest change of states in the last round (in standard deviations), and most rounds.
-_SETTLED, _ROUNDS = 0.05, 4
-#: A slope is taken anew where the state has moved by more than this (standard deviations).
-_STALE = 0.3
-#: Least unexplained acceleration to smooth with, as a share of its prior median.
-_LITTLE = 0.1
-#: Steps (of the logarithm) by which unexplained accelerations fall to the given ones.
-_SHARES = (0.5, 1.0)
-
 
 def along_trajectories(
     problem: Problem,
     phi: Floats,
     sigma: Floats | None = None,
     coordinates: Coordinates | None = None,
+    *,
+    shares: tuple[float, ...] = (0.5, 1.0),
 ) -> Problem:
     """Return the problem with the likelihood of whole trajectories, linearised at smoothed states.
 
@@ -54,6 +45,8 @@ def along_trajectories(
         dimension, then unexplained accelerations. Without it, a guess from what one step leaves.
     coordinates : Coordinates, optional
         Coordinates and noise parameters of the training data, where these are others.
+    shares : tuple of float
+        Steps (of the logarithm) by which unexplained accelerations fall to the given ones.
 
     Returns
     -------
@@ -82,7 +75,7 @@ def along_trajectories(
     noise = _sloped(problem, coordinates, phi, begin, _steps(problem, coordinates, begin))
     problem = smoothed(problem.along(noise), phi, begin)
     if sigma is not begin:  # the physics alone may diverge from rough states
-        for share in _SHARES:
+        for share in shares:
             problem = smoothed(problem, phi, _between(begin, sigma, share, coordinates))
     if not given:  # the noise of measurements adds to the changes of states as measured
         moved = noise_medians(coordinates, problem.scene, history, problem.data.smoothed_states)
@@ -100,18 +93,34 @@ def single_transitions(problem: Problem) -> Problem:
     return problem.on(data).with_likelihood(prior=None)
 
 
-def smoothed(problem: Problem, phi: Floats, sigma: Floats) -> Problem:
+def smoothed(
+    problem: Problem,
+    phi: Floats,
+    sigma: Floats,
+    *,
+    settled: float = 0.05,
+    rounds: int = 4,
+    stale: float = 0.3,
+    little: float = 0.1,
+) -> Problem:
     """Return the problem linearised about states smoothed at phi and sigma.
 
     Near-zero unexplained accelerations are raised to a small value: with stick and slip, smoothing
     by the physics alone does not converge.
+
+    ``settled``: largest change of states in the last round (standard deviations).
+    ``rounds``: at most.
+    ``stale``: a slope is taken anew where the state has moved by more than this (standard
+    deviations).
+
+    ``little``: least unexplained acceleration to smooth with, as a share of its prior median.
     """
     steps = list(problem.trajectory_noise.coordinates.accelerations)
     sigma = sigma.copy()
-    sigma[steps] = np.maximum(sigma[steps], _LITTLE * problem.noise_prior[0][steps])
+    sigma[steps] = np.maximum(sigma[steps], little * problem.noise_prior[0][steps])
     begun: Floats | None = None  # states at which each transition's slope was taken
     residual = problem.trajectory_noise.coordinates.of_residual(problem.residual(phi))
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         noise = problem.trajectory_noise
         coordinates = noise.coordinates
         before, after = noise.smoothed(residual, sigma)
@@ -126,7 +135,7 @@ def smoothed(problem: Problem, phi: Floats, sigma: Floats) -> Problem:
             moved = moved.along(_sloped(moved, coordinates, phi, sigma, spread))
             begun = begin
         else:
-            far = np.asarray((np.abs(begin - begun) > _STALE * spread).any(axis=1))
+            far = np.asarray((np.abs(begin - begun) > stale * spread).any(axis=1))
             moved = moved.along(_sloped(moved, coordinates, phi, sigma, spread, far))
             begun = np.where(far[:, None], begin, begun)
         residual = coordinates.of_residual(moved.residual(phi))
@@ -134,7 +143,7 @@ def smoothed(problem: Problem, phi: Floats, sigma: Floats) -> Problem:
             break  # diverged: nothing follows from the new one
         problem = moved
         shown = after[noise.seen.any(axis=1)]
-        if (np.sqrt(np.mean(shown**2, axis=0)) < _SETTLED * spread).all():
+        if (np.sqrt(np.mean(shown**2, axis=0)) < settled * spread).all():
             break
     return problem
 
@@ -280,7 +289,12 @@ def _sloped(
 
 
 def linearised(
-    problem: Problem, coordinates: Coordinates, slope: Floats, sigma: Floats
+    problem: Problem,
+    coordinates: Coordinates,
+    slope: Floats,
+    sigma: Floats,
+    *,
+    ranges: float = 10.0,
 ) -> TrajectoryNoise:
     """Return the noise along a problem's trajectories from given slopes.
 
@@ -294,13 +308,15 @@ def linearised(
         Derivative of the next state by the state, shape (transition, coordinate, coordinate).
     sigma : ndarray
         Noise parameters at which the states were smoothed, shape (parameter,).
+    ranges : float
+        Prior scale of an unmeasured state, as a multiple of its range, beside its typical size.
     """
     segments, states = problem.segments, problem.data.smoothed_states
     trajectory, step = segments.trajectory, segments.step
     observed = problem.data.history.dataset["observed"].to_numpy()
     deviation = coordinates.wrapped(coordinates.of(observed) - coordinates.of(states))
     end, begin = deviation[trajectory, step + 1], deviation[trajectory, step]
-    far = _FAR * np.ptp(coordinates.of(states), axis=(0, 1)) + coordinates.sizes(problem.scene)
+    far = ranges * np.ptp(coordinates.of(states), axis=(0, 1)) + coordinates.sizes(problem.scene)
     return TrajectoryNoise(
         coordinates=coordinates,
         slope=np.ascontiguousarray(slope),

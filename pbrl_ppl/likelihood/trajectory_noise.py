@@ -14,9 +14,6 @@ from pbrl_ppl.physics import Memory
 from pbrl_ppl.state import Bools, Floats, Ints
 from pbrl_ppl.threads import in_parallel, processors
 
-#: Numbers to filter from which threads pay.
-_MANY = 20_000
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class TrajectoryNoise:
@@ -142,8 +139,13 @@ class TrajectoryNoise:
         white, log_scale = self._whitened(rows, sigmas)
         return white.reshape(coordinates.shape), log_scale.reshape(coordinates.shape[:-1])
 
-    def _whitened(self, rows: Floats, sigmas: Floats) -> tuple[Floats, Floats]:
-        """Return the same of residuals (set, transition, coordinate) with a noise for each set."""
+    def _whitened(
+        self, rows: Floats, sigmas: Floats, *, threads_from: int = 20_000
+    ) -> tuple[Floats, Floats]:
+        """Return the same of residuals (set, transition, coordinate) with a noise for each set.
+
+        ``threads_from``: numbers to filter from which threads pay.
+        """
         own, d = self._extended, len(self.coordinates.places)
         sensor = own.padded(self.coordinates.white(sigmas) ** 2)
         variance, step = self._begin(sigmas), own.steps(sigmas)
@@ -159,7 +161,7 @@ class TrajectoryNoise:
 
         each = -(-len(rows) // processors())
         slices = [slice(i, i + each) for i in range(0, len(rows), each)]
-        many = rows.size > _MANY
+        many = rows.size > threads_from
         parts = in_parallel(some, slices) if many else list(map(some, slices))
         white, log_scale = (np.concatenate(each) for each in zip(*parts, strict=True))
         return white[..., :d], log_scale

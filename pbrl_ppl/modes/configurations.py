@@ -26,10 +26,6 @@ Pair = tuple[str, str] | None
 MOST = 300
 #: A joint that joins nothing, in the tables that people read.
 NONE = "none"
-#: Two standard errors of the evidence may move a probability by so much.
-_MATERIAL = 0.02
-#: With fewer effective draws, the standard error itself says little.
-_FEW = 50
 
 
 @dataclass(frozen=True)
@@ -248,21 +244,27 @@ def stored(found: Sequence[Weighed]) -> list[dict[str, Any]]:
     ]
 
 
-def doubts(rows: Iterable[Mapping[str, Any]]) -> str | None:
-    """Return a warning if the evidences of :func:`stored` rows are too uncertain, or None."""
+def doubts(
+    rows: Iterable[Mapping[str, Any]], *, material: float = 0.02, few: int = 50
+) -> str | None:
+    """Return a warning if the evidences of :func:`stored` rows are too uncertain, or None.
+
+    ``material``: two standard errors of the evidence may move a probability by so much.
+    ``few``: with fewer effective draws, the standard error itself says little.
+    """
     for row in rows:
         probability, error, ess = row["probability"], row["error"], row["ess"]
         if error is None:
             continue
         move = 2.0 * error * probability * (1.0 - probability)
-        if move > _MATERIAL or (ess < _FEW and 4.0 * probability * (1.0 - probability) > _MATERIAL):
+        if move > material or (ess < few and 4.0 * probability * (1.0 - probability) > material):
             joined = ", ".join(
                 f"{joint}: {NONE if pair is None else '-'.join(pair)}"
                 for joint, pair in row["joints"].items()
             )
             return (
                 f"which bodies are joined is rough: the probability {probability:.3g} of {joined}"
-                f" may be off by {max(move, _MATERIAL):.2g} (log-evidence to within {error:.2g},"
+                f" may be off by {max(move, material):.2g} (log-evidence to within {error:.2g},"
                 f" {ess:.0f} effective draws); record motions that load the joint, or give"
                 " parameters that the data say nothing of in the scene (known = ...)"
             )

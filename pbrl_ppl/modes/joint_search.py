@@ -29,25 +29,18 @@ from pbrl_ppl.parameters import JOINT_ANCHORS, inside, prior_draws
 from pbrl_ppl.scene import WORLD, Joint, Scene
 from pbrl_ppl.state import Floats
 
-#: A log-evidence this far below the best by the Laplace method is not looked at more closely: the
-#: approximation's error is a few units, and the same for all configurations in great part.
-_MARGIN = 25.0
-#: Configurations within this much of the best, and the best few in any case, are sought from this
-#: many more starts: a wheel's axes may have been caught in a local optimum.
-_CONTENDERS, _BEST, _STARTS, _SCREENED = 100.0, 2, 4, 200
-#: Rounds of the climbs that tell modes apart, and of a first climb with the exact engine. One that
-#: ends this far below the best log-posterior so far is hopeless, and goes no further: wrong joints
-#: are explained by masses so unlike that the engine takes a hundred times as long.
-_ROUGH, _FIRST, _HOPELESS = 8, 2, 300.0
-#: Configurations to which further joints are added, at most.
-_BREADTH = 4
-#: Starts of the search for a rod's anchors by geometry, and how many are kept.
-_GEOMETRIC, _KEPT = 12, 2
-#: Rows of the recording that the geometry is taken from, at most.
-_ROWS = 500
+#: Configurations whose log-evidence is within this much of the best are sought from more starts.
+_CONTENDERS = 100.0
 
 
-def weigh(problem: Problem, *, seed: int = 0, progress: bool = False) -> tuple[Weighed, ...]:
+def weigh(
+    problem: Problem,
+    *,
+    seed: int = 0,
+    progress: bool = False,
+    margin: float = 25.0,
+    at_least: int = 2,
+) -> tuple[Weighed, ...]:
     """Return the probability of each configuration of the joints of unknown bodies.
 
     Each gets the mode of the continuous parameters that it leaves; the search for it begins where
@@ -67,6 +60,11 @@ def weigh(problem: Problem, *, seed: int = 0, progress: bool = False) -> tuple[W
         The same seed gives the same answer.
     progress : bool
         Whether to show how far it is.
+    margin : float
+        A log-evidence this far below the best by the Laplace method is not looked at more closely:
+        the approximation's error is a few units, and the same for all configurations in great part.
+    at_least : int
+        So many of the best are searched in any case.
 
     Returns
     -------
@@ -83,7 +81,7 @@ def weigh(problem: Problem, *, seed: int = 0, progress: bool = False) -> tuple[W
     console = Console(stderr=True)
     modes, evidence = _tried(problem, seed, console, progress)
     tried, worth = tuple(modes), _worth(modes)
-    leading = _leading(evidence, _CONTENDERS, at_least=_BEST)
+    leading = _leading(evidence, _CONTENDERS, at_least=at_least)
     for configuration in track(leading, "looking again", console=console, disable=not progress):
         if configuration.empty:
             better = _apart(modes[configuration].problem, seed + 1)
@@ -91,7 +89,7 @@ def weigh(problem: Problem, *, seed: int = 0, progress: bool = False) -> tuple[W
             better = _searched_again(modes[configuration], configuration, worth, seed)
         if better.log_posterior > modes[configuration].log_posterior:
             modes[configuration], evidence[configuration] = better, laplace(better)
-    close = _leading(evidence, _MARGIN)
+    close = _leading(evidence, margin)
     if len(close) > 1:
         rng = np.random.default_rng(seed)
         for configuration in track(close, "weighing joints", console=console, disable=not progress):
@@ -105,9 +103,12 @@ def weigh(problem: Problem, *, seed: int = 0, progress: bool = False) -> tuple[W
 
 
 def _tried(
-    problem: Problem, seed: int, console: Console, progress: bool
+    problem: Problem, seed: int, console: Console, progress: bool, *, breadth: int = 4
 ) -> tuple[dict[Configuration, Mode], dict[Configuration, Evidence]]:
-    """Return modes and Laplace evidence of the configurations that a search reaches."""
+    """Return modes and Laplace evidence of the configurations that a search reaches.
+
+    ``breadth``: configurations to which further joints are added, at most.
+    """
     scene = problem.scene
     apart = nothing(scene)
     modes = {apart: _apart(apart.problem(problem), seed)}
@@ -144,7 +145,7 @@ def _tried(
         best = sorted((e for e in grown if score[e] > least), key=lambda e: -score[e])
         room = (MOST - len(modes)) // max(levels - level - 1, 1)
         most = max((len(one_more(scene, configuration)) for configuration in best[:1]), default=1)
-        best = best[: int(np.clip(room // max(most, 1), 1, _BREADTH))]
+        best = best[: int(np.clip(room // max(most, 1), 1, breadth))]
     return modes, evidence
 
 
@@ -158,9 +159,13 @@ def _too_many(scene: Scene, count: int) -> str:
     )
 
 
-def _worth(modes: Mapping[Configuration, Mode]) -> float:
-    """Return the log-posterior below which a mode is given up."""
-    return max(mode.log_posterior for mode in modes.values()) - _HOPELESS
+def _worth(modes: Mapping[Configuration, Mode], *, hopeless: float = 300.0) -> float:
+    """Return the log-posterior below which a mode is given up.
+
+    ``hopeless``: a climb that ends this far below the best log-posterior so far goes no further:
+    wrong joints are explained by masses so unlike that the engine takes a hundred times as long.
+    """
+    return max(mode.log_posterior for mode in modes.values()) - hopeless
 
 
 def _score(configuration: Configuration, evidence: Evidence) -> float:
@@ -197,31 +202,48 @@ def _joint(problem: Problem, configuration: Configuration, fewer: Mode, worth: f
     return _best(problem, _climbed(problem, starts), worth)
 
 
-def _climbed(problem: Problem, starts: list[Floats]) -> list[Mode]:
-    return [find_mode(problem.coarse, initial=start, rounds=_ROUGH) for start in starts]
+def _climbed(problem: Problem, starts: list[Floats], rounds: int = 8) -> list[Mode]:
+    """Return where a few rounds of climbs with few engine steps lead: they tell modes apart."""
+    return [find_mode(problem.coarse, initial=start, rounds=rounds) for start in starts]
 
 
-def _best(problem: Problem, rough: list[Mode], worth: float) -> Mode:
+def _best(problem: Problem, rough: list[Mode], worth: float, *, rounds: int = 2) -> Mode:
     """The best of modes that were found with few engine steps, climbed with the exact engine.
 
     One that has not come near the log-posterior ``worth`` by then is climbed no further.
+
+    ``rounds``: rounds of the first climb with the exact engine.
     """
     best = max(rough, key=lambda mode: mode.log_posterior)
-    first = find_mode(problem, initial=best.phi, rounds=_FIRST)
+    first = find_mode(problem, initial=best.phi, rounds=rounds)
     return first if first.log_posterior < worth else find_mode(problem, initial=first.phi)
 
 
-def _searched_again(mode: Mode, configuration: Configuration, worth: float, seed: int) -> Mode:
-    """Return a better mode with the same anchors and any bodies' parameters."""
+def _searched_again(
+    mode: Mode,
+    configuration: Configuration,
+    worth: float,
+    seed: int,
+    *,
+    starts: int = 4,
+    screened: int = 200,
+) -> Mode:
+    """Return a better mode with the same anchors and any bodies' parameters.
+
+    ``starts``: starts of each of these configurations: a wheel's axes may have been caught in a
+    local optimum.
+
+    ``screened``: draws from the prior that they are chosen from.
+    """
     problem = mode.problem
     priors = problem.layout.priors
     rng = np.random.default_rng(seed)
-    draws = prior_draws(priors, rng, _SCREENED)
+    draws = prior_draws(priors, rng, screened)
     places = _anchor_places(problem, configuration)
     draws[:, places] = mode.phi[places]
     draws = inside(priors, draws)
     z = np.nan_to_num(problem.coarse.whitened(draws, mode.sigma), nan=1e6)
-    order = np.argsort(np.log1p(z**2).sum(axis=(1, 2)))[:_STARTS]
+    order = np.argsort(np.log1p(z**2).sum(axis=(1, 2)))[:starts]
     return _best(problem, _climbed(problem, [draws[i] for i in order]), worth)
 
 
@@ -262,10 +284,15 @@ def _placed(problem: Problem, configuration: Configuration) -> list[Floats]:
     return [np.concatenate([anchors[i] for anchors in alternatives]) for i in range(count)]
 
 
-def _anchors(problem: Problem, name: str, joint: Joint) -> list[Floats]:
+def _anchors(
+    problem: Problem, name: str, joint: Joint, *, n_starts: int = 12, kept: int = 2
+) -> list[Floats]:
     """Return anchors that keep their distance over the recording: zero for a hinge.
 
     A hinge's are linear least squares; a rod's are not, and are sought from several starts.
+
+    ``n_starts``: starts of the search by geometry.
+    ``kept``: anchors that are kept.
     """
     priors = [problem.layout.priors[problem.layout.index(anchor, name)] for anchor in JOINT_ANCHORS]
     a, b = (_states(problem, body) for body in joint.bodies or ())
@@ -279,7 +306,7 @@ def _anchors(problem: Problem, name: str, joint: Joint) -> list[Floats]:
         return np.asarray(np.linalg.norm(apart, axis=1) - np.linalg.norm(length, axis=1))
 
     rng = np.random.default_rng(0)
-    starts = prior_draws(priors, rng, _GEOMETRIC)
+    starts = prior_draws(priors, rng, n_starts)
     starts[0] = [prior.centre for prior in priors]
     if joint.kind == "hinge":
         starts = starts[:1]
@@ -291,14 +318,17 @@ def _anchors(problem: Problem, name: str, joint: Joint) -> list[Floats]:
         for start in starts
     ]
     found.sort(key=lambda result: float(result.cost))
-    return [size * result.x for result in found[:_KEPT]]
+    return [size * result.x for result in found[:kept]]
 
 
-def _states(problem: Problem, body: str) -> Floats:
-    """Return a body's recorded start states, shape (row, 6); zero for the world."""
+def _states(problem: Problem, body: str, *, most_rows: int = 500) -> Floats:
+    """Return a body's recorded start states, shape (row, 6); zero for the world.
+
+    ``most_rows``: rows of the recording that the geometry is taken from, at most.
+    """
     start = problem.data.history.dataset["start"].to_numpy()
     rows = start[np.isfinite(start).all(axis=(-1, -2))]
-    rows = rows[:: -(-len(rows) // _ROWS)]
+    rows = rows[:: -(-len(rows) // most_rows)]
     if body == WORLD:
         return np.zeros((len(rows), 6))
     names = [mover.name for mover in problem.scene.moving]

@@ -30,29 +30,15 @@ from pbrl_ppl.parameters import box, inside, prior_residual, prior_slopes
 from pbrl_ppl.state import Floats, Ints
 from pbrl_ppl.threads import one_blas_thread
 
-#: Intervals of the shortest pieces, and the ratio of a length to the one before.
-SHORTEST, RATIO = 4, 4
 #: A start state that is magnified by more than this, beyond growth in proportion to time, makes a
 #: piece too long to tell a law from.
 MOST_GROWTH = 30.0
-#: Dampings that are tried at once, as multiples of the last good one, and the least.
-_DAMPINGS, _LEAST_DAMPING = (0.2, 10.0, 1e4), 1e-8
-#: Widths of derivatives that are tried where no step gains, as shares of the usual ones.
-_WIDER = (3.0, 0.1)
-#: Steps of derivatives: first, then shares of a posterior standard deviation of phi and of a start;
-#: the least and the largest, as shares of each scale.
-_FIRST, _OF_PHI, _OF_START = 1e-4, 0.5, 0.3
+#: Steps of derivatives, as a share of a posterior standard deviation of phi.
+_OF_PHI = 0.5
+#: The least and the largest of them, as shares of each scale.
 _LEAST, _MOST = 1e-6, 2e-2
 #: Gain (nats) that ends a fit, and a candidate's first one at lower lengths.
 _TIGHT, _LOOSE = 0.1, 1.0
-#: Rounds of a candidate's first fit at the greatest length, and at lower ones.
-_FEW, _FEWER = 4, 2
-#: Rounds of a leading candidate's fit.
-_MANY = 10
-#: Trajectories whose scores' scatter is a variance, at least.
-_MANY_TRAJECTORIES = 8
-#: Steps from one linearisation; one that gains less than this share of all of them is the last.
-_STEPS, _MUCH = 2, 0.2
 
 
 @one_blas_thread
@@ -101,24 +87,34 @@ def ladder(mode: Mode) -> list[Mode]:
     return [*found[:-1], with_robust_covariance(found[-1])]
 
 
-def lengths(longest: int, gap: int = 1) -> list[int]:
+def lengths(longest: int, gap: int = 1, *, shortest: int = 4, ratio: int = 4) -> list[int]:
     """Return the lengths of pieces for trajectories of so many intervals.
 
     Pieces are longer than a gap of unmeasured rows, or some would have no measurement.
+
+    ``shortest``: intervals of the shortest pieces.
+
+    ``ratio``: of a length to the one before.
 
     Examples
     --------
     >>> lengths(30), lengths(100), lengths(3), lengths(100, gap=11)
     ([4, 30], [4, 16, 100], [3], [22, 100])
     """
-    shorter, length = [], max(SHORTEST, 2 * gap if gap > 1 else 1)
+    shorter, length = [], max(shortest, 2 * gap if gap > 1 else 1)
     while 2 * length <= longest:
         shorter.append(length)
-        length *= RATIO
+        length *= ratio
     return [*shorter, longest]
 
 
-def climb_ladder(start: Sequence[tuple[Problem, Floats]], parents: Sequence[Linear]) -> list[Mode]:
+def climb_ladder(
+    start: Sequence[tuple[Problem, Floats]],
+    parents: Sequence[Linear],
+    *,
+    few: int = 4,
+    fewer: int = 2,
+) -> list[Mode]:
     """Return first modes of another model at the lengths of its parent, after few rounds.
 
     Parameters
@@ -129,6 +125,10 @@ def climb_ladder(start: Sequence[tuple[Problem, Floats]], parents: Sequence[Line
     parents : sequence of Linear
         Result of :func:`derivatives` of the parent at each length: those by the parameters that
         both models have, and by the start states, are not taken anew.
+    few : int
+        Rounds of a candidate's first fit at the greatest length.
+    fewer : int
+        Rounds at lower lengths.
     """
     found: list[Mode] = []
     for i, ((problem, phi), parent) in enumerate(zip(start, parents, strict=True)):
@@ -138,7 +138,7 @@ def climb_ladder(start: Sequence[tuple[Problem, Floats]], parents: Sequence[Line
         costs = [_start_cost(*each) for each in begins]
         known = parent.of(problem.layout.labels)
         last = i + 1 == len(start)  # it corrects those before
-        rounds, tolerance = (_FEW, _TIGHT) if last else (_FEWER, _LOOSE)
+        rounds, tolerance = (few, _TIGHT) if last else (fewer, _LOOSE)
         found.append(fit_pieces(*begins[int(np.argmin(costs))], rounds, tolerance, known))
     return found
 
@@ -150,12 +150,14 @@ def _along(problem: Problem, shorter: Mode) -> Problem:
     return linearised_pieces(problem, start, likelihood.starts.slope, np.array(likelihood.tau))
 
 
-def with_robust_covariance(mode: Mode) -> Mode:
+def with_robust_covariance(mode: Mode, *, many: int = 8) -> Mode:
     """Return a mode of simulated pieces with the covariance under errors as correlated as they are.
 
     A sandwich: the inverse precision, the variance of the score, the inverse precision. With many
     trajectories, no parameter's is less than by the scatter of the trajectories' scores (a
     cluster-robust covariance), which what differs from one to the other widens.
+
+    ``many``: trajectories whose scores' scatter is a variance, at least.
     """
     problem, likelihood, p = mode.problem, output_error(mode.problem), len(mode.phi)
     if not p:
@@ -176,7 +178,7 @@ def with_robust_covariance(mode: Mode) -> Mode:
     found = inverse @ score @ inverse
     _, cluster = np.unique(problem.segments.trajectory, return_inverse=True)
     n = cluster.max() + 1
-    if n >= _MANY_TRAJECTORIES:
+    if n >= many:
         scores = np.zeros((n, p))
         np.add.at(scores, cluster, np.einsum("arp,ar->ap", jacobian, mode.whitened_residual))
         score = n / (n - 1) * scores.T @ scores + np.diag(slopes**2)
@@ -239,6 +241,13 @@ def fit_pieces(
     rounds: int = 20,
     tolerance: float = _TIGHT,
     known: Linear | None = None,
+    *,
+    n_steps: int = 2,
+    much: float = 0.2,
+    dampings: tuple[float, ...] = (0.2, 10.0, 1e4),
+    least_damping: float = 1e-8,
+    wider: tuple[float, ...] = (3.0, 0.1),
+    first_width: float = 1e-4,
 ) -> Mode:
     """Return a mode of simulated pieces by Gauss-Newton steps, start states projected out.
 
@@ -254,13 +263,25 @@ def fit_pieces(
         Gain in log-posterior (nats) below which it ends.
     known : Linear, optional
         Derivatives that are not taken anew, of a smaller model nearby.
+    n_steps : int
+        Steps from one linearisation.
+    much : float
+        A step that gains less than this share of all of them is the last of a linearisation.
+    dampings : tuple of float
+        Dampings that are tried at once, as multiples of the last good one.
+    least_damping : float
+        The least damping.
+    wider : tuple of float
+        Widths of derivatives that are tried where no step gains, as shares of the usual ones.
+    first_width : float
+        First steps of derivatives, as shares of each scale.
     """
     priors, layout, exact = problem.layout.priors, problem.layout, problem
     scale, sizes = layout.scale(phi), output_error(problem).starts.coordinates.sizes(problem.scene)
     phi, start = inside(priors, phi), problem.segments.start
     if known is not None:
         problem = problem.coarse.corrected_to(problem.rough, phi)
-    steps = _FIRST * np.where(layout.discrete, 0.0, scale), _FIRST * sizes
+    steps = first_width * np.where(layout.discrete, 0.0, scale), first_width * sizes
     damping, failed = 1e-3, 0
     for _ in range(rounds):
         linear = _linearise(problem, phi, start, steps, known)
@@ -269,8 +290,8 @@ def fit_pieces(
         if not failed:
             steps = step.differences(scale, sizes)
         gained = 0.0
-        for _ in range(_STEPS):
-            tried = [step.moved(damping * factor) for factor in _DAMPINGS]
+        for _ in range(n_steps):
+            tried = [step.moved(damping * factor) for factor in dampings]
             points, starts = (np.array(own) for own in zip(*tried, strict=True))
             residuals = _residual(problem, points, starts)
             costs = [step.cost(*each) for each in zip(points, starts, residuals, strict=True)]
@@ -280,16 +301,16 @@ def fit_pieces(
                 phi, start = points[best], starts[best]
                 step = step.at(phi, start, residuals[best])
             gained += max(gain, 0.0)
-            if gain <= max(tolerance, _MUCH * gained):
+            if gain <= max(tolerance, much * gained):
                 break
-            damping = min(max(damping * _DAMPINGS[best], _LEAST_DAMPING), 1.0)
+            damping = min(max(damping * dampings[best], least_damping), 1.0)
         if gained > tolerance:
             failed = 0
             continue
-        if known is not None or failed == len(_WIDER):
+        if known is not None or failed == len(wider):
             break
         # friction makes kinks: over another width the derivative sees others
-        steps = steps[0] * _WIDER[failed], steps[1] * _WIDER[failed]
+        steps = steps[0] * wider[failed], steps[1] * wider[failed]
         damping, failed = 1e-3, failed + 1
     problem = replace(problem, physics=exact.physics, defect=None)
     linear = _linearise(problem, phi, start, steps, known)
@@ -308,9 +329,12 @@ def corrected(mode: Mode) -> Mode:
     return replace(mode, problem=problem.coarse.corrected_to(problem.rough, mode.phi))
 
 
-def refined(modes: Sequence[Mode]) -> list[Mode]:
-    """Return modes with the last one fitted until it gains no more."""
-    return [*modes[:-1], fit_pieces(modes[-1].problem, modes[-1].phi, rounds=_MANY)]
+def refined(modes: Sequence[Mode], *, rounds: int = 10) -> list[Mode]:
+    """Return modes with the last one fitted until it gains no more.
+
+    ``rounds``: of the fit.
+    """
+    return [*modes[:-1], fit_pieces(modes[-1].problem, modes[-1].phi, rounds=rounds)]
 
 
 def _start_cost(problem: Problem, phi: Floats) -> float:
@@ -447,8 +471,13 @@ class _Step:
         """Laplace covariance of phi, shape (p, p)."""
         return covariance_of(self.precision)
 
-    def differences(self, scale: Floats, sizes: Floats) -> tuple[Floats, Floats]:
-        """Return steps of the next derivatives, shapes (p,) and (cell,)."""
+    def differences(
+        self, scale: Floats, sizes: Floats, *, of_start_sd: float = 0.3
+    ) -> tuple[Floats, Floats]:
+        """Return steps of the next derivatives, shapes (p,) and (cell,).
+
+        ``of_start_sd``: steps of derivatives as shares of a start's standard deviation.
+        """
         width = _OF_PHI / np.sqrt(np.maximum(np.diag(self.precision), 1e-300))
         width = np.where(
             self.problem.layout.discrete, 0.0, np.clip(width, _LEAST * scale, _MOST * scale)
@@ -459,7 +488,7 @@ class _Step:
         of_start += np.isfinite(self.starts.begin) * np.where(
             begun, self.weight[self.starts.column], 0.0
         ) ** 2  # fmt: skip
-        begin = _OF_START / np.sqrt(np.maximum(np.median(of_start, axis=0), 1e-300))
+        begin = of_start_sd / np.sqrt(np.maximum(np.median(of_start, axis=0), 1e-300))
         return width, np.clip(begin, _LEAST * sizes, _MOST * sizes)
 
     def moved(self, damping: float) -> tuple[Floats, Floats]:

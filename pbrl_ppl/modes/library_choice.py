@@ -15,13 +15,6 @@ from pbrl_ppl.likelihood import Observations, Problem, estimate_sigma, log_noise
 from pbrl_ppl.physics import Part
 from pbrl_ppl.state import Floats, Ints
 
-#: A part's combinations times its measured numbers that are still summed over.
-_MOST = 50_000_000
-#: Tails and width of the proposal of log sigma; proposals a draw, and before the first.
-_TAIL, _WIDER, _THIN, _BURN = 5, 1.2, 10, 200
-#: Numbers held at once.
-_NUMBERS = 4_000_000
-
 
 class _Combinations:
     """All combinations of parameter sets of one part's bodies, with priors and residuals."""
@@ -35,7 +28,7 @@ class _Combinations:
         possible = [np.flatnonzero(p) for p in priors]
         count = prod(len(sets) for sets in possible)
         measured = problem.observations.values[:, :, part.bodies]
-        if count * measured.size > _MOST:
+        if count * measured.size > 50_000_000:
             raise FitError(
                 f"fit: {', '.join(bodies)} meet in this history, so that {count} combinations of"
                 f" parameter sets are to be summed over; give some probability 0 for some bodies,"
@@ -56,11 +49,16 @@ class _Combinations:
         )
         self.residual = self.observations.residual(states)
 
-    def log_joint(self, sigma: Floats, nu: float | Floats | None) -> Floats:
-        """Return the log-density of data and combination given sigma, shape (draw, combination)."""
+    def log_joint(
+        self, sigma: Floats, nu: float | Floats | None, *, numbers: int = 4_000_000
+    ) -> Floats:
+        """Return the log-density of data and combination given sigma, shape (draw, combination).
+
+        ``numbers``: numbers held at once.
+        """
         seen = self.observations.measured
         result = np.empty((len(sigma), len(self.indices)))
-        size = max(1, _NUMBERS // max(self.residual.size, 1))
+        size = max(1, numbers // max(self.residual.size, 1))
         for begin in range(0, len(sigma), size):
             part = sigma[begin : begin + size, None]
             each = self.likelihood.log_density(self.residual[None], part, seen, nu)
@@ -69,7 +67,15 @@ class _Combinations:
 
 
 def choose_from_library(
-    problem: Problem, draws: int, chains: int, seed: int
+    problem: Problem,
+    draws: int,
+    chains: int,
+    seed: int,
+    *,
+    df: int = 5,
+    wider: float = 1.2,
+    thin: int = 10,
+    burn: int = 200,
 ) -> tuple[Floats, Floats, Ints, Floats, Ints]:
     """Draw sigma from its marginal posterior, and the parameter sets given sigma.
 
@@ -85,6 +91,14 @@ def choose_from_library(
         Draws of each chain, and chains.
     seed : int
         Of the draws.
+    df : int
+        Degrees of freedom of the proposal of log sigma.
+    wider : float
+        Its width over the posterior's.
+    thin : int
+        Proposals a draw.
+    burn : int
+        Proposals before the first draw.
 
     Returns
     -------
@@ -123,9 +137,9 @@ def choose_from_library(
     begin = problem.likelihood.centre(_rough_sigma(problem, parts, median))
     found = minimize(lambda x: -float(density(x[None])[0]), begin, method="L-BFGS-B").x
     # log sigma of n residuals has about this precision; wider, for combinations that mix
-    shape = _WIDER**2 / (2.0 * counts + spread**-2.0)
-    proposal = stats.multivariate_t(found, np.diag(shape), df=_TAIL)
-    n = draws * _THIN + _BURN
+    shape = wider**2 / (2.0 * counts + spread**-2.0)
+    proposal = stats.multivariate_t(found, np.diag(shape), df=df)
+    n = draws * thin + burn
     sigmas, chosen, accepted = [], [], []
     shares = [np.zeros(len(own.indices)) for own in parts]
     for _ in range(chains):
@@ -136,9 +150,9 @@ def choose_from_library(
         for i in range(1, n):
             moves = log_uniform[i] < log_weight[i] - log_weight[kept[i - 1]]
             kept[i] = i if moves else kept[i - 1]
-        drawn = slice(_BURN + _THIN - 1, None, _THIN)
-        moved = np.diff(kept, prepend=0)[_BURN:] != 0
-        accepted.append(moved.reshape(draws, _THIN).mean(axis=1))
+        drawn = slice(burn + thin - 1, None, thin)
+        moved = np.diff(kept, prepend=0)[burn:] != 0
+        accepted.append(moved.reshape(draws, thin).mean(axis=1))
         log_sigma = x[kept[drawn]]
         sigmas.append(np.exp(log_sigma))
         index = np.zeros((draws, len(names)), dtype=np.intp)

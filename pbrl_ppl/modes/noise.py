@@ -30,8 +30,6 @@ FAR_OFF = 1e3
 _FAR = 6.0
 #: Unexplained acceleration that counts as zero, as a share of its prior's median.
 NOTHING = 1e-3
-#: Step of second differences in the logarithm of a noise parameter.
-_SECOND = 0.05
 
 
 def finite(problem: Problem, residual: Floats) -> Floats:
@@ -159,7 +157,7 @@ def gaussian_profile(problem: Problem, square: Floats) -> Floats:
 
 
 def noise_gaussian(
-    problem: Problem, residual: Floats, sigma: Floats, phi: Floats
+    problem: Problem, residual: Floats, sigma: Floats, phi: Floats, *, width: float = 0.05
 ) -> tuple[Floats, Floats]:
     """Return the Laplace approximation of log noise parameters by second differences.
 
@@ -176,6 +174,8 @@ def noise_gaussian(
         Most probable noise parameters, shape (parameter,).
     phi : ndarray
         Parameters, shape (p,).
+    width : float
+        Of second differences in the logarithm of a noise parameter.
 
     Returns
     -------
@@ -198,7 +198,7 @@ def noise_gaussian(
             point[place] += step
         return cost(point)
 
-    middle, hessian, h = moved(), np.empty((n, n)), _SECOND
+    middle, hessian, h = moved(), np.empty((n, n)), width
     for i in range(n):
         hessian[i, i] = (moved((i, h)) - 2 * middle + moved((i, -h))) / h**2
         for j in range(i):
@@ -207,10 +207,6 @@ def noise_gaussian(
             hessian[i, j] = hessian[j, i] = mixed / (4 * h**2)
     values, vectors = np.linalg.eigh(hessian)
     return at, np.asarray((vectors / np.maximum(values, spread**-2)) @ vectors.T)
-
-
-#: Step of a second difference in the tails, and the least curvature.
-_TAIL_STEP, _LEAST_CURVATURE = 0.02, 1.0
 
 
 def _tail_cost(problem: Problem, phi: Floats, sigma: Floats) -> Callable[[Floats], float]:
@@ -239,18 +235,24 @@ def best_tails(problem: Problem, phi: Floats, sigma: Floats) -> Floats:
     return result
 
 
-def tail_precision(problem: Problem, phi: Floats, sigma: Floats) -> Floats:
-    """Return the curvature of the negative log-posterior in each tail parameter."""
+def tail_precision(
+    problem: Problem, phi: Floats, sigma: Floats, *, least: float = 1.0, width: float = 0.02
+) -> Floats:
+    """Return the curvature of the negative log-posterior in each tail parameter.
+
+    ``least``: least curvature.
+    ``width``: of a second difference in the tails.
+    """
     tails = list(problem.tails)
     lower, upper = (end[tails] for end in box(problem.layout.priors))
     cost = _tail_cost(problem, phi, sigma)
     curvature = np.empty(len(tails))
-    for i, step in enumerate(np.minimum(_TAIL_STEP, 0.25 * (upper - lower))):
+    for i, step in enumerate(np.minimum(width, 0.25 * (upper - lower))):
         middle = phi[tails].copy()
         middle[i] = np.clip(middle[i], lower[i] + step, upper[i] - step)
         ends = [middle.copy(), middle, middle.copy()]
         ends[0][i] -= step
         ends[2][i] += step
         below, at, above = (cost(end) for end in ends)
-        curvature[i] = max((below - 2 * at + above) / step**2, _LEAST_CURVATURE)
+        curvature[i] = max((below - 2 * at + above) / step**2, least)
     return curvature

@@ -16,22 +16,8 @@ from pbrl_ppl.parameters import box, by_prior, inside, prior_draws
 from pbrl_ppl.state import Floats
 from pbrl_ppl.threads import one_blas_thread
 
-#: Transitions used to tell basins apart, and how many of the best are searched with all data; with
-#: at most this many transitions, all are.
-_PART, _POLISHED, _FEW = 40, 2, 20
-#: Population and generations that look for the mode of few data, how many of them are climbed
-#: from, the most parameters that is for, and the most engine steps it may take.
-_POPULATION, _GENERATIONS, _EVOLVED, _MOST_EVOLVED, _AFFORDED = 200, 120, 8, 15, 2e7
-#: Gain in log-posterior which shows that the coarse derivative had not led to the top. (Friction
-#: makes the top rough: some units are within its grain.)
-_WORTHWHILE = 5.0
-#: Predictions this close (sum of squares, in noise units) are of the same mode.
-_SAME = 10.0
-#: Parameters whose predictions agree are of different modes if by the derivative they should differ
-#: by this (sum of squares, in noise units): ten standard deviations.
-_FAR = 100.0
-#: Log-posterior by which a mode is too low to hold a share of the posterior, however wide it is.
-_LOWER = 20.0
+#: Population and generations of the evolution that looks for the mode of few data.
+_POPULATION, _GENERATIONS = 200, 120
 
 
 @one_blas_thread
@@ -43,6 +29,11 @@ def find_modes(
     screened: int | None = None,
     initial: Floats | None = None,
     rounds: int | None = None,
+    n_part: int = 40,
+    polished: int = 2,
+    n_few: int = 20,
+    most_parameters: int = 15,
+    afforded: float = 2e7,
 ) -> list[Mode]:
     """Return modes found from several starts, best first.
 
@@ -60,6 +51,16 @@ def find_modes(
         Where to begin, shape (p,); then there is one local search.
     rounds : int, optional
         With ``initial``, the most rounds, without polish: a first look at where it leads.
+    n_part : int
+        Transitions used to tell basins apart.
+    polished : int
+        How many of the best are searched with all data.
+    n_few : int
+        With at most so many transitions, all are used.
+    most_parameters : int
+        Of an evolution, which few data allow.
+    afforded : float
+        Engine steps that it may take.
 
     Returns
     -------
@@ -86,7 +87,7 @@ def find_modes(
         return [finish(problem, _polish(problem, near))]
     if not priors:  # everything is known but the noise
         return [finish(problem, climb(problem, np.zeros(0), problem.coarse.simulator))]
-    few = problem.segments.n <= _FEW
+    few = problem.segments.n <= n_few
     starts = (16 if few else 4) if starts is None else starts
     screened = (1000 if few else 48) if screened is None else screened
     rng = np.random.default_rng(seed)
@@ -94,7 +95,7 @@ def find_modes(
     draws = np.vstack([[prior.centre for prior in priors], draws])
     draws = inside(priors, draws)
     # the basins show in a part of the data already, and with few engine steps
-    part = problem if few else _part(problem, _PART)
+    part = problem if few else _part(problem, n_part)
     residual = part.residual(draws)
     sigma = estimate_sigma(np.nanmedian(residual, axis=0), part.observations, part.scene)
     z = np.nan_to_num(residual / sigma, nan=FAR_OFF).reshape(len(draws), -1)
@@ -102,13 +103,13 @@ def find_modes(
     order = np.argsort(np.log1p(np.minimum(z, FAR_OFF) ** 2).sum(axis=1))
     begin = draws[order[:starts]]
     steps = problem.simulator.steps * problem.segments.n * problem.data.horizon
-    if few and len(priors) <= _MOST_EVOLVED and steps * _POPULATION * _GENERATIONS < _AFFORDED:
+    if few and len(priors) <= most_parameters and steps * _POPULATION * _GENERATIONS < afforded:
         begin = np.vstack([begin, _evolve(problem, rng)])
     rough = [described(part, climb(part, phi, part.simulator)) for phi in begin]
     rough.sort(key=lambda peak: -peak.log_posterior)
     found = _distinct(part, rough)
     if not few:
-        found = [climb(problem, phi, problem.coarse.simulator) for phi, *_ in found[:_POLISHED]]
+        found = [climb(problem, phi, problem.coarse.simulator) for phi, *_ in found[:polished]]
     found.sort(key=lambda peak: -peak.log_posterior)
     if not few and len(found) > 1:  # all data may join what a part of them told apart
         found = _distinct(problem.coarse, found)
@@ -116,11 +117,13 @@ def find_modes(
     return [finish(problem, peak) for peak in (best, *found[1:])]
 
 
-def _evolve(problem: Problem, rng: np.random.Generator) -> Floats:
+def _evolve(problem: Problem, rng: np.random.Generator, *, climbed: int = 8) -> Floats:
     """Return the best points of differential evolution, best first, shape (evolved, p).
 
     Where few transitions slide, the mode may be too narrow for draws from the prior to find. The
     exact engine is needed: with fewer steps, friction's kinks are elsewhere.
+
+    ``climbed``: how many of the population are climbed from.
     """
     priors = problem.layout.priors
     draws = prior_draws(priors, rng, _POPULATION)
@@ -140,23 +143,29 @@ def _evolve(problem: Problem, rng: np.random.Generator) -> Floats:
         strategy="rand1bin", recombination=0.9, maxiter=_GENERATIONS, polish=False,
         vectorized=True, updating="deferred", tol=0.0, atol=STALLED,
     )  # fmt: skip
-    best = np.argsort(found.population_energies)[:_EVOLVED]
+    best = np.argsort(found.population_energies)[:climbed]
     return inside(priors, found.population[best])
 
 
-def _distinct(problem: Problem, found: list[LocalMode]) -> list[LocalMode]:
+def _distinct(
+    problem: Problem, found: list[LocalMode], *, same_below: float = 10.0, far: float = 100.0
+) -> list[LocalMode]:
     """Drop peaks that predict the same as an earlier one and are connected to it.
 
     Equivalent wheels and uninformed directions are connected; mirror images are not: they predict
     the same, but points between them do not.
+
+    ``same_below``: predictions this close (sum of squares, in noise units) are of the same mode.
+    ``far``: parameters whose predictions agree are of different modes if by the derivative they
+    should differ by this (sum of squares, in noise units): ten standard deviations.
     """
     folded = by_prior(problem.layout, np.array([peak.phi for peak in found]))
     z = problem.whitened(folded, found[0].sigma)
     z = np.nan_to_num(z, nan=FAR_OFF)
     kept: dict[int, Floats] = {}
     for i in range(len(found)):
-        same = [j for j in kept if ((z[i] - z[j]) ** 2).sum() < _SAME]
-        if not any(((kept[j] @ (folded[i] - folded[j])) ** 2).sum() < _FAR for j in same):
+        same = [j for j in kept if ((z[i] - z[j]) ** 2).sum() < same_below]
+        if not any(((kept[j] @ (folded[i] - folded[j])) ** 2).sum() < far for j in same):
             kept[i] = finish(problem, found[i]).jacobian
     return [found[i] for i in kept]
 
@@ -180,19 +189,28 @@ def find_mode(
     seed: int | np.random.Generator = 0,
     initial: Floats | None = None,
     rounds: int | None = None,
+    lower: float = 20.0,
 ) -> Mode:
-    """Return the best mode with others that are not far below it; see :func:`find_modes`."""
+    """Return the best mode with others that are not far below it; see :func:`find_modes`.
+
+    ``lower``: log-posterior by which a mode is too low to hold a share of the posterior, however
+    wide it is.
+    """
     best, *others = find_modes(problem, seed=seed, initial=initial, rounds=rounds)
-    near = (mode for mode in others if mode.log_posterior > best.log_posterior - _LOWER)
+    near = (mode for mode in others if mode.log_posterior > best.log_posterior - lower)
     return replace(best, others=tuple(near))
 
 
-def _polish(problem: Problem, found: LocalMode) -> LocalMode:
-    """Return a peak refined with the exact engine, if that raises the log-posterior."""
+def _polish(problem: Problem, found: LocalMode, *, worthwhile: float = 5.0) -> LocalMode:
+    """Return a peak refined with the exact engine, if that raises the log-posterior.
+
+    ``worthwhile``: gain in log-posterior which shows that the coarse derivative had not led to the
+    top. (Friction makes the top rough: some units are within its grain.)
+    """
     if not problem.layout.size:
         return found
     found = described(problem, found)
     exact = climb(problem, found.phi, problem.simulator, rounds=1, tries=2)
-    if exact.log_posterior < found.log_posterior + _WORTHWHILE:
+    if exact.log_posterior < found.log_posterior + worthwhile:
         return max(found, exact, key=lambda peak: peak.log_posterior)
     return climb(problem, exact.phi, problem.simulator)

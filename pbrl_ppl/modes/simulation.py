@@ -9,9 +9,6 @@ from pbrl_ppl.modes.search import find_mode
 from pbrl_ppl.modes.trajectories import find_trajectory_mode
 from pbrl_ppl.threads import one_blas_thread
 
-#: Rounds of the last climb, which has all engine steps and the prior of sigma.
-_CLIMB = 5
-
 
 def find_simulation_mode(problem: Problem, seed: int) -> Mode:
     """Return the best mode of simulated trajectories, from one of whole trajectories.
@@ -34,7 +31,7 @@ def find_simulation_mode(problem: Problem, seed: int) -> Mode:
 
 
 @one_blas_thread
-def simulation_mode(mode: Mode, prior: NoisePrior | None = None) -> Mode:
+def simulation_mode(mode: Mode, prior: NoisePrior | None = None, *, rounds: int = 5) -> Mode:
     """Return the mode of simulated trajectories, from one of whole trajectories.
 
     Parameters
@@ -43,6 +40,8 @@ def simulation_mode(mode: Mode, prior: NoisePrior | None = None) -> Mode:
         Of whole trajectories.
     prior : tuple, optional
         Of sigma; by default it is taken from the pieces.
+    rounds : int
+        Of the last climb, which has all engine steps and the prior of sigma.
 
     Returns
     -------
@@ -55,4 +54,4 @@ def simulation_mode(mode: Mode, prior: NoisePrior | None = None) -> Mode:
         median, spread = last.problem.noise_prior
         prior = tuple(median.tolist()), spread
     problem = last.problem.with_likelihood(prior=prior)
-    return with_robust_covariance(find_mode(problem, initial=last.phi, rounds=_CLIMB))
+    return with_robust_covariance(find_mode(problem, initial=last.phi, rounds=rounds))

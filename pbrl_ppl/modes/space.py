@@ -16,16 +16,6 @@ from pbrl_ppl.state import Bools, Floats, Ints, wrapped
 
 #: Noise that may vanish is a power of its coordinate.
 _ROOT = 3.0
-#: A parameter whose derivative is below this in units of noise over its prior is not informed.
-_SILENT = 1e-3
-#: Step of differences of a prior's density in the unconstrained space, and its least curvature: a
-#: truncated prior's tails there are those of a logistic distribution.
-_STEP, _FLAT = 1e-3, 0.05
-#: Distances at which a posterior is evaluated (standard deviations), and the fall (nats) from which
-#: a point is outside; a Gaussian falls by 2 at the first.
-_FAR, _LOW = (2.0, 4.0, 8.0, 16.0), 2.5
-#: Numbers held at once.
-_NUMBERS = 4_000_000
 
 
 def unconstrain(prior: Prior, x: Any) -> tuple[Any, Any]:
@@ -259,9 +249,12 @@ class Space:
         there = np.isfinite(phi).all(axis=-1, keepdims=True)
         return inside(self.problem.layout.priors, np.where(there, phi, self.centre))
 
-    def log_density(self, q: Floats) -> Floats:
-        """Return the log-posterior up to the evidence at points (n, d), shape (n,)."""
-        width = max(1, _NUMBERS // max(self.problem.measured.size, 1))
+    def log_density(self, q: Floats, *, numbers: int = 4_000_000) -> Floats:
+        """Return the log-posterior up to the evidence at points (n, d), shape (n,).
+
+        ``numbers``: numbers held at once.
+        """
+        width = max(1, numbers // max(self.problem.measured.size, 1))
         density = self.log_priors(q).sum(axis=-1)
         for first in range(0, len(q), width):
             some = q[first : first + width]
@@ -277,11 +270,16 @@ class Space:
             q[:, place] = unconstrain(prior, drawn)[0]
         return q
 
-    def laplace(self, mode: Mode) -> tuple[Floats, Floats]:
+    def laplace(
+        self, mode: Mode, *, least_curvature: float = 0.05, width: float = 1e-3
+    ) -> tuple[Floats, Floats]:
         """Return the Laplace approximation about a mode, shapes (d,) and (d, d).
 
         Its curvature is Gauss and Newton's. A density's mode moves with its coordinates: where the
         data say little, it is that of the prior here.
+
+        ``least_curvature``: a truncated prior's tails there are those of a logistic distribution.
+        ``width``: of differences of a prior's density in the unconstrained space.
         """
         p, mean = self.phi_size, self.at(mode.phi, mode.sigma)
         about = self._about(mean)
@@ -296,10 +294,10 @@ class Space:
                 [1.0 / unconstrain(*pair)[1] for pair in zip(priors, mode.phi, strict=True)]
             )
             jacobian = mode.jacobian * slope
-            ends = mean + _STEP * np.eye(len(mean))[:p], mean - _STEP * np.eye(len(mean))[:p]
+            ends = mean + width * np.eye(len(mean))[:p], mean - width * np.eye(len(mean))[:p]
             here = about._of_parameters(mean)
             above, below = (np.diagonal(about._of_parameters(end)) for end in ends)
-            curvature = np.maximum((2 * here - above - below) / _STEP**2, _FLAT)
+            curvature = np.maximum((2 * here - above - below) / width**2, least_curvature)
             precision = jacobian.T @ jacobian + np.diag(curvature)
             for place in self.problem.tails:
                 precision[place, place] += slope[place] ** 2 / mode.covariance[place, place]
@@ -307,7 +305,7 @@ class Space:
             inverse = np.linalg.inv(precision * np.outer(scale, scale) + 1e-12 * np.eye(p))
             covariance[:p, :p] = scale[:, None] * inverse * scale
             residual = np.nan_to_num(self.problem.robust(mode.phi, mode.sigma)).ravel()
-            pull = (above - below) / (2 * _STEP) - jacobian.T @ residual
+            pull = (above - below) / (2 * width) - jacobian.T @ residual
             step = np.zeros_like(mean)
             step[:p] = covariance[:p, :p] @ pull
             tried = mean + np.array([0.0, 0.25, 0.5, 1.0])[:, None] * step
@@ -320,35 +318,49 @@ class Space:
         middle[self._circles] = q[self._circles]
         return replace(self, centre=middle)
 
-    def widened(self, mean: Floats, covariance: Floats) -> Floats:
+    def widened(
+        self,
+        mean: Floats,
+        covariance: Floats,
+        *,
+        distances: tuple[float, ...] = (2.0, 4.0, 8.0, 16.0),
+        outside: float = 2.5,
+    ) -> Floats:
         """Return a covariance, widened where the posterior falls off slowly, shape (d, d).
 
         At a kink, or with few contacts, the curvature overstates how well a parameter is known.
+
+        ``distances``: at which a posterior is evaluated (standard deviations).
+        ``outside``: the fall (nats) from which a point is outside; a Gaussian falls by 2 at the
+        first distance.
         """
         p = self.phi_size
         loud = np.flatnonzero(~self.silent)
         if not len(loud):
             return covariance
         steps = np.sqrt(np.diag(covariance))[loud]
-        ends = np.array([*_FAR, *(-far for far in _FAR)])
+        ends = np.array([*distances, *(-far for far in distances)])
         moves = np.zeros((len(loud), len(ends), len(mean)))
         moves[np.arange(len(loud)), :, loud] = steps[:, None] * ends
         points = np.vstack([mean, mean + moves.reshape(-1, len(mean))])
         top, *heights = self._about(mean).log_density(points)
         fall = (top - np.array(heights)).reshape(len(loud), 2, -1)
         # on either side, up to the first point that has fallen
-        within = np.nan_to_num(fall, nan=np.inf) < _LOW
+        within = np.nan_to_num(fall, nan=np.inf) < outside
         count = np.logical_and.accumulate(within, axis=2).sum(axis=2)
-        stretch = np.array([_FAR[0], *_FAR])[count].mean(axis=1) / _FAR[0]
+        stretch = np.array([distances[0], *distances])[count].mean(axis=1) / distances[0]
         extra = np.zeros(len(mean))
         extra[:p][loud] = steps**2 * (stretch**2 - 1.0)
         return np.asarray(covariance + np.diag(extra))
 
 
-def silent(mode: Mode) -> Bools:
+def silent(mode: Mode, *, least: float = 1e-3) -> Bools:
     """Return the mask of parameters of which the data say nothing: their posterior is the prior.
 
     A wheel's parameters are never among them, for its prior is not one of independent numbers.
+
+    ``least``: a parameter whose derivative is below this in units of noise over its prior is not
+    informed.
     """
     problem = mode.problem
     # the sigma of a log-normal prior is that of the logarithm
@@ -359,7 +371,7 @@ def silent(mode: Mode) -> Bools:
         ]
     )
     size = np.sqrt((mode.jacobian**2).sum(axis=0)) * np.nan_to_num(scale, nan=1.0)
-    mask = (size < _SILENT) & bool(mode.jacobian.any())
+    mask = (size < least) & bool(mode.jacobian.any())
     for wheel in wheels(problem.layout):
         mask[list(wheel.places)] = False
     mask[list(problem.tails)] = False

@@ -22,20 +22,14 @@ from pbrl_ppl.threads import one_blas_thread
 
 #: Rounds at most; one that moves phi by less than this, in standard deviations, is the last.
 _ROUNDS, _SETTLED = 6, 0.2
-#: A second climb begins with unexplained accelerations of this share of their prior's median:
-#: errors of measuring and unexplained accelerations trade places, and have a mode each.
-_QUIET = 0.1
 #: Rounds of a climb between two linearisations.
 _CLIMB = 5
-#: Corrections of the error of few engine steps, at most; one with which the log-posterior (nats) is
-#: as with many steps is the last.
-_CORRECTIONS, _SAME = 3, 0.5
-#: Climbs of a search, and how much farther apart than draws from single transitions they begin.
-_STARTS, _WIDER = 5, 2.0
 
 
 @one_blas_thread
-def find_trajectory_mode(problem: Problem, seed: int) -> Mode:
+def find_trajectory_mode(
+    problem: Problem, seed: int, *, starts: int = 5, wider: float = 2.0
+) -> Mode:
     """Return the best mode of whole trajectories, from several starts about one of Eq. 11.
 
     A climb's end depends on the side of a kink that the states are smoothed on.
@@ -46,6 +40,10 @@ def find_trajectory_mode(problem: Problem, seed: int) -> Mode:
         Of whole trajectories.
     seed : int
         Of the starts.
+    starts : int
+        Climbs of the search.
+    wider : float
+        How much farther apart than draws from single transitions they begin.
 
     Returns
     -------
@@ -53,14 +51,16 @@ def find_trajectory_mode(problem: Problem, seed: int) -> Mode:
         Result of :func:`following`.
     """
     near = find_mode(single_transitions(problem), seed=seed)
-    off = near.draws(np.random.default_rng(seed), _STARTS - 1) - near.phi
-    far = inside(problem.layout.priors, near.phi + _WIDER * off)
+    off = near.draws(np.random.default_rng(seed), starts - 1) - near.phi
+    far = inside(problem.layout.priors, near.phi + wider * off)
     there = np.isfinite(near.problem.residual(far)).all(axis=(1, 2, 3, 4))
     found = [following(trajectory_mode(problem, phi)) for phi in (near.phi, *far[there])]
     return max(found, key=lambda mode: mode.log_posterior)
 
 
-def trajectory_mode(problem: Problem, phi: Floats, sigma: Floats | None = None) -> Mode:
+def trajectory_mode(
+    problem: Problem, phi: Floats, sigma: Floats | None = None, *, share: float = 0.1
+) -> Mode:
     """Return the mode of whole trajectories, linearised at smoothed states.
 
     The better of two, which start with the given noise and with near-zero process noise.
@@ -73,6 +73,10 @@ def trajectory_mode(problem: Problem, phi: Floats, sigma: Floats | None = None) 
         Where to begin, shape (p,).
     sigma : ndarray, optional
         Noise parameters to begin with where the problem is one of trajectories, smoothed nearby.
+    share : float
+        The second climb begins with unexplained accelerations of this share of their prior's
+        median: errors of measuring and unexplained accelerations trade places, and have a mode
+        each.
 
     Returns
     -------
@@ -86,14 +90,16 @@ def trajectory_mode(problem: Problem, phi: Floats, sigma: Floats | None = None) 
         problem = replace(rough, physics=problem.physics)
         sigma = problem.trajectory_noise.sigma
     mode = nearby_mode(problem, phi, sigma)
-    quiet = mode.problem.quiet(mode.sigma, _QUIET)
+    quiet = mode.problem.quiet(mode.sigma, share)
     if not np.array_equal(quiet, mode.sigma):
         problem = smoothed(mode.problem, mode.phi, quiet)
         mode = max(mode, nearby_mode(problem, mode.phi, quiet), key=lambda own: own.log_posterior)
     return mode
 
 
-def nearby_mode(problem: Problem, phi: Floats, sigma: Floats) -> Mode:
+def nearby_mode(
+    problem: Problem, phi: Floats, sigma: Floats, *, corrections: int = 3, same: float = 0.5
+) -> Mode:
     """Return the mode by alternating climbs with smoothing.
 
     It climbs with few engine steps, whose error at the start is corrected, and corrects it again
@@ -105,9 +111,13 @@ def nearby_mode(problem: Problem, phi: Floats, sigma: Floats) -> Mode:
         Of whole trajectories.
     phi, sigma : ndarray
         Where to begin, shapes (p,) and (parameter,).
+    corrections : int
+        Of the error of few engine steps, at most.
+    same : float
+        A correction with which the log-posterior (nats) is as with many steps is the last.
     """
     found: list[Mode] = []
-    for _ in range(_CORRECTIONS):
+    for _ in range(corrections):
         cheap = problem.corrected(phi)
         mode = _settled(cheap, phi, sigma)
         if cheap is problem:
@@ -116,7 +126,7 @@ def nearby_mode(problem: Problem, phi: Floats, sigma: Floats) -> Mode:
         moved, phi = _change(mode, phi), mode.phi
         sigma, height = profiled(problem, phi)
         found.append(replace(mode, problem=problem, sigma=sigma, log_posterior=height, others=()))
-        if moved < _SETTLED or abs(height - mode.log_posterior) < _SAME:
+        if moved < _SETTLED or abs(height - mode.log_posterior) < same:
             break
     return max(found, key=lambda own: own.log_posterior)
 

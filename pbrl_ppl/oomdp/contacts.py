@@ -16,8 +16,6 @@ from pbrl_ppl.state import Bools, Floats
 #: A convex part of a solid: corners (k, 2) counter-clockwise, and a radius about them; one corner
 #: is a circle, two are a wall.
 Part = tuple[Floats, float]
-#: Collision radius by default, in bounding radii of the smallest moving body.
-_RADIUS = 0.4
 
 
 @final
@@ -111,7 +109,9 @@ class SectorContacts:
         angle = 2 * np.pi * middle / (self.sectors * self.rays)
         return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
-    def of(self, scene: Scene, states: Floats, wrenches: Floats | None = None) -> Bools:
+    def of(
+        self, scene: Scene, states: Floats, wrenches: Floats | None = None, *, share: float = 0.4
+    ) -> Bools:
         """Return the predicates contact_theta(obj) of every moving body.
 
         Parameters
@@ -122,6 +122,8 @@ class SectorContacts:
             States or poses, shape (n, body, 6 or 3), SI units, bodies as in ``scene.moving``.
         wrenches : ndarray, optional
             Ignored: contacts do not depend on the action.
+        share : float
+            Collision radius by default, in bounding radii of the smallest moving body.
 
         Returns
         -------
@@ -153,7 +155,7 @@ class SectorContacts:
         # along a ray solids are no nearer than their bounding circles
         radius = self.radius
         if radius is None:
-            radius = _RADIUS * smallest_radius(scene)
+            radius = share * smallest_radius(scene)
         near = circles(world.solids, world.pairs, poses) > -radius
         for (i, j), rows in zip(world.pairs, near.T, strict=True):
             at = np.flatnonzero(rows)

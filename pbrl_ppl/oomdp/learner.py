@@ -15,9 +15,6 @@ from pbrl_ppl.oomdp.regression import Experience
 from pbrl_ppl.scene import Scene, body_sizes, nearest
 from pbrl_ppl.state import STATE, THETA, WRENCH, Bools, Floats, wrapped
 
-#: States beyond this many times the largest learned are of extrapolations that have diverged.
-_DIVERGED = 1e6
-
 
 class Learner(ABC):
     """Independent models of transitions of single bodies, learned as they are observed.
@@ -223,7 +220,14 @@ class Learner(ABC):
         angular = force * np.hypot(*gains[:2, 2]) + torque * abs(gains[2, 2])
         return np.array([linear]), np.array([angular])
 
-    def step(self, states: Floats, wrenches: Floats, previous: Floats | None = None) -> Floats:
+    def step(
+        self,
+        states: Floats,
+        wrenches: Floats,
+        previous: Floats | None = None,
+        *,
+        diverged: float = 1e6,
+    ) -> Floats:
         """Return the states after one sampling interval (Eqs. 5 and 6).
 
         Parameters
@@ -234,6 +238,9 @@ class Learner(ABC):
             Shape (n, body, 3), world frame, N and N m.
         previous : ndarray, optional
             Ignored.
+        diverged : float
+            States beyond this many times the largest learned are of extrapolations that have
+            diverged.
 
         Returns
         -------
@@ -269,7 +276,7 @@ class Learner(ABC):
             out[rows, i] = state + (
                 _turned(added, state[:, THETA]) if self.pose_invariant else added
             )
-        out[abs(out) > _DIVERGED * self._largest] = np.nan
+        out[abs(out) > diverged * self._largest] = np.nan
         return np.asarray(out[None])
 
     def experience(self, body: str) -> Experience:

@@ -17,8 +17,6 @@ from pbrl_ppl.state import Bools, Floats, Ints
 #: Predicates of a condition, one flag each.
 Key = tuple[bool, ...]
 
-#: Weights computed at a time, to limit memory.
-_WEIGHTS = 4_000_000
 #: Share of the largest eigenvalue of X' W X below which eigenvalues are rounding errors.
 _SINGULAR = 1e-13
 
@@ -78,9 +76,12 @@ class Regression:
         columns = np.concatenate([self._x, y], axis=1)
         self._products = np.einsum("ni,nj->nij", self._x, columns).reshape(len(x), -1)
 
-    def __call__(self, queries: Floats) -> Floats:
-        """Return predictions, shape (m, q), at queries of shape (m, p)."""
-        size = max(1, _WEIGHTS // len(self._x))
+    def __call__(self, queries: Floats, *, weights: int = 4_000_000) -> Floats:
+        """Return predictions, shape (m, q), at queries of shape (m, p).
+
+        ``weights``: weights computed at a time, to limit memory.
+        """
+        size = max(1, weights // len(self._x))
         parts = np.array_split(queries / self.scale, max(1, -(-len(queries) // size)))
         return np.concatenate([self._predict(part) for part in parts])
 

@@ -19,8 +19,6 @@ _FARTHEST = 30.0
 FAMILIES = (
     "log_normal", "truncated_normal", "normal", "half_normal", "von_mises", "categorical"
 )  # fmt: skip
-#: How far inside a bound the search stays, as a share of the prior's scale.
-_MARGIN = 1e-6
 
 
 @dataclass(frozen=True)
@@ -309,12 +307,15 @@ def inside(priors: Sequence[Prior], phi: Floats) -> Floats:
     return np.clip(phi, lower, upper)
 
 
-def box(priors: Sequence[Prior]) -> tuple[Floats, Floats]:
-    """Return the bounds of a search: the supports less a margin, which discrete priors lack."""
+def box(priors: Sequence[Prior], *, margin: float = 1e-6) -> tuple[Floats, Floats]:
+    """Return the bounds of a search: the supports less a margin, which discrete priors lack.
+
+    ``margin``: how far inside a bound the search stays, as a share of the prior's scale.
+    """
     support = np.array([prior.support for prior in priors]).reshape(-1, 2)
     width = np.array([prior.scale for prior in priors])
     width[[prior.discrete for prior in priors]] = 0.0
-    return support[:, 0] + _MARGIN * width, support[:, 1] - _MARGIN * width
+    return support[:, 0] + margin * width, support[:, 1] - margin * width
 
 
 def differentiate(

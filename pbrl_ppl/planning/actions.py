@@ -17,9 +17,6 @@ from pbrl_ppl.planning.goals import read_tables, read_toml
 from pbrl_ppl.scene import Scene, nearest
 from pbrl_ppl.state import THETA, WRENCH, Floats
 
-#: Quantile of the recorded pushes that a plan pushes with, and for how many intervals.
-_QUANTILE, _INTERVALS = 0.9, (2, 5)
-
 
 @dataclass(frozen=True)
 class Action:
@@ -137,7 +134,9 @@ class ActionSet:
         return cls(tuple(actions), table.get("durations"))
 
     @classmethod
-    def recorded(cls, idata: Any) -> ActionSet:
+    def recorded(
+        cls, idata: Any, *, quantile: float = 0.9, intervals: tuple[int, ...] = (2, 5)
+    ) -> ActionSet:
         """Return actions like those in the posterior's data, whose effects the model knows.
 
         For each body that was pushed: forces along x and y and torques, in both directions, alone
@@ -147,6 +146,10 @@ class ActionSet:
         ----------
         idata : InferenceData or DataTree
             A posterior.
+        quantile : float
+            Quantile of the recorded pushes that a plan pushes with.
+        intervals : tuple of float
+            For how many intervals a plan pushes.
 
         Raises
         ------
@@ -163,7 +166,7 @@ class ActionSet:
                 continue
             sizes = np.hypot(given[..., i, 0], given[..., i, 1]).ravel(), abs(given[..., i, 2])
             force, torque = (
-                float(np.quantile(s[s > 0], _QUANTILE)) if (s > 0).any() else 0.0 for s in sizes
+                float(np.quantile(s[s > 0], quantile)) if (s > 0).any() else 0.0 for s in sizes
             )
             if not (force or torque):
                 continue
@@ -175,7 +178,7 @@ class ActionSet:
             ]
         if not actions:
             raise GoalError("actions: nothing was pushed in the posterior's data; give actions")
-        return cls(tuple(actions), tuple(scene.time_step * n for n in _INTERVALS))
+        return cls(tuple(actions), tuple(scene.time_step * n for n in intervals))
 
     def check(self, scene: Scene) -> None:
         """Check that the scene has the bodies, and that durations are whole sampling intervals.
@@ -245,14 +248,13 @@ Bounds = Mapping[str, Mapping[str, Sequence[float]]]
 #: Wrenches (n, time, body, 3) to states (n, time + 1, body, 6).
 Predict = Callable[[Floats], Floats]
 
-#: Pieces of a sequence within bounds by default.
-_PIECES = 8
-
 
 def allowed_wrenches(
-    scene: Scene, actions: ActionSet | Bounds, steps: int, hold: int | None
+    scene: Scene, actions: ActionSet | Bounds, steps: int, hold: int | None, *, pieces: int = 8
 ) -> Allowed:
     """Return the sequences that an action set or bounds allow.
+
+    ``pieces``: pieces of a sequence by default.
 
     Raises
     ------
@@ -288,7 +290,7 @@ def allowed_wrenches(
             low[at], high[at] = pair
     if not (high > low).any():
         raise GoalError("bounds: nothing may vary; give a lowest and a higher highest value")
-    return _Within(low, high, steps, hold or max(1, round(steps / _PIECES)))
+    return _Within(low, high, steps, hold or max(1, round(steps / pieces)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,24 +22,22 @@ from pbrl_ppl.planning.search import Found, Task, contact_cost, tail_mean
 from pbrl_ppl.scene import Body, Scene, Shape
 from pbrl_ppl.state import Bools, Floats, Ints
 
-#: Nodes expanded in one engine call; fewer under many draws, whose calls are large anyway.
-_BATCH = 32
-#: Share of the limits for the search under one draw that guides the search under all.
-_GUIDE = 0.5
 #: Cells of the closed set ten tolerances from the goal, in tolerances and, for speeds, tolerances a
 #: sampling interval; further away and nearer they grow and shrink in proportion, between limits.
 _CELLS = np.array([4.0, 4.0, 5.0, 2.0, 2.0, 2.5])
-_TEN, _NEAR, _FAR = 10.0, 0.25, 2.0
 #: The largest tolerances that cells are in proportion to: of the position, as a share of the body's
 #: bounding radius, and of the angle (rad).
 _WIDEST, _WIDEST_ANGLE = 0.2, 0.1
-#: Times that the cells are halved where the search runs out of nodes.
-_REFINED = 8
-#: Seconds between reports of progress.
-_REPORT = 0.5
 
 
-def astar(task: Task, *, weight: float = 3.0, improve: bool = False) -> Found:
+def astar(
+    task: Task,
+    *,
+    weight: float = 3.0,
+    improve: bool = False,
+    share: float = 0.5,
+    every: float = 0.5,
+) -> Found:
     """Search for the quickest actions that bring bodies to the goal.
 
     The cost of a plan is its time and the penalties for contact. A node holds the states under all
@@ -60,6 +58,10 @@ def astar(task: Task, *, weight: float = 3.0, improve: bool = False) -> Found:
         :class:`pbrl_ppl.planning.astar.TimeToGo` for where it is.
     improve : bool
         Whether to go on for a cheaper plan until a limit, or until there is none.
+    share : float
+        Share of the limits for the search under one draw that guides the search under all.
+    every : float
+        Seconds between reports of progress.
 
     Returns
     -------
@@ -82,8 +84,8 @@ def astar(task: Task, *, weight: float = 3.0, improve: bool = False) -> Found:
     try:
         if task.dynamics.draws > 1:
             guide = _Search(replace(task, dynamics=task.dynamics.single()), weight)
-            while not guide.best and guide.generated < _GUIDE * nodes and guide.open():
-                if time.monotonic() - begin > _GUIDE * task.seconds:
+            while not guide.best and guide.generated < share * nodes and guide.open():
+                if time.monotonic() - begin > share * task.seconds:
                     break
                 guide.expand()
             search.follow(guide.path(guide.best or guide.nearest))
@@ -96,7 +98,7 @@ def astar(task: Task, *, weight: float = 3.0, improve: bool = False) -> Found:
                 stopped = "nodes" if search.generated >= nodes else "time"
                 break
             search.expand()
-            if now - reported > _REPORT:
+            if now - reported > every:
                 reported = now
                 far = search.least_distance
                 task.progress(f"{search.generated} states, nearest to the goal {far:.3g} m")
@@ -136,9 +138,12 @@ class _Search:
         self.refined = 0
         self.begin()
 
-    def open(self) -> bool:
-        """Return whether the queue holds a node; start again with finer cells where it does not."""
-        if not self.queue and self.best is None and self.refined < _REFINED:
+    def open(self, *, most_refined: int = 8) -> bool:
+        """Return whether the queue holds a node; start again with finer cells where it does not.
+
+        ``most_refined``: times that the cells are halved where the search runs out of nodes.
+        """
+        if not self.queue and self.best is None and self.refined < most_refined:
             self.refined += 1
             self.begin()
         return bool(self.queue)
@@ -165,9 +170,13 @@ class _Search:
         if self.root[..., 3:].any():
             self.least_distance = np.inf
 
-    def expand(self) -> None:
-        """Expand the most promising nodes by all actions, in one engine call each."""
-        size = min(max(1, _BATCH // self.dynamics.draws), len(self.queue))
+    def expand(self, *, at_once: int = 32) -> None:
+        """Expand the most promising nodes by all actions, in one engine call each.
+
+        ``at_once``: nodes expanded in one engine call; fewer under many draws, whose calls are
+        large anyway.
+        """
+        size = min(max(1, at_once // self.dynamics.draws), len(self.queue))
         batch = [heapq.heappop(self.queue)[1] for _ in range(size)]
         count = len(self.actions.actions)
         self._try(np.repeat(batch, count), np.tile(np.arange(count), size))
@@ -254,11 +263,24 @@ class _Search:
         for node, value in enumerate(priority.tolist(), start=first):
             heapq.heappush(self.queue, (value, node))
 
-    def _cells(self, states: Floats, far: Floats) -> NDArray[np.int32]:
-        """Return the cell of the closed set of each node, shape (n, number)."""
+    def _cells(
+        self,
+        states: Floats,
+        far: Floats,
+        *,
+        tolerances: float = 10.0,
+        least: float = 0.25,
+        most: float = 2.0,
+    ) -> NDArray[np.int32]:
+        """Return the cell of the closed set of each node, shape (n, number).
+
+        ``tolerances``: distance from the goal at which cells have their usual size, in tolerances.
+        ``least``: cells shrink nearer to the goal in proportion, down to this.
+        ``most``: and grow further away, up to this.
+        """
         mean = np.nan_to_num(states.mean(axis=0))
         mean[..., 2] = mean_angle(np.nan_to_num(states[..., 2]))
-        level = np.floor(np.log2(np.clip(far / (_TEN * self.near), _NEAR, _FAR)))
+        level = np.floor(np.log2(np.clip(far / (tolerances * self.near), least, most)))
         size = self.cells * 2.0 ** (level[:, None, None] - self.refined)
         cell = np.floor(mean / size).reshape(len(mean), -1)
         return np.concatenate([level[:, None], cell], axis=1).astype(np.int32)
@@ -290,9 +312,6 @@ def played(task: Task, steps: list[tuple[int, int]]) -> Floats:
     return wrenches
 
 
-#: Cells along the longer side of the grid on which distances around walls are found, and the margin
-#: of the grid in bounding radii: a body can go around the end of a wall.
-_GRID, _ROOM = 160, 4.0
 #: Least acceleration, in bounding radii (or rad) an interval squared: without a push, the time to
 #: the goal is long but finite, because others may hit the body.
 _LEAST = 1e-6
@@ -383,8 +402,20 @@ class _Field:
         )
 
 
-def _distances(scene: Scene, body: Body, target: Target, start: Floats) -> _Field | None:
-    """Return distances of a body's origin from its target around obstacles; None without any."""
+def _distances(
+    scene: Scene,
+    body: Body,
+    target: Target,
+    start: Floats,
+    *,
+    cells: int = 160,
+    margin: float = 4.0,
+) -> _Field | None:
+    """Return distances of a body's origin from its target around obstacles; None without any.
+
+    ``cells``: cells along the longer side of the grid.
+    ``margin``: margin of the grid in bounding radii: a body can go around the end of a wall.
+    """
     static = tuple(obstacle for obstacle in scene.bodies if obstacle.static)
     if (not scene.walls and not static) or target.x is None or target.y is None:
         return None
@@ -392,9 +423,9 @@ def _distances(scene: Scene, body: Body, target: Target, start: Floats) -> _Fiel
     if scene.extent is not None:
         corners = np.reshape(scene.extent, (2, 2)).T
         points = np.vstack([points, corners])
-    room = _ROOM * body.shape.bounding_radius
+    room = margin * body.shape.bounding_radius
     low, high = points.min(axis=0) - room, points.max(axis=0) + room
-    cell = float((high - low).max()) / _GRID
+    cell = float((high - low).max()) / cells
     shape = tuple(int(n) + 1 for n in np.ceil((high - low) / cell))
     centres = low + cell * np.indices(shape).reshape(2, -1).T
     # a circle that fits into the body wherever it turns, about its origin

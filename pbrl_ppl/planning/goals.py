@@ -15,9 +15,6 @@ from pbrl_ppl.errors import GoalError
 from pbrl_ppl.scene import Scene, nearest
 from pbrl_ppl.state import POSE, Floats
 
-#: Position tolerance by default, as a share of the body's bounding radius.
-_TOLERANCE = 0.2
-
 
 @dataclass(frozen=True)
 class Target:
@@ -172,11 +169,13 @@ class Goal:
         moving = [body.name for body in scene.moving]
         return [moving.index(target.body) for target in self.targets]
 
-    def tolerances(self, scene: Scene) -> list[float]:
-        """Return the position tolerance of each target (m)."""
+    def tolerances(self, scene: Scene, *, share: float = 0.2) -> list[float]:
+        """Return the position tolerance of each target (m).
+
+        ``share``: position tolerance by default, as a share of the body's bounding radius.
+        """
         return [
-            t.tolerance or _TOLERANCE * scene.body(t.body).shape.bounding_radius
-            for t in self.targets
+            t.tolerance or share * scene.body(t.body).shape.bounding_radius for t in self.targets
         ]
 
     def errors(self, scene: Scene, states: Floats) -> Floats:

@@ -27,10 +27,6 @@ from pbrl_ppl.scene import Scene, nearest
 from pbrl_ppl.state import POSE, STATE, WRENCH, Floats
 
 METHODS = ("astar", "mppi")
-#: Rows that a printed plan shows, at most.
-_SHOWN = 8
-#: Draws of Eq. 13's noise that a predicted distribution holds, at least.
-_NOISY = 64
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -108,8 +104,11 @@ class Plan:
         reached = "reached" if self.reached else "not reached"
         return f"Plan({len(self.wrenches)} intervals, {self.duration:.3g} s, goal {reached})"
 
-    def __str__(self) -> str:
-        """Return the plan's sentence, and a table of at most eight rows, with mean predictions."""
+    def __str__(self, *, most_rows: int = 8) -> str:
+        """Return the plan's sentence, and a table of at most eight rows, with mean predictions.
+
+        ``most_rows``: rows that are shown, at most.
+        """
         bodies = [body.name for body in self.scene.moving]
         times = self.scene.time_step * np.arange(len(self.wrenches))
         mean = self.predicted["predicted"].mean("draw").transpose("time", "body", "state")
@@ -120,7 +119,7 @@ class Plan:
         )
         table.insert(0, "time", np.repeat(times, len(bodies)))
         table.insert(1, "body", bodies * len(times))
-        rows = np.unique(np.linspace(0, len(table) - 1, _SHOWN).round().astype(int))
+        rows = np.unique(np.linspace(0, len(table) - 1, most_rows).round().astype(int))
         shown = table.iloc[rows if len(table) else []]
         return f"{self.in_words()}\n{shown.to_string(index=False, float_format='%.3g')}"
 
@@ -252,7 +251,7 @@ def plan(
     states = rollout(dynamics, first, found.wrenches)
     distance = float(tail_mean(goal.distance(scene, states[:, -1]), tail))
     if noise:
-        times = -(-_NOISY // dynamics.draws)
+        times = -(-64 // dynamics.draws)  # so many draws of Eq. 13's noise, at least
         states = np.concatenate(
             [rollout(dynamics, first, found.wrenches, rng) for _ in range(times)]
         )

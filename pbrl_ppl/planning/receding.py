@@ -10,16 +10,6 @@ from pbrl_ppl.errors import GoalError
 from pbrl_ppl.planning.search import Found, Task, contact_cost, tail_mean
 from pbrl_ppl.state import Floats
 
-#: Correlation of the noise from one interval to the next.
-_PERSISTENCE = 0.7
-#: Standard deviation of the wrenches that are tried, as a share of the strongest.
-_SPREAD = 0.5
-#: Share of the samples that have about as much weight as all others.
-_ELITE = 0.05
-#: Cost of the speed at the end of the horizon, in sampling intervals at it: a fast body does not
-#: stay there.
-_ARRIVAL = 0.8
-
 
 class Horizon:
     """Receding horizon: wrenches for the next intervals, improved and shifted at every step.
@@ -60,7 +50,15 @@ class Horizon:
         self.way = max(float(task.goal.distance(scene, task.start)), reach)
         self.generated = 0
 
-    def improve(self, start: Floats, before: Floats) -> None:
+    def improve(
+        self,
+        start: Floats,
+        before: Floats,
+        *,
+        persistence: float = 0.7,
+        first_spread: float = 0.5,
+        elite: float = 0.05,
+    ) -> None:
         """Draw sequences about the mean; weigh them by their cost.
 
         Parameters
@@ -69,21 +67,27 @@ class Horizon:
             States that they begin from, shape (draw, body, 6).
         before : ndarray
             Wrenches in the interval before, shape (body, 3).
+        persistence : float
+            Correlation of the noise from one interval to the next.
+        first_spread : float
+            Standard deviation of the wrenches that are tried, as a share of the strongest.
+        elite : float
+            Share of the samples that have about as much weight as all others.
         """
         size = (self.samples, *self.mean.shape)
         for iteration in range(self.iterations):
-            spread = _SPREAD * self.most * 0.7**iteration
+            spread = first_spread * self.most * 0.7**iteration
             noise = self.rng.standard_normal(size)
             for t in range(1, size[1]):
                 noise[:, t] = (
-                    _PERSISTENCE * noise[:, t - 1] + np.sqrt(1 - _PERSISTENCE**2) * noise[:, t]
+                    persistence * noise[:, t - 1] + np.sqrt(1 - persistence**2) * noise[:, t]
                 )
             tried = np.clip(self.mean + spread * noise, -self.most, self.most)
             tried[0] = self.mean
             cost = self._cost(start, tried, before)
             worst = np.max(cost[np.isfinite(cost)], initial=0.0)
             cost = np.where(np.isfinite(cost), cost, 1e3 * worst)
-            few = np.sort(cost)[: max(2, int(_ELITE * self.samples))]
+            few = np.sort(cost)[: max(2, int(elite * self.samples))]
             least = 1e-9 * few[-1] + np.finfo(float).tiny
             weight = np.exp(-(cost - few[0]) / max(few[-1] - few[0], least))
             self.mean = np.tensordot(weight / weight.sum(), tried, axes=1)
@@ -94,8 +98,12 @@ class Horizon:
         self.mean = np.concatenate([self.mean[1:], self.mean[-1:]])
         return first
 
-    def _cost(self, start: Floats, tried: Floats, before: Floats) -> Floats:
-        """Return L2 distance from the goal (mean and last), last speed, and contacts."""
+    def _cost(self, start: Floats, tried: Floats, before: Floats, *, at_end: float = 0.8) -> Floats:
+        """Return L2 distance from the goal (mean and last), last speed, and contacts.
+
+        ``at_end``: cost of the speed at the end of the horizon, in sampling intervals at it: a fast
+        body does not stay there.
+        """
         task, horizon = self.task, tried.shape[1]
         scene, goal = task.dynamics.scene, task.goal
         states = np.repeat(start[:, None], len(tried), axis=1)
@@ -109,7 +117,7 @@ class Horizon:
             far = tail_mean(goal.distance(scene, states), task.tail)
             cost += (far + self.way * contact_cost(goal, scene, states)) / horizon
         speed = np.sqrt((states[..., self.bodies, 3:5] ** 2).sum(axis=(-2, -1)))
-        arrival = _ARRIVAL * scene.time_step * tail_mean(speed, task.tail)
+        arrival = at_end * scene.time_step * tail_mean(speed, task.tail)
         return np.asarray(cost + far + arrival)
 
 

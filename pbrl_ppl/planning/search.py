@@ -16,9 +16,6 @@ from pbrl_ppl.state import Floats
 
 #: States that a search generates at most by default: 15 s or so for one body.
 NODES = 2_000_000
-#: Shapes this near touch, as a share of the smallest moving body's bounding radius: the engine lets
-#: bodies that rest on each other sink in a little.
-_TOUCH = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +99,7 @@ def tail_mean(values: Floats, tail: float) -> Floats:
     return np.asarray(np.partition(values, n - worst, axis=0)[n - worst :].mean(axis=0))
 
 
-def contact_cost(goal: Goal, scene: Scene, states: Floats) -> Floats:
+def contact_cost(goal: Goal, scene: Scene, states: Floats, *, near: float = 0.01) -> Floats:
     """Return the penalty of a second in contact, as a mean over the draws.
 
     Parameters
@@ -113,6 +110,9 @@ def contact_cost(goal: Goal, scene: Scene, states: Floats) -> Floats:
         Bodies, walls and shapes.
     states : ndarray
         Shape (draw, n, body, 6), SI units.
+    near : float
+        Shapes this near touch, as a share of the smallest moving body's bounding radius: the engine
+        lets bodies that rest on each other sink in a little.
 
     Returns
     -------
@@ -122,6 +122,6 @@ def contact_cost(goal: Goal, scene: Scene, states: Floats) -> Floats:
     if not goal.contact_penalty:
         return np.zeros(states.shape[1])
     poses = np.nan_to_num(states[..., :3]).reshape(-1, states.shape[2], 3)
-    touch = _TOUCH * smallest_radius(scene)
+    touch = near * smallest_radius(scene)
     share = (overlap(scene, poses) > -touch).reshape(states.shape[:2]).mean(axis=0)
     return np.where(share > 0, goal.contact_penalty * np.maximum(share, 1e-9), 0.0)

@@ -24,17 +24,6 @@ _CURES = (
     ((" r[", " mu_c["), "record contacts (collisions with a wall or another body)"),
     (("torque", "inertia", "angular", "w_theta", "pivot"), "record the body turning"),
 )
-_ANY_CURE = "record motion in which that matters"
-#: Ratio of posterior to prior sd below which data inform, and above which they do not. The latter
-#: allows for the error of an sd from a hundred effective draws, 7 %.
-CLEARLY, HARDLY = 0.5, 0.85
-#: Shift of the mean, in prior sds, above which the data inform whatever the width.
-_MOVED = 0.3
-#: Squared column norm in prior sds below which the data's precision is a tenth of the prior's.
-_NO_EFFECT = 0.1
-#: Parameters with less than this share of the strongest effect in a direction are left out of it.
-_MINOR = 0.2
-_PRIOR_DRAWS = 20_000
 
 
 @dataclass(frozen=True)
@@ -111,7 +100,7 @@ class Identifiability:
         cures: dict[str, list[str]] = {}
         for name in self.silent:
             found = (cure for words, cure in _CURES if any(word in f" {name}" for word in words))
-            cures.setdefault(next(found, _ANY_CURE), []).append(name)
+            cures.setdefault(next(found, "record motion in which that matters"), []).append(name)
         silent = (
             f"The data say nothing about {_listed(names)}: {cure}, or give the value as known."
             for cure, names in cures.items()
@@ -136,7 +125,11 @@ class Identifiability:
 
 
 def identify(
-    fitted: Any, *, mode: Mode | None = None, effects: Iterable[Effect] = catalogue
+    fitted: Any,
+    *,
+    mode: Mode | None = None,
+    effects: Iterable[Effect] = catalogue,
+    no_effect: float = 0.1,
 ) -> Identifiability:
     """Return which parameters the data inform, and which combinations they cannot tell apart.
 
@@ -154,6 +147,8 @@ def identify(
         highest likelihood, with measured start states taken as exact.
     effects : iterable of Effect
         Where the names of a posterior's effects are looked up; add your own to the package's.
+    no_effect : float
+        Squared column norm in prior sds below which the data's precision is a tenth of the prior's.
 
     Returns
     -------
@@ -201,7 +196,7 @@ def identify(
     silent = tuple(
         label
         for label, information in zip(labels, np.diag(gram), strict=True)
-        if information < _NO_EFFECT and verdicts[label] != INFORMED
+        if information < no_effect and verdicts[label] != INFORMED
     )
     return Identifiability(widths, silent, _directions(gram, labels))
 
@@ -226,13 +221,16 @@ def uninformed(idata: Any, *, effects: Iterable[Effect] = catalogue) -> tuple[st
     return tuple(width.parameter for width in widths if width.verdict == PRIOR_ONLY)
 
 
-def _prior_draws(layout: Layout) -> dict[str, Floats]:
-    """Return prior draws by label, wheels folded as the posterior's are."""
+def _prior_draws(layout: Layout, *, n_draws: int = 20_000) -> dict[str, Floats]:
+    """Return prior draws by label, wheels folded as the posterior's are.
+
+    ``n_draws``: draws from the prior.
+    """
     rng = np.random.default_rng(0)
     # anchors in different bodies cannot be compared
     free = {owner for b in layout.blocks if b.name in JOINT_INDICES for owner in b.owners}
     draws = {
-        f"{block.name}[{owner}]": prior.sample(rng, _PRIOR_DRAWS)
+        f"{block.name}[{owner}]": prior.sample(rng, n_draws)
         for block in layout.blocks
         for owner, prior in zip(block.owners, block.priors, strict=True)
         if (owner not in free or block.of != "joint") and LEARNED_REMAINDER not in block.name
@@ -253,10 +251,25 @@ def _spread(prior: Prior, draws: Floats) -> float:
     return float(_natural(prior, draws).std())
 
 
-def _width(label: str, prior_sd: float, posterior_sd: float, moved: float) -> Width:
+def _width(
+    label: str,
+    prior_sd: float,
+    posterior_sd: float,
+    moved: float,
+    *,
+    clearly: float = 0.5,
+    hardly: float = 0.85,
+    far: float = 0.3,
+) -> Width:
+    """Return how much narrower a parameter's posterior is than its prior, and the verdict.
+
+    Below the ratio ``clearly`` of their sds the data inform; above ``hardly``, which allows for the
+    error of an sd from a hundred effective draws (7 %), they do not, unless the mean has moved by
+    ``far`` prior sds.
+    """
     ratio = posterior_sd / prior_sd
-    verdict = INFORMED if ratio < CLEARLY else WEAK
-    if ratio >= HARDLY and moved < _MOVED:
+    verdict = INFORMED if ratio < clearly else WEAK
+    if ratio >= hardly and moved < far:
         verdict = PRIOR_ONLY
     return Width(label, prior_sd, posterior_sd, ratio, verdict)
 
@@ -279,8 +292,12 @@ def _widths(
     return tuple(widths)
 
 
-def _directions(gram: Floats, labels: list[str]) -> tuple[Direction, ...]:
-    """Return combinations that move predictions by less than the noise, unlike their parameters."""
+def _directions(gram: Floats, labels: list[str], *, minor: float = 0.2) -> tuple[Direction, ...]:
+    """Return combinations that move predictions by less than the noise, unlike their parameters.
+
+    ``minor``: parameters with less than this share of the strongest effect in a direction are left
+    out of it.
+    """
     active = np.flatnonzero(np.diag(gram) >= 1.0)
     part = gram[np.ix_(active, active)]
     alone = np.sqrt(np.diag(part))
@@ -289,7 +306,7 @@ def _directions(gram: Floats, labels: list[str]) -> tuple[Direction, ...]:
     for row in _sparse(vectors[:, values < 1.0].T):
         weight = row / np.linalg.norm(row)
         cancelled = np.abs(weight) * alone
-        members = np.flatnonzero(cancelled >= max(1.0, _MINOR * cancelled.max()))
+        members = np.flatnonzero(cancelled >= max(1.0, minor * cancelled.max()))
         if len(members) < 2:
             continue
         weight = weight * np.sign(weight[members[0]])

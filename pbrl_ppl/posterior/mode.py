@@ -13,8 +13,6 @@ from pbrl_ppl.parameters import nearest
 from pbrl_ppl.posterior.record import PosteriorRecord, StoredMode
 from pbrl_ppl.state import Floats, Ints
 
-#: Log-posterior of a draw above that of the mode from which the mode is climbed to again (nats).
-_HIGHER = 0.1
 #: Rounds of a climb that starts near the mode.
 _CLIMB = 5
 
@@ -39,7 +37,13 @@ class Point:
 
 
 def packed_mode(
-    problem: Problem, mode: Point, phi: Floats, sigma: Floats, likelihood: Floats
+    problem: Problem,
+    mode: Point,
+    phi: Floats,
+    sigma: Floats,
+    likelihood: Floats,
+    *,
+    higher: float = 0.1,
 ) -> StoredMode:
     """Return a posterior's mode for its record.
 
@@ -56,12 +60,15 @@ def packed_mode(
         Posterior draws, shapes (draw, p) and (draw, state).
     likelihood : ndarray
         Log-likelihood of each draw, shape (draw,).
+    higher : float
+        Log-posterior of a draw above that of the mode from which the mode is climbed to again
+        (nats).
     """
     height = float(log_posterior(problem, mode.phi, mode.sigma, mode.choice))
     if problem.library is None and not problem.layout.discrete.any():
         draws = log_posterior(problem, phi, sigma, log_likelihood=likelihood)
         best = int(np.argmax(draws))
-        if draws[best] > height + _HIGHER:
+        if draws[best] > height + higher:
             found = find_mode(problem, initial=phi[best], rounds=_CLIMB)
             if found.log_posterior > height:
                 mode, height = Point(found.phi, found.sigma), found.log_posterior

@@ -26,8 +26,6 @@ from pbrl_ppl.state import Floats
 #: Limits of a truncated normal: it is exponential with mu this many sigmas outside its support, and
 #: uniform with sigma this many times the width of what it covers.
 _OUTSIDE, _LEVEL = 5.0, 5.0
-#: Limits of a von Mises concentration: nearly uniform, and 0.001 rad.
-_KAPPA = (1e-3, 1e6)
 #: Variables of a posterior that are not parameters.
 _OTHERS = ("library_index", "sigma")
 
@@ -197,16 +195,19 @@ def moment_matched(prior: Prior, draws: Floats) -> Prior:
     return replace(prior, mu=mean, sigma=sd)
 
 
-def _concentration(resultant: float) -> float:
-    """Return kappa whose von Mises distribution has this mean resultant length, 0 to 1."""
-    low, high = np.log(_KAPPA)
+def _concentration(resultant: float, *, limits: tuple[float, ...] = (1e-3, 1e6)) -> float:
+    """Return kappa whose von Mises distribution has this mean resultant length, 0 to 1.
+
+    ``limits``: of a concentration: nearly uniform, and 0.001 rad.
+    """
+    low, high = np.log(limits)
 
     def excess(log_kappa: float) -> float:
         kappa = np.exp(log_kappa)
         return float(i1e(kappa) / i0e(kappa)) - resultant
 
     if excess(low) >= 0 or excess(high) <= 0:
-        return 0.0 if excess(low) >= 0 else _KAPPA[1]
+        return 0.0 if excess(low) >= 0 else limits[1]
     return float(np.exp(brentq(excess, low, high)))
 
 

@@ -27,18 +27,8 @@ from pbrl_ppl.state import Bools, Floats, Ints
 TARGET_ACCEPTANCE = 0.234
 #: Variance of a Gaussian that draws are proposed from over that of what it stands for.
 _WIDER = 1.3
-#: Share of moves that jump between modes, where there are several.
-_JUMPS = 0.25
-#: Moves under a cheaper density that make one proposal, and moves of the noise for each of the
-#: parameters; along trajectories each runs the filter.
-_INNER, _NOISE, _NOISE_ALONG = 10, 5, 1
-#: Effective share of the particles that a rung leaves, and that a last weighting must leave.
-_RUNG, _WORTH = 0.5, 0.3
-#: Sweeps between two looks at whether particles have forgotten where they were, looks at most, and
-#: the largest correlation with it then.
-_SWEEPS, _LOOKS, _FORGOTTEN = 3, 5, 0.5
-#: Rungs at most.
-_RUNGS = 60
+#: Tests whether particles have forgotten where they were, at most.
+_LOOKS = 5
 
 
 class Target(Protocol):
@@ -168,10 +158,13 @@ class Block:
         each = [mode.log_density(x) for mode in self.modes]
         return np.asarray(logsumexp(each, axis=0) - np.log(len(each)))
 
-    def kind(self, rng: np.random.Generator) -> str:
-        """Return which move is made next."""
+    def kind(self, rng: np.random.Generator, *, jumps: float = 0.25) -> str:
+        """Return which move is made next.
+
+        ``jumps``: share of moves that jump between modes, where there are several.
+        """
         if len(self.modes) > 1:
-            return "jump" if rng.uniform() < _JUMPS else "walk"
+            return "jump" if rng.uniform() < jumps else "walk"
         return "walk" if rng.uniform() < 0.5 else "draw"
 
     def propose(self, x: Floats, kind: str, rng: np.random.Generator) -> tuple[Floats, Floats]:
@@ -348,6 +341,8 @@ class Ensemble:
         *,
         adapt: bool = True,
         noise: bool = True,
+        noise_moves: int = 5,
+        noise_along: int = 1,
     ) -> float:
         """Move all particles by Metropolis sweeps; return the share of accepted moves.
 
@@ -364,10 +359,14 @@ class Ensemble:
             Whether step sizes follow acceptance rates.
         noise : bool
             Whether the noise moves too.
+        noise_moves : int
+            Moves of the noise for each of the parameters.
+        noise_along : int
+            The same along trajectories, where each runs the filter.
         """
         rates = []
         along = not self.space.problem.likelihood.independent
-        moves = 0 if not noise else _NOISE_ALONG if along else _NOISE
+        moves = 0 if not noise else noise_along if along else noise_moves
         for chosen in groups(self.space, len(self.q)):
             self.q[chosen], rate = self._moved(self.q[chosen], target, sweeps, cheap, adapt, moves)
             rates.append(rate)
@@ -413,14 +412,18 @@ class Ensemble:
                 )
         return y, gain, kinds
 
-    def _ahead(self, q: Floats, cheap: Target, adapt: bool) -> tuple[Floats, Floats, list[str]]:
+    def _ahead(
+        self, q: Floats, cheap: Target, adapt: bool, *, inner: int = 10
+    ) -> tuple[Floats, Floats, list[str]]:
         """Return a proposal of several moves under a cheaper density.
 
         They must be as likely in the reverse order: step sizes adapt only at the end.
+
+        ``inner``: moves under a cheaper density that make one proposal.
         """
         begin = here = cheap.columns(q, cheap.look(q))[:, :-1]
         learned: list[tuple[list[str], Floats]] = []
-        for _ in range(_INNER):
+        for _ in range(inner):
             y, gain, kinds = self._proposed(q)
             there = cheap.columns(y, cheap.look(y))[:, :-1]
             accepted, rate = self._accepted(there, here, gain)
@@ -428,7 +431,7 @@ class Ensemble:
             q, here = self._chosen(accepted, y, q), np.where(accepted, there, here)
         if adapt:
             for kinds, rate in learned:
-                self._adapt(kinds, rate / _INNER + TARGET_ACCEPTANCE * (1 - 1 / _INNER))
+                self._adapt(kinds, rate / inner + TARGET_ACCEPTANCE * (1 - 1 / inner))
         with np.errstate(invalid="ignore"):
             return q, np.nan_to_num(begin - here, nan=-np.inf), []
 
@@ -482,9 +485,19 @@ class Ensemble:
         return np.where(accepted[:, None], y, q), np.where(accepted[:, None], there, here)
 
     def settle(
-        self, target: Target, cheap: Target | None = None, looks: int = _LOOKS
+        self,
+        target: Target,
+        cheap: Target | None = None,
+        looks: int = _LOOKS,
+        *,
+        n_sweeps: int = 3,
+        forgotten: float = 0.5,
     ) -> tuple[float, float]:
         """Move until particles have decorrelated from where they were, ``looks`` times at most.
+
+        ``n_sweeps``: sweeps between two tests whether particles have forgotten where they were.
+
+        ``forgotten``: the largest correlation with it then.
 
         Returns
         -------
@@ -495,11 +508,11 @@ class Ensemble:
         """
         begin, rates = self.q.copy(), []
         places = np.concatenate([block.places for block in self.blocks])
-        sweeps = 1 if cheap is not None else _SWEEPS
+        sweeps = 1 if cheap is not None else n_sweeps
         for _ in range(looks):
             rates.append(self.move(target, sweeps, cheap))
             correlation = _correlation(begin[:, places], self.q[:, places])
-            if correlation < _FORGOTTEN:
+            if correlation < forgotten:
                 break
             self.learn()
         return float(np.mean(rates)), correlation
@@ -577,6 +590,7 @@ def anneal(
     *,
     cheap: Target | None = None,
     weigh: bool = False,
+    most: int = 60,
 ) -> Annealed:
     """Take particles of one density to another, in place.
 
@@ -590,6 +604,8 @@ def anneal(
         As of :meth:`Ensemble.move`.
     weigh : bool
         Whether to end where weights suffice for the rest of the path.
+    most : int
+        Rungs at most.
     """
     beta, log_z, rungs, kept = 0.0, 0.0, 0, 1.0
     rates: list[float] = []
@@ -604,10 +620,10 @@ def anneal(
                 " from another mode, or use the method 'laplace'"
             )
         rest = (1.0 - beta) * gap
-        if weigh and (rungs == _RUNGS or _suffices(rest)):
+        if weigh and (rungs == most or _suffices(rest)):
             log_z += float(logsumexp(rest) - np.log(len(rest)))
             return Annealed(beta, log_z, rungs, _mean(rates), kept)
-        step = _step(gap, 1.0 - beta) if rungs < _RUNGS else 1.0 - beta
+        step = _step(gap, 1.0 - beta) if rungs < most else 1.0 - beta
         total = logsumexp(step * gap)
         log_z += float(total - np.log(len(gap)))
         beta = 1.0 if step == 1.0 - beta else beta + step
@@ -628,27 +644,33 @@ def _mean(rates: list[float]) -> float:
     return float(np.mean(rates)) if rates else 1.0
 
 
-def _suffices(log_weight: Floats) -> bool:
-    """Return whether weights are good enough to end with."""
+def _suffices(log_weight: Floats, *, worth: float = 0.3) -> bool:
+    """Return whether weights are good enough to end with.
+
+    ``worth``: effective share that a last weighting must leave.
+    """
     if not np.isfinite(log_weight).sum() > 2:
         return False
     weight, k = smoothed(log_weight[np.isfinite(log_weight)])
-    return bool(k <= MAX_PARETO_K and 1.0 / (weight**2).sum() >= _WORTH * len(log_weight))
+    return bool(k <= MAX_PARETO_K and 1.0 / (weight**2).sum() >= worth * len(log_weight))
 
 
-def _step(gap: Floats, most: float) -> float:
-    """Return the largest step of a path that leaves enough effective particles."""
+def _step(gap: Floats, most: float, *, kept: float = 0.5) -> float:
+    """Return the largest step of a path that leaves enough effective particles.
+
+    ``kept``: effective share of the particles that a rung leaves.
+    """
 
     def share(step: float) -> float:
         weight = np.exp(step * gap - logsumexp(step * gap))
         return float(1.0 / (weight**2).sum() / len(gap))
 
-    if share(most) >= _RUNG:
+    if share(most) >= kept:
         return most
     low, high = 0.0, most
     for _ in range(40):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if share(middle) >= _RUNG else (low, middle)
+        low, high = (middle, high) if share(middle) >= kept else (low, middle)
     return max(low, 1e-6 * most)
 
 

@@ -40,13 +40,6 @@ from pbrl_ppl.state import Floats
 if TYPE_CHECKING:
     import pymc as pm
 
-#: Weighted proposals a draw.
-_PROPOSALS = 1.4
-#: Walkers of a chain of the ensemble.
-_WALKERS = 20
-#: Engine steps below which a cheaper posterior does not pay.
-_LITTLE = 2000
-
 
 @dataclass(frozen=True)
 class Method:
@@ -173,12 +166,15 @@ class SamplerRun:
         return from_groups(data, {})
 
 
-def _importance(job: SamplerRun) -> Any:
-    """Weight proposals from a cheaper posterior; see `importance`."""
+def _importance(job: SamplerRun, *, proposals: float = 1.4) -> Any:
+    """Weight proposals from a cheaper posterior; see `importance`.
+
+    ``proposals``: weighted proposals a draw.
+    """
     chains = job.chains if job.resume is None else group(job.resume, "posterior").sizes["chain"]
     shape, seed = (chains, job.draws), stream(job.seed, job.starts())
     n = chains * job.draws
-    pool = draw_proposals(job.reference(), int(_PROPOSALS * n), seed)
+    pool = draw_proposals(job.reference(), int(proposals * n), seed)
     chosen, k, size = resample(pool.log_weight, n, np.random.default_rng([*seed, 1]))
     phi, sigma = pool.phi[chosen], pool.sigma[chosen]
     values = job.problem.named(phi.reshape(*shape, -1), sigma.reshape(*shape, -1))
@@ -191,11 +187,15 @@ def _importance(job: SamplerRun) -> Any:
     return trace
 
 
-def _metropolis(job: SamplerRun) -> Any:
-    """Run the ensemble as chains; see `ensemble`. A chain is its walkers, one after another."""
+def _metropolis(job: SamplerRun, *, most_walkers: int = 20, little: int = 2000) -> Any:
+    """Run the ensemble as chains; see `ensemble`. A chain is its walkers, one after another.
+
+    ``most_walkers``: walkers of a chain of the ensemble.
+    ``little``: engine steps below which a cheaper posterior does not pay.
+    """
     reference, rng = job.reference(), np.random.default_rng(stream(job.seed, job.starts()))
     problem = reference.space.problem
-    walkers = min(_WALKERS, job.draws)
+    walkers = min(most_walkers, job.draws)
     per_walker = -(-job.draws // walkers)
     chains = job.chains
     if job.resume is None:
@@ -207,7 +207,7 @@ def _metropolis(job: SamplerRun) -> Any:
     ensemble, exact = Ensemble(reference, q, rng), Posterior(reference.space)
     cost = problem.simulator.steps * problem.segments.n * problem.data.horizon
     cheap = None
-    if cost / len(problem.simulator.parts) > _LITTLE:
+    if cost / len(problem.simulator.parts) > little:
         cheap = Posterior.of_few_steps(reference.space)
     tune = -(-job.tune // walkers) * job.thin
     kept, rates = [], []

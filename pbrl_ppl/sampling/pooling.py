@@ -30,16 +30,10 @@ from pbrl_ppl.state import Bools, Floats, wrapped
 _INFORMS = 0.2
 #: Quantiles: the middle, and the ends of the usual interval.
 _MIDDLE, _ENDS = 0.5, ((1 - HDI_PROB) / 2, (1 + HDI_PROB) / 2)
-#: Standard deviation of a uniform angle, and the largest concentration of a von Mises.
-_ANY_ANGLE, _SHARPEST = np.pi / np.sqrt(3), 1e6
-#: Draws for the moments of a wheel's prior, folded to one of its equal descriptions.
-_PRIOR_DRAWS = 4000
+#: Standard deviation of a uniform angle (rad).
+_ANY_ANGLE = np.pi / np.sqrt(3)
 #: The scales on which priors are normal, by their family.
 _SCALES = {"log_normal": "logarithm", "von_mises": "angle"}
-#: The grid of the spread, in units of its prior's scale.
-_LEAST, _MOST, _POINTS = 1e-6, 6.0, 800
-#: A point of the grid that is less probable changes no quantile.
-_NOTHING = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +85,15 @@ class Population:
 
 
 def population(
-    estimate: Floats, sd: Floats, *, centre: float, width: float, spread: float
+    estimate: Floats,
+    sd: Floats,
+    *,
+    centre: float,
+    width: float,
+    spread: float,
+    least: float = 1e-6,
+    most: float = 6.0,
+    points: int = 800,
 ) -> Population:
     """Pool normal likelihoods partially, integrated over mean and spread.
 
@@ -103,6 +105,12 @@ def population(
         Of the kind's mean, normal a priori.
     spread : float
         Scale of the half-normal prior of the standard deviation between robots.
+    least : float
+        Least spread of the grid, in units of its prior's scale.
+    most : float
+        The largest.
+    points : int
+        Points of the grid.
 
     Examples
     --------
@@ -112,7 +120,7 @@ def population(
     (1.05, True)
     """
     informed = np.isfinite(sd)
-    tau = spread * np.geomspace(_LEAST, _MOST, _POINTS)
+    tau = spread * np.geomspace(least, most, points)
     own = np.where(informed, estimate, 0.0)[:, None]
     precision = 1 / (sd[:, None] ** 2 + tau**2)  # zero of those that say nothing
     total = precision.sum(axis=0) + width**-2
@@ -137,9 +145,14 @@ def population(
     return Population(weights, tau, middle, total**-0.5, value, deviation, p_same, informed)
 
 
-def _quantile(weights: Floats, mean: Floats, sd: Floats, q: float) -> float:
-    """Return a quantile of a mixture of normals."""
-    some = weights > _NOTHING
+def _quantile(
+    weights: Floats, mean: Floats, sd: Floats, q: float, *, nothing: float = 1e-9
+) -> float:
+    """Return a quantile of a mixture of normals.
+
+    ``nothing``: a point of the grid that is less probable changes no quantile.
+    """
+    some = weights > nothing
     weights, mean, sd = weights[some] / weights[some].sum(), mean[some], sd[some]
     low, high = float((mean - 9 * sd).min()), float((mean + 9 * sd).max())
 
@@ -334,12 +347,15 @@ def _drawn(
     return result
 
 
-def _priors(layout: Layout) -> dict[str, Prior]:
-    """Return priors by label; those of a wheel are of the chosen one of its equal descriptions."""
+def _priors(layout: Layout, *, n_draws: int = 4000) -> dict[str, Prior]:
+    """Return priors by label; those of a wheel are of the chosen one of its equal descriptions.
+
+    ``n_draws``: draws for the moments of a wheel's prior, folded to one of its equal descriptions.
+    """
     priors = dict(zip(layout.labels, layout.priors, strict=True))
     for wheel in wheels(layout):
         if wheel.period < 4:
-            drawn = prior_draws(wheel.priors, np.random.default_rng(0), _PRIOR_DRAWS)
+            drawn = prior_draws(wheel.priors, np.random.default_rng(0), n_draws)
             columns = layout.columns(dict(zip(wheel.labels, drawn.T, strict=True)))
             folded = nearest(layout, columns)[:, list(wheel.places)].T
             for label, x in zip(wheel.labels, folded, strict=True):
@@ -403,12 +419,17 @@ def _pooled_angles(
     return found, reference
 
 
-def _next_prior(prior: Prior, found: Population, reference: float) -> dict[str, float]:
-    """Return hyper-parameters with the median and 94 % interval of a robot without data."""
+def _next_prior(
+    prior: Prior, found: Population, reference: float, *, sharpest: float = 1e6
+) -> dict[str, float]:
+    """Return hyper-parameters with the median and 94 % interval of a robot without data.
+
+    ``sharpest``: the largest concentration of a von Mises.
+    """
     middle, low, high = (found.next(q) for q in (_MIDDLE, *_ENDS))
     sigma = (high - low) / float(np.diff(norm.ppf(_ENDS))[0])
     if prior.family == "von_mises":
-        return {"mu": float(wrapped(middle + reference)), "kappa": min(sigma**-2, _SHARPEST)}
+        return {"mu": float(wrapped(middle + reference)), "kappa": min(sigma**-2, sharpest)}
     lower, upper = (-np.inf, np.inf) if prior.family == "log_normal" else prior.support
     return {"mu": float(np.clip(middle, lower - 5 * sigma, upper + 5 * sigma)), "sigma": sigma}
 

@@ -20,7 +20,6 @@ MOST_DRAWS = 99
 LEVELS = (0.5, 0.9)
 #: How often a right sampler fails the uniformity tests of one calibration; its coverages likewise.
 FALSE_ALARM = 0.01
-_BINS, _LEAST_A_BIN = (20, 10, 5, 4, 2), 5
 
 
 def rank(draws: Floats, truth: float, effective: float) -> tuple[int, int]:
@@ -70,9 +69,13 @@ def uniformity(position: Floats) -> float:
     return float(chisquare(np.histogram(position, bins(len(position)), (0.0, 1.0))[0]).pvalue)
 
 
-def bins(n: int) -> int:
-    """Return the number of bins for n positions: a divisor of 100, with 5 or more in each."""
-    return next((b for b in _BINS if n >= _LEAST_A_BIN * b), _BINS[-1])
+def bins(n: int, *, bins: tuple[int, ...] = (20, 10, 5, 4, 2), a_bin: int = 5) -> int:
+    """Return the number of bins for n positions: a divisor of 100, with 5 or more in each.
+
+    ``bins``: numbers of bins, the most first.
+    ``a_bin``: ranks a bin, at least.
+    """
+    return next((b for b in bins if n >= a_bin * b), bins[-1])
 
 
 def holm(p_values: Floats) -> Floats:

@@ -41,11 +41,6 @@ from pbrl_ppl.state import STATE, Floats
 #: One replication's numbers, by name, each a list over the parameters.
 Record = dict[str, list[float]]
 
-#: Most repetitions of a fit with fewer than 99 effective draws, and the factor of its draws.
-_AGAIN, _LONGER = 2, 4
-#: Most draws from the prior for each one that the engine can simulate.
-_MOST_REDRAWN = 50
-
 
 #: Warnings of a fit that are ignored in replications.
 _KNOWN = (
@@ -72,7 +67,9 @@ class Truth(NamedTuple):
     values: Floats
 
 
-def draw_truths(design: Problem, n: int, seed: int, colour: float = 0.0) -> tuple[list[Truth], int]:
+def draw_truths(
+    design: Problem, n: int, seed: int, colour: float = 0.0, *, most_redrawn: int = 50
+) -> tuple[list[Truth], int]:
     """Draw parameters from the model's prior with PyMC, and what is measured with them.
 
     Next states are drawn by Eq. 13, and whole trajectories with process noise; simulations from the
@@ -88,6 +85,8 @@ def draw_truths(design: Problem, n: int, seed: int, colour: float = 0.0) -> tupl
         Of the draws.
     colour : float
         Correlation of neighbouring rows' errors, of simulations.
+    most_redrawn : int
+        Most draws from the prior for each one that the engine can simulate.
 
     Returns
     -------
@@ -108,7 +107,7 @@ def draw_truths(design: Problem, n: int, seed: int, colour: float = 0.0) -> tupl
     names = [*(block.name for block in design.layout.blocks), *design.noise_variables]
     names += [] if whole else ["next_state"]
     total = n
-    while total <= _MOST_REDRAWN * n:
+    while total <= most_redrawn * n:
         drawn = prior_predictive_draws(model, names, total, seed)
         phi = design.layout.to_vectors(drawn, total)
         sigma = np.hstack([drawn[name].reshape(total, -1) for name in design.noise_variables])
@@ -122,7 +121,7 @@ def draw_truths(design: Problem, n: int, seed: int, colour: float = 0.0) -> tupl
         total *= 2
     raise FitError(
         f"calibrate: {possible.sum()} of {len(possible)} draws from the prior can be simulated,"
-        f" expected at least 1 in {_MOST_REDRAWN}; make the scene's prior narrower"
+        f" expected at least 1 in {most_redrawn}; make the scene's prior narrower"
     )
 
 
@@ -214,7 +213,15 @@ def _remeasured(design: Problem, observed: Floats) -> Problem:
     return problem.with_likelihood(prior=design.likelihood.prior)
 
 
-def replicate(design: Problem, truth: Truth, seed: int, settings: Mapping[str, Any]) -> Record:
+def replicate(
+    design: Problem,
+    truth: Truth,
+    seed: int,
+    settings: Mapping[str, Any],
+    *,
+    most_repeats: int = 2,
+    longer: int = 4,
+) -> Record:
     """Fit what was simulated and rank the truth among the posterior draws.
 
     Parameters
@@ -227,6 +234,10 @@ def replicate(design: Problem, truth: Truth, seed: int, settings: Mapping[str, A
         Of the fit.
     settings : mapping
         Arguments of :func:`pbrl_ppl.fit`.
+    most_repeats : int
+        Most repetitions of a fit with fewer than 99 effective draws.
+    longer : int
+        The factor of its draws.
 
     Returns
     -------
@@ -236,7 +247,7 @@ def replicate(design: Problem, truth: Truth, seed: int, settings: Mapping[str, A
     # bodies that met in the simulation are simulated in one world
     problem = simulated(design, truth.values).joined(truth.phi[None], truth.sigma[None])
     settings = {"cores": 1, **settings}
-    for again in range(_AGAIN + 1):
+    for again in range(most_repeats + 1):
         with warnings.catch_warnings():
             # convergence is in the result; the other warnings are about simulated data
             for kind in _KNOWN:
@@ -254,9 +265,9 @@ def replicate(design: Problem, truth: Truth, seed: int, settings: Mapping[str, A
         }
         # of folded draws: a change between equal descriptions of a wheel is no failure to mix
         r_hat, ess = convergence(from_groups({"posterior": xr.Dataset(data)}, {}))
-        if min(ess.values()) >= MOST_DRAWS or again == _AGAIN:
+        if min(ess.values()) >= MOST_DRAWS or again == most_repeats:
             break
-        settings |= {key: _LONGER * settings[key] for key in ("draws", "tune")}
+        settings |= {key: longer * settings[key] for key in ("draws", "tune")}
     problem = problem_of(idata, {attached.effect for attached in problem.physics.effects})
     residual = problem.residual(truth.phi)
     of_truth = problem.log_density(residual, truth.sigma, truth.phi).sum(keepdims=True)

@@ -12,16 +12,18 @@ from pbrl_ppl.modes import Mode, Space
 from pbrl_ppl.posterior import group, parameter_draws
 from pbrl_ppl.state import Floats
 
-#: Starts are this many posterior standard deviations from the mode.
-_AWAY = 2.0
 
+def dispersed(
+    mode: Mode, rng: np.random.Generator, chains: int, *, away: float = 2.0
+) -> list[dict[str, Floats]]:
+    """Draw starts about two posterior standard deviations from the mode, one a chain.
 
-def dispersed(mode: Mode, rng: np.random.Generator, chains: int) -> list[dict[str, Floats]]:
-    """Draw starts about two posterior standard deviations from the mode, one a chain."""
+    ``away``: posterior standard deviations from the mode.
+    """
     space = Space.of(mode)
     mean, covariance = space.laplace(mode)
     factor = np.linalg.cholesky(covariance + 1e-12 * np.diag(np.diag(covariance)))
-    q = mean + _AWAY * rng.standard_normal((chains, len(mean))) @ factor.T
+    q = mean + away * rng.standard_normal((chains, len(mean))) @ factor.T
     return [mode.problem.named(space.possible(one), space.split(one)[1]) for one in q]
 
 
