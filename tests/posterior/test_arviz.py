@@ -29,8 +29,8 @@ def idata(tmp_path_factory):
 
 
 def aligned(idata):
-    """Return the draws that have predictions."""
-    return idata.sel(draw=idata["posterior_predictive"]["draw"].values)
+    """Return draws that have predictions: of so few, a fifth is the tail whatever their ESS."""
+    return idata.sel(draw=idata["posterior_predictive"]["draw"].values[:80])
 
 
 @pytest.fixture(scope="module")
@@ -252,7 +252,7 @@ def test_arviz_s_loo_pit_of_every_number(idata) -> None:
     whole = from_groups(data, idata.attrs)
     each = by_number(whole)
     named = {} if DATATREE else {"y": "next_state"}
-    theirs = az.loo_pit(each, **named)
+    theirs = az.loo_pit(by_number(aligned(whole)), **named)
     theirs = theirs["next_state"].values if DATATREE else theirs
     ours = loo_pit(aligned(whole)).values.ravel()
     assert theirs.shape == (71,)
