@@ -195,10 +195,10 @@ class Agent(ABC):
             end = rollout(model.after(self._last), state, self._ahead)[:, -1]
             if float(task.goal.shortfall(task.scene, end).mean()) <= 1.0:  # false for NaN
                 return self._ahead
-        found = plan(model, state, task.goal, task.actions, before=self._last, **self._options)
-        if found.stopped == "interrupted":  # the search catches it
+        planned = plan(model, state, task.goal, task.actions, before=self._last, **self._options)
+        if planned.stopped == "interrupted":  # the search catches it
             raise KeyboardInterrupt
-        return found.wrenches if found.reached else found.wrenches[:1]
+        return planned.wrenches if planned.reached else planned.wrenches[:1]
 
 
 class PhysicsAgent(Agent):

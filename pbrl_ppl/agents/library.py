@@ -142,7 +142,7 @@ class LibraryAgent(PhysicsAgent):
 
     def _data(self, name: str) -> tuple[Floats, Floats, Floats]:
         """Return states, wrenches and next states of a body or class."""
-        state, action, after = (np.array(each) for each in zip(*self._seen[name], strict=True))
+        state, action, after = (np.array(column) for column in zip(*self._seen[name], strict=True))
         return state, action, after
 
     def _phi(self, layout: Layout) -> Floats:
@@ -168,8 +168,10 @@ class LibraryAgent(PhysicsAgent):
             # as many draws as the paper's schedule gives
             _, _, index, _, _ = choose_from_library(problem, 400, 1, self.seed)
         share = np.bincount(index[..., 0].ravel(), minlength=len(among.names)) / index[..., 0].size
-        found = dict(zip(among.names, share.tolist(), strict=True))
-        self._probability[name] = np.array([found.get(each, 0.0) for each in self.library.names])
+        shares = dict(zip(among.names, share.tolist(), strict=True))
+        self._probability[name] = np.array(
+            [shares.get(set_name, 0.0) for set_name in self.library.names]
+        )
         self._choice[name] = int(self._probability[name].argmax())
         self._fitted[name], self.fits = len(state), self.fits + 1
 
@@ -179,8 +181,8 @@ def _restricted(library: ParameterLibrary, scene: Scene, name: str) -> Parameter
     wanted = {block.name for block in build_layout(scene).blocks}
     prior = dict(zip(library.names, library.prior(name).tolist(), strict=True))
     sets = {
-        each: {key: value for key, value in dict(values).items() if key in wanted}
-        for each, values in library.sets
-        if prior[each] > 0
+        label: {key: value for key, value in dict(values).items() if key in wanted}
+        for label, values in library.sets
+        if prior[label] > 0
     }
-    return ParameterLibrary(sets, {each: prior[each] for each in sets})
+    return ParameterLibrary(sets, {label: prior[label] for label in sets})

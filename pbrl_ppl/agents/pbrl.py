@@ -127,7 +127,7 @@ class PBRLAgent(PhysicsAgent):
         """Return whether new transitions inform: there are many, or errors above so many sigma."""
         if len(self._transitions) == self._fitted or self._dynamics is None:
             return len(self._transitions) > self._fitted
-        state, inputs, after = (each[self._fitted :] for each in self._data())
+        state, inputs, after = (array[self._fitted :] for array in self._data())
         action, previous = inputs[..., :3], inputs[..., 3:6]
         error = prediction_errors(self._dynamics, state, action, after, previous)
         if (error <= self._negligible).all():
@@ -140,7 +140,7 @@ class PBRLAgent(PhysicsAgent):
 
     def _data(self) -> tuple[Floats, Floats, Floats]:
         """Return states, inputs as in `pbrl_ppl.state.INPUT`, and next states."""
-        state, action, after = (np.array(each) for each in zip(*self._transitions, strict=True))
+        state, action, after = (np.array(column) for column in zip(*self._transitions, strict=True))
         before = np.concatenate([np.zeros_like(action[:1]), action[:-1]])
         begin = self.task.scene.time_step * np.arange(len(action))
         clock = np.stack([0 * begin, begin, begin + self.task.scene.time_step], axis=1)
@@ -184,12 +184,12 @@ class PBRLAgent(PhysicsAgent):
 
         self.looks, self._looked = self.looks + 1, len(free)
         level = false_alarm / (self.looks * (self.looks + 1))
-        found, mode = select_effects(
+        selected, mode = select_effects(
             search, self._declared, self.added, self._catalogue, level=level, floor=self._negligible
         )
         known = {revision.attached: revision.transitions for revision in self.added}
         self.added = tuple(
-            replace(each, transitions=known.get(each.attached, len(free))) for each in found
+            replace(law, transitions=known.get(law.attached, len(free))) for law in selected
         )
         return mode if free.all() else None
 
@@ -219,7 +219,7 @@ class PBRLAgent(PhysicsAgent):
 
     def _fit(self) -> None:
         start = self._revised() if self.revise else None
-        effects = (*self._declared, *(each.attached for each in self.added))
+        effects = (*self._declared, *(law.attached for law in self.added))
         model = self._model(effects)
         start = start or self._start(effects, model.problem)
         method = "map" if self.draws is None else "laplace"

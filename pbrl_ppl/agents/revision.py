@@ -111,7 +111,7 @@ def select_effects(
     Mode
         Mode of the model with them.
     """
-    tried = tuple(each for each in catalogue if not isinstance(each.stage, Structure | Noise))
+    tried = tuple(effect for effect in catalogue if not isinstance(effect.stage, Structure | Noise))
     selection = _Selection(search, tried, level, floor)
     mode, chosen = search((*declared, *(revision.attached for revision in added))), added
     for revision in added:

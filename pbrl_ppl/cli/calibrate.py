@@ -62,7 +62,7 @@ def calibrate(
             likelihood = "trajectories" if trajectories else "transitions"
         check_can_make(output)
         declared, (design,) = reading.read(scene, [history])
-        declared, own = reading.with_effects(declared)
+        declared, effects = reading.with_effects(declared)
         import pbrl_ppl.reporting as report
         from pbrl_ppl.files import write_atomically
         from pbrl_ppl.sampling import calibration
@@ -70,9 +70,9 @@ def calibrate(
         with _pool(jobs) as executor:
             try:
                 result = calibration.calibrate(
-                    declared, design, effects=own, likelihood=likelihood, colour=colour, seed=seed,
-                    draws=draws, replications=replications, folder=output, executor=executor,
-                    progress=not quiet,
+                    declared, design, effects=effects, likelihood=likelihood, colour=colour,
+                    seed=seed, draws=draws, replications=replications, folder=output,
+                    executor=executor, progress=not quiet,
                 )  # fmt: skip
             except PbrlError:
                 raise

@@ -91,19 +91,19 @@ def check(
             for sentence in checked.summary:
                 console.print(f"prior: {sentence}", soft_wrap=True)
     if as_json:
-        found = checked and {"passed": not checked.sentences, "sentences": checked.summary}
+        prior_check = checked and {"passed": not checked.sentences, "sentences": checked.summary}
         print_json(
             {
                 **contents,
                 "trajectories": loaded.n_trajectories,
                 "transitions": loaded.n_transitions,
                 "missing": missing,
-                "velocities_not_used": [vars(each) for each in unused],
+                "velocities_not_used": [vars(column) for column in unused],
                 "unit_mismatches": unit_mismatches(loaded),
                 "mass_contradictions": masses,
                 "typical": {body.name: dict(body.typical) for body in sized.dynamic},
                 "default_priors": priors,
-                "prior": found,
+                "prior": prior_check,
             }
         )
 
@@ -168,8 +168,8 @@ def _priors_table(priors: dict[str, dict[str, str]]) -> Table:
     table.add_column("parameter")
     for body in priors:
         table.add_column(body)
-    for name in dict.fromkeys(name for own in priors.values() for name in own):
-        table.add_row(name, *(own.get(name, "") for own in priors.values()))
+    for name in dict.fromkeys(name for priors_of in priors.values() for name in priors_of):
+        table.add_row(name, *(priors_of.get(name, "") for priors_of in priors.values()))
     return table
 
 
@@ -209,7 +209,7 @@ def criticise(
             )
         else:
             check_history(declared, loaded, loaded.segments(1))
-            found = criticism.criticise(
+            attribution = criticism.criticise(
                 declared, loaded, catalogue=catalogue, seed=seed, progress=progress
             )
     if simulate:
@@ -218,17 +218,17 @@ def criticise(
     if as_json:
         print_json(
             {
-                "candidates": [vars(candidate) for candidate in found.candidates],
-                "mode": found.mode,
-                "unexplained_acceleration": found.unexplained_acceleration,
-                "substeps": found.substeps,
+                "candidates": [vars(candidate) for candidate in attribution.candidates],
+                "mode": attribution.mode,
+                "unexplained_acceleration": attribution.unexplained_acceleration,
+                "substeps": attribution.substeps,
             }
         )
         return
     print_table(
         "what the declared model might lack, by the score test",
         ["effect", "<body", "S", "dof", "p (corrected)", "<first estimate"],
-        map(_candidate_row, found.candidates),
+        map(_candidate_row, attribution.candidates),
     )
     typer.echo(
         "small p: the residual looks like that effect's signature; close-loop says whether it is"
@@ -236,28 +236,33 @@ def criticise(
     )
 
 
-def _print_laws(found: Attribution, as_json: bool) -> None:
+def _print_laws(attribution: Attribution, as_json: bool) -> None:
     """Print the laws that simulation names, and the simulation error."""
     if as_json:
-        print_json({**vars(found), "laws": [vars(law) for law in found.laws]})
+        print_json({**vars(attribution), "laws": [vars(law) for law in attribution.laws]})
         return
     print_table(
         "effects that the simulation error of trajectories shows",
         ["effect", "<body", "nats", "share of error", "<size"],
         (
             [law.effect, law.body, f"{law.nats:.0f}", f"{100 * law.share:.2g} %", _sizes(law)]
-            for law in found.laws
+            for law in attribution.laws
         ),
     )
     print_table(
-        f"simulation error over {found.seconds:.3g} s (SI)",
+        f"simulation error over {attribution.seconds:.3g} s (SI)",
         ["state", "declared", "with them", "autocorrelation (rows)"],
         (
-            [name, f"{error:.3g}", f"{found.after[name]:.3g}", f"{found.correlated[name]:.1f}"]
-            for name, error in found.before.items()
+            [
+                name,
+                f"{error:.3g}",
+                f"{attribution.after[name]:.3g}",
+                f"{attribution.correlated[name]:.1f}",
+            ]
+            for name, error in attribution.before.items()
         ),
     )
-    for sentence in found.sentences:
+    for sentence in attribution.sentences:
         typer.echo(sentence)
 
 
@@ -292,19 +297,19 @@ def doctor(as_json: options.AsJson = False, quiet: options.Quiet = False) -> Non
 
         from pbrl_ppl.posterior import versions
 
-        found: dict[str, Any] = {"versions": versions(), "platform": platform.platform()}
+        facts: dict[str, Any] = {"versions": versions(), "platform": platform.platform()}
         progress("trying the engine")
-        found["engine"] = _engine()
-        found["threads"] = {
+        facts["engine"] = _engine()
+        facts["threads"] = {
             "processors": _processors(),
             **{
                 str(pool["user_api"]): int(pool["num_threads"])
                 for pool in threadpoolctl.threadpool_info()
             },
         }
-        found["package"] = str(Path(__file__).parents[1])
-    wrong = found["engine"]["difference"] > 1e-9  # the paths agree to rounding
-    print_result(as_json, found | {"ok": not wrong}, _doctor_lines(found))
+        facts["package"] = str(Path(__file__).parents[1])
+    wrong = facts["engine"]["difference"] > 1e-9  # the paths agree to rounding
+    print_result(as_json, facts | {"ok": not wrong}, _doctor_lines(facts))
     if wrong:
         typer.echo("error: the compiled engine loop is wrong here; please report this", err=True)
         raise typer.Exit(FAILED)
@@ -340,15 +345,15 @@ def _engine() -> dict[str, Any]:
     }
 
 
-def _doctor_lines(found: dict[str, Any]) -> list[str]:
+def _doctor_lines(facts: dict[str, Any]) -> list[str]:
     """Return what was found as lines of text."""
-    engine = found["engine"]
+    engine = facts["engine"]
     slow = "" if engine["path"] == "compiled" else ": a Python loop, slow; no compiled one here"
-    shown = found["versions"] | {
-        "platform": found["platform"],
+    shown = facts["versions"] | {
+        "platform": facts["platform"],
         "engine": f"{engine['path']}{slow}, {engine['microseconds_per_transition']:.1f} us a"
         f" transition, {engine['difference']:.1g} from the plain loop",
-        "threads": ", ".join(f"{number} {name}" for name, number in found["threads"].items()),
-        "package": found["package"],
+        "threads": ", ".join(f"{number} {name}" for name, number in facts["threads"].items()),
+        "package": facts["package"],
     }
     return [f"{name:12} {text}" for name, text in shown.items()]

@@ -81,15 +81,15 @@ def close_logs(
                 trim=settings["trim"],
             )
     effects = loops.effects().drop_duplicates(["name", "effect", "body"])
-    found = [
-        f"{effect}[{body}]: {', '.join(each['name'])}"
-        for (effect, body), each in effects.groupby(["effect", "body"], sort=False)
+    lines = [
+        f"{effect}[{body}]: {', '.join(rows['name'])}"
+        for (effect, body), rows in effects.groupby(["effect", "body"], sort=False)
     ]
     page = output / "index.html"
     print_result(
         as_json,
         {"page": page, "logs": loops.rows},
-        [*found, report.in_words(loops.rows), f"page: {page}"],
+        [*lines, report.in_words(loops.rows), f"page: {page}"],
     )
     if loops.failed:
         raise typer.Exit(FAILED)

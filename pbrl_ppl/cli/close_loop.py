@@ -136,12 +136,12 @@ def _finished(
     """
     from pbrl_ppl import criticism
 
-    found: list[str] = []
+    names: list[str] = []
 
     def noted(stage: str) -> None:
         progress(stage)
         if stage.startswith(_FOUND):
-            found.append(stage)
+            names.append(stage)
 
     try:
         return criticism.close_loop(scene, *histories, progress=noted, **settings), False
@@ -149,7 +149,7 @@ def _finished(
         progress("interrupted: Gaussians at the modes instead; once more ends without a report")
         return interrupt.finish(), True
     except KeyboardInterrupt:
-        so_far = f"so far: {'; '.join(found)}; " if found else ""
+        so_far = f"so far: {'; '.join(names)}; " if names else ""
         advice = "--method laplace, fewer rows or a coarser log take less time"
         raise typer.Exit(interrupted(f"nothing was written; {so_far}{advice}")) from None
 

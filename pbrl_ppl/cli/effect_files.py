@@ -38,16 +38,16 @@ def own_effects(paths: Sequence[Path] | None) -> tuple[Effect, ...]:
     """
     from pbrl_ppl.effects import catalogue
 
-    found: dict[str, Effect] = {}
+    effects: dict[str, Effect] = {}
     for path in paths or ():
         for effect in _defined(path):
             if effect in catalogue:  # imported by the file
                 continue
-            if found.setdefault(effect.name, effect) is not effect:
+            if effects.setdefault(effect.name, effect) is not effect:
                 raise EffectError(
                     f"effect file {path}: there are two effects {effect.name}; rename one"
                 )
-    return tuple(found.values())
+    return tuple(effects.values())
 
 
 def with_catalogue(paths: Sequence[Path] | None) -> tuple[Effect, ...]:
@@ -58,7 +58,7 @@ def with_catalogue(paths: Sequence[Path] | None) -> tuple[Effect, ...]:
 
 
 def added_effects(
-    scene: Scene, own: Sequence[Effect]
+    scene: Scene, effects: Sequence[Effect]
 ) -> tuple[Scene, tuple[Effect | Attached, ...]]:
     """Return a scene without its own effects' names, and these effects on their bodies.
 
@@ -66,10 +66,10 @@ def added_effects(
     it applies to.
     """
     added: list[Effect | Attached] = []
-    for effect in own:
+    for effect in effects:
         declared = [body.name for body in scene.bodies if effect.name in body.effects]
         added += [effect.on(body) for body in declared] or [effect]
-    names = {effect.name for effect in own}
+    names = {effect.name for effect in effects}
     bodies = tuple(
         replace(body, effects=tuple(name for name in body.effects if name not in names))
         for body in scene.bodies
@@ -96,7 +96,7 @@ def _defined(path: Path) -> list[Effect]:
         raise EffectError(
             f"effect file {path}{_line(error, path)}: {type(error).__name__}: {error}; fix the file"
         ) from error
-    effects = [*dict.fromkeys(each for each in names.values() if isinstance(each, Effect))]
+    effects = [*dict.fromkeys(value for value in names.values() if isinstance(value, Effect))]
     if not effects:
         raise EffectError(
             f"effect file {path}: it has no Effect at module level, such as tether ="

@@ -99,7 +99,7 @@ def fit(
             )
         progress("reading the scene and the history")
         declared, (loaded,) = reading.read(scene, [history])
-        declared, own = reading.with_effects(declared)
+        declared, effects = reading.with_effects(declared)
         progress("loading the sampler")
         from pbrl_ppl import sampling
         from pbrl_ppl.physics import check_history
@@ -110,7 +110,7 @@ def fit(
         progress("looking for the mode, then sampling")
         try:
             model = sampling.physics_model(
-                declared, loaded, own, likelihood=likelihood, horizon=horizon, nu=nu, seed=seed,
+                declared, loaded, effects, likelihood=likelihood, horizon=horizon, nu=nu, seed=seed,
                 sigma="scalar" if scalar else "per_dimension",
                 around=None if likelihood == "transitions" else earlier,
             )  # fmt: skip

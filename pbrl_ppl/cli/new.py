@@ -121,7 +121,7 @@ def recorded(
             " correct them, or give --time-step; times since the row before are a column duration"
         )
     step = float(f"{step:.6g}")
-    found, said = propose(table, layout, step)
+    proposed, said = propose(table, layout, step)
     measured = table.reindex(columns=["x", "y", "theta"]).notna().groupby(table["body"]).any()
     angles = measured["theta"] & ~measured["x"] & ~measured["y"]
     hung = tuple(name for name in names if angles.get(name, False))
@@ -130,7 +130,7 @@ def recorded(
             f"only the angle of {' and '.join(hung)} was measured: hung by the upper end; correct"
             " the places of [[joint]]"
         )
-    return Recorded(tuple(names), step, None if plain and not said else found, said, hung)
+    return Recorded(tuple(names), step, None if plain and not said else proposed, said, hung)
 
 
 def _names(frame: pd.DataFrame, columns: Mapping[str, str | float]) -> list[str]:
@@ -205,16 +205,16 @@ def new(
             raise SceneError("--from copies a model as it is: leave the other options, or --from")
         if history is None and (columns or units):
             raise SceneError("--columns and --units say how a recording is read: add --history")
-        found: Recorded | None = None
+        recording: Recorded | None = None
         try:
             if model is not None:
                 written = _copied(model, scene, overwrite)
             else:
                 shapes = outlines(bodies or [])
                 if history is not None:
-                    found = recorded(history, layout, [*shapes], time_step=time_step)
-                answers = _asked(shapes, side, time_step, history, found)
-                text = scene_text(answers, found)
+                    recording = recorded(history, layout, [*shapes], time_step=time_step)
+                answers = _asked(shapes, side, time_step, history, recording)
+                text = scene_text(answers, recording)
                 Scene.from_toml(text)  # written whole and valid, or not at all
                 write_text(scene, text)
                 written = [scene]
@@ -225,7 +225,7 @@ def new(
     elif not quiet:
         for path in written:
             typer.echo(f"wrote {path}")
-        for sentence in found.said if found else ():
+        for sentence in recording.said if recording else ():
             typer.echo(f"{history}: {sentence}")
         if model is None:
             typer.echo(f"joints, walls, wheels, known masses: uncomment them in {scene}")
@@ -235,15 +235,15 @@ def new(
         typer.echo(f"{begin}: {shlex.join(command)}")
 
 
-def _topics(given: list[str] | None) -> dict[str, tuple[str, ...]]:
+def _topics(texts: list[str] | None) -> dict[str, tuple[str, ...]]:
     """Return the topics of each body from ``--topic NAME=TOPIC,...``."""
-    found = {}
-    for text in given or ():
+    topics = {}
+    for text in texts or ():
         name, _, listed = text.partition("=")
         if not (name and listed):
             raise SceneError(f"--topic: {text!r} is not NAME=TOPIC, such as cart=/odom")
-        found[name] = tuple(listed.split(","))
-    return found
+        topics[name] = tuple(listed.split(","))
+    return topics
 
 
 def models_folder() -> Path:
@@ -353,7 +353,7 @@ def scene_text(answers: Answers, found: Recorded | None = None) -> str:
     )  # fmt: skip
 
 
-def outlines(given: Iterable[str]) -> dict[str, Shape]:
+def outlines(texts: Iterable[str]) -> dict[str, Shape]:
     """Return shapes by name from ``NAME=box:LENGTHxWIDTH`` and the like.
 
     Examples
@@ -362,7 +362,7 @@ def outlines(given: Iterable[str]) -> dict[str, Shape]:
     (0.03, 0.2)
     """
     shapes: dict[str, Shape] = {}
-    for text in given:
+    for text in texts:
         name, _, outline = text.rpartition("=")
         kind, _, rest = outline.partition(":")
         if name in shapes:

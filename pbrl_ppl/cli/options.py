@@ -56,7 +56,7 @@ def commands() -> list[Command]:
     package = importlib.import_module("pbrl_ppl.cli")
     for module in pkgutil.iter_modules(package.__path__):
         importlib.import_module(f"pbrl_ppl.cli.{module.name}")
-    return sorted(_COMMANDS.values(), key=lambda each: each.rank)
+    return sorted(_COMMANDS.values(), key=lambda command: command.rank)
 
 
 def _with_fields(function: Callable[..., None]) -> Callable[..., None]:
@@ -263,24 +263,24 @@ def command_line(context: typer.Context) -> str:
         elif value is True:
             options.append(parameter.opts[0])
         else:
-            for each in value if isinstance(value, (list, tuple)) else (value,):
-                options += [parameter.opts[0], str(each)]
+            for item in value if isinstance(value, (list, tuple)) else (value,):
+                options += [parameter.opts[0], str(item)]
     return shlex.join([*words, *options])
 
 
-def noise_of(given: list[str] | None) -> dict[str, float]:
+def noise_of(texts: list[str] | None) -> dict[str, float]:
     """Return standard deviations by state dimension from ``--noise``."""
-    return dict(pairs(given, "--noise", "x=0.002", float))
+    return dict(pairs(texts, "--noise", "x=0.002", float))
 
 
-def columns_of(given: list[str] | None) -> dict[str, str | float]:
+def columns_of(texts: list[str] | None) -> dict[str, str | float]:
     """Return column names, or numbers, from options such as ``x=pos_x,force_x=0``."""
-    return dict(pairs(given, "--columns", "x=pos_x", _number_or_name))
+    return dict(pairs(texts, "--columns", "x=pos_x", _number_or_name))
 
 
-def units_of(given: list[str] | None) -> dict[str, str]:
+def units_of(texts: list[str] | None) -> dict[str, str]:
     """Return units from options such as ``x=mm,theta=deg``."""
-    return dict(pairs(given, "--units", "x=mm", str))
+    return dict(pairs(texts, "--units", "x=mm", str))
 
 
 def _number_or_name(text: str) -> str | float:
@@ -292,20 +292,20 @@ def _number_or_name(text: str) -> str | float:
 
 
 def pairs(
-    given: list[str] | None, option: str, example: str, kind: Callable[[str], T]
+    texts: list[str] | None, option: str, example: str, kind: Callable[[str], T]
 ) -> list[tuple[str, T]]:
     """Return names and values from ``NAME=VALUE,...``."""
-    found = []
-    for item in ",".join(given).split(",") if given else ():
+    pairs_read = []
+    for item in ",".join(texts).split(",") if texts else ():
         name, _, value = (part.strip() for part in item.partition("="))
         try:
             if not (name and value):
                 raise ValueError
-            found.append((name, kind(value)))
+            pairs_read.append((name, kind(value)))
         except ValueError:
             message = f"{item!r} is not NAME=VALUE, such as {example}"
             raise typer.BadParameter(message, param_hint=option) from None
-    return found
+    return pairs_read
 
 
 def pose(text: str, bodies: Sequence[str], option: str) -> tuple[str, list[float | None]]:
@@ -329,10 +329,10 @@ def pose(text: str, bodies: Sequence[str], option: str) -> tuple[str, list[float
     return name.strip(), values
 
 
-def starts_of(given: list[str] | None, bodies: Sequence[str]) -> dict[str, list[float]]:
+def starts_of(texts: list[str] | None, bodies: Sequence[str]) -> dict[str, list[float]]:
     """Return the start of each body from ``--start``."""
     starts: dict[str, list[float]] = {}
-    for text in given or ():
+    for text in texts or ():
         name, values = pose(text, bodies, "--start")
         starts[name] = [value for value in values if value is not None]
         if len(starts[name]) < len(values):

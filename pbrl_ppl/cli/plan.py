@@ -91,14 +91,14 @@ def plan(
             "angle_tolerance": angle_tolerance,
             "contact_penalty": contact_penalty,
         }
-        given = {name: value for name, value in costs.items() if value is not None}
+        weights = {name: value for name, value in costs.items() if value is not None}
         if goal and goal[0].endswith(".toml"):
-            if len(goal) > 1 or given:
+            if len(goal) > 1 or weights:
                 raise GoalError("--goal: a file has the whole goal; drop the other options of it")
             wanted = Goal.load(goal[0])
         else:
             targets = dict(options.pose(text, bodies, "--goal") for text in goal or ())
-            wanted = Goal.of(targets, **given)
+            wanted = Goal.of(targets, **weights)
         starts = options.starts_of(start, bodies)
         allowed = None if actions is None else ActionSet.load(actions)
         limit: dict[str, Any] = {} if nodes is None else {"nodes": nodes}
@@ -229,10 +229,10 @@ def suggest(
         raise typer.Exit(FAILED)
 
 
-def _bounds(given: Sequence[str], bodies: Sequence[str]) -> dict[str, dict[str, list[float]]]:
+def _bounds(texts: Sequence[str], bodies: Sequence[str]) -> dict[str, dict[str, list[float]]]:
     """Return bounds from ``BODY.NAME=LOW,HIGH``; the body may be left out if there is one."""
-    found: dict[str, dict[str, list[float]]] = {}
-    for text in given:
+    bounds: dict[str, dict[str, list[float]]] = {}
+    for text in texts:
         place, _, numbers = text.partition("=")
         body, dot, name = place.strip().rpartition(".")
         if not dot:
@@ -240,9 +240,9 @@ def _bounds(given: Sequence[str], bodies: Sequence[str]) -> dict[str, dict[str, 
                 raise GoalError(f"--bounds {text}: say which body: {bodies[0]}.{text}")
             body = bodies[0]
         try:
-            found.setdefault(body, {})[name] = [float(number) for number in numbers.split(",")]
+            bounds.setdefault(body, {})[name] = [float(number) for number in numbers.split(",")]
         except ValueError:
             raise GoalError(
                 f"--bounds {text}: expected BODY.NAME=LOW,HIGH, such as cart.force_x=-20,20"
             ) from None
-    return found
+    return bounds

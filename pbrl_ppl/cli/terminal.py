@@ -184,10 +184,10 @@ def check_can_make(folder: Path) -> None:
     """
     made: list[Path] = []
     try:
-        for each in reversed((folder, *folder.parents)):
-            if not each.exists():
-                each.mkdir()
-                made.append(each)
+        for place in reversed((folder, *folder.parents)):
+            if not place.exists():
+                place.mkdir()
+                made.append(place)
         with tempfile.TemporaryFile(dir=folder):
             pass
     except (NotADirectoryError, FileExistsError):
@@ -199,5 +199,5 @@ def check_can_make(folder: Path) -> None:
         ) from None
     finally:
         with contextlib.suppress(OSError):
-            for each in reversed(made):
-                each.rmdir()
+            for place in reversed(made):
+                place.rmdir()

@@ -117,12 +117,12 @@ def attribute(
     def missing(now: Mode) -> tuple[Attached, ...]:
         return candidates(mode.problem.scene, now.problem.physics.effects, catalogue)
 
-    found = SimulatedSearch(missing, criteria, say)(mode)
-    before, after = found.declared, found.after
+    search = SimulatedSearch(missing, criteria, say)(mode)
+    before, after = search.declared, search.after
     problem = after.problem
     names, likelihood = problem.observations.names, output_error(problem)
     return Attribution(
-        laws=found.described(),
+        laws=search.described(),
         before=dict(zip(names, before.sigma.tolist(), strict=True)),
         after=dict(zip(names, after.sigma.tolist(), strict=True)),
         correlated=dict(zip(names, likelihood.tau, strict=True)),

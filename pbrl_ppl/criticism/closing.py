@@ -39,7 +39,7 @@ from pbrl_ppl.criticism.results import (
 from pbrl_ppl.criticism.rivals import keep_groups
 from pbrl_ppl.criticism.score import Signature, named_beside
 from pbrl_ppl.criticism.selection import Selection, Step
-from pbrl_ppl.criticism.simulated import Simulated, SimulatedSearch
+from pbrl_ppl.criticism.simulated import SimulatedSearch
 from pbrl_ppl.criticism.unexplained import (
     UnexplainedAcceleration,
     measurement_noise,
@@ -192,13 +192,9 @@ class _Model:
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """Search for effects: declared model, laws of simulations, ranking, model found, its effects.
-
-    ``found`` is None where nothing can be simulated.
-    """
+    """Search for effects: declared model, ranking, model with effects, and the effects' steps."""
 
     declared: Mode
-    found: Simulated | None
     first: list[Signature]
     mode: Mode
     steps: list[Step]
@@ -261,8 +257,10 @@ def _closed(task: _Task, train: History, test: History, recorded: History) -> Lo
     with_added = prior
     if steps and not prior.passed:  # the missing effect may be why
         values = dict(zip(revised.problem.layout.labels, revised.phi.tolist(), strict=True))
-        held = {label: values[label] for step in steps for label in step.signature.attached.labels}
-        with_added = _prior_test(task, train, revised.problem.physics.effects, held)
+        added_values = {
+            label: values[label] for step in steps for label in step.signature.attached.labels
+        }
+        with_added = _prior_test(task, train, revised.problem.physics.effects, added_values)
     misfit = find_misfit(revised, after, horizon=horizon, seed=seed).with_test(with_added)
     if steps:
         misfit = with_negligible_acceleration(misfit, revised, after)
@@ -307,13 +305,13 @@ def _searched(declared: Mode, selection: Selection) -> _Search:
     """Add the effects that simulations name, then smaller ones by innovations."""
     say = selection.say
     say(Stage.SIMULATE)
-    found = None
+    simulated = None
     with suppress(HistoryError):  # start states could follow all that was measured
-        found = SimulatedSearch(selection.missing, selection.criteria, say)(declared)
+        simulated = SimulatedSearch(selection.missing, selection.criteria, say)(declared)
     say(Stage.SCORE)
     first = selection.rank(declared)
-    mode, steps = selection.adopted(declared, found, first)
-    return _grown(_Search(declared, found, first, mode, steps), selection)
+    mode, steps = selection.adopted(declared, simulated, first)
+    return _grown(_Search(declared, first, mode, steps), selection)
 
 
 def _grown(search: _Search, selection: Selection) -> _Search:
@@ -339,13 +337,13 @@ def _prior_test(
     task: _Task,
     train: History,
     effects: tuple[Attached, ...],
-    held: Mapping[str, float] | None = None,
+    fixed: Mapping[str, float] | None = None,
 ) -> ResidualTest:
     """Test whether the prior, with some parameters held, could have made the data."""
     horizon = telling_horizon(train, task.criteria.prior)
     problem = Problem.of(Physics(task.scene, effects, threads=2), train, horizon=horizon)
     checked = prior_predictive_check(
-        problem, seed=task.seed, held=held, criteria=task.criteria.prior
+        problem, seed=task.seed, fixed=fixed, criteria=task.criteria.prior
     )
     share = float(checked.dataset["share_beyond"].max())
     sentence, *more = checked.summary
@@ -363,7 +361,9 @@ def _fits(task: _Task, modes: list[Mode]) -> list[Fit]:
         others = [_fit(task, mode) for mode in modes[1:]]
         results = [first(), *others]
     issued = {str(message): message for _, caught, _ in results for message in caught}
-    uninformed = [text for text, each in issued.items() if isinstance(each, UninformedWarning)]
+    uninformed = [
+        text for text, warning in issued.items() if isinstance(warning, UninformedWarning)
+    ]
     said = [sentence for _, _, sentences in results for sentence in sentences]
     for sentence in dict.fromkeys((*said, *uninformed)):
         task.say(sentence)
@@ -395,7 +395,7 @@ def _fit(task: _Task, mode: Mode) -> tuple[Fit, list[Warning], list[str]]:
         said.append(f"{n} draws of each chain are too few")
     # of the last fit; draws from a Gaussian are no chains that converge
     unheeded: tuple[type[Warning], ...] = (ConvergenceWarning,) if method == "laplace" else ()
-    kept = [each.message for each in caught if not issubclass(each.category, unheeded)]
+    kept = [warning.message for warning in caught if not issubclass(warning.category, unheeded)]
     return fitted, [message for message in kept if isinstance(message, Warning)], said
 
 
@@ -498,7 +498,7 @@ def _added(step: Step, revised: _Model) -> Added:
     """Return an added effect with its posterior."""
     candidate, effect = step.signature.candidate, step.signature.attached.effect
     named = {
-        named_beside(each, step.signature.attached) for each in revised.mode.problem.physics.effects
+        named_beside(law, step.signature.attached) for law in revised.mode.problem.physics.effects
     }  # an effect that was added as well is told from it
     drawn = posterior_draws(revised.fit.posterior)
     bodies = [

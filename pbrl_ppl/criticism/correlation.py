@@ -91,11 +91,11 @@ def correlation_tests(
     share = innovations_over_steps(mode)
     scene, places = mode.problem.scene, noise.coordinates.places
     cells = [f"{STATE[p % len(STATE)]} of {scene.moving[p // len(STATE)].name}" for p in places]
-    own = _lagged(white, seen, number, None, criteria)
+    by_lag = _lagged(white, seen, number, None, criteria)
     few = "too few pairs of intervals"
     whiteness = ResidualTest.untested(_WHITENESS, few)
-    if own.enough.any():
-        whiteness = _test(own, own.p_value, share, cells, [])
+    if by_lag.enough.any():
+        whiteness = _test(by_lag, by_lag.p_value, share, cells, [])
     series, names = _commands(mode)
     values = np.zeros((0, 0, len(cells)))
     commands = ResidualTest.untested(_COMMANDS, few if names else "no command varies")
@@ -106,7 +106,7 @@ def correlation_tests(
         if p_value is not None:
             commands = _test(driven, p_value, share, cells, names)
     return (whiteness, commands), Correlations(
-        tuple(cells), own.values[:, 0], own.pairs[:, 0], tuple(names), values
+        tuple(cells), by_lag.values[:, 0], by_lag.pairs[:, 0], tuple(names), values
     )
 
 
@@ -173,11 +173,11 @@ def _regression_p_value(
 
 
 def _test(
-    found: _Correlation, p_value: float, share: Floats, cells: list[str], names: list[str]
+    correlation: _Correlation, p_value: float, share: Floats, cells: list[str], names: list[str]
 ) -> ResidualTest:
     """Return the test of correlations with commands, or of whiteness if there are no names."""
-    passed = found.passes(p_value, share)
-    worst = found.worst(np.ones(len(cells)) if passed else share)
+    passed = correlation.passes(p_value, share)
+    worst = correlation.worst(np.ones(len(cells)) if passed else share)
     lag = worst.lag if names else worst.lag + 1
     intervals = f"{lag} interval{'s' * (lag > 1)}"
     if not names:

@@ -131,16 +131,18 @@ def leave_out(mode: Mode, fold: Ints) -> LeftOut:
     density, sigmas = np.empty(count), np.empty((count, len(mode.sigma)))
     phis = np.empty((count, len(phi)))
     for f in range(count):
-        own = fold == f
-        sigma, z, jacobian = without(own)
-        out, inner = (jacobian[rows].reshape(z[rows].size, len(phi)) for rows in (own, ~own))
+        members = fold == f
+        sigma, z, jacobian = without(members)
+        out, inner = (
+            jacobian[rows].reshape(z[rows].size, len(phi)) for rows in (members, ~members)
+        )
         rest = inner.T @ inner + prior
         whole = rest + out.T @ out
         # the optimiser stops near the top; the rest of the step must not count for this fold
-        gradient = out.T @ z[own].ravel() + inner.T @ z[~own].ravel() + pull
+        gradient = out.T @ z[members].ravel() + inner.T @ z[~members].ravel() + pull
         move, free = _to_top(mode, whole, gradient, scale)
-        at_top = z[own].ravel() + out @ move
-        gained = 0.5 * float((z[own] ** 2).sum() - (at_top**2).sum())
+        at_top = z[members].ravel() + out @ move
+        gained = 0.5 * float((z[members] ** 2).sum() - (at_top**2).sum())
         slope = out[:, free].T @ at_top
         values, vectors = np.linalg.eigh(rest[free][:, free])
         values = np.maximum(values, 1e-300)
@@ -148,7 +150,7 @@ def leave_out(mode: Mode, fold: Ints) -> LeftOut:
         spread = np.linalg.slogdet(whole[free][:, free])[1] - np.log(values).sum()
         gained -= 0.5 * float((part**2 / values).sum() + spread)
         move[free] += vectors @ (part / values)
-        density[f] = problem.log_density(residual, sigma, phi)[own].sum() + gained
+        density[f] = problem.log_density(residual, sigma, phi)[members].sum() + gained
         phis[f], sigmas[f] = inside(priors, phi + scale * move), sigma
     return LeftOut(density, phis, sigmas)
 
@@ -216,7 +218,7 @@ def _linearised(
     if problem.likelihood.independent:
         z = problem.robust(phi, mode.sigma)
         jacobian = mode.jacobian.reshape(*z.shape, p) * scale
-        return lambda own: (mode.sigma, z, jacobian)
+        return lambda fold: (mode.sigma, z, jacobian)
     noise = problem.trajectory_noise
     nu = noise.of_coordinates(problem.nu(phi), residual.shape)
     slopes = _residual_slopes(mode, scale)
@@ -224,8 +226,8 @@ def _linearised(
     still = replace(noise, begin=nothing, measured=nothing)
     step = 1e-4  # of a whitened residual
 
-    def without(own: Bools) -> tuple[Floats, Floats, Floats]:
-        hidden = replace(noise, seen=noise.seen & ~own[:, None], sigma=mode.sigma)
+    def without(fold: Bools) -> tuple[Floats, Floats, Floats]:
+        hidden = replace(noise, seen=noise.seen & ~fold[:, None], sigma=mode.sigma)
         sigma = profile_sigma(problem.along(hidden), residual, phi)
         z = noise.whiten(residual, sigma)
         white = still.filtered(slopes, sigma)[0]

@@ -93,7 +93,7 @@ def find_dependence(
     -------
     test : ResidualTest
         Untested with too few transitions.
-    found : Unexplained or None
+    dependence : Unexplained or None
         The strongest dependence; None if none is significant.
     """
     rng = np.random.default_rng(seed)
@@ -113,8 +113,10 @@ def find_dependence(
         if body.kinematic:
             continue
         features = recorded_quantities(problem, i)[chosen]
-        own = np.flatnonzero(places // len(STATE) == i)
-        y, names, of = _in_both_frames(innovations[:, own], places[own] % len(STATE), features)
+        of_body = np.flatnonzero(places // len(STATE) == i)
+        y, names, of = _in_both_frames(
+            innovations[:, of_body], places[of_body] % len(STATE), features
+        )
         y = y - y.mean(axis=0)
         smoother = _cross_validated(_summed(features), groups, rng)
         shares = _explained(smoother, y)
@@ -122,7 +124,7 @@ def find_dependence(
             [_explained(smoother, y[rng.permutation(len(y))]).max() for _ in range(permutations)]
         )
         at = int(np.argmax(shares))
-        size = np.sqrt(max(float(shares[at]), 0.0)) * relative[own[of[at]]]
+        size = np.sqrt(max(float(shares[at]), 0.0)) * relative[of_body[of[at]]]
         p_value = float((1 + (null >= shares[at]).sum()) / (1 + permutations)) * tests
         small = shares[at] < limits.dependence_share or size < criteria.negligible
         if p_value > limits.dependence_p or small:
@@ -198,8 +200,8 @@ def _cross_validated(
     """Return the matrix that predicts each transition from those of other groups."""
     smoother = np.zeros_like(kernel)
     names = rng.permutation(np.unique(groups))
-    for held in np.array_split(names, min(folds, len(names))):
-        out = np.isin(groups, held)
+    for left_out in np.array_split(names, min(folds, len(names))):
+        out = np.isin(groups, left_out)
         inner = kernel[np.ix_(~out, ~out)] + _RIDGE * np.eye(int((~out).sum()))
         smoother[np.ix_(out, ~out)] = np.linalg.solve(inner, kernel[np.ix_(~out, out)]).T
     return smoother

@@ -48,9 +48,9 @@ class Forecast:
         """Return root mean squares by state dimension."""
         result = {}
         for d in np.unique(self.dimension):
-            own = square[:, self.dimension == d]
-            if not np.isnan(own).all():
-                result[STATE[d]] = float(np.sqrt(np.nanmean(own)))
+            columns = square[:, self.dimension == d]
+            if not np.isnan(columns).all():
+                result[STATE[d]] = float(np.sqrt(np.nanmean(columns)))
         return result
 
 
@@ -127,7 +127,7 @@ def whole_rollouts(problem: Problem, phi: Floats, sigma: Floats) -> dict[int, Fl
         states[i] = _finite_part(problem, phi, start[i : i + 1], inputs[i : i + 1])
     states = np.concatenate([start[:, None], states], axis=1)
     whole = zip(trajectory.tolist(), states, lengths.tolist(), strict=True)
-    return {which: each[: length + 1] for which, each, length in whole}
+    return {which: paths[: length + 1] for which, paths, length in whole}
 
 
 def _finite_part(problem: Problem, phi: Floats, start: Floats, inputs: Floats) -> Floats:
@@ -264,11 +264,11 @@ def _forecasts(before: Mode, after: Mode) -> tuple[Forecast, Forecast]:
     """Return the longest forecasts of both models; errors are NaN where one diverges."""
     intervals = longest_forecast(after.problem)
     worse, better = (
-        forecast(each.problem, each.phi, each.sigma, intervals) for each in (before, after)
+        forecast(mode.problem, mode.phi, mode.sigma, intervals) for mode in (before, after)
     )
     both = np.isfinite(worse.error) & np.isfinite(better.error)
     worse, better = (
-        replace(each, error=np.where(both, each.error, np.nan)) for each in (worse, better)
+        replace(mode, error=np.where(both, mode.error, np.nan)) for mode in (worse, better)
     )
     return worse, better
 

@@ -60,7 +60,10 @@ class HeldOut:
         coordinates = mode.problem.trajectory_noise.coordinates
         measured = observed_coordinates(mode.problem.scene, history).sensors
         if not set(measured) <= set(coordinates.sensors):
-            names = [", ".join(STATE[d] for d in each) for each in (measured, coordinates.sensors)]
+            names = [
+                ", ".join(STATE[d] for d in dimensions)
+                for dimensions in (measured, coordinates.sensors)
+            ]
             raise HistoryError(
                 f"test history measures {names[0]}, the training history {names[1]}; they must"
                 " be the same"
@@ -112,9 +115,9 @@ class HeldOut:
         most_draws : int
             Posterior draws of the predictive density, at most.
         """
-        mode, own = self.mode, unit.problem.trajectory_noise
-        seen = own.seen
-        whitened = self.whitened(unit) * own.scale(unit.mode.sigma) / own.scale(noise)
+        mode, of_unit = self.mode, unit.problem.trajectory_noise
+        seen = of_unit.seen
+        whitened = self.whitened(unit) * of_unit.scale(unit.mode.sigma) / of_unit.scale(noise)
         phi, sigma = fit.draws
         rng = np.random.default_rng(seed)
         chosen = rng.choice(len(phi), min(most_draws, len(phi)), replace=False)

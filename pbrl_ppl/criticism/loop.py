@@ -188,9 +188,9 @@ class Loop:
         """
         if self.verdict != UNEXPLAINED:
             raise FitError(f"nothing to learn: the verdict is {self.verdict}")
-        found = self.unexplained.body if self.unexplained is not None else ""
+        where = self.unexplained.body if self.unexplained is not None else ""
         bodies = [moving.name for moving in self.scene.dynamic]
-        body = body or found or (bodies[0] if len(bodies) == 1 else "")
+        body = body or where or (bodies[0] if len(bodies) == 1 else "")
         if not body:
             raise FitError(f"remainder: no body stands out; give the body, one of {bodies}")
         return learn_remainder(
@@ -205,7 +205,7 @@ class Loop:
                 "verdict": self.verdict,
                 "numerical": self.numerical,
                 "added": [_fields(added, "sentence") for added in self.added],
-                "candidates": [_fields(each, "sentence", "units") for each in self.candidates],
+                "candidates": [_fields(item, "sentence", "units") for item in self.candidates],
                 "small": [[candidate.effect, candidate.body] for candidate in self.small],
                 "tests": self.tests,
                 "unexplained_acceleration": self.acceleration,

@@ -206,8 +206,10 @@ def _forecasts(
         chance = len(dimensions) * float(chi2.sf(total, max(z.size / 2, 1)))
         if np.sqrt(z.mean()) > worst:
             worst, p_value, name = float(np.sqrt(z.mean())), min(1.0, chance), STATE[d]
-            own = int(noise.coordinates.places[columns[int(np.argmax(np.nansum(square, axis=0)))]])
-            body = mode.problem.scene.moving[own // len(STATE)].name
+            worst_place = int(
+                noise.coordinates.places[columns[int(np.argmax(np.nansum(square, axis=0)))]]
+            )
+            body = mode.problem.scene.moving[worst_place // len(STATE)].name
     passed = p_value > criteria.false_alarm or worst < criteria.worse_forecast
     dt = mode.problem.scene.time_step
     seconds = longest * dt
@@ -220,7 +222,9 @@ def _forecasts(
             f" {100 * criteria.negligible:g} % of the bodies' acceleration make"
         )
     growth = Growth(
-        steps * dt, tuple(each.rmse() for each in every), tuple(each.floor() for each in every)
+        steps * dt,
+        tuple(rollout.rmse() for rollout in every),
+        tuple(rollout.floor() for rollout in every),
     )
     if passed:
         body = name = ""

@@ -66,7 +66,7 @@ class PriorCheck:
     @property
     def sentences(self) -> tuple[str, ...]:
         """Return where the prior could not have made the data; empty where it could."""
-        limits, found = self.criteria, []
+        limits, sentences = self.criteria, []
         for body in self.dataset["body"].values:
             for state in self.dataset["state"].values:
                 changes = self.dataset.sel(body=body, state=state)
@@ -80,7 +80,7 @@ class PriorCheck:
                     continue
                 # a position changes mostly by the velocity before, which is in the same units
                 factor = "" if str(state) in POSE else _unit(changes["factor"], limits)
-                found.append(
+                sentences.append(
                     f"{state} of {body} changes by up to {float(changes['measured_largest']):.3g}"
                     f" {unit} in {self.seconds:g} s; under the prior 94 % of changes are within"
                     f" {float(changes['predicted_extent']):.3g} {unit}, and {100 * share:.0f} % of"
@@ -88,11 +88,11 @@ class PriorCheck:
                     f" of commands too, or the prior's hyper-parameters{factor}"
                 )
         if self.diverged > 0.1 * self.draws:
-            found.append(
+            sentences.append(
                 f"the engine diverged on {self.diverged} of {self.draws} draws from the prior:"
                 " narrow the prior, or use more substeps"
             )
-        return tuple(found)
+        return tuple(sentences)
 
     @property
     def summary(self) -> tuple[str, ...]:
@@ -105,7 +105,7 @@ def prior_predictive_check(
     *,
     draws: int = 400,
     seed: int = 0,
-    held: Mapping[str, float] | None = None,
+    fixed: Mapping[str, float] | None = None,
     criteria: PriorCriteria = DEFAULT.prior,
     chunk: int = 16,
 ) -> PriorCheck:
@@ -125,7 +125,7 @@ def prior_predictive_check(
         and of few draws the largest varies from seed to seed.
     seed : int
         The same seed gives the same answer.
-    held : mapping of str to float, optional
+    fixed : mapping of str to float, optional
         Parameters that have these values in every draw, by their labels.
     criteria : PriorCriteria
         When the prior could not have made the data.
@@ -174,7 +174,7 @@ def prior_predictive_check(
         if (d := STATE.index(velocity.state)) in columns:
             measured[:, history.bodies.index(velocity.body), columns.index(d)] = np.nan
     phi = draw_prior(problem, rng, draws)
-    for label, value in (held or {}).items():
+    for label, value in (fixed or {}).items():
         phi[:, problem.layout.labels.index(label)] = value
     ends = np.concatenate(
         [
@@ -235,10 +235,10 @@ def _unit(factor: xr.DataArray, criteria: PriorCriteria) -> str:
     if middle <= 1:
         low, high = 1 / high, 1 / low
     low, high = low / criteria.unit_factor, high * criteria.unit_factor
-    near = [each for each in _UNITS if low < each < high]
+    near = [factor_of_units for factor_of_units in _UNITS if low < factor_of_units < high]
     if low < 1 or not near:
         return ""
-    best = min(near, key=lambda each: abs(np.log(each / size)))
+    best = min(near, key=lambda factor_of_units: abs(np.log(factor_of_units / size)))
     return (
         f" (the changes are about {middle:.2g} times those of the prior's middle, a factor near"
         f" {over}{_UNITS[best]}: units?)"
@@ -276,7 +276,7 @@ def telling_horizon(history: History, criteria: PriorCriteria = DEFAULT.prior) -
     while steps[-1] < longest:
         steps.append(min(2 * steps[-1], longest))
     noise = _mean_square(places, angle, 1, 3) / 20.0
-    changes = np.array([_mean_square(places, angle, each, 1) for each in steps])
+    changes = np.array([_mean_square(places, angle, step, 1) for step in steps])
     telling = changes >= criteria.signal**2 * noise
     moves = (telling & (changes > 0.0)).any(
         axis=0
@@ -314,24 +314,24 @@ def _measurement_noise(
 
     ``least_intervals``: over all times and up to this many intervals or more.
     """
-    found = measurement_noise(history)
+    noises = measurement_noise(history)
     observed = history.dataset["observed"].to_numpy()
     half = observed.shape[1] // 2
     steps = [2**k for k in range(max(half, 1).bit_length())]
     for d, name in enumerate(STATE):
         angle = np.full(len(observed), d == THETA)
-        for body in range(len(found)):
-            own = observed[:, :, body, d]
-            noise = float(_mean_square(own, angle, 1, 3).mean()) / 20.0
-            largest = max(float(_mean_square(own, angle, each, 1).mean()) for each in steps)
+        for body in range(len(noises)):
+            column = observed[:, :, body, d]
+            noise = float(_mean_square(column, angle, 1, 3).mean()) / 20.0
+            largest = max(float(_mean_square(column, angle, step, 1).mean()) for step in steps)
             if half >= least_intervals and largest <= 2.0 * still * noise:
-                found[body, d] = max(found[body, d], np.sqrt(noise))
-            if name in stated and np.isfinite(own).any():
+                noises[body, d] = max(noises[body, d], np.sqrt(noise))
+            if name in stated and np.isfinite(column).any():
                 if name in POSE and np.isnan(observed[:, :, body, d + len(POSE)]).all():
                     # a velocity that a position gives is as uncertain as the position
-                    found[body, d + len(POSE)] *= stated[name] / (found[body, d] or stated[name])
-                found[body, d] = stated[name]
-    return found
+                    noises[body, d + len(POSE)] *= stated[name] / (noises[body, d] or stated[name])
+                noises[body, d] = stated[name]
+    return noises
 
 
 def _compare(predicted: Floats, measured: Floats, slack: Floats) -> xr.Dataset:
@@ -353,17 +353,17 @@ def _compare(predicted: Floats, measured: Floats, slack: Floats) -> xr.Dataset:
     dims = ("body", "state")
     some = seen.any(axis=0)
     safe = np.where(some, 1.0, np.nan)
-    pooled, own = (np.where(some, values, 0.0) for values in (pooled, measured))
+    pooled, cells = (np.where(some, values, 0.0) for values in (pooled, measured))
     predicted_quantiles = np.nanquantile(pooled, QUANTILES, axis=0) * safe
-    measured_quantiles = np.nanquantile(own, QUANTILES, axis=0) * safe
+    measured_quantiles = np.nanquantile(cells, QUANTILES, axis=0) * safe
     return xr.Dataset(
         {
             "predicted": (("quantile", *dims), predicted_quantiles),
             "measured": (("quantile", *dims), measured_quantiles),
             "predicted_sd": (dims, np.nanstd(pooled, axis=0) * safe),
-            "measured_sd": (dims, np.nanstd(own, axis=0) * safe),
+            "measured_sd": (dims, np.nanstd(cells, axis=0) * safe),
             "predicted_extent": (dims, np.nanquantile(np.abs(pooled), HDI_PROB, axis=0) * safe),
-            "measured_largest": (dims, np.nanmax(np.abs(own), axis=0) * safe),
+            "measured_largest": (dims, np.nanmax(np.abs(cells), axis=0) * safe),
             "share_inside": (dims, inside.sum(axis=0) / total * safe),
             "share_beyond": (dims, beyond.sum(axis=0) / total * safe),
             "cells": (dims, seen.sum(axis=0)),

@@ -71,13 +71,13 @@ def checked_histories(
     train, bad = without_bad_frames(train)
     test, more = without_bad_frames(test)
     check_moves(observed_coordinates(scene, train), scene)
-    known, asked = (
+    known, tested = (
         np.isfinite(history.dataset["observed"].to_numpy()).any(axis=(0, 1))
         for history in (train, test)
     )
-    if (asked & ~known).any():
+    if (tested & ~known).any():
         missing = ", ".join(
-            f"{STATE[d]} of {scene.moving[body].name}" for body, d in np.argwhere(asked & ~known)
+            f"{STATE[d]} of {scene.moving[body].name}" for body, d in np.argwhere(tested & ~known)
         )
         raise HistoryError(
             f"test history measures {missing}, which the training history does"
@@ -117,19 +117,19 @@ def outliers(mode: Mode, criteria: Criteria = DEFAULT) -> Floats:
     trajectory = np.tile(segments.trajectory, 2)
     row = np.concatenate([segments.step + 1, segments.step])
     observed = problem.data.history.dataset["observed"]
-    found = np.full(observed.shape, np.nan)
-    flat = found.reshape(*found.shape[:2], -1)
+    errors = np.full(observed.shape, np.nan)
+    flat = errors.reshape(*errors.shape[:2], -1)
     for cell, place in enumerate(noise.coordinates.places):
-        own = size[:, cell]
-        count = np.isfinite(own).sum()
+        sizes = size[:, cell]
+        count = np.isfinite(sizes).sum()
         if noise.coordinates.sensor[cell] < 0 or count < limits.least_measurements:
             continue
-        far = own > limits.deviations * np.nanmedian(own) / norm.isf(0.25)
+        far = sizes > limits.deviations * np.nanmedian(sizes) / norm.isf(0.25)
         far &= np.abs(off[:, cell]) > limits.errors * error[cell]
-        far &= own > limits.neighbours * np.nan_to_num(_beside(own, trajectory, row))
+        far &= sizes > limits.neighbours * np.nan_to_num(_beside(sizes, trajectory, row))
         if 0 < far.sum() <= max(limits.most * count, 1):
             flat[trajectory[far], row[far], place] = off[far, cell]
-    return found
+    return errors
 
 
 def _beside(size: Floats, trajectory: Ints, row: Ints) -> Floats:

@@ -141,18 +141,18 @@ def with_correlated_errors(
         sigma = profile_sigma(problem, residual, mode.phi)
         density = problem.log_density(residual, sigma, mode.phi).sum()
         tried.append((float(density), problem, sigma))
-    _, problem, sigma = max(tried, key=lambda each: each[0])
-    found = trajectory_mode(problem, mode.phi, sigma)
-    coordinates = found.problem.trajectory_noise.coordinates
-    data = found.problem.data
+    _, problem, sigma = max(tried, key=lambda trial: trial[0])
+    revised = trajectory_mode(problem, mode.phi, sigma)
+    coordinates = revised.problem.trajectory_noise.coordinates
+    data = revised.problem.data
     extent = ranges(coordinates, data.history, data.smoothed_states)
     # as large as the measurement noise of single rows was
     white = mode.sigma[: len(coordinates.drifts)]
     most = np.maximum(criteria.negligible * extent, white)
-    if (found.sigma[coordinates.drift_parameters] > most).any():
+    if (revised.sigma[coordinates.drift_parameters] > most).any():
         return None
-    gained = trajectory_evidence(found) - trajectory_evidence(mode)
-    return found if gained >= criteria.min_evidence else None
+    gained = trajectory_evidence(revised) - trajectory_evidence(mode)
+    return revised if gained >= criteria.min_evidence else None
 
 
 def same_noise(mode: Mode, other: Mode) -> Mode:
@@ -227,7 +227,7 @@ def structure_mode(
     )
     layout = problem.layout
     phi = layout.from_layout(mode.problem.layout, mode.phi)
-    own = layout.places(candidate.labels)
+    columns = layout.places(candidate.labels)
     guesses = estimate[None]
     if candidate.effect.scan is not None:
         body = problem.scene.body(candidate.body)
@@ -236,15 +236,15 @@ def structure_mode(
 
     def fitted(problem: Problem, phi: Floats, place: Floats, sigma: Floats) -> Mode:
         start = phi.copy()
-        start[own] = place
+        start[columns] = place
         return trajectory_mode(problem, inside(layout.priors, start), sigma)
 
-    places = _places(problem, phi, problem.quiet(mode.sigma, noise_share), own, guesses)
+    places = _places(problem, phi, problem.quiet(mode.sigma, noise_share), columns, guesses)
     fits = [fitted(problem, phi, place, mode.sigma) for place in places[:most_places]]
-    best = max(fits, key=lambda found: found.log_posterior)
+    best = max(fits, key=lambda fit: fit.log_posterior)
     for _ in range(rounds):
         quiet = best.problem.quiet(best.sigma, noise_share)
-        place, *_ = _places(best.problem, best.phi, quiet, own, best.phi[own][None])
+        place, *_ = _places(best.problem, best.phi, quiet, columns, best.phi[columns][None])
         again = fitted(best.problem, best.phi, place, best.sigma)
         if again.log_posterior < best.log_posterior + least_gain:
             break
@@ -257,7 +257,7 @@ def _places(
     problem: Problem,
     phi: Floats,
     sigma: Floats,
-    own: list[int],
+    columns: list[int],
     guesses: Floats,
     *,
     nu: float = 4.0,
@@ -274,20 +274,20 @@ def _places(
     first simplex has sides of ``first_side`` of the prior's scale, the last ``last_side`` of those.
     Places whose losses differ by less than ``least_difference`` are the same.
     """
-    lower, upper = (bound[own] for bound in problem.layout.bounds)
+    lower, upper = (bound[columns] for bound in problem.layout.bounds)
 
     def loss(values: Floats) -> float:
         if np.any(values <= lower) or np.any(values >= upper):
             return np.inf
         here = phi.copy()
-        here[own] = values
+        here[columns] = values
         whitened = np.nan_to_num(problem.whitened(here, sigma)).reshape(problem.segments.n, -1)
         square = (whitened**2).sum(axis=1)
         return float(0.5 * (nu + whitened.shape[1]) * np.log1p(square / nu).sum())
 
     losses = [loss(guess) for guess in guesses]
-    side = first_side * min(problem.layout.priors[place].scale for place in own)
-    found: list[tuple[float, Floats]] = []
+    side = first_side * min(problem.layout.priors[place].scale for place in columns)
+    scored: list[tuple[float, Floats]] = []
     for i in np.argsort(losses)[:most_guesses]:
         best = minimize(
             lambda values: loss(side * values),
@@ -295,11 +295,11 @@ def _places(
             method="Nelder-Mead",
             options={
                 "maxfev": most_runs,
-                "initial_simplex": guesses[i] / side + np.eye(len(own) + 1, len(own), -1),
+                "initial_simplex": guesses[i] / side + np.eye(len(columns) + 1, len(columns), -1),
                 "xatol": last_side,
                 "fatol": 0.1,
             },
         )
-        if all(abs(best.fun - value) > least_difference for value, _ in found):
-            found.append((float(best.fun), side * best.x))
-    return [place for _, place in sorted(found, key=lambda entry: entry[0])]
+        if all(abs(best.fun - value) > least_difference for value, _ in scored):
+            scored.append((float(best.fun), side * best.x))
+    return [place for _, place in sorted(scored, key=lambda entry: entry[0])]

@@ -124,7 +124,7 @@ def learn_remainder(
 
 def remainder_in_words(before: Any, after: Any) -> str:
     """Return a sentence on what a learned remainder does, from both posteriors."""
-    sizes = [posterior_draws(each)[ACCELERATION].mean(axis=0) for each in (before, after)]
+    sizes = [posterior_draws(posterior)[ACCELERATION].mean(axis=0) for posterior in (before, after)]
     names = group(after, "posterior")[ACCELERATION]
     worst = int(np.argmax(sizes[0] - sizes[1]))
     name = str(names[names.dims[-1]].values[worst])
@@ -165,10 +165,10 @@ def _learned(
     for output, y in forces.items():
         if missing.isdisjoint({"omega"} if output == 2 else {"vx", "vy"}):
             continue
-        found = _process((x[chosen] - low) / size, y[chosen], seed, criteria.min_remainder)
-        if found is None:
+        process = _process((x[chosen] - low) / size, y[chosen], seed, criteria.min_remainder)
+        if process is None:
             continue
-        sd, lengths = found
+        sd, lengths = process
         centre = rng.uniform(-margin, 1.0 + margin, (centres, x.shape[1]))
         off = (centre[:, None] - centre) / lengths
         values, vectors = np.linalg.eigh(np.exp(-0.5 * (off**2).sum(axis=-1)))

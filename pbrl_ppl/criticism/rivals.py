@@ -80,7 +80,7 @@ def named_effects(
         or if the body is left out and there are several.
     """
     by_name = {effect.name: effect for effect in catalogue}
-    found: list[Attached] = []
+    named: list[Attached] = []
     for text in names:
         name, _, body = (part.strip() for part in text.partition(_ON))
         if name not in by_name:
@@ -98,14 +98,14 @@ def named_effects(
                 f"effect {name} is of the noise: experiments cannot identify noise effects"
             )
         attached = effect.on(body or bodies[0]).in_si(scene)
-        if attached not in found:
-            found.append(attached)
-    if len(found) < 2:
+        if attached not in named:
+            named.append(attached)
+    if len(named) < 2:
         raise EffectError(
             f"effects: got {list(names)}, expected two or more to separate, such as"
             " linear_drag and quadratic_drag"
         )
-    return found
+    return named
 
 
 def posterior_mode(fit: Fit) -> Mode:
@@ -163,13 +163,13 @@ def fit_rivals(
         others = tuple(one for one in problem.physics.effects if one not in effects)
         base = trajectory_mode(*with_effects(declared, others), declared.sigma)
     noise = np.median(sigma, axis=0)
-    found = []
+    fits = []
     for attached in effects:
         if present == [attached]:
             chosen = phi[rng.choice(len(phi), draws, replace=False)]
-            found.append(Rival(attached, declared, chosen, noise))
+            fits.append(Rival(attached, declared, chosen, noise))
             continue
         (signature,) = rank_candidates(base, [attached])
         mode = refitted(base, signature)
-        found.append(Rival(attached, mode, mode.draws(rng, draws), noise))
-    return found
+        fits.append(Rival(attached, mode, mode.draws(rng, draws), noise))
+    return fits

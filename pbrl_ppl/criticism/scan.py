@@ -71,13 +71,13 @@ def grid_points(
     if proposed is None:
         proposed, wide = effect.scan(problem.scene, problem.data.history, body), wide.coarse
     declared = wide.layout.places(problem.layout.labels)
-    own = wide.layout.places(candidate.labels)
+    places = wide.layout.places(candidate.labels)
     null = np.array(effect.null)
 
     def whitened(points: Floats) -> Floats:
         phi = np.zeros((len(points), wide.layout.size))
         phi[:, declared] = mode.phi
-        phi[:, own] = points
+        phi[:, places] = points
         return -np.nan_to_num(wide.whitened(phi, mode.sigma)).reshape(len(points), -1)
 
     free = np.isnan(proposed)
@@ -86,7 +86,7 @@ def grid_points(
     # one-sided where the null is the least that there can be
     ahead, behind = np.minimum(null + steps, upper) - null, np.maximum(null - steps, lower) - null
     nothing = whitened(null[None])[0]
-    found = []
+    kept = []
     for begin in range(0, len(proposed), at_once):
         part = slice(begin, begin + at_once)
         points, plan = _points(proposed[part], free[part], null, (ahead, behind))
@@ -99,8 +99,8 @@ def grid_points(
             else:
                 signature = (states[rows] - nothing).T
             if np.any(signature):
-                found.append(GridPoint(values, signature, columns))
-    return found
+                kept.append(GridPoint(values, signature, columns))
+    return kept
 
 
 def _points(
@@ -152,20 +152,20 @@ def detection_limits_of_scan(
     """
     tried = candidates * len(points)
     names = [parameter.name for parameter in effect.parameters]
-    found: dict[str, float] = {}
+    limits: dict[str, float] = {}
     whole = [
         (point.values, unit) for point, unit in zip(points, units, strict=True) if not point.columns
     ]
     if whole and len(names) == 1:
         null = effect.null[0]
         seen = [values[0] for values, unit in whole if unit[0] >= _needed(tried, criteria)]
-        found[names[0]] = float(min(seen, key=lambda value: abs(value - null), default=np.inf))
+        limits[names[0]] = float(min(seen, key=lambda value: abs(value - null), default=np.inf))
     for point, unit in zip(points, units, strict=True):
         for column, size in zip(
             point.columns, detectable_sizes(unit, tried, criteria), strict=False
         ):
-            found[names[column]] = min(found.get(names[column], np.inf), size)
-    return found
+            limits[names[column]] = min(limits.get(names[column], np.inf), size)
+    return limits
 
 
 def caps(effect: Effect, points: Sequence[GridPoint]) -> bool:

@@ -127,7 +127,7 @@ def _signatures(mode: Mode, candidates: Sequence[Attached]) -> tuple[Floats, Flo
     residual = np.concatenate([mode.whitened_residual.ravel(), -prior_residual(priors, mode.phi)])
     jacobian = np.vstack([_slopes(mode), np.diag(prior_slopes(priors, mode.phi))])
     signatures = in_parallel(partial(_slopes, mode), candidates)
-    return residual, jacobian, [np.pad(own, ((0, p), (0, 0))) for own in signatures]
+    return residual, jacobian, [np.pad(signature, ((0, p), (0, 0))) for signature in signatures]
 
 
 def _slopes(mode: Mode, attached: Attached | None = None) -> Floats:
@@ -303,14 +303,16 @@ def _best_grid_point(mode: Mode, attached: Attached, test: _Test, again: int = 4
 
     tried = grid_points(mode, attached)
     scores = [evidence(point) for point in tried]
-    units = [found.unit for found in scores]
+    units = [score.unit for score in scores]
     best, values = _none(n, len(test.back)), np.array(effect.null)
     leading = sorted(range(len(tried)), key=lambda i: scores[i].log_p)[:again]
     finer: list[GridPoint] = []
     if leading and scores[leading[0]].log_p < 0.0:
         finer = grid_points(mode, attached, np.array([tried[i].proposed for i in leading]))
     if finer:  # with more engine steps a body may pass by
-        best, point = min(((evidence(each), each) for each in finer), key=lambda own: own[0].log_p)
+        best, point = min(
+            ((evidence(trial), trial) for trial in finer), key=lambda pair: pair[0].log_p
+        )
         values = point.values.copy()
         for column, size in zip(point.columns, best.size, strict=False):
             values[column] += size

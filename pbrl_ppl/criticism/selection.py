@@ -108,12 +108,12 @@ class Selection:
             return mode, []
         self.simulated = simulated.after
         scored = {signature.attached: signature for signature in ranked}
-        self.tried = {_key(scored[each]): worth for each, worth in simulated.tried.items()}
+        self.tried = {_key(scored[known]): worth for known, worth in simulated.tried.items()}
         for attached, (nats, share) in simulated.tried.items():
-            told = (
+            sentences = (
                 f"takes {100 * share:.2g} % off the error of whole trajectories ({nats:.0f} nats)"
             )
-            self._note(scored[attached], told)
+            self._note(scored[attached], sentences)
         if not simulated.laws:
             return mode, []
         problem = mode.problem.with_physics(effects=simulated.after.problem.physics.effects)
@@ -140,7 +140,7 @@ class Selection:
     @staticmethod
     def _without(mode: Mode, attached: Attached) -> Mode:
         """Return the mode of the model without an effect."""
-        kept = tuple(each for each in mode.problem.physics.effects if each != attached)
+        kept = tuple(other for other in mode.problem.physics.effects if other != attached)
         return nearby_mode(*with_effects(mode, kept), mode.sigma)
 
     def best_addition(self, mode: Mode, ranked: list[Signature]) -> Step | None:
@@ -158,16 +158,18 @@ class Selection:
         while waiting:
             # those far behind the first are tried only once it has failed
             enough = limits.worth_a_refit * waiting[0].candidate.statistic
-            leading = [each for each in waiting if each.candidate.statistic >= enough]
-            waiting = [each for each in waiting if each.candidate.statistic < enough]
+            leading = [addition for addition in waiting if addition.candidate.statistic >= enough]
+            waiting = [addition for addition in waiting if addition.candidate.statistic < enough]
             self.say(f"refitting with each of {len(leading)} candidates")
             fits = dict(zip(leading, in_parallel(partial(refitted, mode), leading), strict=True))
             scores = {signature: score(signature, fitted) for signature, fitted in fits.items()}
             scores = {signature: value for signature, value in scores.items() if np.isfinite(value)}
             while scores:
                 best = max(scores.values())
-                tied = [each for each, value in scores.items() if value > best - limits.tie]
-                signature = min(tied, key=lambda each: order.index(each.attached.effect.name))
+                tied = [addition for addition, value in scores.items() if value > best - limits.tie]
+                signature = min(
+                    tied, key=lambda addition: order.index(addition.attached.effect.name)
+                )
                 height, fitted = scores.pop(signature), fits[signature]
                 step = self._confirm(mode, signature, fitted, ranked)
                 if step is None:
@@ -214,7 +216,7 @@ class Selection:
             return True
         effects = mode.problem.physics.effects
         if self.simulated.problem.physics.effects != effects:
-            begin = {each: sizes_of(mode, each) for each in effects}
+            begin = {effect: sizes_of(mode, effect) for effect in effects}
             self.simulated = fit_pieces(*with_effects(self.simulated, effects, begin))
         sizes = np.array(list(signature.candidate.estimate.values()))
         enough = self.criteria.simulation.least_nats
@@ -279,7 +281,7 @@ class Selection:
         if -forecasts.total > max(criteria.negligible, forecasts.needed(criteria.min_elpd_se)):
             return f"errors of cross-validated forecasts rise by {-100 * forecasts.total:.2g} %"
         needed = max(criteria.min_elpd, density.needed(criteria.min_elpd_se))
-        either = any(each.certain(criteria.min_elpd_se) for each in (density, forecasts))
+        either = any(gain.certain(criteria.min_elpd_se) for gain in (density, forecasts))
         if density.total >= criteria.min_elpd and either:
             return ""
         gained = f"{density.total:.1f} ± {density.error:.1f} nats"

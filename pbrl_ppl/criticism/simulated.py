@@ -105,7 +105,7 @@ class Accepted:
     @property
     def confounded_names(self) -> tuple[str, ...]:
         """Names of these effects, with their bodies where they act on another."""
-        return tuple(named_beside(each, self.attached) for each in self.confounded)
+        return tuple(named_beside(rival, self.attached) for rival in self.confounded)
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,13 +249,13 @@ class SimulatedSearch:
             ]  # fmt: skip
             now = best.modes
             for law in best.laws:
-                others = tuple(each for each in close if each not in best.laws)
+                others = tuple(rival for rival in close if rival not in best.laws)
                 laws.append(Accepted(law, others))
                 self.say(f"simulations name {law.effect.name} on {law.body}")
         last, laws, without = self._pruned(now[-1], laws)
         named = {law.attached for law in laws}
         laws = [
-            replace(law, confounded=tuple(each for each in law.confounded if each not in named))
+            replace(law, confounded=tuple(rival for rival in law.confounded if rival not in named))
             for law in laws
         ]
         return Simulated(declared, last, tuple(laws), tuple(without), tried)
@@ -276,7 +276,7 @@ class SimulatedSearch:
         if trials and trials[0].modes[-1].problem.data.history.n_trajectories == 1:
             share = limits.least_share_alone
         enough = [
-            each for each in trials if each.net >= limits.least_nats and each.share >= share
+            tried for tried in trials if tried.net >= limits.least_nats and tried.share >= share
         ]  # fmt: skip
         if not enough:
             return None
@@ -294,11 +294,13 @@ class SimulatedSearch:
         """
         limits = self.criteria.simulation
         candidates = [
-            each for each in self.missing(now[-1]) if not isinstance(each.effect.stage, Noise)
+            candidate
+            for candidate in self.missing(now[-1])
+            if not isinstance(candidate.effect.stage, Noise)
         ]
         cheap = [corrected(mode) for mode in now]
         ranked = [rank_candidates(mode, candidates, self.criteria) for mode in cheap]
-        scores = [{signature.attached: signature for signature in own} for own in ranked]
+        scores = [{signature.attached: signature for signature in scored} for scored in ranked]
 
         def same(one: Attached) -> tuple[Attached, ...]:
             """Return the candidates that are the same law here, to rounding."""
@@ -307,25 +309,25 @@ class SimulatedSearch:
                 if other is one
                 or (
                     len(other.labels) == len(one.labels)
-                    and all(twins(own[one], own[other], self.criteria) for own in scores)
+                    and all(twins(scored[one], scored[other], self.criteria) for scored in scores)
                 )
             )  # fmt: skip
 
         parents = [derivatives(mode) for mode in cheap]
         leaders: dict[Attached, Floats] = {}
         for signatures in ranked:
-            found = 0
-            for signature in sorted(signatures, key=lambda own: -own.fall):
-                if 2 * signature.fall < limits.least_score or found == limits.leaders:
+            leading = 0
+            for signature in sorted(signatures, key=lambda scored: -scored.fall):
+                if 2 * signature.fall < limits.least_score or leading == limits.leaders:
                     break
                 if leaders.keys().isdisjoint((signature.attached, *same(signature.attached))):
                     leaders[signature.attached] = self._first_size(signature)
-                    found += 1
+                    leading += 1
         distinct: list[Attached] = []
-        for each in candidates:
-            seen = any(own[each].basis.shape[1] for own in scores)
-            if seen and set(distinct).isdisjoint(same(each)):
-                distinct.append(each)
+        for candidate in candidates:
+            seen = any(scored[candidate].basis.shape[1] for scored in scores)
+            if seen and set(distinct).isdisjoint(same(candidate)):
+                distinct.append(candidate)
         choices = {
             law: float(np.log(len(distinct) * max(1, scores[-1][law].candidate.looks)))
             for law in leaders
@@ -333,7 +335,9 @@ class SimulatedSearch:
 
         def alone(law: Attached) -> _Trial:
             trial = self._trial(now, parents, {law: leaders[law]}, choices[law])
-            return replace(trial, same=tuple(each for each in same(law) if each != law))
+            return replace(
+                trial, same=tuple(candidate for candidate in same(law) if candidate != law)
+            )
 
         if leaders:
             self.say(f"simulating with each of {len(leaders)} candidates")
@@ -342,10 +346,15 @@ class SimulatedSearch:
             both: list[dict[Attached, Floats]] = []
             some = [trial for trial in trials if trial.share >= self.criteria.negligible]
             for pair in combinations(some[: limits.paired], 2):
-                first, second = (scores[-1][each.laws[0]] for each in pair)
+                first, second = (scores[-1][candidate.laws[0]] for candidate in pair)
                 if twins(first, second, self.criteria):
                     continue
-                both.append({each.laws[0]: sizes_of(each.modes[0], each.laws[0]) for each in pair})
+                both.append(
+                    {
+                        candidate.laws[0]: sizes_of(candidate.modes[0], candidate.laws[0])
+                        for candidate in pair
+                    }
+                )
 
             def together(begin: dict[Attached, Floats]) -> _Trial:
                 return self._trial(now, parents, begin, sum(choices[law] for law in begin))
@@ -403,8 +412,8 @@ class SimulatedSearch:
             without = in_parallel(partial(_without, mode), [(law.attached,) for law in laws])
             if len(laws) < 2:
                 break
-            worth = [net_evidence(each, mode) for each in without]
-            taken = [share_taken(each, mode) for each in without]
+            worth = [net_evidence(smaller, mode) for smaller in without]
+            taken = [share_taken(smaller, mode) for smaller in without]
             least = int(np.argmin(worth))
             enough = worth[least] > self.criteria.simulation.least_nats
             if enough and taken[least] > self.criteria.negligible:
@@ -459,7 +468,7 @@ def _compared(now: list[Mode], trials: list[_Trial]) -> list[_Trial]:
 
 def _without(mode: Mode, laws: Sequence[Attached]) -> Mode:
     """Return the mode without some laws, refitted from where they were."""
-    kept = tuple(each for each in mode.problem.physics.effects if each not in laws)
+    kept = tuple(law for law in mode.problem.physics.effects if law not in laws)
     return fit_pieces(*with_effects(mode, kept))
 
 

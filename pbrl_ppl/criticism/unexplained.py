@@ -130,8 +130,8 @@ def without_acceleration(mode: Mode) -> Mode:
 
 def _without(mode: Mode, places: Iterable[int], residual: Floats) -> Floats:
     """Return the noise parameters that are best if those at some places are next to nothing."""
-    held = {place: NOTHING * mode.problem.noise_prior[0][place] for place in places}
-    return profile_sigma(mode.problem, residual, mode.phi, held)
+    fixed = {place: NOTHING * mode.problem.noise_prior[0][place] for place in places}
+    return profile_sigma(mode.problem, residual, mode.phi, fixed)
 
 
 def innovations_over_steps(mode: Mode) -> Floats:

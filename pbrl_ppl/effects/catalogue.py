@@ -83,9 +83,9 @@ def attach(
     extra, effects = tuple(extra), tuple(effects)
     bodies = {body.name: body for body in scene.dynamic}
     # a user's effect that is given may also be declared by name, as in a saved scene
-    given = [item.effect if isinstance(item, Attached) else item for item in extra]
-    check_names((*effects, *given))
-    by_name = {effect.name: effect for effect in (*effects, *given)}
+    listed = [item.effect if isinstance(item, Attached) else item for item in extra]
+    check_names((*effects, *listed))
+    by_name = {effect.name: effect for effect in (*effects, *listed)}
     result: list[Attached] = []
     for body in scene.dynamic:
         for name in body.effects:

@@ -53,12 +53,12 @@ def learned_remainder(table: str) -> LearnedRemainder:
         (bump,), 0 for the force forward, 1 sideways, 2 for the torque, and ``forms`` (form, bump)
         in N and N m.
     """
-    given = json.loads(table)
-    forms = np.array(given["forms"], dtype=float)
+    values = json.loads(table)
+    forms = np.array(values["forms"], dtype=float)
     law = _law_of(
-        np.array(given["centre"], dtype=float),
-        1.0 / np.array(given["width"], dtype=float),
-        np.array(given["output"], dtype=np.int64),
+        np.array(values["centre"], dtype=float),
+        1.0 / np.array(values["width"], dtype=float),
+        np.array(values["output"], dtype=np.int64),
         forms,
     )
     prior = Prior("normal", sigma=1.0)

@@ -57,7 +57,7 @@ def _scan(
     order = order[change[order] > least]
     point, inward = _hits(body.shape, begin[order], end[order], scene.time_step)
     reach = body.shape.bounding_radius
-    found = []
+    scored = []
     for i, j in combinations(range(len(point)), 2):  # point + radius * inward is the same for both
         apart, turned = point[j] - point[i], inward[i] - inward[j]
         if turned @ turned < 0.05:
@@ -67,9 +67,9 @@ def _scan(
             continue
         centre = 0.5 * (point[i] + point[j] + radius * (inward[i] + inward[j]))
         off = np.linalg.norm(point + radius * inward - centre, axis=1)
-        found.append((int((off < near * reach).sum()), (*centre, radius)))
-    found.sort(key=lambda agreed: -agreed[0])
-    discs = [disc for count, disc in found[: most_discs // 4] if count > 1]
+        scored.append((int((off < near * reach).sum()), (*centre, radius)))
+    scored.sort(key=lambda agreed: -agreed[0])
+    discs = [disc for count, disc in scored[: most_discs // 4] if count > 1]
     for at, way in zip(point, inward, strict=True):
         for size in sizes:
             for c, s in _TURNS:

@@ -176,7 +176,7 @@ def _scan_rods(
         length = _length(ends, poses)
         return np.asarray(length - length.mean())
 
-    found: list[Floats] = []
+    rods: list[Floats] = []
     for begin in body_points(body) / radius:
         ends = np.array([*begin, *_centre(begin, poses)])
         fitted = least_squares(deviation, ends, x_scale="jac").x
@@ -186,9 +186,9 @@ def _scan_rods(
             or not shortest < length < longest * spread
         ):
             continue
-        if all(np.abs(fitted - other[:4]).max() > same for other in found):
-            found.append(np.array([*fitted, length]))
-    return radius * np.array(found).reshape(-1, 5)
+        if all(np.abs(fitted - other[:4]).max() > same for other in rods):
+            rods.append(np.array([*fitted, length]))
+    return radius * np.array(rods).reshape(-1, 5)
 
 
 def _length(ends: Floats, poses: Floats) -> Floats:

@@ -201,7 +201,7 @@ def _opened(path: Path) -> Iterator[AnyReader]:
 def _types(reader: AnyReader) -> dict[str, str]:
     """Return the message type of each topic; several of one topic with "or" between them."""
     kinds_of: dict[str, dict[str, None]] = {}
-    for connection in sorted(reader.connections, key=lambda each: each.topic):
+    for connection in sorted(reader.connections, key=lambda connected: connected.topic):
         kinds_of.setdefault(connection.topic, {})[connection.msgtype] = None
     return {topic: " or ".join(kinds) for topic, kinds in kinds_of.items()}
 

@@ -50,11 +50,11 @@ def autocovariance(
     """
     pieces, rows, bodies = residual.shape
     start, phi, last = (
-        np.where(seen[..., None], own, 0.0).reshape(pieces, rows * bodies, -1)
-        for own in (by_start, by_phi, residual[..., None])
+        np.where(seen[..., None], part, 0.0).reshape(pieces, rows * bodies, -1)
+        for part in (by_start, by_phi, residual[..., None])
     )
     start = _orthonormal(start)
-    phi, last = (own - start @ (np.swapaxes(start, 1, 2) @ own) for own in (phi, last))
+    phi, last = (part - start @ (np.swapaxes(start, 1, 2) @ part) for part in (phi, last))
     phi = _orthonormal(phi.reshape(1, pieces * rows * bodies, -1)).reshape(*last.shape[:2], -1)
     freedom = seen.sum() - (start**2).sum() - (phi**2).sum()
     if freedom < least_freedom:
@@ -63,11 +63,11 @@ def autocovariance(
     times = np.geomspace(shortest, max(rows, 1.0), n_times)
     grid = np.array([(np.exp(-1 / t), share) for t in times for share in shares])
     chunks = np.ceil(len(grid) * pieces * columns.shape[-1] ** 2 / chunk)
-    found = [
-        _restricted(columns, seen, start.shape[2], *own.T)
-        for own in np.array_split(grid, min(int(chunks), len(grid)))
+    restricted = [
+        _restricted(columns, seen, start.shape[2], *part.T)
+        for part in np.array_split(grid, min(int(chunks), len(grid)))
     ]
-    square, log_det = (np.concatenate(own) for own in zip(*found, strict=True))
+    square, log_det = (np.concatenate(part) for part in zip(*restricted, strict=True))
     square = np.maximum(square, 1e-300)
     log_weight = -0.5 * (log_det + freedom * np.log(square))
     weight = np.exp(log_weight - log_weight.max())
@@ -95,14 +95,14 @@ def _restricted(
     """
     gram, log_det = _whitened(columns, seen, memory[:, None, None], share[:, None, None])
     spare = 1.0 - (columns**2).sum((1, 2))  # (piece, column)
-    own = gram[..., :starts, :starts] + spare[:, :starts, None] * np.eye(starts)
+    within = gram[..., :starts, :starts] + spare[:, :starts, None] * np.eye(starts)
     across = gram[..., :starts, starts:]
-    left = gram[..., starts:, starts:] - np.swapaxes(across, 2, 3) @ np.linalg.solve(own, across)
-    log_det = log_det + np.linalg.slogdet(own)[1].sum(axis=1)
+    left = gram[..., starts:, starts:] - np.swapaxes(across, 2, 3) @ np.linalg.solve(within, across)
+    log_det = log_det + np.linalg.slogdet(within)[1].sum(axis=1)
     left = left.sum(axis=1)
-    own, across = left[:, :-1, :-1], left[:, :-1, -1:]
-    taken = (across * np.linalg.solve(own, across)).sum((1, 2))
-    return left[:, -1, -1] - taken, log_det + np.linalg.slogdet(own)[1]
+    within, across = left[:, :-1, :-1], left[:, :-1, -1:]
+    taken = (across * np.linalg.solve(within, across)).sum((1, 2))
+    return left[:, -1, -1] - taken, log_det + np.linalg.slogdet(within)[1]
 
 
 def _whitened(

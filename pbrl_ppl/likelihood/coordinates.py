@@ -71,7 +71,9 @@ class Coordinates:
             CONTACT: self.contacts,
             DRIFT: self.drifts,
         }
-        return {name: tuple(STATE[d] for d in own) for name, own in dimensions.items() if own}
+        return {
+            name: tuple(STATE[d] for d in places) for name, places in dimensions.items() if places
+        }
 
     @property
     def accelerations(self) -> range:
@@ -260,8 +262,8 @@ def observed_coordinates(scene: Scene, history: History, *, exactness: float = 1
     body, dimension = np.divmod(places, len(STATE))
     stated = dict(scene.noise)
     exact = exactness * state_sizes(scene)
-    given = np.array([name in stated for name in STATE])
-    sensed = free & measured & ~still & ~given
+    known = np.array([name in stated for name in STATE])
+    sensed = free & measured & ~still & ~known
     sensors = np.flatnonzero(sensed.any(axis=0))
     rates = np.flatnonzero((free & ~still).any(axis=0)[VELOCITY:]) + VELOCITY
     sensor = np.full(len(places), -1)

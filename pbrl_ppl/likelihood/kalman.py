@@ -334,15 +334,15 @@ def score(
         for i in range(d - 1, -1, -1):
             if not seen[k, i]:
                 continue
-            own = gain[k, i]
+            weight = gain[k, i]
             total, spread = white[k, i] / scale[k, i], 1.0 / scale[k, i] ** 2
             for a in range(d):
                 moved[a] = 0.0
                 for b in range(d):
-                    moved[a] += known[a, b] * own[b]
+                    moved[a] += known[a, b] * weight[b]
             for a in range(d):
-                total += own[a] * state[a]
-                spread += own[a] * moved[a]
+                total += weight[a] * state[a]
+                spread += weight[a] * moved[a]
             sensor[i] += total * total - spread
             auxiliary[0, k, i] = total / np.sqrt(spread)
             state[i] -= total
@@ -353,20 +353,20 @@ def score(
         for a in range(d):
             for b in range(d):
                 step[kind[k], a, b] += state[a] * state[b] - known[a, b]
-        own = slope[k]
+        weight = slope[k]
         for a in range(d):
             moved[a] = 0.0
             for b in range(d):
-                moved[a] += own[b, a] * state[b]
+                moved[a] += weight[b, a] * state[b]
                 total = 0.0
                 for c in range(d):
-                    total += known[a, c] * own[c, b]
+                    total += known[a, c] * weight[c, b]
                 pulled[a, b] = total
         for a in range(d):
             for b in range(a + 1):
                 total = 0.0
                 for c in range(d):
-                    total += own[c, a] * pulled[c, b]
+                    total += weight[c, a] * pulled[c, b]
                 known[a, b] = known[b, a] = total
         for a in range(d):
             state[a] = moved[a]

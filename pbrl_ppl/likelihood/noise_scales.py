@@ -44,16 +44,17 @@ def noise_medians(
     least = least_noise(scene)
     real = np.isfinite(history.dataset["clock"].to_numpy())
     shown = real & ~unseen(history).any(axis=-1)
-    each, seen = (
+    typical, seen = (
         _typical(
-            coordinates, [np.diff(own[row], axis=0) for own, row in zip(states, rows, strict=True)]
+            coordinates,
+            [np.diff(path[row], axis=0) for path, row in zip(states, rows, strict=True)],
         )
         for rows in (real, shown)
     )
     dt = float(history.dataset.attrs["time_step"])
     sensors = sensor_share * seen[list(coordinates.sensors)]
-    steps = acceleration_share * _MEDIAN * _vectors(each, coordinates.rates) / dt
-    contacts = contact_share * each[list(coordinates.contacts)] / dt
+    steps = acceleration_share * _MEDIAN * _vectors(typical, coordinates.rates) / dt
+    contacts = contact_share * typical[list(coordinates.contacts)] / dt
     drifts = drift_share * _MEDIAN * ranges(coordinates, history, states)
     medians = [
         np.maximum(sensors, least[list(coordinates.sensors)]),
@@ -89,17 +90,17 @@ def ranges(coordinates: Coordinates, history: History, states: Floats) -> Floats
 
 def _typical(coordinates: Coordinates, changes: list[Floats]) -> Floats:
     """Return the root mean square change of each state dimension, shape (6,)."""
-    square = np.concatenate([own.reshape(len(own), -1) for own in changes]) ** 2
-    own = square.mean(axis=0)[coordinates.places]
+    square = np.concatenate([change.reshape(len(change), -1) for change in changes]) ** 2
+    change = square.mean(axis=0)[coordinates.places]
     of = coordinates.places % len(STATE)
-    return np.array([np.sqrt(own[of == d].mean()) if (of == d).any() else 0.0 for d in range(6)])
+    return np.array([np.sqrt(change[of == d].mean()) if (of == d).any() else 0.0 for d in range(6)])
 
 
-def _vectors(each: Floats, rates: tuple[int, ...]) -> Floats:
+def _vectors(typical: Floats, rates: tuple[int, ...]) -> Floats:
     """Return sizes of velocity changes, x and y as one vector, shape (rate,)."""
     plane = [d for d in rates if d % VELOCITY != THETA]
-    size = float(np.sqrt((each[plane] ** 2).sum()))
-    return np.array([each[d] if d % VELOCITY == THETA else size for d in rates])
+    size = float(np.sqrt((typical[plane] ** 2).sum()))
+    return np.array([typical[d] if d % VELOCITY == THETA else size for d in rates])
 
 
 def bodies_acceleration(problem: Problem) -> Floats:

@@ -76,11 +76,11 @@ class Starts:
         ``rows`` has shape (piece, row, ...); a start that is not observed is 0.
         """
         pieces, horizon, bodies, state = self.seen.shape
-        cut, own = horizon * bodies * state, self.column >= 0
+        cut, sensed = horizon * bodies * state, self.column >= 0
         out = np.zeros((pieces, 1 + horizon, bodies, state, *rows.shape[2:]))
         out[:, 1:] = rows[:, :cut].reshape(pieces, horizon, bodies, state, *rows.shape[2:])
         body = self.coordinates.places // len(STATE)
-        out[:, 0, body[own], self.column[own]] = rows[:, cut:][:, own]
+        out[:, 0, body[sensed], self.column[sensed]] = rows[:, cut:][:, sensed]
         return out
 
     @property
@@ -109,9 +109,9 @@ class Starts:
         pieces, coordinates = self.begin.shape
         moved = np.where(self.seen[..., None], self.slope, 0.0) * weight[:, None]
         moved = moved.reshape(pieces, -1, coordinates)
-        own = np.isfinite(self.begin) * self._weights(weight)
-        own += self.given * firm * np.linalg.norm(moved, axis=1)
-        rows = np.concatenate([moved, own[:, :, None] * np.eye(coordinates)], axis=1)
+        diagonal = np.isfinite(self.begin) * self._weights(weight)
+        diagonal += self.given * firm * np.linalg.norm(moved, axis=1)
+        rows = np.concatenate([moved, diagonal[:, :, None] * np.eye(coordinates)], axis=1)
         scale = np.linalg.norm(rows, axis=1)
         scale = np.where(scale > 0, scale, 1.0)
         rows = rows / scale[:, None]
@@ -158,9 +158,9 @@ class OutputErrorLikelihood(Likelihood):
         weight = 1.0 / (np.asarray(sigma) * np.sqrt(self.tau))
         if weight.ndim > 1:
             flat = weight.reshape(-1, weight.shape[-1])
-            own = residual.reshape(len(flat), *residual.shape[weight.ndim - 1 :])
-            each = [self._projected(r, w) for r, w in zip(own, flat, strict=True)]
-            return np.reshape(each, (*weight.shape[:-1], *each[0].shape))
+            flattened = residual.reshape(len(flat), *residual.shape[weight.ndim - 1 :])
+            projected = [self._projected(r, w) for r, w in zip(flattened, flat, strict=True)]
+            return np.reshape(projected, (*weight.shape[:-1], *projected[0].shape))
         return self._projected(residual, weight)
 
     def _projected(self, residual: Floats, weight: Floats) -> Floats:
@@ -174,9 +174,9 @@ class OutputErrorLikelihood(Likelihood):
         """Return one number for all; that of a body's coordinates, shape (..., piece, row)."""
         if not isinstance(nu, np.ndarray) or nu.ndim == 0:
             return nu
-        own = np.broadcast_to(nu, shape).reshape(*shape[:-3], -1)
-        begin = np.full((*own.shape[:-1], len(self.starts.column)), np.inf)
-        return np.concatenate([own, begin], axis=-1)
+        rows = np.broadcast_to(nu, shape).reshape(*shape[:-3], -1)
+        begin = np.full((*rows.shape[:-1], len(self.starts.column)), np.inf)
+        return np.concatenate([rows, begin], axis=-1)
 
     def log_density(
         self, residual: Floats, sigma: Floats, measured: Bools, nu: float | Floats | None = None
@@ -221,8 +221,10 @@ class OutputErrorLikelihood(Likelihood):
         """
         z = self._projected(residual, 1.0 / np.asarray(sigma))
         cut = z.shape[-1] - len(self.starts.column)
-        own = z[..., :cut].reshape(residual.shape) * sigma
-        return own, z[..., cut:] * np.where(self.starts.column >= 0, sigma[self.starts.column], 0.0)
+        rows = z[..., :cut].reshape(residual.shape) * sigma
+        return rows, z[..., cut:] * np.where(
+            self.starts.column >= 0, sigma[self.starts.column], 0.0
+        )
 
     def profile(self, residual: Floats, least: Floats, *, rounds: int = 6) -> Floats:
         """Return the maximum-likelihood sigma of each dimension, shape (state,).
@@ -232,8 +234,8 @@ class OutputErrorLikelihood(Likelihood):
         """
         sigma = np.maximum(np.sqrt((residual**2).sum((0, 1, 2)) / self.starts.counts), least)
         for _ in range(rounds):
-            own, begin = self.unwhitened(residual, sigma)
-            square = (own**2).sum((0, 1, 2))
+            rows, begin = self.unwhitened(residual, sigma)
+            square = (rows**2).sum((0, 1, 2))
             seen = self.starts.column >= 0
             np.add.at(square, self.starts.column[seen], (begin**2).sum(axis=0)[seen])
             better = np.maximum(np.sqrt(square / self.starts.counts), least)
@@ -253,10 +255,10 @@ class OutputErrorLikelihood(Likelihood):
         ``uncorrelated``: correlations below this end the sum.
         ``least_pairs``: pairs of residuals that an autocorrelation is taken over, at least.
         """
-        own, _ = self.unwhitened(residual, sigma)
-        seen, tau = self.starts.seen, np.ones(own.shape[-1])
+        rows, _ = self.unwhitened(residual, sigma)
+        seen, tau = self.starts.seen, np.ones(rows.shape[-1])
         for d in range(len(tau)):
-            x, there = own[..., d], seen[..., d]
+            x, there = rows[..., d], seen[..., d]
             variance = (x**2).sum() / max(there.sum(), 1)
             for lag in range(1, x.shape[1]):
                 pair = there[:, lag:] & there[:, :-lag]
@@ -292,8 +294,8 @@ def in_pieces(problem: Problem, length: int, states: Floats) -> Problem:
     seen = problem.observations.measured
     slope = np.zeros((*seen.shape, len(coordinates.places)))
     begin = _begin(problem, coordinates, column, problem.segments.start)
-    given = (column < 0) & np.isfinite(coordinates.of(_observed_starts(problem)))
-    starts = Starts(coordinates, slope, seen, begin, given, column)
+    known = (column < 0) & np.isfinite(coordinates.of(_observed_starts(problem)))
+    starts = Starts(coordinates, slope, seen, begin, known, column)
     tau = (1.0,) * len(columns)
     return replace(
         problem, likelihood=OutputErrorLikelihood(starts=starts, tau=tau, nu=problem.likelihood.nu)

@@ -178,12 +178,12 @@ class Problem:
                     sigma[:, i] = every[:, sensors.index(d)]
         matters = np.any(~(off <= same * sigma[:, None, None, None]), axis=(2, 3, 4))
         names = [body.name for body in self.scene.moving]
-        own = [
+        parts = [
             names[i] for i in np.flatnonzero((met & np.expand_dims(matters, -1)).any(axis=(0, 1)))
         ]
-        if not own:
+        if not parts:
             return self
-        return self.with_physics(together=tuple(dict.fromkeys((*self.physics.together, *own))))
+        return self.with_physics(together=tuple(dict.fromkeys((*self.physics.together, *parts))))
 
     @property
     def scene(self) -> Scene:
@@ -262,7 +262,7 @@ class Problem:
         """Return the model's variables by name at phi (..., p) and sigma (..., parameter)."""
         if self.scalar_sigma:
             return self.layout.to_dict(phi) | {"sigma": sigma[..., 0]}
-        ends = np.cumsum([len(own) for own in self.noise_variables.values()])[:-1]
+        ends = np.cumsum([len(labels) for labels in self.noise_variables.values()])[:-1]
         noise = dict(zip(self.noise_variables, np.split(sigma, ends, axis=-1), strict=True))
         return self.layout.to_dict(phi) | noise
 
@@ -288,9 +288,11 @@ class Problem:
 
     def predict(self, phi: Floats, engine: Engine | None = None) -> Floats:
         """Return predicted states, shape (..., transition, H, body, 6), for phi (..., p)."""
-        engine, given = engine or self.simulator, (phi, self.segments.start, self.inputs)
+        engine, arguments = engine or self.simulator, (phi, self.segments.start, self.inputs)
         sensitivity = self.likelihood.sensitivity
-        states = engine(*given) if sensitivity is None else sensitivity.predicted(engine, *given)
+        states = (
+            engine(*arguments) if sensitivity is None else sensitivity.predicted(engine, *arguments)
+        )
         return states if self.defect is None else states + self.defect
 
     def residual(self, phi: Floats, engine: Engine | None = None) -> Floats:
@@ -379,7 +381,9 @@ def variable_coords(problem: Problem) -> dict[str, list[Any]]:
         "step": list(range(1, problem.data.horizon + 1)),
     }
     if problem.likelihood.filtered:
-        coords |= {_NOISE_DIMS[name]: list(own) for name, own in problem.noise_variables.items()}
+        coords |= {
+            _NOISE_DIMS[name]: list(names) for name, names in problem.noise_variables.items()
+        }
     owners = tuple(problem.scene.owners)
     coords.setdefault(_owner_dim(problem, owners, ""), list(owners))
     for block in problem.layout.blocks:

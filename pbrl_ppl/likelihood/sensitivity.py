@@ -63,8 +63,8 @@ class Sensitivity:
         """
         sets, which = np.unique(self.phi, axis=0, return_inverse=True)
         rows = [which.ravel() == i for i in range(len(sets))]
-        own = [self.before[row].reshape(-1, self.phi.shape[1]) for row in rows]
-        return list(zip(sets, rows, own, strict=True))
+        parts = [self.before[row].reshape(-1, self.phi.shape[1]) for row in rows]
+        return list(zip(sets, rows, parts, strict=True))
 
     @cached_property
     def _far(self) -> Floats:
@@ -78,8 +78,8 @@ class Sensitivity:
     def moved(self, phi: Floats) -> Floats:
         """Return the change of the states with phi, shape (..., transition, coordinate)."""
         result = np.empty((*phi.shape[:-1], *self.before.shape[:2]))
-        for own, rows, by_phi in self._sets:
-            change = change_from(self.layout, phi, own) @ by_phi.T
+        for before, rows, by_phi in self._sets:
+            change = change_from(self.layout, phi, before) @ by_phi.T
             result[..., rows, :] = change.reshape(*phi.shape[:-1], -1, result.shape[-1])
         return result
 

@@ -37,14 +37,14 @@ def simulated_trajectories(
     flat = states.reshape(*states.shape[:2], -1)
     for step in range(states.shape[1] - 1):
         now = np.flatnonzero(segments.step == step)
-        own = segments.trajectory[now]
-        begin, inputs = states[own, step], problem.inputs[now]
+        trajectory = segments.trajectory[now]
+        begin, inputs = states[trajectory, step], problem.inputs[now]
         lost = ~np.isfinite(begin).all(axis=(1, 2))
         ends = problem.one_world(phi, np.where(lost[:, None, None], 0.0, begin), inputs)[:, 0]
         ends[lost] = np.nan
         met = touching(problem.scene, begin, np.nan_to_num(ends))
         pushes = coordinates.pushes(sigma, met, rng)
-        flat[own[:, None], step + 1, coordinates.places] = coordinates.of(ends) + pushes
+        flat[trajectory[:, None], step + 1, coordinates.places] = coordinates.of(ends) + pushes
         coordinates.completed(problem.scene, states[:, step + 1])
     drawn = rng.standard_normal((*flat.shape[:2], len(coordinates.places)))
     measured = states.copy()

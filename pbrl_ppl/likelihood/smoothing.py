@@ -61,7 +61,7 @@ def along_trajectories(
     history = problem.data.history
     states = first_states(history)
     states = with_predicted_gaps(problem.on(replace(problem.data, horizon=1, states=states)), phi)
-    given = coordinates is not None
+    continued = coordinates is not None
     if coordinates is None:
         coordinates = observed_coordinates(problem.scene, history)
         check_moves(coordinates, problem.scene)
@@ -77,7 +77,7 @@ def along_trajectories(
     if sigma is not begin:  # the physics alone may diverge from rough states
         for share in shares:
             problem = smoothed(problem, phi, _between(begin, sigma, share, coordinates))
-    if not given:  # the noise of measurements adds to the changes of states as measured
+    if not continued:  # the noise of measurements adds to the changes of states as measured
         moved = noise_medians(coordinates, problem.scene, history, problem.data.smoothed_states)
         steps = list(coordinates.accelerations)
         least = problem.noise_prior[0].copy()
@@ -167,8 +167,8 @@ def with_sensitivity(problem: Problem, phi: Floats, sigma: Floats) -> Problem:
     slopes = problem.rough.simulator.jacobian(phi, segments.start, problem.inputs)[:, 0]
     still = replace(noise, begin=nothing, measured=nothing, sensitivity=None)
     before = np.empty((*nothing.shape, len(phi)))
-    for j, own in enumerate(coordinates.of(np.moveaxis(slopes, -1, 0))):
-        first, after = still.smoothed(-np.nan_to_num(own), sigma)
+    for j, slope in enumerate(coordinates.of(np.moveaxis(slopes, -1, 0))):
+        first, after = still.smoothed(-np.nan_to_num(slope), sigma)
         before[:, :, j] = np.where(noise.first[:, None], first, np.roll(after, 1, axis=0))
     if not np.isfinite(before).all():
         return problem
@@ -201,10 +201,10 @@ def with_predicted_gaps(problem: Problem, phi: Floats) -> Floats:
     segments, inputs = problem.segments, problem.inputs
     for step in np.flatnonzero(hidden.any(axis=(0, 2))):
         now = np.flatnonzero(segments.step == step - 1)
-        own = segments.trajectory[now]
-        ends = problem.one_world(phi, states[own, step - 1], inputs[now])[:, 0]
-        found = hidden[own, step] & np.isfinite(ends).all(axis=-1)
-        states[own, step] = np.where(found[..., None], ends, states[own, step])
+        trajectory = segments.trajectory[now]
+        ends = problem.one_world(phi, states[trajectory, step - 1], inputs[now])[:, 0]
+        filled = hidden[trajectory, step] & np.isfinite(ends).all(axis=-1)
+        states[trajectory, step] = np.where(filled[..., None], ends, states[trajectory, step])
     return states
 
 
@@ -279,8 +279,8 @@ def _sloped(
     def predict(states: Floats) -> Floats:
         """Return the states after an interval; a coarse engine's slope agrees with a fine one's."""
         begin = states.reshape(-1, *states.shape[2:])
-        held = np.tile(inputs, (len(states), 1, 1, 1))
-        return np.asarray(problem.rough.simulator(phi, begin, held)[:, 0]).reshape(states.shape)
+        repeated = np.tile(inputs, (len(states), 1, 1, 1))
+        return np.asarray(problem.rough.simulator(phi, begin, repeated)[:, 0]).reshape(states.shape)
 
     d = len(steps)
     slope = np.empty((segments.n, d, d)) if rows is None else problem.trajectory_noise.slope.copy()

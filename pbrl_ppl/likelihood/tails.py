@@ -45,7 +45,7 @@ def degrees_of_freedom(physics: Physics, phi: Floats, nu: float | None) -> Float
             if attached.body == body.name and isinstance(attached.effect.stage, Noise):
                 values = (phi[..., labels.index(label)] for label in attached.labels)
                 names = (parameter.name for parameter in attached.effect.parameters)
-                own = attached.effect.stage.tail(dict(zip(names, values, strict=True)))
-                tails[..., 0, 0, i, 0] += own
+                inverse = attached.effect.stage.tail(dict(zip(names, values, strict=True)))
+                tails[..., 0, 0, i, 0] += inverse
     with np.errstate(divide="ignore"):
         return np.asarray(1.0 / np.maximum(tails, 0.0))

@@ -83,10 +83,10 @@ class TrajectoryNoise:
         return self.memory.recall((sigma,), self._filter_gains)
 
     def _filter_gains(self, sigma: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        own = self._extended
+        extended = self._extended
         gain, scale, after = gains(
-            own.slope, self.first, own.seen, self._begin(sigma),
-            own.padded(self.coordinates.white(sigma) ** 2), own.steps(sigma), self.kind,
+            extended.slope, self.first, extended.seen, self._begin(sigma),
+            extended.padded(self.coordinates.white(sigma) ** 2), extended.steps(sigma), self.kind,
         )  # fmt: skip
         return gain, scale, after, np.log(scale).sum(axis=1)
 
@@ -146,24 +146,24 @@ class TrajectoryNoise:
 
         ``threads_from``: numbers to filter from which threads pay.
         """
-        own, d = self._extended, len(self.coordinates.places)
-        sensor = own.padded(self.coordinates.white(sigmas) ** 2)
-        variance, step = self._begin(sigmas), own.steps(sigmas)
-        begin, measured = own.padded(self.begin), own.padded(self.measured)
+        extended, d = self._extended, len(self.coordinates.places)
+        sensor = extended.padded(self.coordinates.white(sigmas) ** 2)
+        variance, step = self._begin(sigmas), extended.steps(sigmas)
+        begin, measured = extended.padded(self.begin), extended.padded(self.measured)
 
         def some(chosen: slice) -> tuple[Floats, Floats]:
-            residual = np.ascontiguousarray(own.padded(rows[chosen]))
-            found: tuple[Floats, Floats] = whitened(
-                own.slope, self.first, own.seen, variance[chosen], sensor[chosen], step[chosen],
-                self.kind, residual, begin, measured,
+            residual = np.ascontiguousarray(extended.padded(rows[chosen]))
+            result: tuple[Floats, Floats] = whitened(
+                extended.slope, self.first, extended.seen, variance[chosen], sensor[chosen],
+                step[chosen], self.kind, residual, begin, measured,
             )  # fmt: skip
-            return found
+            return result
 
-        each = -(-len(rows) // processors())
-        slices = [slice(i, i + each) for i in range(0, len(rows), each)]
+        a_thread = -(-len(rows) // processors())
+        slices = [slice(i, i + a_thread) for i in range(0, len(rows), a_thread)]
         many = rows.size > threads_from
         parts = in_parallel(some, slices) if many else list(map(some, slices))
-        white, log_scale = (np.concatenate(each) for each in zip(*parts, strict=True))
+        white, log_scale = (np.concatenate(a_thread) for a_thread in zip(*parts, strict=True))
         return white[..., :d], log_scale
 
     def filtered(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
@@ -174,11 +174,13 @@ class TrajectoryNoise:
 
     def _filtered(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
         """Return the same as :meth:`filtered` in the filter's extended state."""
-        own, (gain, scale, *_) = self._extended, self._gains(sigma)
-        rows = np.ascontiguousarray(own.padded(residual))  # another layout would be compiled, too
+        extended, (gain, scale, *_) = self._extended, self._gains(sigma)
+        rows = np.ascontiguousarray(
+            extended.padded(residual)
+        )  # another layout would be compiled, too
         white, state = innovations(
-            own.slope, self.first, own.seen, gain, scale, rows,
-            own.padded(self.begin), own.padded(self.measured),
+            extended.slope, self.first, extended.seen, gain, scale, rows,
+            extended.padded(self.begin), extended.padded(self.measured),
         )  # fmt: skip
         return white, state
 
@@ -196,12 +198,12 @@ class TrajectoryNoise:
 
     def smoothed(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
         """Return smoothed deviations (transition, coordinate) before and after transitions."""
-        own, coordinates = self._extended, self.coordinates
+        extended, coordinates = self._extended, self.coordinates
         white, filtered = self._filtered(residual[None], sigma)
         before, _, after = self._pulled(white[0], sigma)
-        begin = own.padded(self.begin) - self._begin(sigma) * before
+        begin = extended.padded(self.begin) - self._begin(sigma) * before
         end = filtered[0] - np.einsum("kab,kb->ka", self._gains(sigma)[2], after)
-        return own.states(coordinates, begin), own.states(coordinates, end)
+        return extended.states(coordinates, begin), extended.states(coordinates, end)
 
     def pulled(self, weighted: Floats, sigma: Floats) -> Floats:
         """Return the derivative of weighted innovations by predictions (transition, coordinate)."""
@@ -210,9 +212,9 @@ class TrajectoryNoise:
 
     def _pulled(self, weighted: Floats, sigma: Floats) -> tuple[Floats, Floats, Floats]:
         """Return :func:`kalman.adjoint` of weighted innovations."""
-        own, (gain, scale, *_) = self._extended, self._gains(sigma)
+        extended, (gain, scale, *_) = self._extended, self._gains(sigma)
         pulled: tuple[Floats, Floats, Floats] = adjoint(
-            own.slope, self.last, own.seen, gain, scale, weighted
+            extended.slope, self.last, extended.seen, gain, scale, weighted
         )
         return pulled
 
@@ -226,11 +228,11 @@ class TrajectoryNoise:
         sigma : ndarray
             Shape (parameter,).
         """
-        own, coordinates, d = self._extended, self.coordinates, len(self.coordinates.places)
+        extended, coordinates, d = self._extended, self.coordinates, len(self.coordinates.places)
         white = self._filtered(coordinates.of_residual(residual)[None], sigma)[0][0]
         gain, scale, _, log_scale = self._gains(sigma)
         sensor, step, begin, _ = score(
-            own.slope, self.last, own.seen, gain, scale, white, self.kind
+            extended.slope, self.last, extended.seen, gain, scale, white, self.kind
         )
         # measured states begin a trajectory: their error is that of measuring
         began = np.where(self.first[:, None], begin, 0.0)
@@ -239,8 +241,10 @@ class TrajectoryNoise:
         free = coordinates.sensor >= 0
         np.add.at(slope, coordinates.sensor[free], (sensor[:d] + measured)[free])
         np.add.at(slope, coordinates.drifted[1], began[:, d:].sum(axis=0))
-        steps = np.where(own.always[:, None, None], step.sum(axis=0), step[1])
-        np.add.at(slope, own.pushed, np.einsum("ja,jab,jb->j", own.push, steps, own.push))
+        steps = np.where(extended.always[:, None, None], step.sum(axis=0), step[1])
+        np.add.at(
+            slope, extended.pushed, np.einsum("ja,jab,jb->j", extended.push, steps, extended.push)
+        )
         norm = -0.5 * np.log(2 * np.pi) * self.seen.sum()
         value = norm - 0.5 * float((white**2).sum()) - float(log_scale.sum())
         return value, sigma**2 * slope
@@ -261,9 +265,9 @@ class TrajectoryNoise:
             At a transition's end, and before the first of a trajectory, shape (transition,
             coordinate) each; 0 where nothing was measured.
         """
-        own, (gain, scale, *_) = self._extended, self._gains(sigma)
+        extended, (gain, scale, *_) = self._extended, self._gains(sigma)
         white = self._filtered(residual[None], sigma)[0][0]
-        every = score(own.slope, self.last, own.seen, gain, scale, white, self.kind)[3]
+        every = score(extended.slope, self.last, extended.seen, gain, scale, white, self.kind)[3]
         end, begin = every[..., : residual.shape[1]]
         return end, np.where(self.first[:, None] & ~(self.wide > 0), begin, 0.0)
 
@@ -282,14 +286,17 @@ class TrajectoryNoise:
         mean, covariance : ndarray
             Shapes (transition, coordinate) and (transition, coordinate, coordinate).
         """
-        own, d, first = self._extended, len(self.coordinates.places), self.first[:, None]
+        extended, d, first = self._extended, len(self.coordinates.places), self.first[:, None]
         after, filtered = self._gains(sigma)[2], self._filtered(residual[None], sigma)[1][0]
-        state = np.where(first, own.padded(self.begin), np.roll(filtered, 1, axis=0))
-        begin = self._begin(sigma)[:, :, None] * np.eye(own.slope.shape[1])
+        state = np.where(first, extended.padded(self.begin), np.roll(filtered, 1, axis=0))
+        begin = self._begin(sigma)[:, :, None] * np.eye(extended.slope.shape[1])
         known = np.where(first[..., None], begin, np.roll(after, 1, axis=0))
-        covariance = own.slope @ known @ own.slope.transpose(0, 2, 1) + own.steps(sigma)[self.kind]
+        covariance = (
+            extended.slope @ known @ extended.slope.transpose(0, 2, 1)
+            + extended.steps(sigma)[self.kind]
+        )
         return (
-            np.einsum("kab,kb->ka", own.slope, state)[:, :d] - residual,
+            np.einsum("kab,kb->ka", extended.slope, state)[:, :d] - residual,
             covariance[:, :d, :d] + np.diag(self.coordinates.white(sigma) ** 2),
         )
 

@@ -321,16 +321,19 @@ class _View:
         dry = np.asarray(model.dof_frictionloss[first : first + count])
         joints = range(int(model.body_jntadr[i]), int(model.body_jntadr[i] + model.body_jntnum[i]))
         kinds = np.array([model.jnt_type[j] for j in joints])
-        found: dict[str, float] = {}
+        parameters: dict[str, float] = {}
         if hinged:
-            found["pivot_damping_coefficient"], found["pivot_friction_torque"] = damping[0], dry[0]
+            parameters["pivot_damping_coefficient"], parameters["pivot_friction_torque"] = (
+                damping[0],
+                dry[0],
+            )
         else:
             if FREE in kinds:  # one coefficient for all
                 slide, turn = damping[:3], damping[3:]
             else:
                 slide, turn = damping[kinds == SLIDE], damping[kinds == HINGE]
-            found["linear_drag_coefficient"] = slide.mean()
-            found["angular_drag_coefficient"] = turn[0]
+            parameters["linear_drag_coefficient"] = slide.mean()
+            parameters["angular_drag_coefficient"] = turn[0]
             if np.ptp(slide) > _EVEN * slide.max():
                 self.left_out.append(f'different damping along the slides of "{self.name(i)}"')
             if dry.any():
@@ -338,7 +341,7 @@ class _View:
                     f'frictionloss of the joints of "{self.name(i)}" (see the effect'
                     " sliding_friction)"
                 )
-        return {name: float(value) for name, value in found.items() if value}
+        return {name: float(value) for name, value in parameters.items() if value}
 
     def inertia(self, i: int) -> tuple[float, Floats, float]:
         """Return mass, centre of mass (2,), and moment about it, of a body and those welded to it.
@@ -381,15 +384,15 @@ class _View:
                 f" outline; keep one of them, or give its outline:"
                 f' shapes={{"{name}": {self.box_about(geoms, theta)}}}'
             )
-        found = self.flat(geoms[0], theta)
-        if found is None:
+        shape = self.flat(geoms[0], theta)
+        if shape is None:
             kind = _GEOMS[min(int(self.model.geom_type[geoms[0]]), len(_GEOMS) - 1)]
             raise SceneError(
                 f'body "{name}": its geom "{self.geom_name(geoms[0])}" is a {kind} that has no'
                 " circle or rectangle for an outline in this plane; make it a box or a cylinder, or"
                 f' give its outline: shapes={{"{name}": {self.box_about(geoms, theta)}}}'
             )
-        return found
+        return shape
 
     def flat(self, g: int, theta: float) -> tuple[Shape, Floats] | None:
         """Return a geom's outline in a frame that is turned by theta, and its centroid (2,)."""
@@ -409,7 +412,9 @@ class _View:
             return None
         angle = math.atan2(along[1], along[0]) - theta
         quarter = round(angle / (math.pi / 2))
-        width, height = (rounded(2 * each) for each in (half[::-1] if quarter % 2 else half))
+        width, height = (
+            rounded(2 * half_size) for half_size in (half[::-1] if quarter % 2 else half)
+        )
         if abs(angle - quarter * math.pi / 2) < FLAT:
             return Shape.box(width, height), centre
         corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * half @ rotation(angle).T
@@ -433,7 +438,7 @@ class _View:
         """Return the static bodies and walls that the world's geoms are."""
         model = self.model
         heights = [self.corners(g) @ self.axes[2] for i in moving for g in self.geoms(i)]
-        low, high = (np.array([end(each) for each in heights]) for end in (np.min, np.max))
+        low, high = (np.array([end(column) for column in heights]) for end in (np.min, np.max))
         bodies, walls, names = [], [], {self.name(i) for i in moving}
         for g in np.flatnonzero(model.body_weldid[model.geom_bodyid] == 0).tolist():
             name = f'geom "{self.geom_name(g)}" of the world'
@@ -457,14 +462,14 @@ class _View:
             ):
                 self.left_out.append(f"{name}, which is above or below all bodies")
                 continue
-            found = self.flat(g, 0.0)
-            if found is None:
+            shape = self.flat(g, 0.0)
+            if shape is None:
                 self.left_out.append(f"{name}, which has no outline in this plane")
                 continue
             label = self.geom_name(g)
             label = f"{label} (world)" if label in names else label
             names.add(label)
-            bodies.append(Body(label, found[0], static=True, pose=(*pair(found[1]), 0.0)))
+            bodies.append(Body(label, shape[0], static=True, pose=(*pair(shape[1]), 0.0)))
         return bodies, walls
 
     def wall(self, g: int, turned: Floats) -> Wall:

@@ -82,7 +82,7 @@ def mjcf_ranges(
     if not 0 < probability < 1:
         raise SceneError(f"probability is {probability!r}, expected between 0 and 1")
     scene, draws = scene_of(idata), labelled_draws(idata)
-    found: dict[str, dict[str, Floats]] = {}
+    intervals: dict[str, dict[str, Floats]] = {}
     for body in scene.moving:
         values: dict[str, Any] = dict(body.known)
         for block in layout_of(idata, effects).blocks:
@@ -92,19 +92,19 @@ def mjcf_ranges(
         if "mass" in values:
             scale = values.get("inertia_scale_scale", 1.0)
             values["inertia"] = values["mass"] * body.shape.unit_moment * scale
-        found[body.name] = values
+        intervals[body.name] = values
     tails = (1 - probability) / 2, (1 + probability) / 2
     ranges = {
         body: {
-            name: [float(end) for end in np.quantile(each, tails)]
-            for name, each in values.items()
-            if np.size(each) > 1
+            name: [float(end) for end in np.quantile(values_of, tails)]
+            for name, values_of in values.items()
+            if np.size(values_of) > 1
         }
-        for body, values in found.items()
+        for body, values in intervals.items()
     }
     means = {
-        body: {name: float(np.mean(each)) for name, each in values.items()}
-        for body, values in found.items()
+        body: {name: float(np.mean(values_of)) for name, values_of in values.items()}
+        for body, values in intervals.items()
     }
     text, left_out = _Writer(scene, means, PLANES[plane], depth).write()
     if left_out:
@@ -182,8 +182,8 @@ class _Writer:
         drag, turning = (values.get(f"{e}_drag_coefficient", 0.0) for e in ("linear", "angular"))
         for axis, kind, damping in ((0, "slide", drag), (1, "slide", drag), (2, "hinge", turning)):
             joint = {"name": f"{body.name}_{('x', 'y', 'theta')[axis]}", "type": kind}
-            given = {"axis": _text(self.axes[axis]), "damping": f"{damping:.9g}"}
-            element.insert(axis, ET.Element("joint", joint | given))
+            attributes = {"axis": _text(self.axes[axis]), "damping": f"{damping:.9g}"}
+            element.insert(axis, ET.Element("joint", joint | attributes))
         self.list_effects(body, {"linear_drag", "angular_drag"})
 
     def hang(self, joint: Joint, parent: str, name: str) -> None:

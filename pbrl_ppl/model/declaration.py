@@ -130,8 +130,8 @@ def _chosen(
     index = pm.Categorical("library_index", p=p, dims=dims["library_index"])
     result = {}
     for block, place in problem.layout.slices():
-        own = index[[names.index(owner) for owner in block.owners]]
-        value = pt.as_tensor(table[place])[np.arange(len(block.owners)), own]
+        sets = index[[names.index(owner) for owner in block.owners]]
+        value = pt.as_tensor(table[place])[np.arange(len(block.owners)), sets]
         result[block.name] = pm.Deterministic(block.name, value, dims=dims[block.name])
     return result
 
@@ -145,14 +145,14 @@ def _noise(problem: Problem) -> Any:
     if not problem.likelihood.filtered:
         return pm.LogNormal("sigma", mu=np.log(median), sigma=spread, dims="state")
     parts, mu = [pt.zeros(0)], np.log(median)
-    for name, own in problem.noise_variables.items():
-        centre, dims = mu[: len(own)], variable_dims(problem)[name]
+    for name, names in problem.noise_variables.items():
+        centre, dims = mu[: len(names)], variable_dims(problem)[name]
         if name in (ACCELERATION, DRIFT):
             variable = pm.Exponential(name, scale=np.exp(centre) / np.log(2.0), dims=dims)
         else:
             variable = pm.LogNormal(name, mu=centre, sigma=spread, dims=dims)
         parts.append(variable)
-        mu = mu[len(own) :]
+        mu = mu[len(names) :]
     return pt.concatenate(parts)
 
 
@@ -162,8 +162,8 @@ def _index(block: Block, layout: Layout, variables: dict[str, Any]) -> Any:
     if not block.conditional or name not in variables:
         return None
     free = next(index_block.owners for index_block in layout.blocks if index_block.name == name)
-    held = [variables[name][free.index(owner)] if owner in free else 0 for owner in block.owners]
-    return pt.stack(held)
+    holders = [variables[name][free.index(owner)] if owner in free else 0 for owner in block.owners]
+    return pt.stack(holders)
 
 
 def _random(

@@ -46,8 +46,8 @@ class _BlackBoxOp(Op):
         self, inputs: Sequence[Any], outputs: Sequence[Any], cotangents: Sequence[Any]
     ) -> list[Any]:
         """Return the vector-Jacobian products by the inputs."""
-        found = _PullbackOp(self)(*inputs, cotangents[0], return_list=True)
-        by = dict(zip(self.differentiable, found, strict=True))
+        gradients = _PullbackOp(self)(*inputs, cotangents[0], return_list=True)
+        by = dict(zip(self.differentiable, gradients, strict=True))
         return [
             by[i] if i in by else grad_undefined(self, i, variable, self.reason)
             for i, variable in enumerate(inputs)

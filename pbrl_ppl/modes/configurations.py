@@ -113,7 +113,7 @@ def alike(scene: Scene) -> tuple[Alike, ...]:
     for name, joint in zip(scene.joint_names, scene.joints, strict=True):
         if joint.bodies is None:
             groups.setdefault((joint.kind, *index_priors(scene, joint)), []).append(name)
-    found = []
+    joints = []
     for (_, *priors), names in groups.items():
         p_a, p_b = (prior.probabilities for prior in priors)
         both = np.outer(p_a, p_b)
@@ -123,8 +123,8 @@ def alike(scene: Scene) -> tuple[Alike, ...]:
             for i, j in pairs
         ]
         possible = [option for option in weighed if option[1] > 0]
-        found.append(Alike(tuple(names), (*possible, (None, float(both.trace())))))
-    return tuple(found)
+        joints.append(Alike(tuple(names), (*possible, (None, float(both.trace())))))
+    return tuple(joints)
 
 
 def index_law(pair: Pair, scene: Scene, p_a: Floats, p_b: Floats) -> Floats:
@@ -183,13 +183,13 @@ def configurations(scene: Scene) -> tuple[Configuration, ...]:
     """
     groups = alike(scene)
     ways = (
-        combinations_with_replacement([pair for pair, _ in own.weights], len(own.names))
-        for own in groups
+        combinations_with_replacement([pair for pair, _ in group.weights], len(group.names))
+        for group in groups
     )
-    found = [_configuration(groups, held) for held in product(*ways)]
+    listed = [_configuration(groups, pairs) for pairs in product(*ways)]
     possible = [
         configuration
-        for configuration in found
+        for configuration in listed
         if configuration.empty or np.isfinite(configuration.log_prior)
     ]
     return tuple(sorted(possible, key=lambda configuration: not configuration.empty))
@@ -198,39 +198,39 @@ def configurations(scene: Scene) -> tuple[Configuration, ...]:
 def nothing(scene: Scene) -> Configuration:
     """Return the configuration without joints, whether or not the prior allows it."""
     groups = alike(scene)
-    return _configuration(groups, [[None] * len(own.names) for own in groups])
+    return _configuration(groups, [[None] * len(group.names) for group in groups])
 
 
 def one_more(scene: Scene, configuration: Configuration) -> tuple[Configuration, ...]:
     """Yield the configurations with one more joint."""
-    groups, chosen, found = alike(scene), dict(configuration.pairs), []
-    for i, own in enumerate(groups):
-        order = [pair for pair, _ in own.weights]
-        held = [[chosen[name] for name in group.names] for group in groups]
-        if None not in held[i]:
+    groups, chosen, larger = alike(scene), dict(configuration.pairs), []
+    for i, alike_joints in enumerate(groups):
+        order = [pair for pair, _ in alike_joints.weights]
+        pairs_of = [[chosen[name] for name in group.names] for group in groups]
+        if None not in pairs_of[i]:
             continue
         for pair in order[:-1]:
-            grown = sorted([*held[i][: held[i].index(None)], pair], key=order.index)
-            held_now = [*grown, *[None] * (len(own.names) - len(grown))]
-            found.append(_configuration(groups, [*held[:i], held_now, *held[i + 1 :]]))
-    return tuple(found)
+            grown = sorted([*pairs_of[i][: pairs_of[i].index(None)], pair], key=order.index)
+            held_now = [*grown, *[None] * (len(alike_joints.names) - len(grown))]
+            larger.append(_configuration(groups, [*pairs_of[:i], held_now, *pairs_of[i + 1 :]]))
+    return tuple(larger)
 
 
-def _configuration(groups: Sequence[Alike], held: Sequence[Sequence[Pair]]) -> Configuration:
+def _configuration(groups: Sequence[Alike], pairs_of: Sequence[Sequence[Pair]]) -> Configuration:
     """Return a configuration from the pairs of each group, with its prior."""
     chosen: dict[str, Pair] = {}
     weight = 1.0
-    for own, pairs in zip(groups, held, strict=True):
-        chosen |= zip(own.names, pairs, strict=True)
+    for group, pairs in zip(groups, pairs_of, strict=True):
+        chosen |= zip(group.names, pairs, strict=True)
         weight *= math.factorial(len(pairs))  # whichever of them is called the first
         for times in Counter(pairs).values():
             weight /= math.factorial(times)
-        law = dict(own.weights)
+        law = dict(group.weights)
         weight *= math.prod(law[pair] for pair in pairs)
     return Configuration(tuple(chosen.items()), math.log(weight) if weight else -math.inf)
 
 
-def stored(found: Sequence[Weighed]) -> list[dict[str, Any]]:
+def stored(configurations: Sequence[Weighed]) -> list[dict[str, Any]]:
     """Return configurations for a posterior's record, most probable first."""
     return [
         {
@@ -240,7 +240,7 @@ def stored(found: Sequence[Weighed]) -> list[dict[str, Any]]:
             "error": weighed.evidence.error,
             "ess": weighed.evidence.ess,
         }
-        for weighed in sorted(found, key=lambda weighed: -weighed.probability)
+        for weighed in sorted(configurations, key=lambda weighed: -weighed.probability)
     ]
 
 

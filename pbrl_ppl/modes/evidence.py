@@ -67,14 +67,16 @@ def trajectory_evidence(mode: Mode, unit: Sequence[int] = ()) -> float:
     """
     centre, of_noise = mode.noise_gaussian()
     value = float(log_posterior(mode.problem, mode.phi, np.exp(centre)) + centre.sum())
-    log_dets = (np.linalg.slogdet(2 * np.pi * own)[1] for own in (of_noise, mode.covariance))
+    log_dets = (
+        np.linalg.slogdet(2 * np.pi * covariance)[1] for covariance in (of_noise, mode.covariance)
+    )
     value += 0.5 * float(sum(log_dets))
     if not len(unit):
         return value
     places, shown = list(unit), mode.problem.trajectory_noise.seen.any(axis=1).sum()
-    own = np.linalg.slogdet(2 * np.pi * mode.covariance[np.ix_(places, places)])[1]
+    covariance = np.linalg.slogdet(2 * np.pi * mode.covariance[np.ix_(places, places)])[1]
     prior = mode.problem.layout.log_prior(mode.phi)[places].sum()
-    return value - float(prior) - 0.5 * float(own + len(places) * np.log(shown))
+    return value - float(prior) - 0.5 * float(covariance + len(places) * np.log(shown))
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,9 +143,9 @@ def importance(
     def density(q: Floats) -> tuple[Floats, Floats]:
         return space.log_density(q), np.zeros((len(q), 0))
 
-    found, _ = adaptive_importance(
+    proposals, _ = adaptive_importance(
         _StudentT(space, centre[loud], factor), density, len(loud), rng, batch=draws, enough=enough,
         most_batches=rounds, trial_batches=rounds,
     )  # fmt: skip
-    error = float(np.sqrt(max(1.0 / max(found.ess, 1.0) - 1.0 / len(found.q), 0.0)))
-    return Evidence(found.log_z, error, found.ess)
+    error = float(np.sqrt(max(1.0 / max(proposals.ess, 1.0) - 1.0 / len(proposals.q), 0.0)))
+    return Evidence(proposals.log_z, error, proposals.ess)

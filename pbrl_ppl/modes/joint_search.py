@@ -118,8 +118,8 @@ def _tried(
         for configuration, parent in track(
             list(parents.items()), what, console=console, disable=not progress
         ):
-            own = configuration.problem(problem)
-            modes[configuration] = _joint(own, configuration, modes[parent], _worth(modes))
+            tied = configuration.problem(problem)
+            modes[configuration] = _joint(tied, configuration, modes[parent], _worth(modes))
             evidence[configuration] = laplace(modes[configuration])
 
     if number(scene) <= MOST:
@@ -313,12 +313,12 @@ def _anchors(
     starts = inside(priors, starts)
     bounds = np.array([prior.support for prior in priors]).T
     size = float(np.ptp(bounds, axis=0).min())  # so that the optimiser's tolerances have no unit
-    found = [
+    results = [
         least_squares(lambda u: miss(size * u) / size, start / size, bounds=bounds / size)
         for start in starts
     ]
-    found.sort(key=lambda result: float(result.cost))
-    return [size * result.x for result in found[:kept]]
+    results.sort(key=lambda result: float(result.cost))
+    return [size * result.x for result in results[:kept]]
 
 
 def _states(problem: Problem, body: str, *, most_rows: int = 500) -> Floats:

@@ -67,7 +67,7 @@ def ladder(mode: Mode) -> list[Mode]:
             f"history: its longest trajectory has {longest + 1} rows, a simulation is judged by at"
             " least 3; record longer trajectories"
         )
-    found: list[Mode] = []
+    modes: list[Mode] = []
     states, phi = mode.problem.data.smoothed_states, mode.phi
     starts = output_error(in_pieces(mode.problem, longest, states)).starts
     measured, unknown = int(starts.counts.sum()), int((~starts.given).sum()) + len(phi)
@@ -80,11 +80,11 @@ def ladder(mode: Mode) -> list[Mode]:
     for length in lengths(longest, longest_gap(history)):
         problem = in_pieces(mode.problem, length, states)
         fitted = fit_pieces(problem, phi)
-        if found and growth(fitted.problem) > MOST_GROWTH:
+        if modes and growth(fitted.problem) > MOST_GROWTH:
             break
-        found.append(fitted)
+        modes.append(fitted)
         phi, states = fitted.phi, simulated_states(fitted)
-    return [*found[:-1], with_robust_covariance(found[-1])]
+    return [*modes[:-1], with_robust_covariance(modes[-1])]
 
 
 def lengths(longest: int, gap: int = 1, *, shortest: int = 4, ratio: int = 4) -> list[int]:
@@ -130,17 +130,17 @@ def climb_ladder(
     fewer : int
         Rounds at lower lengths.
     """
-    found: list[Mode] = []
+    modes: list[Mode] = []
     for i, ((problem, phi), parent) in enumerate(zip(start, parents, strict=True)):
         begins = [(problem, phi)]
-        if found:
-            begins += [(problem, found[-1].phi), (_along(problem, found[-1]), found[-1].phi)]
-        costs = [_start_cost(*each) for each in begins]
+        if modes:
+            begins += [(problem, modes[-1].phi), (_along(problem, modes[-1]), modes[-1].phi)]
+        costs = [_start_cost(*begin) for begin in begins]
         known = parent.of(problem.layout.labels)
         last = i + 1 == len(start)  # it corrects those before
         rounds, tolerance = (few, _TIGHT) if last else (fewer, _LOOSE)
-        found.append(fit_pieces(*begins[int(np.argmin(costs))], rounds, tolerance, known))
-    return found
+        modes.append(fit_pieces(*begins[int(np.argmin(costs))], rounds, tolerance, known))
+    return modes
 
 
 def _along(problem: Problem, shorter: Mode) -> Problem:
@@ -170,12 +170,14 @@ def with_robust_covariance(mode: Mode, *, many: int = 8) -> Mode:
     seen, score = starts.seen_series, np.diag(slopes**2)
     lags = np.abs(np.subtract.outer(np.arange(seen.shape[1]), np.arange(seen.shape[1])))
     for d, white in enumerate(least_errors(problem) * weight):
-        own = by_phi[..., d, :]
-        errors = autocovariance(residual[..., d], seen[..., d], start[..., d, :], own)
+        slopes_of = by_phi[..., d, :]
+        errors = autocovariance(residual[..., d], seen[..., d], start[..., d, :], slopes_of)
         errors[0] += white**2
-        score = score + np.einsum("arbp,rs,asbq->pq", own, errors[lags], own, optimize=True)
+        score = score + np.einsum(
+            "arbp,rs,asbq->pq", slopes_of, errors[lags], slopes_of, optimize=True
+        )
     inverse = covariance_of((mode.jacobian.T @ mode.jacobian) + np.diag(slopes**2))
-    found = inverse @ score @ inverse
+    robust = inverse @ score @ inverse
     _, cluster = np.unique(problem.segments.trajectory, return_inverse=True)
     n = cluster.max() + 1
     if n >= many:
@@ -183,9 +185,9 @@ def with_robust_covariance(mode: Mode, *, many: int = 8) -> Mode:
         np.add.at(scores, cluster, np.einsum("arp,ar->ap", jacobian, mode.whitened_residual))
         score = n / (n - 1) * scores.T @ scores + np.diag(slopes**2)
         least = np.diag(inverse @ score @ inverse)
-        wider = np.sqrt(np.maximum(least / np.maximum(np.diag(found), 1e-300), 1.0))
-        found = found * np.outer(wider, wider)
-    return replace(mode, covariance=found)
+        wider = np.sqrt(np.maximum(least / np.maximum(np.diag(robust), 1e-300), 1.0))
+        robust = robust * np.outer(wider, wider)
+    return replace(mode, covariance=robust)
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,9 +294,9 @@ def fit_pieces(
         gained = 0.0
         for _ in range(n_steps):
             tried = [step.moved(damping * factor) for factor in dampings]
-            points, starts = (np.array(own) for own in zip(*tried, strict=True))
+            points, starts = (np.array(values) for values in zip(*tried, strict=True))
             residuals = _residual(problem, points, starts)
-            costs = [step.cost(*each) for each in zip(points, starts, residuals, strict=True)]
+            costs = [step.cost(*trial) for trial in zip(points, starts, residuals, strict=True)]
             best = int(np.argmin(costs))
             gain = step.cost_before - costs[best]
             if gain > 0:
@@ -514,8 +516,8 @@ def simulated_states(mode: Mode) -> Floats:
     states = problem.data.smoothed_states.copy()
     rows = problem.data.history.dataset["n_rows"].to_numpy()[segments.trajectory]
     for i in range(segments.horizon):
-        own = (segments.step + 1 + i < rows) & np.isfinite(ends[:, i]).all(axis=(1, 2))
-        states[segments.trajectory[own], segments.step[own] + 1 + i] = ends[own, i]
+        reached = (segments.step + 1 + i < rows) & np.isfinite(ends[:, i]).all(axis=(1, 2))
+        states[segments.trajectory[reached], segments.step[reached] + 1 + i] = ends[reached, i]
     states[segments.trajectory, segments.step] = segments.start
     return states
 

@@ -17,7 +17,12 @@ from pbrl_ppl.state import Floats, Ints
 
 
 class _Combinations:
-    """All combinations of parameter sets of one part's bodies, with priors and residuals."""
+    """All combinations of parameter sets of one part's bodies, with priors and residuals.
+
+    At most ``most`` combinations times measured numbers are summed over.
+    """
+
+    most = 50_000_000
 
     def __init__(self, problem: Problem, part: Part, table: Floats) -> None:
         bodies = list(part.physics.scene.owners)
@@ -28,7 +33,7 @@ class _Combinations:
         possible = [np.flatnonzero(p) for p in priors]
         count = prod(len(sets) for sets in possible)
         measured = problem.observations.values[:, :, part.bodies]
-        if count * measured.size > 50_000_000:
+        if count * measured.size > self.most:
             raise FitError(
                 f"fit: {', '.join(bodies)} meet in this history, so that {count} combinations of"
                 f" parameter sets are to be summed over; give some probability 0 for some bodies,"
@@ -61,8 +66,8 @@ class _Combinations:
         size = max(1, numbers // max(self.residual.size, 1))
         for begin in range(0, len(sigma), size):
             part = sigma[begin : begin + size, None]
-            each = self.likelihood.log_density(self.residual[None], part, seen, nu)
-            result[begin : begin + size] = each.sum(axis=-1)
+            densities = self.likelihood.log_density(self.residual[None], part, seen, nu)
+            result[begin : begin + size] = densities.sum(axis=-1)
         return np.asarray(result + self.log_prior)
 
 
@@ -135,13 +140,13 @@ def choose_from_library(
         return np.asarray(np.sum(log_sums, axis=0) + log_noise_prior(problem, log_sigma))
 
     begin = problem.likelihood.centre(_rough_sigma(problem, parts, median))
-    found = minimize(lambda x: -float(density(x[None])[0]), begin, method="L-BFGS-B").x
+    top = minimize(lambda x: -float(density(x[None])[0]), begin, method="L-BFGS-B").x
     # log sigma of n residuals has about this precision; wider, for combinations that mix
     shape = wider**2 / (2.0 * counts + spread**-2.0)
-    proposal = stats.multivariate_t(found, np.diag(shape), df=df)
+    proposal = stats.multivariate_t(top, np.diag(shape), df=df)
     n = draws * thin + burn
     sigmas, chosen, accepted = [], [], []
-    shares = [np.zeros(len(own.indices)) for own in parts]
+    shares = [np.zeros(len(choice.indices)) for choice in parts]
     for _ in range(chains):
         x = proposal.rvs(n, random_state=rng).reshape(n, -1)
         log_weight = density(x) - np.atleast_1d(proposal.logpdf(x))
@@ -156,22 +161,22 @@ def choose_from_library(
         log_sigma = x[kept[drawn]]
         sigmas.append(np.exp(log_sigma))
         index = np.zeros((draws, len(names)), dtype=np.intp)
-        for own, part, share in zip(parts, problem.simulator.parts, shares, strict=True):
-            joint = own.log_joint(np.exp(log_sigma) * ones, problem.nu())
+        for choice, part, share in zip(parts, problem.simulator.parts, shares, strict=True):
+            joint = choice.log_joint(np.exp(log_sigma) * ones, problem.nu())
             share += softmax(joint, axis=1).sum(axis=0)
             # the largest of log-probabilities with Gumbel noise is a draw
             which = (joint + rng.gumbel(size=joint.shape)).argmax(axis=1)
             columns = [names.index(owner) for owner in part.physics.scene.owners]
-            index[:, columns] = own.indices[which]
+            index[:, columns] = choice.indices[which]
         chosen.append(index)
     owners = [owner for block in problem.layout.blocks for owner in block.owners]
     indices = np.stack(chosen)
     of = indices[..., [names.index(owner) for owner in owners]]
     phi = table[np.arange(len(owners)), of]
     best = np.zeros(len(names), dtype=np.intp)
-    for own, part, share in zip(parts, problem.simulator.parts, shares, strict=True):
+    for choice, part, share in zip(parts, problem.simulator.parts, shares, strict=True):
         columns = [names.index(owner) for owner in part.physics.scene.owners]
-        best[columns] = own.indices[share.argmax()]
+        best[columns] = choice.indices[share.argmax()]
     return phi, np.stack(sigmas), indices, np.stack(accepted), best
 
 
@@ -180,10 +185,10 @@ def _rough_sigma(problem: Problem, parts: list[_Combinations], sigma: Floats) ->
     observations = problem.observations
     residual = np.zeros_like(observations.values)
     for turn in range(3):
-        for own, part in zip(parts, problem.simulator.parts, strict=True):
-            z = np.nan_to_num(own.residual / sigma, nan=1e6)
+        for choice, part in zip(parts, problem.simulator.parts, strict=True):
+            z = np.nan_to_num(choice.residual / sigma, nan=1e6)
             cost = np.log1p(z**2) if turn == 0 else z**2
             best = int(cost.reshape(len(z), -1).sum(axis=1).argmin())
-            residual[:, :, part.bodies] = np.nan_to_num(own.residual[best])
+            residual[:, :, part.bodies] = np.nan_to_num(choice.residual[best])
         sigma = estimate_sigma(residual, observations, problem.scene)
     return sigma

@@ -42,7 +42,7 @@ def profile_sigma(
     problem: Problem,
     residual: Floats,
     phi: Floats | None = None,
-    held: Mapping[int, float] | None = None,
+    fixed: Mapping[int, float] | None = None,
 ) -> Floats:
     """Return sigma of highest posterior density at given residuals, shape (parameter,).
 
@@ -54,11 +54,11 @@ def profile_sigma(
         Shape (transition, H, body, state).
     phi : ndarray, optional
         Parameters, shape (p,); needed where the noise's tails are inferred.
-    held : dict of int to float, optional
+    fixed : dict of int to float, optional
         Noise parameters of whole trajectories that are given.
     """
     if problem.likelihood.filtered:
-        return _of_trajectories(problem, problem.trajectory_noise, residual, phi, held or {})
+        return _of_trajectories(problem, problem.trajectory_noise, residual, phi, fixed or {})
     residual = finite(problem, residual)
     ones = np.ones(residual.shape[-1])
     if problem.likelihood.simulated:
@@ -69,10 +69,10 @@ def profile_sigma(
             return np.asarray(np.exp(begin) * ones)
 
     bounds = [(b - 6, b + 6) for b in begin]
-    found = minimize(
+    result = minimize(
         partial(_cost, problem, residual, phi), begin, method="L-BFGS-B", bounds=bounds
     )
-    return np.asarray(np.exp(found.x) * ones)
+    return np.asarray(np.exp(result.x) * ones)
 
 
 def _of_trajectories(
@@ -80,7 +80,7 @@ def _of_trajectories(
     noise: TrajectoryNoise,
     residual: Floats,
     phi: Floats | None,
-    held: Mapping[int, float],
+    fixed: Mapping[int, float],
 ) -> Floats:
     """Return the noise parameters of highest posterior density along trajectories."""
     residual = finite(problem, residual)
@@ -91,7 +91,7 @@ def _of_trajectories(
         least = np.log(NOTHING * problem.noise_prior[0][place])
         begin[place] = max(begin[place], least)
         bounds[place] = (least, max(bounds[place][1], least + _FAR))
-    for place, value in held.items():
+    for place, value in fixed.items():
         begin[place] = np.log(value)
         bounds[place] = (begin[place], begin[place])
     cost = (
@@ -99,8 +99,8 @@ def _of_trajectories(
         if gaussian
         else partial(_cost, problem, residual, phi)
     )
-    found = minimize(cost, begin, jac=gaussian, method="L-BFGS-B", bounds=bounds)
-    return np.asarray(np.exp(found.x))
+    result = minimize(cost, begin, jac=gaussian, method="L-BFGS-B", bounds=bounds)
+    return np.asarray(np.exp(result.x))
 
 
 def _cost(problem: Problem, residual: Floats, phi: Floats | None, log_sigma: Floats) -> float:
@@ -229,9 +229,11 @@ def best_tails(problem: Problem, phi: Floats, sigma: Floats) -> Floats:
     tails = list(problem.tails)
     lower, upper = (end[tails] for end in box(problem.layout.priors))
     bounds = list(zip(lower, upper, strict=True))
-    found = minimize(_tail_cost(problem, phi, sigma), phi[tails], method="L-BFGS-B", bounds=bounds)
+    optimum = minimize(
+        _tail_cost(problem, phi, sigma), phi[tails], method="L-BFGS-B", bounds=bounds
+    )
     result = phi.copy()
-    result[tails] = found.x
+    result[tails] = optimum.x
     return result
 
 

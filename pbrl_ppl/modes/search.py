@@ -107,14 +107,14 @@ def find_modes(
         begin = np.vstack([begin, _evolve(problem, rng)])
     rough = [described(part, climb(part, phi, part.simulator)) for phi in begin]
     rough.sort(key=lambda peak: -peak.log_posterior)
-    found = _distinct(part, rough)
+    peaks = _distinct(part, rough)
     if not few:
-        found = [climb(problem, phi, problem.coarse.simulator) for phi, *_ in found[:polished]]
-    found.sort(key=lambda peak: -peak.log_posterior)
-    if not few and len(found) > 1:  # all data may join what a part of them told apart
-        found = _distinct(problem.coarse, found)
-    best = _polish(problem, found[0])
-    return [finish(problem, peak) for peak in (best, *found[1:])]
+        peaks = [climb(problem, phi, problem.coarse.simulator) for phi, *_ in peaks[:polished]]
+    peaks.sort(key=lambda peak: -peak.log_posterior)
+    if not few and len(peaks) > 1:  # all data may join what a part of them told apart
+        peaks = _distinct(problem.coarse, peaks)
+    best = _polish(problem, peaks[0])
+    return [finish(problem, peak) for peak in (best, *peaks[1:])]
 
 
 def _evolve(problem: Problem, rng: np.random.Generator, *, climbed: int = 8) -> Floats:
@@ -138,17 +138,17 @@ def _evolve(problem: Problem, rng: np.random.Generator, *, climbed: int = 8) -> 
     lower, upper = box(priors)
     lower = np.where(np.isfinite(lower), lower, draws.min(axis=0))
     upper = np.where(np.isfinite(upper), upper, draws.max(axis=0))
-    found = differential_evolution(
+    result = differential_evolution(
         cost, list(zip(lower, upper, strict=True)), init=draws, rng=rng,
         strategy="rand1bin", recombination=0.9, maxiter=_GENERATIONS, polish=False,
         vectorized=True, updating="deferred", tol=0.0, atol=STALLED,
     )  # fmt: skip
-    best = np.argsort(found.population_energies)[:climbed]
-    return inside(priors, found.population[best])
+    best = np.argsort(result.population_energies)[:climbed]
+    return inside(priors, result.population[best])
 
 
 def _distinct(
-    problem: Problem, found: list[LocalMode], *, same_below: float = 10.0, far: float = 100.0
+    problem: Problem, peaks: list[LocalMode], *, same_below: float = 10.0, far: float = 100.0
 ) -> list[LocalMode]:
     """Drop peaks that predict the same as an earlier one and are connected to it.
 
@@ -159,15 +159,15 @@ def _distinct(
     ``far``: parameters whose predictions agree are of different modes if by the derivative they
     should differ by this (sum of squares, in noise units): ten standard deviations.
     """
-    folded = by_prior(problem.layout, np.array([peak.phi for peak in found]))
-    z = problem.whitened(folded, found[0].sigma)
+    folded = by_prior(problem.layout, np.array([peak.phi for peak in peaks]))
+    z = problem.whitened(folded, peaks[0].sigma)
     z = np.nan_to_num(z, nan=FAR_OFF)
     kept: dict[int, Floats] = {}
-    for i in range(len(found)):
+    for i in range(len(peaks)):
         same = [j for j in kept if ((z[i] - z[j]) ** 2).sum() < same_below]
         if not any(((kept[j] @ (folded[i] - folded[j])) ** 2).sum() < far for j in same):
-            kept[i] = finish(problem, found[i]).jacobian
-    return [found[i] for i in kept]
+            kept[i] = finish(problem, peaks[i]).jacobian
+    return [peaks[i] for i in kept]
 
 
 def _part(problem: Problem, transitions: int) -> Problem:
@@ -201,16 +201,16 @@ def find_mode(
     return replace(best, others=tuple(near))
 
 
-def _polish(problem: Problem, found: LocalMode, *, worthwhile: float = 5.0) -> LocalMode:
+def _polish(problem: Problem, start: LocalMode, *, worthwhile: float = 5.0) -> LocalMode:
     """Return a peak refined with the exact engine, if that raises the log-posterior.
 
     ``worthwhile``: gain in log-posterior which shows that the coarse derivative had not led to the
     top. (Friction makes the top rough: some units are within its grain.)
     """
     if not problem.layout.size:
-        return found
-    found = described(problem, found)
-    exact = climb(problem, found.phi, problem.simulator, rounds=1, tries=2)
-    if exact.log_posterior < found.log_posterior + worthwhile:
-        return max(found, exact, key=lambda peak: peak.log_posterior)
+        return start
+    start = described(problem, start)
+    exact = climb(problem, start.phi, problem.simulator, rounds=1, tries=2)
+    if exact.log_posterior < start.log_posterior + worthwhile:
+        return max(start, exact, key=lambda peak: peak.log_posterior)
     return climb(problem, exact.phi, problem.simulator)

@@ -90,7 +90,9 @@ class Space:
         centre = mode.phi.copy()
         for i, prior in enumerate(mode.problem.layout.priors):
             if prior.family == "von_mises":  # cut where it is farthest from every mode
-                angles = np.sort(np.mod([each.phi[i] for each in (mode, *mode.others)], 2 * np.pi))
+                angles = np.sort(
+                    np.mod([other.phi[i] for other in (mode, *mode.others)], 2 * np.pi)
+                )
                 gaps = np.diff([*angles, angles[0] + 2 * np.pi])
                 widest = int(np.argmax(gaps))
                 middle = angles[widest] + 0.5 * gaps[widest] - np.pi
@@ -188,8 +190,8 @@ class Space:
 
         Minus infinity outside; without the silent parameters.
         """
-        each, noise = self._of_parameters(q), self._of_noise(q)
-        sums = [each[..., part.places].sum(axis=-1) for part in self.parts]
+        log_prior, noise = self._of_parameters(q), self._of_noise(q)
+        sums = [log_prior[..., part.places].sum(axis=-1) for part in self.parts]
         total = np.stack([*sums, noise], axis=-1)
         return np.where(np.isfinite(total), total, -np.inf)
 
@@ -235,8 +237,8 @@ class Space:
             for j, part in enumerate(self.parts):
                 nu_of = nu[..., part.bodies, :] if isinstance(nu, np.ndarray) else nu
                 some, seen = residual[..., part.bodies, :], measured[..., part.bodies, :]
-                each = problem.likelihood.log_density(some, sigma, seen, nu_of)
-                value[:, j] = each.sum(axis=-1)
+                log_density = problem.likelihood.log_density(some, sigma, seen, nu_of)
+                value[:, j] = log_density.sum(axis=-1)
         return np.where(np.isnan(value), -np.inf, value)
 
     def residual(self, q: Floats) -> Floats:

@@ -54,8 +54,8 @@ def find_trajectory_mode(
     off = near.draws(np.random.default_rng(seed), starts - 1) - near.phi
     far = inside(problem.layout.priors, near.phi + wider * off)
     there = np.isfinite(near.problem.residual(far)).all(axis=(1, 2, 3, 4))
-    found = [following(trajectory_mode(problem, phi)) for phi in (near.phi, *far[there])]
-    return max(found, key=lambda mode: mode.log_posterior)
+    modes = [following(trajectory_mode(problem, phi)) for phi in (near.phi, *far[there])]
+    return max(modes, key=lambda mode: mode.log_posterior)
 
 
 def trajectory_mode(
@@ -93,7 +93,11 @@ def trajectory_mode(
     quiet = mode.problem.quiet(mode.sigma, share)
     if not np.array_equal(quiet, mode.sigma):
         problem = smoothed(mode.problem, mode.phi, quiet)
-        mode = max(mode, nearby_mode(problem, mode.phi, quiet), key=lambda own: own.log_posterior)
+        mode = max(
+            mode,
+            nearby_mode(problem, mode.phi, quiet),
+            key=lambda candidate: candidate.log_posterior,
+        )
     return mode
 
 
@@ -116,7 +120,7 @@ def nearby_mode(
     same : float
         A correction with which the log-posterior (nats) is as with many steps is the last.
     """
-    found: list[Mode] = []
+    rounds: list[Mode] = []
     for _ in range(corrections):
         cheap = problem.corrected(phi)
         mode = _settled(cheap, phi, sigma)
@@ -125,10 +129,10 @@ def nearby_mode(
         problem = replace(mode.problem, physics=problem.physics, defect=None)
         moved, phi = _change(mode, phi), mode.phi
         sigma, height = profiled(problem, phi)
-        found.append(replace(mode, problem=problem, sigma=sigma, log_posterior=height, others=()))
+        rounds.append(replace(mode, problem=problem, sigma=sigma, log_posterior=height, others=()))
         if moved < _SETTLED or abs(height - mode.log_posterior) < same:
             break
-    return max(found, key=lambda own: own.log_posterior)
+    return max(rounds, key=lambda candidate: candidate.log_posterior)
 
 
 def _settled(problem: Problem, phi: Floats, sigma: Floats) -> Mode:
@@ -157,7 +161,7 @@ def following(mode: Mode) -> Mode:
     Mode
         Its problem's noise has a :class:`pbrl_ppl.model.Sensitivity`.
     """
-    found: list[tuple[float, Mode]] = []
+    rounds: list[tuple[float, Mode]] = []
     problem, phi, sigma = mode.problem, mode.phi, mode.sigma
     for i in range(_ROUNDS):
         if i:
@@ -165,12 +169,12 @@ def following(mode: Mode) -> Mode:
         problem = with_sensitivity(problem, phi, sigma)
         # far from where it is linearised a climb may end anywhere: judged by where it began
         value = float(log_posterior(problem, phi, sigma))
-        found.append((value, find_mode(problem, initial=phi, rounds=_CLIMB)))
-        change = _change(found[-1][1], phi)
-        phi, sigma = found[-1][1].phi, found[-1][1].sigma
+        rounds.append((value, find_mode(problem, initial=phi, rounds=_CLIMB)))
+        change = _change(rounds[-1][1], phi)
+        phi, sigma = rounds[-1][1].phi, rounds[-1][1].sigma
         if change < _SETTLED:
             break
-    return max(found, key=lambda own: own[0])[1]
+    return max(rounds, key=lambda pair: pair[0])[1]
 
 
 def _change(mode: Mode, phi: Floats) -> float:

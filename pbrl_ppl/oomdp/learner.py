@@ -108,12 +108,12 @@ class Learner(ABC):
         """
         k = len(self.scene.moving)
         arrays = []
-        for name, given, width in (
+        for name, array, width in (
             ("state", state, len(STATE)),
             ("action", action, len(WRENCH)),
             ("next_state", next_state, len(STATE)),
         ):
-            values = np.asarray(given, dtype=float)
+            values = np.asarray(array, dtype=float)
             if values.ndim not in (2, 3) or values.shape[-2:] != (k, width):
                 raise HistoryError(
                     f"observe: {name} has shape {values.shape}, expected ({k}, {width}) or"

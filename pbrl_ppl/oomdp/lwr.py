@@ -152,7 +152,9 @@ class OOLWR(Learner):
                     f"OO-LWR: relations has {relation!r}, expected objects with labels() and of(),"
                     " such as SectorContacts()"
                 )
-        self.labels = tuple(label for each in self.relations for label in each.labels(scene))
+        self.labels = tuple(
+            label for predicate in self.relations for label in predicate.labels(scene)
+        )
         for label, count in Counter(self.labels).items():
             if count > 1:
                 raise FitError(
@@ -164,8 +166,8 @@ class OOLWR(Learner):
         """Return predicates in the order of :attr:`labels`, shape (n, body, predicate)."""
         flags = [np.zeros((*states.shape[:2], 0), dtype=bool)]
         for relation in self.relations:
-            found = relation.of(self.scene, states, wrenches)
-            flags.append(found.reshape(*found.shape[:2], math.prod(found.shape[2:])))
+            truths = relation.of(self.scene, states, wrenches)
+            flags.append(truths.reshape(*truths.shape[:2], math.prod(truths.shape[2:])))
         return np.concatenate(flags, axis=-1)
 
     def conditions(self, body: str) -> Mapping[Condition, int]:

@@ -199,8 +199,8 @@ def grouped(flags: Bools) -> dict[Key, Ints]:
     >>> list(grouped(np.array([[True], [False], [True]])).values())
     [array([0, 2]), array([1])]
     """
-    found: dict[Key, list[int]] = defaultdict(list)
+    groups: dict[Key, list[int]] = defaultdict(list)
     rows = flags.reshape(len(flags), math.prod(flags.shape[1:])).tolist()
     for i, row in enumerate(rows):
-        found[tuple(row)].append(i)
-    return {key: np.array(rows) for key, rows in found.items()}
+        groups[tuple(row)].append(i)
+    return {key: np.array(rows) for key, rows in groups.items()}

@@ -117,8 +117,8 @@ class Layout:
         lower, upper = (np.tile(end, (len(phi), 1)) for end in self.bounds)
         for place, index, conditional in self._conditional():
             support = np.array([prior.support for prior in conditional])
-            held = support[phi[:, index].astype(int)]
-            lower[:, place], upper[:, place] = held.T
+            bounds = support[phi[:, index].astype(int)]
+            lower[:, place], upper[:, place] = bounds.T
         return lower, upper
 
     def log_prior(self, phi: Floats) -> Floats:
@@ -139,8 +139,8 @@ class Layout:
             result[..., i] = prior.log_density(phi[..., i])
         for place, index, conditional in self._conditional():
             for number, prior in enumerate(conditional):
-                held = phi[..., index] == number
-                result[held, place] = prior.log_density(phi[held, place])
+                chosen = phi[..., index] == number
+                result[chosen, place] = prior.log_density(phi[chosen, place])
         return result
 
     def prior_draws(self, rng: np.random.Generator, n: int) -> Floats:

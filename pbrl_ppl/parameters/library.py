@@ -61,9 +61,9 @@ class ParameterLibrary:
                         f"parameter set {name!r}: {key} is {value}, expected a finite number"
                     )
         object.__setattr__(self, "sets", _frozen({k: dict(v) for k, v in sets.items()}))
-        given = dict(self.probabilities or {})
-        nested = {k: dict(v) for k, v in given.items() if isinstance(v, Mapping | tuple)}
-        by_set = {k: v for k, v in given.items() if k not in nested}
+        probabilities = dict(self.probabilities or {})
+        nested = {k: dict(v) for k, v in probabilities.items() if isinstance(v, Mapping | tuple)}
+        by_set = {k: v for k, v in probabilities.items() if k not in nested}
         if by_set and nested:
             raise ParameterError(
                 "library: probabilities are by set or by body, not both; give each body's own"
@@ -81,7 +81,7 @@ class ParameterLibrary:
                     f"probabilities of {where} are {', '.join(f'{v:g}' for v in values)}; expected"
                     " none below 0, and some above"
                 )
-        object.__setattr__(self, "probabilities", _frozen(given) if given else None)
+        object.__setattr__(self, "probabilities", _frozen(probabilities) if probabilities else None)
 
     @classmethod
     def from_json(cls, text: str) -> ParameterLibrary:
@@ -90,8 +90,12 @@ class ParameterLibrary:
 
     def to_json(self) -> str:
         """Return the library as JSON, for a posterior file."""
-        given = {k: dict(v) if isinstance(v, tuple) else v for k, v in self.probabilities or ()}
-        return json.dumps([{name: dict(values) for name, values in self.sets}, given or None])
+        probabilities = {
+            k: dict(v) if isinstance(v, tuple) else v for k, v in self.probabilities or ()
+        }
+        return json.dumps(
+            [{name: dict(values) for name, values in self.sets}, probabilities or None]
+        )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -100,10 +104,10 @@ class ParameterLibrary:
 
     def prior(self, body: str) -> Floats:
         """Return the probability of each set for a body or class, shape (set,)."""
-        given: dict[str, Any] = dict(self.probabilities or {})
-        if any(isinstance(value, tuple) for value in given.values()):
-            given = dict(given.get(body, ()))
-        p = np.array([float(given.get(name, 0.0)) for name in self.names])
+        probabilities: dict[str, Any] = dict(self.probabilities or {})
+        if any(isinstance(value, tuple) for value in probabilities.values()):
+            probabilities = dict(probabilities.get(body, ()))
+        p = np.array([float(probabilities.get(name, 0.0)) for name in self.names])
         return p / p.sum() if p.sum() else np.full(len(p), 1.0 / len(p))
 
     def table(self, layout: Layout, scene: Scene) -> Floats:

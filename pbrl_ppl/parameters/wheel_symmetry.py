@@ -75,15 +75,15 @@ class Wheel:
 def wheels(layout: Layout) -> tuple[Wheel, ...]:
     """Return the wheels that have four descriptions of equal likelihood."""
     places = {label: i for i, label in enumerate(layout.labels)}
-    priors, found = layout.priors, []
+    priors, wheels_found = layout.priors, []
     owners = {owner: None for b in layout.blocks if b.of == "body" for owner in b.owners}
     for begin, owner in product(_BEGINNINGS, owners):
         one, two, three = (f"{begin}{name}[{owner}]" for name in MIXED)
         at = places.get(one, -1), places.get(two, -1), places.get(three, -1)
         if min(at) >= 0:
             angle, x, y = at
-            found.append(Wheel((one, two, three), at, (priors[angle], priors[x], priors[y])))
-    return tuple(found)
+            wheels_found.append(Wheel((one, two, three), at, (priors[angle], priors[x], priors[y])))
+    return tuple(wheels_found)
 
 
 def nearest(

@@ -45,9 +45,9 @@ class Action:
     frame: str = "body"
 
     def __post_init__(self) -> None:
-        given = np.array([*np.ravel(self.force), self.torque], dtype=object)
+        components = np.array([*np.ravel(self.force), self.torque], dtype=object)
         try:
-            numbers = given.astype(float)
+            numbers = components.astype(float)
         except (TypeError, ValueError):
             numbers = np.full(3, np.nan)
         if numbers.shape != (3,) or not np.isfinite(numbers).all():
@@ -159,12 +159,12 @@ class ActionSet:
         from pbrl_ppl.posterior import group, scene_of  # not for given actions
 
         scene = scene_of(idata)
-        given = group(idata, "constant_data")["actions"].to_numpy()[..., :3]
+        pushes = group(idata, "constant_data")["actions"].to_numpy()[..., :3]
         actions: list[Action] = []
         for i, body in enumerate(scene.moving):
             if body.kinematic:  # its path was the action, not a push
                 continue
-            sizes = np.hypot(given[..., i, 0], given[..., i, 1]).ravel(), abs(given[..., i, 2])
+            sizes = np.hypot(pushes[..., i, 0], pushes[..., i, 1]).ravel(), abs(pushes[..., i, 2])
             force, torque = (
                 float(np.quantile(s[s > 0], quantile)) if (s > 0).any() else 0.0 for s in sizes
             )
@@ -200,7 +200,7 @@ class ActionSet:
 
     def intervals(self, scene: Scene) -> tuple[int, ...]:
         """Return the durations as numbers of sampling intervals, in increasing order."""
-        found = set()
+        counts = set()
         for duration in self.durations or (scene.time_step,):
             count = duration / scene.time_step
             if not math.isfinite(count) or round(count) < 1 or abs(count - round(count)) > 1e-6:
@@ -208,8 +208,8 @@ class ActionSet:
                     f"actions: a duration is {duration:g} s, expected a whole number of sampling"
                     f" intervals of {scene.time_step:g} s"
                 )
-            found.add(round(count))
-        return tuple(sorted(found))
+            counts.add(round(count))
+        return tuple(sorted(counts))
 
     def wrenches(self, scene: Scene, which: NDArray[np.intp], heading: Floats) -> Floats:
         """Return world-frame wrenches of chosen actions, shape (n, body, 3).
@@ -225,15 +225,15 @@ class ActionSet:
         """
         names = [body.name for body in scene.moving]
         body = np.array([names.index(action.body) for action in self.actions])[which]
-        given = np.array([(*action.force, action.torque) for action in self.actions])[which]
+        pushes = np.array([(*action.force, action.torque) for action in self.actions])[which]
         turns = np.array([action.frame == "body" for action in self.actions])[which]
         rows = np.arange(len(which))
         angle = np.where(turns, heading[rows, body], 0.0)
         c, s = np.cos(angle), np.sin(angle)
         out = np.zeros((len(which), len(names), 3))
-        out[rows, body, 0] = c * given[:, 0] - s * given[:, 1]
-        out[rows, body, 1] = s * given[:, 0] + c * given[:, 1]
-        out[rows, body, 2] = given[:, 2]
+        out[rows, body, 0] = c * pushes[:, 0] - s * pushes[:, 1]
+        out[rows, body, 1] = s * pushes[:, 0] + c * pushes[:, 1]
+        out[rows, body, 2] = pushes[:, 2]
         return out
 
     def strongest(self, body: str) -> tuple[float, float]:
@@ -268,13 +268,13 @@ def allowed_wrenches(
     free = [body.name for body in scene.dynamic]
     low = np.zeros((len(names), len(WRENCH)))
     high = low.copy()
-    for body, given in actions.items():
+    for body, bounds in actions.items():
         if body not in free:
             raise GoalError(
                 f'bounds: the scene has no moving body "{body}" that can be pushed'
                 f"{nearest(body, free)}"
             )
-        for component, ends in given.items():
+        for component, ends in bounds.items():
             if component not in WRENCH:
                 raise GoalError(
                     f'bounds of {body}: "{component}" is no component of a wrench'

@@ -76,11 +76,11 @@ def rollout(
     ndarray
         States, shape (draw, ..., time + 1, body, 6), SI units; the first is the start.
     """
-    lead, held = wrenches.shape[:-3], np.moveaxis(wrenches, -3, 0)
-    held = held.reshape(len(held), math.prod(lead), *wrenches.shape[-2:])
-    states = np.broadcast_to(start, (model.draws, held.shape[1], *start.shape))
-    path, last = [states], np.broadcast_to(model.before, held.shape[1:])
-    for wrench in held:
+    lead, in_time = wrenches.shape[:-3], np.moveaxis(wrenches, -3, 0)
+    in_time = in_time.reshape(len(in_time), math.prod(lead), *wrenches.shape[-2:])
+    states = np.broadcast_to(start, (model.draws, in_time.shape[1], *start.shape))
+    path, last = [states], np.broadcast_to(model.before, in_time.shape[1:])
+    for wrench in in_time:
         states, last = model.step(states, wrench, last), wrench
         if rng is not None:
             states = model.noisy(states, rng)
@@ -268,7 +268,7 @@ class Dynamics:
             noise=noise,
             substeps=record.substeps,
             threads=threads,
-            declared=[each.effect for each in attached],
+            declared=[effect.effect for effect in attached],
         )
 
     @property
@@ -337,8 +337,8 @@ class Dynamics:
             actions = after_recording(wrenches, last)[:, None]
         # the engine refuses states that had diverged: they stay NaN
         lost = np.asarray(~np.isfinite(states).all(axis=(-2, -1)))
-        given = np.where(lost[..., None, None], 0.0, states) if lost.any() else states
-        pairs = zip(self.phi, given, strict=True)
+        begin = np.where(lost[..., None, None], 0.0, states) if lost.any() else states
+        pairs = zip(self.phi, begin, strict=True)
         out = np.stack([self._physics.predict(p, s, actions)[:, 0] for p, s in pairs])
         out[lost] = np.nan
         return out

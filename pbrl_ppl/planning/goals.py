@@ -131,10 +131,10 @@ class Goal:
             if len(pose) != 3:
                 raise GoalError(f"goal of {name}: got {len(pose)} values, expected x, y, theta")
         shared: Any = options
-        found = tuple(
+        read = tuple(
             Target(name, pose[0], pose[1], pose[2], **shared) for name, pose in targets.items()
         )
-        return cls(found, **penalty)
+        return cls(read, **penalty)
 
     @classmethod
     def load(cls, path: str | Path) -> Goal:
@@ -208,8 +208,8 @@ class Goal:
         """Return the error of the worst target in units of its tolerances; 1 or less is reached."""
         offset = self.errors(scene, states)
         worst = np.zeros(offset.shape[:-2])
-        each = zip(self.targets, self.places(scene), self.tolerances(scene), strict=True)
-        for i, (t, place, tolerance) in enumerate(each):
+        targets = zip(self.targets, self.places(scene), self.tolerances(scene), strict=True)
+        for i, (t, place, tolerance) in enumerate(targets):
             far = np.hypot(offset[..., i, 0], offset[..., i, 1]) / tolerance
             worst = np.maximum(worst, np.maximum(far, abs(offset[..., i, 2]) / t.angle_tolerance))
             if t.speed is not None:
@@ -254,8 +254,8 @@ def read_tables(path: str | Path, tables: Iterable[Mapping[str, Any]], kind: Any
         If a key is unknown, or no body is named.
     """
     name = f"[[{kind.__name__.lower()}]]"
-    for given in tables:
-        check_keys(given, [field.name for field in fields(kind)], f"{path}: {name}")
-        if "body" not in given:
+    for table in tables:
+        check_keys(table, [field.name for field in fields(kind)], f"{path}: {name}")
+        if "body" not in table:
             raise GoalError(f"{path}: one {name} has no body; name it")
-        yield kind(**given)
+        yield kind(**table)

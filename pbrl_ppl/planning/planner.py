@@ -247,13 +247,13 @@ def plan(
     limit = np.inf if seconds is None else seconds
     say = progress or (lambda text: None)
     task = Task(dynamics, first, goal, actions, tail, nodes, limit, noise, rng, say)
-    found = search(task, **options)
-    states = rollout(dynamics, first, found.wrenches)
+    result = search(task, **options)
+    states = rollout(dynamics, first, result.wrenches)
     distance = float(tail_mean(goal.distance(scene, states[:, -1]), tail))
     if noise:
         times = -(-64 // dynamics.draws)  # so many draws of Eq. 13's noise, at least
         states = np.concatenate(
-            [rollout(dynamics, first, found.wrenches, rng) for _ in range(times)]
+            [rollout(dynamics, first, result.wrenches, rng) for _ in range(times)]
         )
     predicted = xr.Dataset(
         {"predicted": (("draw", "time", "body", "state"), states)},
@@ -265,8 +265,8 @@ def plan(
         },
     )
     return Plan(
-        scene, goal, first, found.wrenches, predicted, found.reached, found.stopped, distance,
-        found.nodes, found.seconds,
+        scene, goal, first, result.wrenches, predicted, result.reached, result.stopped, distance,
+        result.nodes, result.seconds,
     )  # fmt: skip
 
 
@@ -298,13 +298,13 @@ def start_state(scene: Scene, start: Mapping[str, Sequence[float]] | ArrayLike) 
                 raise GoalError(
                     f"start: nothing says where {body.name} is; give {body.name} = x, y, theta"
                 )
-            given = np.asarray(start.get(body.name, body.pose), dtype=float).ravel()
-            if len(given) not in (3, 6):
+            pose = np.asarray(start.get(body.name, body.pose), dtype=float).ravel()
+            if len(pose) not in (3, 6):
                 raise GoalError(
-                    f"start of {body.name}: got {len(given)} values, expected x, y, theta or these"
+                    f"start of {body.name}: got {len(pose)} values, expected x, y, theta or these"
                     " and vx, vy, omega"
                 )
-            states[i, : len(given)] = given
+            states[i, : len(pose)] = pose
     else:
         states = np.array(start, dtype=float)
         if states.shape != (len(names), len(STATE)):

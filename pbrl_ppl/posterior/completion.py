@@ -215,8 +215,8 @@ def predictive_rows(
         Shape (chain, draw): indices of the draws, chains joined.
     """
     wanted = int(np.clip(most_numbers // max(cells, 1), least, most))
-    each = min(draws, -(-wanted // chains))
-    chosen = np.linspace(draws - 1, 0, each).astype(int)[::-1]
+    a_chain = min(draws, -(-wanted // chains))
+    chosen = np.linspace(draws - 1, 0, a_chain).astype(int)[::-1]
     return np.asarray(draws * np.arange(chains)[:, None] + chosen)
 
 
@@ -293,8 +293,8 @@ def linearisation_errors(problem: Problem, phi: Floats, sigma: Floats) -> Floats
     errors = np.zeros((len(phi), problem.data.history.n_trajectories))
     for row, point, noise in zip(errors, phi, sigma, strict=True):
         again, stored = (
-            each.log_density(each.residual(point), noise, point)
-            for each in (smoothed(problem, point, noise), problem)
+            other.log_density(other.residual(point), noise, point)
+            for other in (smoothed(problem, point, noise), problem)
         )
         np.add.at(row, problem.segments.trajectory, again - stored)
     return errors
@@ -352,57 +352,58 @@ def checked(
     more = f"raise draws, or {on}" if weighted else f"raise draws or thin, or {on}"
     if record.updates is not None:  # resampled draws are no chain that could go on
         more = "these draws were reweighted by update; fit all data anew"
-    found: list[_Warned] = []
+    warnings: list[_Warned] = []
     if asked is not None:
         record = replace(record, interrupted=True)
         text = (
             f"sampling was interrupted after {sizes['draw']} of {asked[0]} draws in"
             f" {sizes['chain']} of {asked[1]} chains, which are kept; for more, {on}"
         )
-        found.append((ConvergenceWarning, text))
-    found += _of_approximations(record)
+        warnings.append((ConvergenceWarning, text))
+    warnings += _of_approximations(record)
     if sizes["draw"] >= least_draws:
         r_hat, ess = convergence(idata)
         worst = max(r_hat, key=lambda k: r_hat[k]), min(ess, key=lambda k: ess[k])
         record = replace(record, max_rhat=r_hat[worst[0]], min_ess=ess[worst[1]])
         if short := _unconverged(record, sizes["chain"], worst, more):
-            found.append((ConvergenceWarning, short))
+            warnings.append((ConvergenceWarning, short))
         if problem.library is None:  # what follows compares with Table 1
-            found += _of_parameters(problem, idata)
+            warnings += _of_parameters(problem, idata)
     elif record.method != "map":  # a mode alone is one draw
         text = (
             f"with {sizes['draw']} draws a chain there is no R-hat (it takes at least"
             f" {least_draws}), so whether the chains have converged is not known; {more}"
         )
-        found.append((ConvergenceWarning, text))
-    replace(record, warnings=tuple(text for _, text in found)).write(idata)
-    for kind, text in found:
+        warnings.append((ConvergenceWarning, text))
+    replace(record, warnings=tuple(text for _, text in warnings)).write(idata)
+    for kind, text in warnings:
         warn(text, kind)
     return idata
 
 
 def _of_approximations(record: PosteriorRecord) -> list[_Warned]:
     """Return warnings on linearised states, importance weights and evidences."""
-    found: list[_Warned] = []
-    held = record.linearisation
-    if held is not None and not held.sd <= MOST:
+    warned: list[_Warned] = []
+    linearisation = record.linearisation
+    if linearisation is not None and not linearisation.sd <= MOST:
         text = (
-            f"the likelihood is linearised where it does not hold: at {held.draws} draws with"
-            f" the states smoothed anew it differs by {held.sd:.2g} nats (standard deviation;"
-            f" want <= {MOST:g}), most in trajectory {held.trajectory}; cut that where"
-            " bodies meet or wheels begin to slip, or compare with a fit of single transitions"
+            f"the likelihood is linearised where it does not hold: at {linearisation.draws} draws"
+            f" with the states smoothed anew it differs by {linearisation.sd:.2g} nats (standard"
+            f" deviation; want <= {MOST:g}), most in trajectory {linearisation.trajectory}; cut"
+            " that where bodies meet or wheels begin to slip, or compare with a fit of single"
+            " transitions"
         )
-        found.append((LinearisationWarning, text))
+        warned.append((LinearisationWarning, text))
     k = record.pareto_k
     if k is not None and not k <= MAX_PARETO_K:
         text = (
             f"Pareto k of the proposals' weights is {k:.2g} (want <= {MAX_PARETO_K}): they may miss"
             " a part of the posterior; raise draws, or compare with the method 'metropolis'"
         )
-        found.append((ConvergenceWarning, text))
+        warned.append((ConvergenceWarning, text))
     if rough := doubts(record.configurations or ()):
-        found.append((ConvergenceWarning, rough))
-    return found
+        warned.append((ConvergenceWarning, rough))
+    return warned
 
 
 def _unconverged(
@@ -434,7 +435,7 @@ def _of_parameters(
     A parameter is at its bound if a share ``stuck`` of its draws is within a share ``near`` of its
     support from there.
     """
-    found: list[_Warned] = []
+    warned: list[_Warned] = []
     phi, _ = parameter_draws(problem, idata)
     ends = problem.layout.supports(phi)
     margin = near * (ends[1] - ends[0])
@@ -447,15 +448,15 @@ def _of_parameters(
                 f" {np.median(bound[:, i]):g}: {share[i]:.0%} of the draws are there; check the"
                 " shape and the frame of the body; an effect that the model lacks may press too"
             )
-            found.append((BoundWarning, text))
+            warned.append((BoundWarning, text))
     silent = uninformed(idata, effects={attached.effect for attached in problem.physics.effects})
     if silent:
         text = (
             f"the data say nothing about {', '.join(silent)}: the posterior is the prior; record"
             " motions that depend on it, or give it in the scene (known = ...)"
         )
-        found.append((UninformedWarning, text))
-    return found
+        warned.append((UninformedWarning, text))
+    return warned
 
 
 def _folded(problem: Problem, trace: Any, seed: int | None) -> xr.Dataset:

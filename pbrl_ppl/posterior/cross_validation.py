@@ -120,9 +120,9 @@ def compare(before: Any, after: Any) -> Comparison | None:
         except Exception:  # a report can do without
             return None
     count = int(first.n_data_points)
-    found = Comparison(_summary(first), _summary(second), difference, error, count, unit)
-    numbers = (found.before.elpd_loo, found.after.elpd_loo, difference, error)
-    return found if np.isfinite(numbers).all() else None
+    comparison = Comparison(_summary(first), _summary(second), difference, error, count, unit)
+    numbers = (comparison.before.elpd_loo, comparison.after.elpd_loo, difference, error)
+    return comparison if np.isfinite(numbers).all() else None
 
 
 def _gain(az: Any, first: Any, second: Any) -> tuple[float, float]:
@@ -226,7 +226,7 @@ def by_number(idata: Any) -> Any:
     some = {"draw": predictive["draw"].to_numpy()}
     posterior = group(idata, "posterior").sel(some).drop_vars(["chain", "draw"])
     likelihood = group(idata, "log_likelihood")["next_state"].sel(some)
-    each = likelihood.transpose("chain", "draw", "transition").to_numpy()
+    log_likelihood = likelihood.transpose("chain", "draw", "transition").to_numpy()
     measured = group(idata, "observed_data")["next_state"].transpose(*NEXT_STATE_DIMS)
     values = measured.to_numpy()
     seen = np.flatnonzero(np.isfinite(values))
@@ -242,7 +242,9 @@ def by_number(idata: Any) -> Any:
         {
             "posterior": posterior.transpose("chain", "draw", ...),
             "posterior_predictive": xr.Dataset({"next_state": (sampled, predicted)}, labels),
-            "log_likelihood": xr.Dataset({"next_state": (sampled, each[..., places[0]])}, labels),
+            "log_likelihood": xr.Dataset(
+                {"next_state": (sampled, log_likelihood[..., places[0]])}, labels
+            ),
             "observed_data": xr.Dataset({"next_state": (_NUMBER, values.ravel()[seen])}, labels),
         },
         idata.attrs,
@@ -281,7 +283,7 @@ def loo_pit(idata: Any) -> xr.DataArray:
     likelihood = likelihood.transpose("transition", "sample")
     measured = group(idata, "observed_data")["next_state"].transpose(*NEXT_STATE_DIMS)
     # smoothed over all draws, for a better estimate of the tail
-    weights = np.stack([smoothed(-each)[0][rows] for each in likelihood.to_numpy()], axis=1)
+    weights = np.stack([smoothed(-column)[0][rows] for column in likelihood.to_numpy()], axis=1)
     weights /= weights.sum(axis=0)
     below = np.einsum("rt,rthbs->thbs", weights, _deviations(predicted, measured) <= 0.0)
     return measured.copy(data=np.where(np.isfinite(measured), below, np.nan))

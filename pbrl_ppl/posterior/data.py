@@ -51,16 +51,16 @@ def record_of(problem: Problem, seed: int, method: str) -> PosteriorRecord:
     scene, attached, likelihood = problem.scene, problem.physics.effects, problem.likelihood
     for body in scene.dynamic:
         new = [
-            each.effect.name
-            for each in attached
-            if each.body == body.name and each.effect.name not in body.effects
+            effect.effect.name
+            for effect in attached
+            if effect.body == body.name and effect.effect.name not in body.effects
         ]
         scene = scene.with_effects(body.name, *new)
     median, spread = problem.noise_prior
     tables = [e.effect.table for e in attached if isinstance(e.effect, LearnedRemainder)]
     return PosteriorRecord(
         scene=scene,
-        effects=tuple((each.effect.name, each.body) for each in attached),
+        effects=tuple((effect.effect.name, effect.body) for effect in attached),
         horizon=problem.data.horizon,
         substeps=problem.physics.substeps,
         together=tuple(problem.physics.together),
@@ -81,13 +81,13 @@ def record_of(problem: Problem, seed: int, method: str) -> PosteriorRecord:
 
 def versions() -> dict[str, str]:
     """Return the versions of Python and of the packages that a posterior depends on."""
-    found = {"python": ".".join(map(str, sys.version_info[:3]))}
+    numbers = {"python": ".".join(map(str, sys.version_info[:3]))}
     for name in PACKAGES:
         try:
-            found[name] = importlib.metadata.version(name)
+            numbers[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+            numbers[name] = "not installed"
+    return numbers
 
 
 def problem_of(
@@ -114,9 +114,9 @@ def problem_of(
         If an effect is not among ``effects``.
     """
     record = PosteriorRecord.of(idata)
-    given, measured = group(idata, "constant_data"), group(idata, "observed_data")["next_state"]
+    constants, measured = group(idata, "constant_data"), group(idata, "observed_data")["next_state"]
     columns = tuple(STATE.index(name) for name in record.measured)
-    start, actions = given["start"].to_numpy(), given["actions"].to_numpy()
+    start, actions = constants["start"].to_numpy(), constants["actions"].to_numpy()
     other = history is not None
     if history is None:
         values = measured.transpose(*NEXT_STATE_DIMS).to_numpy()
@@ -141,9 +141,9 @@ def problem_of(
         ),
         library=record.library,
     )
-    stored = with_recording(problem, given, record.data_sha256)
+    stored = with_recording(problem, constants, record.data_sha256)
     if not other or not stored.likelihood.filtered:
-        return stored if not other or SMOOTHED not in given else problem
+        return stored if not other or SMOOTHED not in constants else problem
     # linearised at the posterior's best draw
     phi, sigma = vectors(idata, problem.layout, stored.noise_variables)
     best = best_draw(idata)
@@ -168,13 +168,13 @@ def linearised_as(problem: Problem, idata: Any) -> Problem:
     PosteriorError
         If the likelihood, the data or the parameters are others.
     """
-    given, posterior = group(idata, "constant_data"), group(idata, "posterior")
+    constants, posterior = group(idata, "constant_data"), group(idata, "posterior")
     record = PosteriorRecord.of(idata)
-    held, kind = record.likelihood_name, problem.likelihood.name
-    if held != kind:
+    stored, kind = record.likelihood_name, problem.likelihood.name
+    if stored != kind:
         raise PosteriorError(
-            f"posterior: its likelihood is of {held}, the model's of {kind}; make the model with"
-            f" the likelihood {held!r}"
+            f"posterior: its likelihood is of {stored}, the model's of {kind}; make the model with"
+            f" the likelihood {stored!r}"
         )
     if problem.likelihood.simulated:
         problem = in_pieces(problem, record.horizon, problem.data.smoothed_states)
@@ -187,9 +187,9 @@ def linearised_as(problem: Problem, idata: Any) -> Problem:
     names = [*(block.name for block in problem.layout.blocks), *problem.noise_variables]
     if missing := [name for name in names if name not in posterior]:
         raise PosteriorError(f"posterior: it has no {', '.join(missing)}; of another model?")
-    if SMOOTHED not in given:
+    if SMOOTHED not in constants:
         return problem
-    problem = with_recording(problem, given, problem.data.history.data_sha256)
+    problem = with_recording(problem, constants, problem.data.history.data_sha256)
     return problem.with_likelihood(prior=record.sigma_prior)
 
 
@@ -220,26 +220,26 @@ def recording(problem: Problem) -> xr.Dataset:
     return kept.assign_attrs({})
 
 
-def with_recording(problem: Problem, given: xr.Dataset, data_sha256: str) -> Problem:
+def with_recording(problem: Problem, constants: xr.Dataset, data_sha256: str) -> Problem:
     """Return a problem with the trajectories of a posterior's constant data, if it has."""
-    if SMOOTHED not in given:
+    if SMOOTHED not in constants:
         return problem
-    history = recorded(problem.scene, given, data_sha256)
-    states = given[SMOOTHED].to_numpy()
-    if _BY_START in given:
-        length, prior = given[_BY_START].sizes["step"], problem.likelihood.prior
+    history = recorded(problem.scene, constants, data_sha256)
+    states = constants[SMOOTHED].to_numpy()
+    if _BY_START in constants:
+        length, prior = constants[_BY_START].sizes["step"], problem.likelihood.prior
         problem = in_pieces(problem.with_data(history=history), length, states)
         start = problem.segments.start
-        slope, tau = given[_BY_START].to_numpy(), given[_TAU].to_numpy()
+        slope, tau = constants[_BY_START].to_numpy(), constants[_TAU].to_numpy()
         return linearised_pieces(problem, start, slope, tau).with_likelihood(prior=prior)
-    coordinates = recorded_coordinates(problem.scene, given)
+    coordinates = recorded_coordinates(problem.scene, constants)
     data = replace(
         problem.data, history=history, horizon=1, states=states, columns=coordinates.columns
     )
-    problem, slope = problem.on(data), given["slope"].to_numpy()
-    noise = linearised(problem, coordinates, slope, given["linearised_at"].to_numpy())
-    if _SENSITIVITY in given:
-        origin, before = given[_ORIGIN].to_numpy(), given[_SENSITIVITY].to_numpy()
+    problem, slope = problem.on(data), constants["slope"].to_numpy()
+    noise = linearised(problem, coordinates, slope, constants["linearised_at"].to_numpy())
+    if _SENSITIVITY in constants:
+        origin, before = constants[_ORIGIN].to_numpy(), constants[_SENSITIVITY].to_numpy()
         follow = Sensitivity(
             problem.scene, problem.layout, coordinates, noise.slope, origin, before
         )
@@ -247,28 +247,30 @@ def with_recording(problem: Problem, given: xr.Dataset, data_sha256: str) -> Pro
     return problem.along(noise)
 
 
-def recorded(scene: Scene, given: xr.Dataset, data_sha256: str = "") -> History:
+def recorded(scene: Scene, constants: xr.Dataset, data_sha256: str = "") -> History:
     """Return the history that a posterior's constant data hold."""
-    names = [str(name) for name in given.data_vars if str(name).startswith(_PREFIX)]
+    names = [str(name) for name in constants.data_vars if str(name).startswith(_PREFIX)]
     back = {
         name: str(name).removeprefix(_PREFIX)
-        for name in (*names, *given.dims)
+        for name in (*names, *constants.dims)
         if str(name).startswith(_PREFIX)
     }
-    dataset = given[names].rename(back)
+    dataset = constants[names].rename(back)
     dataset = dataset.assign_coords(
         kinematic=("body", [body.kinematic for body in scene.moving])
     ).assign_attrs(time_step=scene.time_step, data_sha256=data_sha256)
     return History(dataset)
 
 
-def recorded_coordinates(scene: Scene, given: xr.Dataset) -> Any:
+def recorded_coordinates(scene: Scene, constants: xr.Dataset) -> Any:
     """Return the coordinates of the history that a posterior's constant data hold."""
-    coordinates = observed_coordinates(scene, recorded(scene, given))
-    return coordinates.drifting(float(given["memory"])) if "memory" in given else coordinates
+    coordinates = observed_coordinates(scene, recorded(scene, constants))
+    return (
+        coordinates.drifting(float(constants["memory"])) if "memory" in constants else coordinates
+    )
 
 
-def both_recordings(held: xr.Dataset, new: xr.Dataset) -> xr.Dataset:
+def both_recordings(earlier: xr.Dataset, new: xr.Dataset) -> xr.Dataset:
     """Return one recording after the other; empty where there are none."""
     if SMOOTHED not in new:
         return xr.Dataset()
@@ -277,7 +279,7 @@ def both_recordings(held: xr.Dataset, new: xr.Dataset) -> xr.Dataset:
     result = new[[name for name in ("linearised_at", "memory") if name in new]]
     result = result.drop_vars([str(name) for name in result.coords])
     for names, dim in ((by_transition, "transition"), (whole, f"{_PREFIX}trajectory")):
-        parts = [given[names].reset_coords(drop=True) for given in (held, new)]
+        parts = [dataset[names].reset_coords(drop=True) for dataset in (earlier, new)]
         parts = [part.drop_vars([dim], errors="ignore") for part in parts]
         result = result.merge(xr.concat(parts, dim, join="outer"))
     result[SMOOTHED] = result[SMOOTHED].fillna(0.0)
@@ -298,15 +300,17 @@ def places(segments: Segments) -> dict[str, xr.Variable]:
     }
 
 
-def both_places(held: xr.Dataset, segments: Segments) -> dict[str, xr.Variable]:
+def both_places(earlier: xr.Dataset, segments: Segments) -> dict[str, xr.Variable]:
     """Return coordinates of a posterior's transitions and, after them, of new ones.
 
     Trajectories are numbered on, so that those of two recordings stay apart.
     """
     new = {name: variable.to_numpy() for name, variable in places(segments).items()}
-    new["trajectory"] += int(held["trajectory"].max()) + 1 - new["trajectory"].min()
+    new["trajectory"] += int(earlier["trajectory"].max()) + 1 - new["trajectory"].min()
     return {
-        name: xr.Variable("transition", np.concatenate([held[name], values]), held[name].attrs)
+        name: xr.Variable(
+            "transition", np.concatenate([earlier[name], values]), earlier[name].attrs
+        )
         for name, values in new.items()
     }
 

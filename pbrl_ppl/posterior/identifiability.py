@@ -99,8 +99,8 @@ class Identifiability:
         """Sentences on what the data do not inform; none where they inform all."""
         cures: dict[str, list[str]] = {}
         for name in self.silent:
-            found = (cure for words, cure in _CURES if any(word in f" {name}" for word in words))
-            cures.setdefault(next(found, "record motion in which that matters"), []).append(name)
+            matching = (cure for words, cure in _CURES if any(word in f" {name}" for word in words))
+            cures.setdefault(next(matching, "record motion in which that matters"), []).append(name)
         silent = (
             f"The data say nothing about {_listed(names)}: {cure}, or give the value as known."
             for cure, names in cures.items()
@@ -302,7 +302,7 @@ def _directions(gram: Floats, labels: list[str], *, minor: float = 0.2) -> tuple
     part = gram[np.ix_(active, active)]
     alone = np.sqrt(np.diag(part))
     values, vectors = np.linalg.eigh(part)
-    found = []
+    directions = []
     for row in _sparse(vectors[:, values < 1.0].T):
         weight = row / np.linalg.norm(row)
         cancelled = np.abs(weight) * alone
@@ -311,8 +311,8 @@ def _directions(gram: Floats, labels: list[str], *, minor: float = 0.2) -> tuple
             continue
         weight = weight * np.sign(weight[members[0]])
         named = tuple((labels[active[i]], float(weight[i])) for i in members)
-        found.append(Direction(named, float(np.sqrt(max(weight @ part @ weight, 0.0)))))
-    return tuple(found)
+        directions.append(Direction(named, float(np.sqrt(max(weight @ part @ weight, 0.0)))))
+    return tuple(directions)
 
 
 def _sparse(rows: Floats) -> Floats:

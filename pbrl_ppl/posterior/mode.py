@@ -69,9 +69,9 @@ def packed_mode(
         draws = log_posterior(problem, phi, sigma, log_likelihood=likelihood)
         best = int(np.argmax(draws))
         if draws[best] > height + higher:
-            found = find_mode(problem, initial=phi[best], rounds=_CLIMB)
-            if found.log_posterior > height:
-                mode, height = Point(found.phi, found.sigma), found.log_posterior
+            climbed = find_mode(problem, initial=phi[best], rounds=_CLIMB)
+            if climbed.log_posterior > height:
+                mode, height = Point(climbed.phi, climbed.sigma), climbed.log_posterior
     return _packed(problem, mode, height, phi)
 
 
@@ -97,8 +97,8 @@ def updated_mode(
     """
     phi, sigma, choice = draws
     if problem.library is None and not problem.layout.discrete.any():
-        found = find_mode(problem, initial=earlier.phi, rounds=_CLIMB)
-        return _packed(problem, Point(found.phi, found.sigma), found.log_posterior, phi)
+        mode = find_mode(problem, initial=earlier.phi, rounds=_CLIMB)
+        return _packed(problem, Point(mode.phi, mode.sigma), mode.log_posterior, phi)
     height = log_posterior(problem, phi, sigma, choice, log_likelihood=likelihood)
     i = int(np.argmax(height))
     best = Point(phi[i], sigma[i], None if choice is None else choice[i])

@@ -270,17 +270,17 @@ def scene_of(idata: Any) -> Scene:
     PosteriorError
         If there is none.
     """
-    held = stored_fields(idata, ("scene",))
-    if not held:
+    fields = stored_fields(idata, ("scene",))
+    if not fields:
         raise PosteriorError("posterior: it holds no scene; make it with pbrl_ppl.fit")
-    scene: Scene = held["scene"]
+    scene: Scene = fields["scene"]
     return scene
 
 
 def layout_of(idata: Any, effects: Iterable[Effect] = catalogue) -> Layout:
     """Return the layout of a posterior's parameters."""
-    scene, held = scene_of(idata), stored_fields(idata, ("learned_remainder",))
-    return build_layout(scene, _attached(scene, held.get("learned_remainder"), effects))
+    scene, fields = scene_of(idata), stored_fields(idata, ("learned_remainder",))
+    return build_layout(scene, _attached(scene, fields.get("learned_remainder"), effects))
 
 
 def stored_fields(idata: Any, names: Iterable[str] | None = None) -> dict[str, Any]:
@@ -319,10 +319,10 @@ def _from_json(kind: Any, value: Any) -> Any:
     """Return a value of a type from what JSON holds of it."""
     if is_dataclass(kind):
         kinds = _kinds(kind)  # type: ignore[arg-type]  # a type, not an instance
-        held = {name: _from_json(kinds[name], own) for name, own in value.items()}
+        values = {name: _from_json(kinds[name], entry) for name, entry in value.items()}
         if kind is Coordinates:  # no row has no columns in JSON
-            held["push"] = held["push"].reshape(-1, len(held["places"]))
-        return kind(**held)  # type: ignore[operator]
+            values["push"] = values["push"].reshape(-1, len(values["places"]))
+        return kind(**values)  # type: ignore[operator]
     if kind in (Ints, Floats):
         return np.array(value, dtype=np.int64 if kind == Ints else float)
     if get_origin(kind) is tuple:

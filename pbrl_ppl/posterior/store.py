@@ -66,13 +66,13 @@ def group(idata: Any, name: str) -> xr.Dataset:
     PosteriorError
         If there is no such group.
     """
-    found = groups(idata)
-    if name not in found:
+    stored = groups(idata)
+    if name not in stored:
         raise PosteriorError(
-            f"posterior: it has no group {name!r}, only {', '.join(found)}; save it with"
+            f"posterior: it has no group {name!r}, only {', '.join(stored)}; save it with"
             " save_posterior after fit"
         )
-    return found[name]
+    return stored[name]
 
 
 def from_groups(datasets: Mapping[str, xr.Dataset], attrs: Mapping[str, Any]) -> Any:
@@ -143,18 +143,18 @@ def load_posterior(path: str | Path) -> Any:
             attrs = dict(root.attrs)
         with h5py.File(path) as file:
             names = [name for name, item in file.items() if isinstance(item, h5py.Group)]
-        found = {}
+        loaded = {}
         for name in names:
             with xr.open_dataset(path, group=name, engine="h5netcdf") as data:
-                found[name] = data.load()
+                loaded[name] = data.load()
     except (OSError, ValueError, KeyError) as error:
         raise PosteriorError(
             f"{path}: this is not a NetCDF file; pass one that fit saved"
         ) from error
     check_schema(attrs, str(path))
-    if missing := [name for name in _NEEDED if name not in found]:
+    if missing := [name for name in _NEEDED if name not in loaded]:
         raise PosteriorError(f"{path}: it lacks {', '.join(missing)}; save the whole fit again")
-    return from_groups(found, attrs)
+    return from_groups(loaded, attrs)
 
 
 def check_schema(attrs: Mapping[str, Any], where: str) -> None:

@@ -67,7 +67,7 @@ def updated_scene(idata: Any, *, effects: Iterable[Effect] = catalogue) -> Scene
     draws = labelled_draws(idata)
     folded = nearest(layout, layout.columns(draws))
     draws |= {x: folded[:, i] for i, x in enumerate(layout.labels) if x in draws}
-    found: defaultdict[str, dict[str, dict[str, float]]] = defaultdict(dict)
+    priors: defaultdict[str, dict[str, dict[str, float]]] = defaultdict(dict)
     for block in layout.blocks:
         # a learned remainder belongs to one recording and cannot be declared in a scene
         if block.of != "body" or LEARNED_REMAINDER in block.name:
@@ -82,10 +82,10 @@ def updated_scene(idata: Any, *, effects: Iterable[Effect] = catalogue) -> Scene
                     " give no width to a prior; fit again, with more draws"
                 )
             matched = moment_matched(prior, draws[label])
-            found[owner][block.name] = {k: getattr(matched, k) for k in matched.hyper_names}
+            priors[owner][block.name] = {k: getattr(matched, k) for k in matched.hyper_names}
     bodies = []
     for body in scene.bodies:
-        both = found[body.owner] | found[body.name]  # those that it shares, and its effects'
+        both = priors[body.owner] | priors[body.name]  # those that it shares, and its effects'
         new = {name: tuple(hyper.items()) for name, hyper in both.items()}
         laws = tuple(name for name in body.effects if name != LEARNED_REMAINDER)
         known = tuple((dict(body.prior) | new).items())
@@ -112,8 +112,10 @@ def _joints(idata: Any, scene: Scene) -> tuple[Joint, ...]:
             law = np.sum(laws, axis=0)
             both = zip(JOINT_INDICES, (law.sum(axis=1), law.sum(axis=0)), strict=True)
             named = [(index, zip(scene.joinable, p.tolist(), strict=True)) for index, p in both]
-            found = tuple((index, tuple((n, p) for n, p in table if p)) for index, table in named)
-            joint = replace(joint, prior=found)
+            named_pairs = tuple(
+                (index, tuple((n, p) for n, p in table if p)) for index, table in named
+            )
+            joint = replace(joint, prior=named_pairs)
         joints.append(joint)
     return tuple(joints)
 
@@ -154,11 +156,12 @@ def joint_probabilities(idata: Any) -> dict[str, dict[str, float]]:
     table: dict[str, dict[str, float]] = {}
     for row in rows:
         for joint, pair in row["joints"].items():
-            own = table.setdefault(joint, {})
+            probabilities = table.setdefault(joint, {})
             name = NONE if pair is None else "-".join(pair)
-            own[name] = own.get(name, 0.0) + row["probability"]
+            probabilities[name] = probabilities.get(name, 0.0) + row["probability"]
     return {
-        joint: dict(sorted(own.items(), key=lambda item: -item[1])) for joint, own in table.items()
+        joint: dict(sorted(probabilities.items(), key=lambda item: -item[1]))
+        for joint, probabilities in table.items()
     }
 
 
@@ -258,15 +261,15 @@ def learned_library(
     for name, idata in posteriors.items():
         scene, flat = scene_of(idata), scalars(idata)
         for body in scene.dynamic:
-            found = {key: float(value) for key, value in body.known}
+            parameters = {key: float(value) for key, value in body.known}
             for label, values in flat.data_vars.items():
                 key, _, owner = str(label).rstrip("]").partition("[")
                 if owner in (body.name, body.owner) and key not in _OTHERS:
                     x = values.to_numpy()
                     angle = key == "w_theta"  # its mean is a direction
-                    found[key] = float(np.angle(np.exp(1j * x).mean()) if angle else x.mean())
+                    parameters[key] = float(np.angle(np.exp(1j * x).mean()) if angle else x.mean())
             alone = len({body.owner for body in scene.dynamic}) == 1
-            sets[name if alone else f"{name}.{body.owner}"] = found
+            sets[name if alone else f"{name}.{body.owner}"] = parameters
     return ParameterLibrary(sets, probabilities)
 
 

@@ -187,13 +187,15 @@ def _by_contact(axes: Axes, evidence: Evidence) -> None:
 
 def _shares(axes: Axes, evidence: Evidence) -> None:
     gains = np.sort(np.maximum(evidence.by_transition, 0.0))[::-1]
-    held = np.cumsum(gains) / max(float(gains.sum()), 1e-300)
-    axes.plot(100 * np.arange(len(held) + 1) / len(held), 100 * np.r_[0, held], color=AFTER)
+    cumulated = np.cumsum(gains) / max(float(gains.sum()), 1e-300)
+    axes.plot(
+        100 * np.arange(len(cumulated) + 1) / len(cumulated), 100 * np.r_[0, cumulated], color=AFTER
+    )
     axes.plot([0, 100], [0, 100], color=PLAIN, linestyle=":", linewidth=1)
     count = len(evidence.carriers())
-    axes.plot([100 * count / len(held)], [80], "o", color=BEFORE)
+    axes.plot([100 * count / len(cumulated)], [80], "o", color=BEFORE)
     text = f"{count} transitions\nhold 80 %"
-    label(axes, text, (100 * count / len(held), 80), xytext=(8, -24))
+    label(axes, text, (100 * count / len(cumulated), 80), xytext=(8, -24))
     axes.set_title("by transition", fontsize=10)
     axes.set(xlabel="transitions, largest gain first (%)", ylabel="share of the gains (%)")
 

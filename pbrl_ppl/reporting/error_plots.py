@@ -178,7 +178,7 @@ def _fit_to(axes: Axes, values: Floats) -> None:
 
 def _write(axes: Axes, notes: list[tuple[str, str]]) -> None:
     """Write notes in their colours at the top of a panel."""
-    for i, (colour, text) in enumerate((each, said) for each, said in notes if said):
+    for i, (colour, text) in enumerate((colour_of, said) for colour_of, said in notes if said):
         axes.text(
             0.98, 0.97 - 0.11 * i, text, color=colour, transform=axes.transAxes, ha="right",
             va="top", fontsize=8, bbox={"color": "white", "alpha": 0.7, "pad": 1.0},
@@ -204,21 +204,23 @@ def _beside(line: Floats, measured: Floats) -> Floats:
 
 def plot_correlations(loop: Loop, width: float = WIDE) -> Figure:
     """Plot correlations of errors with earlier errors and with commands."""
-    found = loop.correlations
-    figure, axes = blank_figure(width, 3.2, 1, 2 if found.commands else 1)
-    lags = np.arange(1, len(found.own) + 1)
-    _plot_correlations(axes[0], lags, found.own, found.pairs, list(found.cells))
+    correlations = loop.correlations
+    figure, axes = blank_figure(width, 3.2, 1, 2 if correlations.commands else 1)
+    lags = np.arange(1, len(correlations.own) + 1)
+    _plot_correlations(
+        axes[0], lags, correlations.own, correlations.pairs, list(correlations.cells)
+    )
     axes[0].set_xlabel("intervals before")
     axes[0].set_title("with itself", fontsize="medium")
-    if found.commands:
-        lags = np.arange(len(found.driven))
+    if correlations.commands:
+        lags = np.arange(len(correlations.driven))
         names = [
             f"{cell}, {command.replace('_', ' ')}"
-            for command in found.commands
-            for cell in found.cells
+            for command in correlations.commands
+            for cell in correlations.cells
         ]
-        pairs = np.full((len(lags), len(names)), max(float(found.pairs.max(initial=1)), 1.0))
-        _plot_correlations(axes[1], lags, found.driven.reshape(len(lags), -1), pairs, names)
+        pairs = np.full((len(lags), len(names)), max(float(correlations.pairs.max(initial=1)), 1.0))
+        _plot_correlations(axes[1], lags, correlations.driven.reshape(len(lags), -1), pairs, names)
         axes[1].set_xlabel("intervals before")
         axes[1].set_title("with commands", fontsize="medium")
     axes[0].set_ylabel("correlation of errors")

@@ -285,10 +285,10 @@ def _residual_force(
         values = c * x + s * y if dimension == "forward speed" else c * y - s * x
     else:
         dimension = {"x": "vx", "y": "vy", "theta": "omega"}.get(dimension, dimension)
-        found = acceleration(dimension) if dimension in STATE else None
-        if found is None:
+        places = acceleration(dimension) if dimension in STATE else None
+        if places is None:
             return None
-        values = found
+        values = places
     moving = problem.scene.moving[body]
     sizes = dict(zip(problem.layout.labels, phi.tolist(), strict=True))
     mass = dict(moving.known).get("mass", sizes.get(f"mass[{moving.owner}]"))

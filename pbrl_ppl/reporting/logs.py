@@ -334,9 +334,9 @@ def row_of(log: Log, folder: Path, inputs: str) -> Row | None:
                 for added in report["added"]
             ],
             "detectable": {
-                f"{each['effect']}[{each['body']}]": each["detectable"]
-                for each in report["candidates"]
-                if not each.get("caps", False)
+                f"{candidate['effect']}[{candidate['body']}]": candidate["detectable"]
+                for candidate in report["candidates"]
+                if not candidate.get("caps", False)
             },
             "error_before": error["before"]["normalised_rmse"],
             "error_after": error["after"]["normalised_rmse"],

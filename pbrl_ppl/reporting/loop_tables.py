@@ -21,7 +21,7 @@ from pbrl_ppl.state import STATE, Floats
 
 def measured_parameters(candidate: Candidate, loop: Loop) -> tuple[str, ...]:
     """Return a candidate's parameters without those of state dimensions that were not measured."""
-    effect = next((each for each in loop.catalogue if each.name == candidate.effect), None)
+    effect = next((other for other in loop.catalogue if other.name == candidate.effect), None)
     names = tuple(candidate.units)
     if effect is None or not isinstance(effect.stage, Sensor):
         return names
@@ -33,10 +33,10 @@ def limits_in_words(candidate: Candidate, loop: Loop) -> str:
 
     A limit beyond what the effect's prior allows is left out: no plausible size would be found.
     """
-    effect = next((each for each in loop.catalogue if each.name == candidate.effect), None)
+    effect = next((other for other in loop.catalogue if other.name == candidate.effect), None)
     if effect is not None:
         effect = effect.in_si(units_of(loop.scene, candidate.body))
-    priors = {} if effect is None else {each.name: each for each in effect.parameters}
+    priors = {} if effect is None else {other.name: other for other in effect.parameters}
     limits = {}
     for name in measured_parameters(candidate, loop):
         if name not in candidate.detectable:
@@ -93,7 +93,7 @@ def error_tables(loop: Loop) -> list[Table]:
             caption = f"{title} (root mean square error)"
             tables.append(_before_after(loop, caption, "State dimension", rows, "Unit"))
     errors = (loop.before, loop.after, loop.noise_floor)
-    nrmse, elpd = [each.normalised_rmse for each in errors], [each.elpd for each in errors]
+    nrmse, elpd = [error.normalised_rmse for error in errors], [error.elpd for error in errors]
     rows = [
         _row(loop, "Error in units of the noise", nrmse),
         _row(loop, "Log predictive density in nats (more is better)", elpd, digits=4),
@@ -158,7 +158,7 @@ def acceleration_table(loop: Loop) -> Table:
             (
                 name,
                 *(number(value) for value in values),
-                *(share(each) for each in shares),
+                *(share(relative) for relative in shares),
                 acceleration_unit(name),
                 "yes" if left.certain_after.get(name) else "no",
             )
@@ -195,7 +195,7 @@ def residual_test_table(loop: Loop) -> Table:
 
 def candidate_table(loop: Loop) -> Table:
     """Tabulate the candidates of the first round."""
-    added = {(each.effect, each.body) for each in loop.added}
+    added = {(effect.effect, effect.body) for effect in loop.added}
     return Table(
         "Candidates of the first round, best first",
         ("Effect", "Score", "Degrees of freedom", "p (corrected)", "First estimate",
@@ -218,7 +218,7 @@ def candidate_table(loop: Loop) -> Table:
         ],
         words=(4, 8, 9),
         marks=[
-            "added" if (each.effect, each.body) in added else "" for each in loop.candidates
+            "added" if (effect.effect, effect.body) in added else "" for effect in loop.candidates
         ],
     )  # fmt: skip
 

@@ -157,8 +157,8 @@ def close_loop_many(
         loops.pooled["cart"].scene  # the next cart's, with what is known of carts
     """
     if source is None:
-        given = repr(str(manifest)) if isinstance(manifest, str | Path) else "logs"
-        source = Source(command=f"pp.close_loop_many({given}, {str(folder)!r}, seed={seed}, ...)")
+        where = repr(str(manifest)) if isinstance(manifest, str | Path) else "logs"
+        source = Source(command=f"pp.close_loop_many({where}, {str(folder)!r}, seed={seed}, ...)")
     logs = read_manifest(manifest) if isinstance(manifest, str | Path) else tuple(manifest)
     folder = _opened(Path(folder))
     settings = Settings(
@@ -190,16 +190,16 @@ def close_loop_many(
             rows[log.name] = row
             tell(f"{len(rows)}/{len(logs)} {_row_in_words(row)}")
             write(_ordered(logs, rows), {}, {})
-    found = _ordered(logs, rows), *_pooled(logs, rows, folder)
-    write(*found)
-    return ManyLoops(folder, *found)
+    summary = _ordered(logs, rows), *_pooled(logs, rows, folder)
+    write(*summary)
+    return ManyLoops(folder, *summary)
 
 
 def _row_in_words(row: Row) -> str:
     if row["status"] == "failed":
         return f"{row['name']}: failed: {row['message']}"
-    found = ", ".join(f"{each['effect']}[{each['body']}]" for each in row["effects"])
-    return f"{row['name']}: {row['verdict']}{f' ({found})' if found else ''}, {row['seconds']:g} s"
+    names = ", ".join(f"{effect['effect']}[{effect['body']}]" for effect in row["effects"])
+    return f"{row['name']}: {row['verdict']}{f' ({names})' if names else ''}, {row['seconds']:g} s"
 
 
 def _ordered(logs: Iterable[Log], rows: Mapping[str, Row]) -> tuple[Row, ...]:
@@ -242,16 +242,18 @@ def _pooled(
         if row["status"] == "done" and row["verdict"] not in (UNEXPLAINED, NOT_CONVERGED):
             usable.append(log.name)
     kinds.pop("", None)
-    found, reasons = {}, {}
+    pooled, reasons = {}, {}
     for kind, names in kinds.items():
         if len(names) < 2:
             reasons[kind] = f"{len(names)} adequate model(s), expected at least 2"
             continue
         try:
-            found[kind] = pool({name: load_posterior(folder / name / "after.nc") for name in names})
+            pooled[kind] = pool(
+                {name: load_posterior(folder / name / "after.nc") for name in names}
+            )
         except PbrlError as error:
             reasons[kind] = str(error)
-    return found, reasons
+    return pooled, reasons
 
 
 def _write_summary(
@@ -265,7 +267,7 @@ def _write_summary(
     contents = {
         "contents": _KIND,
         "logs": rows,
-        "pooled": {kind: each.to_dict() for kind, each in pooled.items()},
+        "pooled": {kind: population.to_dict() for kind, population in pooled.items()},
         "not_pooled": not_pooled,
     }
     texts = {
@@ -274,8 +276,8 @@ def _write_summary(
         "effects.csv": effect_table(rows).to_csv(index=False, lineterminator="\n"),
         "index.html": page(rows, pooled, not_pooled, source),
     }
-    for kind, each in pooled.items():
-        texts[f"kind-{kind}.toml"] = each.scene.to_toml()
-        texts[f"kind-{kind}.csv"] = each.robots().to_csv(index=False, lineterminator="\n")
+    for kind, population in pooled.items():
+        texts[f"kind-{kind}.toml"] = population.scene.to_toml()
+        texts[f"kind-{kind}.csv"] = population.robots().to_csv(index=False, lineterminator="\n")
     for name, text in texts.items():
         write_text(folder / name, text)

@@ -25,7 +25,7 @@ def summary_table(rows: Iterable[Row]) -> pd.DataFrame:
     table = []
     for row in rows:
         done = row["status"] == "done"
-        named = [f"{each['effect']}[{each['body']}]" for each in row.get("effects", ())]
+        named = [f"{effect['effect']}[{effect['body']}]" for effect in row.get("effects", ())]
         more = {
             "effects": "; ".join(named),
             "warnings": len(row.get("warnings", ())),
@@ -40,11 +40,11 @@ def effect_table(rows: Iterable[Row]) -> pd.DataFrame:
     columns = ["name", "kind", "effect", "body", "parameter", "mean", "sd", "low", "high", "unit",
                "p_value"]  # fmt: skip
     table = [
-        (row["name"], row["kind"], added["effect"], added["body"], name, each["mean"], each["sd"],
-         *each["hdi"], each["unit"], added["p_value"])
+        (row["name"], row["kind"], added["effect"], added["body"], name, parameter["mean"],
+         parameter["sd"], *parameter["hdi"], parameter["unit"], added["p_value"])
         for row in rows
         for added in row.get("effects", ())
-        for name, each in added["parameters"].items()
+        for name, parameter in added["parameters"].items()
     ]  # fmt: skip
     return pd.DataFrame(table, columns=columns)
 
@@ -62,21 +62,21 @@ def page(
     source: Source,
 ) -> str:
     """Render one page of HTML with links to each log's report."""
-    found: dict[tuple[str, str], list[str]] = {}
+    logs_of: dict[tuple[str, str], list[str]] = {}
     for row in rows:
-        for each in row.get("effects", ()):
-            found.setdefault((each["effect"], each["body"]), []).append(row["name"])
+        for effect in row.get("effects", ()):
+            logs_of.setdefault((effect["effect"], effect["body"]), []).append(row["name"])
     warnings = {row["name"]: row["warnings"] for row in rows if row.get("warnings")}
     sections = [
         Logs(rows),
-        found and Effects(rows, list(found)),
+        logs_of and Effects(rows, list(logs_of)),
         (pooled or not_pooled) and Kinds(pooled, not_pooled),
         warnings and Warnings(warnings),
         LogsSource(source),
     ]
     return render_page(
         f"{len(rows)} logs",
-        LogsHeader(rows, found),
+        LogsHeader(rows, logs_of),
         [section for section in sections if isinstance(section, Section)],
     )
 
@@ -143,7 +143,10 @@ class Kinds(Section):
     link = title
 
     def context(self) -> Mapping[str, object]:
-        kinds = {kind: (each.names, _pooled(each, kind)) for kind, each in self.pooled.items()}
+        kinds = {
+            kind: (population.names, _pooled(population, kind))
+            for kind, population in self.pooled.items()
+        }
         return vars(self) | {"kinds": kinds}
 
 
@@ -245,8 +248,8 @@ def _cell(row: Row, effect: str, body: str) -> str:
     for added in row.get("effects", ()):
         if (added["effect"], added["body"]) == (effect, body):
             texts = [
-                f"{number(each['mean'])} ± {quantity(each['sd'], each['unit'])}"
-                for each in added["parameters"].values()
+                f"{number(parameter['mean'])} ± {quantity(parameter['sd'], parameter['unit'])}"
+                for parameter in added["parameters"].values()
             ]
             return Markup("<strong>{}</strong>").format("; ".join(texts))
     sizes = row.get("detectable", {}).get(f"{effect}[{body}]") or {}

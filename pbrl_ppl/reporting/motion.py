@@ -72,7 +72,7 @@ def held_out_motions(loop: Loop, most: int = 6, most_rows: int = 3000) -> list[M
         return not np.isposinf(last), -float(np.nan_to_num(first))
 
     for motion in sorted(motions, key=worst):
-        if shown and sum(len(each.time) for each in [*shown, motion]) > most_rows:
+        if shown and sum(len(other.time) for other in [*shown, motion]) > most_rows:
             break
         shown.append(motion)
     return shown[:most]
@@ -95,7 +95,7 @@ def divergence_in_words(motions: Sequence[Motion]) -> str:
     """Return which model's predictions of how many motions diverge, and after how long."""
     parts = []
     for which, name in (("before", "declared"), ("after", "revised")):
-        ends = [diverged_after(each.time, getattr(each, which)) for each in motions]
+        ends = [diverged_after(motion.time, getattr(motion, which)) for motion in motions]
         seconds = [end for end in ends if end is not None]
         if seconds:
             first = "" if len(seconds) == 1 else "at the earliest "
@@ -148,8 +148,10 @@ def _drawn(scene: Scene, motion: Motion, margin: float) -> dict[str, object]:
     places = _decimals(1e-5 * float((box[1] - box[0]).max()))
     both = (motion.before, motion.after)
 
-    def poses(given: Floats) -> object:
-        return _listed(np.concatenate([given[..., :2].round(places), given[..., 2:].round(5)], -1))
+    def poses(states: Floats) -> object:
+        return _listed(
+            np.concatenate([states[..., :2].round(places), states[..., 2:].round(5)], -1)
+        )
 
     return {
         "name": motion.name,

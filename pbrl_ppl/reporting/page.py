@@ -128,14 +128,14 @@ def render_page(title: str, header: Section, sections: Sequence[Section]) -> str
     parts = [header, *sections]
     contexts = [part.context() for part in parts]
     draws = [part.pictures() for part in parts]
-    drawn = iter(_drawn([draw for each in draws for draw in each.values()]))
+    drawn = iter(_drawn([draw for pictures in draws for draw in pictures.values()]))
     shown = [
         Markup(
             environment.get_template(f"{part.template}.html.jinja").render(
-                context, picture={name: next(drawn) for name in each}
+                context, picture={name: next(drawn) for name in pictures}
             )
         )
-        for part, context, each in zip(parts, contexts, draws, strict=True)
+        for part, context, pictures in zip(parts, contexts, draws, strict=True)
     ]
     return environment.get_template("page.html.jinja").render(
         title=title, header=shown[0], sections=list(zip(sections, shown[1:], strict=True))

@@ -172,7 +172,7 @@ class Predictions(Section):
         """Return the coverage in a sentence, or why there is none."""
         if not self.covered:
             return self.why_not or "It holds no predictions."
-        inside = [each.wide for each in self.covered.values()]
+        inside = [coverage.wide for coverage in self.covered.values()]
         return (
             f"Intervals that should hold 94 % of measurements hold {100 * min(inside):.0f} to"
             f" {100 * max(inside):.0f} % of them, in {len(inside)} state dimensions, each"
@@ -181,8 +181,13 @@ class Predictions(Section):
 
     def context(self) -> Mapping[str, object]:
         rows = [
-            (name, f"{100 * each.half:.1f} %", f"{100 * each.wide:.1f} %", str(each.measurements))
-            for name, each in self.covered.items()
+            (
+                name,
+                f"{100 * coverage.half:.1f} %",
+                f"{100 * coverage.wide:.1f} %",
+                str(coverage.measurements),
+            )
+            for name, coverage in self.covered.items()
         ]
         table = Table(
             "Measurements inside leave-one-out predictions",
@@ -288,7 +293,7 @@ def _warned(posterior: Any, identified: bool) -> list[str]:
         "draws are too few",
         *(("say nothing about",) if identified else ()),
     )
-    return [each for each in every if not any(words in each for words in covered)]
+    return [sentence for sentence in every if not any(words in sentence for words in covered)]
 
 
 def _about(posterior: Any) -> str:

@@ -203,7 +203,7 @@ class Parameters:
         ess = table[["ess_bulk", "ess_tail"]].min(axis=1)
         hats = table["r_hat"].fillna(np.inf)
         failed, rough = len(self.failed), int(table["wrong"].astype(bool).sum())
-        found = (
+        sentences = (
             f"The largest R-hat of {count} parameters is {number(hats.max(), 4)} (at most"
             f" {self.good_r_hat} is wanted), the smallest effective sample size"
             f" {number(ess.min())} (at least {self.good_ess:.0f})."
@@ -211,15 +211,15 @@ class Parameters:
         )
         agree = "The draws suffice" if self.weighted else "The chains agree"
         if failed:
-            return "Not converged.", f"{failed} of {count} parameters did not converge. {found}"
+            return "Not converged.", f"{failed} of {count} parameters did not converge. {sentences}"
         if rough:
             return "Well enough.", (
                 f"{agree}, but {rough} of {count} parameters have fewer effective draws"
                 f" or a larger R-hat than is wanted: the last digits of their intervals are rough."
-                f" {found} With R-hat up to {self.rough_r_hat} and from {self.rough_ess:.0f}"
+                f" {sentences} With R-hat up to {self.rough_r_hat} and from {self.rough_ess:.0f}"
                 " effective draws on conclusions stand; for more digits take more draws."
             )
-        return "Yes.", f"{agree}{'' if self.weighted else ' and are long enough'}. {found}"
+        return "Yes.", f"{agree}{'' if self.weighted else ' and are long enough'}. {sentences}"
 
 
 def _span(low: float, high: float) -> str:
@@ -245,11 +245,11 @@ def recorded_poses(posterior: Any) -> Floats | None:
     """Return the recorded poses that a posterior holds, shape (trajectory, time, body, 3)."""
     if not stored_fields(posterior, ("scene",)):
         return None
-    given = group(posterior, "constant_data")
-    if "recorded_start" in given:
-        return np.asarray(given["recorded_start"].to_numpy()[..., :3])
+    constants = group(posterior, "constant_data")
+    if "recorded_start" in constants:
+        return np.asarray(constants["recorded_start"].to_numpy()[..., :3])
     # single transitions: the start of each, in order
-    return np.asarray(given["start"].to_numpy()[None, ..., :3])
+    return np.asarray(constants["start"].to_numpy()[None, ..., :3])
 
 
 @dataclass(frozen=True, eq=False)

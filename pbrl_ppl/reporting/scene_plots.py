@@ -98,8 +98,8 @@ def plot_recording(
         Of the figure (inches).
     """
     figure, (axes,) = blank_figure(width, 0.62 * width if width > NARROW else width, 1, 1)
-    for each, style, alpha in ((poses, "-", 0.8), (held_out, ":", 1.0)):
-        for states in () if each is None else each:
+    for paths, style, alpha in ((poses, "-", 0.8), (held_out, ":", 1.0)):
+        for states in () if paths is None else paths:
             for i in range(states.shape[1]):
                 axes.plot(*states[:, i, :2].T, style, color=_colour(i), linewidth=1.4, alpha=alpha)
     shown = np.isfinite(poses[..., :3]).all(axis=(2, 3))

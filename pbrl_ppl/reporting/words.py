@@ -33,9 +33,9 @@ def verdict_in_words(loop: Loop) -> str:
     """
     if loop.verdict == NOT_CONVERGED:
         named = [_named(one) for one in loop.added]
-        found = f" (found so far: {_listed(named, 'and')})" if named else ""
+        so_far = f" (found so far: {_listed(named, 'and')})" if named else ""
         return (
-            f"No verdict: the chains have not converged{found}; take more draws (--draws),"
+            f"No verdict: the chains have not converged{so_far}; take more draws (--draws),"
             " Gaussians at the modes (--method laplace), or give the parameters tighter priors."
         )
     return f"{_found(loop)}: {_gained(loop)}; {_remains(loop)}."
@@ -49,10 +49,10 @@ def _found(loop: Loop) -> str:
         matters = " that matters" if loop.small or remaining_acceleration(loop) else ""
         return f"Nothing{matters} was found missing"
     if len(loop.added) == 1:
-        found = f"{_named(loop.added[0])}{_size(loop.added[0])}"
+        sentence = f"{_named(loop.added[0])}{_size(loop.added[0])}"
     else:
-        found = _listed([_named(one) for one in loop.added], "and")
-    return f"{found[0].upper()}{found[1:]}"
+        sentence = _listed([_named(one) for one in loop.added], "and")
+    return f"{sentence[0].upper()}{sentence[1:]}"
 
 
 def _named(added: Added) -> str:
@@ -189,7 +189,9 @@ def remaining_acceleration(loop: Loop) -> str:
     The largest over the bodies' acceleration.
     """
     left = loop.acceleration
-    sure = {name: left.relative_after[name] for name, each in left.certain_after.items() if each}
+    sure = {
+        name: left.relative_after[name] for name, certain in left.certain_after.items() if certain
+    }
     return max(sure, key=sure.__getitem__, default="")
 
 
@@ -306,7 +308,7 @@ def _sizes(added: Added) -> str:
 def _worst_error(loop: Loop) -> list[str]:
     """Write the held-out error far ahead that is worst, before and after if something was added."""
     before, after, floor = (
-        each.rollout_rmse for each in (loop.before, loop.after, loop.noise_floor)
+        kind.rollout_rmse for kind in (loop.before, loop.after, loop.noise_floor)
     )
 
     def times_floor(name: str) -> float:

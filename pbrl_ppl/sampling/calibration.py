@@ -245,16 +245,16 @@ def _opened(folder: Path, about: Mapping[str, Any]) -> Path:
             if any(folder.iterdir()):
                 raise OutputError(f"{folder}: holds other files; choose a new or an empty folder")
             write_text(path, json.dumps(about, indent=1) + "\n")
-        found = json.loads(path.read_text(encoding="utf-8"))
+        stored = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         if isinstance(error, OutputError):
             raise
         raise OutputError(f"{path}: cannot be made or read: {error}") from error
-    changed = [key for key, value in about.items() if found.get(key) != value]
+    changed = [key for key, value in about.items() if stored.get(key) != value]
     if changed:
         raise OutputError(
             f"{folder}: holds a calibration with another {', '.join(changed)}"
-            f" ({changed[0]}: {found.get(changed[0])!r:.80}, expected {about[changed[0]]!r:.80});"
+            f" ({changed[0]}: {stored.get(changed[0])!r:.80}, expected {about[changed[0]]!r:.80});"
             " choose another folder, or the arguments it was begun with"
         )
     return folder

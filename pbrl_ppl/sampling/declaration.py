@@ -174,6 +174,6 @@ def physics_model(
 def _try_own(physics: Physics, history: History) -> None:
     """Try the effects that are not of the catalogue; see :func:`pbrl_ppl.physics.try_effect`."""
     known = {effect.name for effect in catalogue} | {LEARNED_REMAINDER}
-    own = {each.effect.name: each.effect for each in physics.effects}
-    for name in own.keys() - known:
-        try_effect(own[name], physics.scene, history)
+    effects = {attached.effect.name: attached.effect for attached in physics.effects}
+    for name in effects.keys() - known:
+        try_effect(effects[name], physics.scene, history)

@@ -155,8 +155,8 @@ class Block:
 
     def log_density(self, x: Floats) -> Floats:
         """Return the log-density of the mixture at points (n, d), shape (n,)."""
-        each = [mode.log_density(x) for mode in self.modes]
-        return np.asarray(logsumexp(each, axis=0) - np.log(len(each)))
+        densities = [mode.log_density(x) for mode in self.modes]
+        return np.asarray(logsumexp(densities, axis=0) - np.log(len(densities)))
 
     def kind(self, rng: np.random.Generator, *, jumps: float = 0.25) -> str:
         """Return which move is made next.
@@ -174,9 +174,9 @@ class Block:
             second = (first + rng.integers(1, len(self.modes), size=len(x))) % len(self.modes)
             moved, gain = np.empty_like(x), np.empty(len(x))
             for i, j in permutations(range(len(self.modes)), 2):
-                own, (a, b) = (first == i) & (second == j), (self.modes[i], self.modes[j])
-                moved[own] = b.mean + a.standardised(x[own]) @ b.factor.T
-                gain[own] = np.log(np.diag(b.factor) / np.diag(a.factor)).sum()
+                between, (a, b) = (first == i) & (second == j), (self.modes[i], self.modes[j])
+                moved[between] = b.mean + a.standardised(x[between]) @ b.factor.T
+                gain[between] = np.log(np.diag(b.factor) / np.diag(a.factor)).sum()
             return moved, gain
         noise = rng.standard_normal(x.shape)
         if kind == "walk":
@@ -245,22 +245,24 @@ class Reference:
 
         ``cheap`` is the space of fewer engine steps, which tells how far off densities fall.
         """
-        each = []
+        gaussians = []
         for one in (mode, *mode.others):
             mean, covariance = space.laplace(one)
-            each.append((mean, _WIDER * (cheap or space).widened(mean, covariance)))
+            gaussians.append((mean, _WIDER * (cheap or space).widened(mean, covariance)))
 
         def block(places: Ints) -> Block:
             modes: list[_Gaussian] = []
-            for mean, covariance in each:
-                own = _gaussian(mean[places], covariance[np.ix_(places, places)])
-                apart = [np.abs(old.standardised(own.mean[None])).max(initial=0.0) for old in modes]
+            for mean, covariance in gaussians:
+                gaussian = _gaussian(mean[places], covariance[np.ix_(places, places)])
+                apart = [
+                    np.abs(old.standardised(gaussian.mean[None])).max(initial=0.0) for old in modes
+                ]
                 if all(distance > 1.0 for distance in apart):
-                    modes.append(own)
+                    modes.append(gaussian)
             return Block(places, tuple(modes))
 
         parts = [block(part.places) for part in space.parts]
-        return cls(space, each[0][0], parts, [block(places) for places in space.noise_blocks])
+        return cls(space, gaussians[0][0], parts, [block(places) for places in space.noise_blocks])
 
     @classmethod
     def of_draws(cls, space: Space, q: Floats) -> Reference:
@@ -268,8 +270,8 @@ class Reference:
         middle = q.mean(axis=0)
 
         def block(places: Ints) -> Block:
-            own = _gaussian(middle[places], _WIDER * np.cov(q[:, places], rowvar=False))
-            return Block(places, (own,))
+            gaussian = _gaussian(middle[places], _WIDER * np.cov(q[:, places], rowvar=False))
+            return Block(places, (gaussian,))
 
         parts = [block(part.places) for part in space.parts]
         return cls(space, middle, parts, [block(places) for places in space.noise_blocks])
@@ -320,8 +322,8 @@ class Ensemble:
 
     def __init__(self, reference: Reference, q: Floats, rng: np.random.Generator) -> None:
         self.space, self.q, self.rng, self._sweeps = reference.space, q.copy(), rng, 0
-        own = reference.learned(q[:0])
-        self.parts, self.noise = own.parts, own.noise
+        learned = reference.learned(q[:0])
+        self.parts, self.noise = learned.parts, learned.noise
 
     @property
     def blocks(self) -> list[Block]:

@@ -251,15 +251,15 @@ def _drawn(
     if problem.library is not None:
         return job, *summed(problem, job.draws, job.chains, job.seed)
     if problem.layout.discrete.any():
-        found = weigh(problem, seed=job.seed, progress=job.progress)
+        weighed = weigh(problem, seed=job.seed, progress=job.progress)
 
         def of_configuration(mode: Mode) -> Any:
             return _run(chosen, replace(job, problem=mode.problem, mode=mode))
 
         trace = mix(
-            problem, found, of_configuration, draws=job.draws, chains=job.chains, seed=job.seed
+            problem, weighed, of_configuration, draws=job.draws, chains=job.chains, seed=job.seed
         )
-        return job, trace, most_probable(problem, found)
+        return job, trace, most_probable(problem, weighed)
     if job.resume is not None:
         return job, _run(chosen, job), stored_mode(problem, job.resume)
     job = _at_mode(job, start)
@@ -303,14 +303,14 @@ def _check(problem: Problem, method: str, start: Any, resume: Any) -> None:
             f"fit: start is a {type(start).__name__}, expected a Mode; pass a posterior to go on"
             " with as resume"
         )
-    names = [] if start is None else [each.likelihood.name for each in (start.problem, problem)]
+    names = [] if start is None else [other.likelihood.name for other in (start.problem, problem)]
     if "simulation" in names and names[0] != names[1]:
         raise FitError(
             f"fit: start is a mode of the likelihood {names[0]}, the model's is {names[1]}; leave"
             " out start, or pass it to physics_model as around"
         )
-    given = "start" if start is not None else "resume" if resume is not None else None
-    if problem.library is not None and (method not in (DEFAULT, "paper") or given):
+    argument = "start" if start is not None else "resume" if resume is not None else None
+    if problem.library is not None and (method not in (DEFAULT, "paper") or argument):
         raise FitError(
             "fit: a model with a library is summed over exactly, or walked over by the method"
             " 'paper'; leave out method or use that, and leave out start and resume"
@@ -322,10 +322,10 @@ def _check(problem: Problem, method: str, start: Any, resume: Any) -> None:
                 " bodies is sampled by itself, which tempering from the prior is not made for; use"
                 " 'metropolis', or name the bodies in the scene"
             )
-        if given:
+        if argument:
             raise FitError(
-                f"fit: {given} was given and which bodies a joint joins is unknown; a fit cannot"
-                f" go on from one choice of bodies to all of them; leave {given} out and raise"
+                f"fit: {argument} was given and which bodies a joint joins is unknown; a fit cannot"
+                f" go on from one choice of bodies to all of them; leave {argument} out and raise"
                 " draws"
             )
 

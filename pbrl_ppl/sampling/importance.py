@@ -96,15 +96,15 @@ def draw_proposals(
     rng, batch = np.random.default_rng(seed), -(-n // batches)
     space = reference.space
     most = int(np.clip(numbers // (batch * space.problem.segments.n), batches, most_batches))
-    found, reference = adaptive_importance(
+    proposals, reference = adaptive_importance(
         reference, partial(log_densities, Posterior(space)), len(space.loud), rng, batch=batch,
         enough=effective_share * n, smooth=smoothed, most_batches=most, max_pareto_k=MAX_PARETO_K,
     )  # fmt: skip
-    if not found.good:
+    if not proposals.good:
         return _annealed(reference, batch, batches, rng)
     return Proposals(
-        *space.split(found.q), found.log_weight, found.values, found.log_z, 0, 1.0, 1.0,
-        _GAUSSIANS,
+        *space.split(proposals.q), proposals.log_weight, proposals.values, proposals.log_z, 0, 1.0,
+        1.0, _GAUSSIANS,
     )  # fmt: skip
 
 
@@ -123,12 +123,12 @@ def _annealed(
     reached = anneal(particles, start, exact, cheap=cheap, weigh=True)
     q, independent = particles.snapshots(Path(start, exact, reached.beta), cheap, times)
     q = space.prior_draws(q, rng)
-    height, each = log_densities(exact, q)
+    height, log_likelihood = log_densities(exact, q)
     with np.errstate(invalid="ignore"):
         left = (1.0 - reached.beta) * (height - heights(space, start, q))
     kept = independent * reached.kept * (1.0 if first is None else first.kept)
     return Proposals(
-        *space.split(q), np.where(np.isnan(left), -np.inf, left), each,
+        *space.split(q), np.where(np.isnan(left), -np.inf, left), log_likelihood,
         reached.log_z + (0.0 if first is None else first.log_z), reached.rungs, reached.accepted,
         kept, _GAUSSIANS if cheap is None else _FEW_STEPS,
     )  # fmt: skip

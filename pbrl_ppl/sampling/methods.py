@@ -319,7 +319,7 @@ def as_trace(problem: Problem, draws: Mapping[str, Any], stats: Mapping[str, Any
     """
     posterior = posterior_dataset(problem, draws)
     per_draw = {name: (("chain", "draw"), value) for name, value in stats.items()}
-    given = {
+    data = {
         "start": (START_DIMS, problem.segments.start),
         "actions": (ACTION_DIMS, problem.inputs),
     }
@@ -329,7 +329,7 @@ def as_trace(problem: Problem, draws: Mapping[str, Any], stats: Mapping[str, Any
             "posterior": posterior,
             "sample_stats": xr.Dataset(per_draw, {d: posterior[d] for d in ("chain", "draw")}),
             "observed_data": labelled(problem, observed),
-            "constant_data": labelled(problem, given),
+            "constant_data": labelled(problem, data),
         },
         {},
     )

@@ -30,7 +30,7 @@ NEGLIGIBLE = 1e-3
 
 def mix(
     problem: Problem,
-    found: Sequence[Weighed],
+    weighed: Sequence[Weighed],
     sample: Callable[[Mode], Any],
     *,
     draws: int,
@@ -48,7 +48,7 @@ def mix(
     ----------
     problem : Problem
         Of a scene with joints of unknown bodies.
-    found : sequence of Weighed
+    weighed : sequence of Weighed
         Configurations with their probabilities.
     sample : callable
         ``sample(mode) -> trace`` of a configuration.
@@ -64,19 +64,19 @@ def mix(
         configurations as an attribute.
     """
     rng = np.random.default_rng(seed)
-    probability = np.array([configuration.probability for configuration in found])
+    probability = np.array([configuration.probability for configuration in weighed])
     wanted = np.flatnonzero(allocate(probability, chains * draws))
     traces = {}
     for i in wanted[np.argsort(-probability[wanted])]:
-        traces[i] = sample(found[i].mode)
+        traces[i] = sample(weighed[i].mode)
         done = group(traces[i], "posterior").sizes
         if done["chain"] < chains or (done["draw"] < draws and len(traces) < len(wanted)):
             raise KeyboardInterrupt  # PyMC ended quietly, and some have no draws at all
     draws = min(group(trace, "posterior").sizes["draw"] for trace in traces.values())
-    fitted = np.isin(np.arange(len(found)), list(traces))
+    fitted = np.isin(np.arange(len(weighed)), list(traces))
     counts = allocate(np.where(fitted, probability, 0.0), chains * draws)
-    label = rng.permutation(np.repeat(np.arange(len(found)), counts)).reshape(chains, draws)
-    values = _values(problem, found, traces, label, rng)
+    label = rng.permutation(np.repeat(np.arange(len(weighed)), counts)).reshape(chains, draws)
+    values = _values(problem, weighed, traces, label, rng)
     rest = groups(next(iter(traces.values())))
     data = {
         "posterior": posterior_dataset(problem, values),
@@ -84,10 +84,10 @@ def mix(
         "observed_data": rest["observed_data"],
         "constant_data": rest["constant_data"],
     }
-    return from_groups(data, {"configurations": stored(found)})
+    return from_groups(data, {"configurations": stored(weighed)})
 
 
-def most_probable(problem: Problem, found: Sequence[Weighed]) -> Point:
+def most_probable(problem: Problem, configurations: Sequence[Weighed]) -> Point:
     """Return the mode of the most probable configuration, as a point of the whole model.
 
     Anchors of joints that join nothing are at the centre of their prior.
@@ -96,10 +96,10 @@ def most_probable(problem: Problem, found: Sequence[Weighed]) -> Point:
     ----------
     problem : Problem
         Of a scene with joints of unknown bodies.
-    found : sequence of Weighed
+    configurations : sequence of Weighed
         Configurations with their probabilities.
     """
-    best = max(found, key=lambda weighed: weighed.probability)
+    best = max(configurations, key=lambda weighed: weighed.probability)
     layout = problem.layout
     values = dict(zip(best.mode.problem.layout.labels, best.mode.phi.tolist(), strict=True))
     phi = np.array([values.get(label, np.nan) for label in layout.labels])[None]
@@ -128,7 +128,7 @@ def allocate(probability: Floats, n: int) -> Ints:
 
 def _values(
     problem: Problem,
-    found: Sequence[Weighed],
+    weighed: Sequence[Weighed],
     traces: Mapping[int, Any],
     label: Ints,
     rng: np.random.Generator,
@@ -141,11 +141,11 @@ def _values(
     for i, posterior in drawn.items():
         here = label == i
         sigma[here] = posterior["sigma"].to_numpy()[here]
-        for block in found[i].configuration.problem(problem).layout.blocks:
+        for block in weighed[i].configuration.problem(problem).layout.blocks:
             values = posterior[block.name].to_numpy()
             for j, owner in enumerate(block.owners):
                 phi[here, layout.index(block.name, owner)] = values[here, j]
-        for joint, pair in found[i].configuration.pairs:
+        for joint, pair in weighed[i].configuration.pairs:
             law = _index_law(problem, joint, pair)
             drawn_pairs = rng.choice(law.size, size=int(here.sum()), p=law.ravel())
             _put_indices(problem, phi, here, joint, drawn_pairs)
@@ -245,8 +245,8 @@ def most_frequent(problem: Problem, trace: Any) -> Point:
     best = np.zeros(index.shape[1], dtype=np.intp)
     for part in problem.simulator.parts:
         columns = [names.index(owner) for owner in part.physics.scene.owners]
-        found, counts = np.unique(index[:, columns], axis=0, return_counts=True)
-        best[columns] = found[counts.argmax()]
+        rows, counts = np.unique(index[:, columns], axis=0, return_counts=True)
+        best[columns] = rows[counts.argmax()]
     return _point(problem, best)
 
 

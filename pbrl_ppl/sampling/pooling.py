@@ -121,18 +121,18 @@ def population(
     """
     informed = np.isfinite(sd)
     tau = spread * np.geomspace(least, most, points)
-    own = np.where(informed, estimate, 0.0)[:, None]
+    estimates = np.where(informed, estimate, 0.0)[:, None]
     precision = 1 / (sd[:, None] ** 2 + tau**2)  # zero of those that say nothing
     total = precision.sum(axis=0) + width**-2
-    middle = ((precision * own).sum(axis=0) + centre * width**-2) / total
+    middle = ((precision * estimates).sum(axis=0) + centre * width**-2) / total
     log_weight = 0.5 * np.log(precision[informed]).sum(axis=0) - 0.5 * np.log(total)
-    log_weight -= 0.5 * (precision * (own - middle) ** 2).sum(axis=0)
+    log_weight -= 0.5 * (precision * (estimates - middle) ** 2).sum(axis=0)
     log_weight -= 0.5 * ((middle - centre) / width) ** 2 + 0.5 * (tau / spread) ** 2
     log_weight += np.log(tau)  # the grid is even in the logarithm
     weights = np.exp(log_weight - log_weight.max())
     # each robot's mean given the spread lies between its estimate and the population's mean
     share = tau**2 * precision
-    value = share * own + (1 - share) * middle
+    value = share * estimates + (1 - share) * middle
     variance = (1 - share) * tau**2 + (1 - share) ** 2 / total
     p_same = np.nan
     if informed.sum() > 1:
@@ -194,18 +194,18 @@ class Pooled:
         intervals. ``p_same`` as of :class:`Population`, ``informed`` how many robots inform.
         """
         rows = []
-        for name, found in self.populations.items():
+        for name, pooled in self.populations.items():
             row: dict[str, Any] = {"parameter": name, "scale": self._families[name][0]}
             for key, of, natural in (
-                ("mean", found.mean, True),
-                ("spread", found.deviation, False),
-                ("next", found.next, True),
+                ("mean", pooled.mean, True),
+                ("spread", pooled.deviation, False),
+                ("next", pooled.next, True),
             ):
                 middle = "next_median" if key == "next" else key
                 for label, q in ((middle, _MIDDLE), (f"{key}_low", _ENDS[0]),
                                  (f"{key}_high", _ENDS[1])):  # fmt: skip
                     row[label] = self._natural(name, of(q)) if natural else of(q)
-            rows.append(row | {"informed": int(found.informed.sum()), "p_same": found.p_same})
+            rows.append(row | {"informed": int(pooled.informed.sum()), "p_same": pooled.p_same})
         return pd.DataFrame(rows)
 
     def robots(self) -> pd.DataFrame:
@@ -216,13 +216,13 @@ class Pooled:
                 "parameter": name,
                 "single_mean": self._single[name][number, 0],
                 "single_sd": self._single[name][number, 1],
-                "informed": bool(found.informed[number]),
+                "informed": bool(pooled.informed[number]),
                 **{
-                    label: self._natural(name, found.robot(number, q))
+                    label: self._natural(name, pooled.robot(number, q))
                     for label, q in (("median", _MIDDLE), ("low", _ENDS[0]), ("high", _ENDS[1]))
                 },
             }
-            for name, found in self.populations.items()
+            for name, pooled in self.populations.items()
             for number, robot in enumerate(self.names)
         ]
         return pd.DataFrame(rows)
@@ -300,21 +300,21 @@ def pool(
                 f" {', '.join(_table1(layouts[0]))}; expected the same scene"
             )
     drawn = _drawn(names, list(posteriors.values()), layouts)
-    shared = [label for label in drawn[0] if all(label in each for each in drawn)]
-    every = dict.fromkeys(label for each in drawn for label in each)
+    shared = [label for label in drawn[0] if all(label in robot for robot in drawn)]
+    every = dict.fromkeys(label for robot in drawn for label in robot)
     populations, families, single, priors = {}, {}, {}, {}
     by_layout = {layout: _priors(layout) for layout in layouts}  # most are the same
     every_prior = [by_layout[layout] for layout in layouts]
     for label in shared:
-        prior_of = [each[label] for each in every_prior]
-        draws = [each[label] for each in drawn]
+        prior_of = [robot[label] for robot in every_prior]
+        draws = [robot[label] for robot in drawn]
         family = layouts[0].priors[layouts[0].labels.index(label)]
-        found, reference = _pooled(prior_of, draws, spread, family.uniform)
-        populations[label] = found
+        pooled, reference = _pooled(prior_of, draws, spread, family.uniform)
+        populations[label] = pooled
         families[label] = (_SCALES.get(prior_of[0].family, "itself"), reference)
         single[label] = np.array(list(map(_moments, prior_of, draws)))
-        if found.informed.any():
-            priors[label] = _next_prior(family, found, reference)
+        if pooled.informed.any():
+            priors[label] = _next_prior(family, pooled, reference)
     left_out = tuple(label for label in every if label not in shared)
     scene = _scene(scenes, priors, left_out)
     return Pooled(names, scene, populations, left_out, families, single)
@@ -338,12 +338,12 @@ def _drawn(
         phi = nearest(layout, layout.columns(posterior))
         first = phi if first is None else first
         phi = nearest(layout, phi, first)  # Table 1 comes first in all
-        own = dict(zip(layout.labels, phi.T, strict=True))
+        values = dict(zip(layout.labels, phi.T, strict=True))
         of_bodies = [f"{b.name}[{o}]" for b in layout.blocks if b.of == "body" for o in b.owners]
         for label in of_bodies:
-            if not np.ptp(own[label]) > 0:
+            if not np.ptp(values[label]) > 0:
                 raise PosteriorError(f"pool: the draws of {label} of {name} do not vary")
-        result.append({label: own[label] for label in of_bodies})
+        result.append({label: values[label] for label in of_bodies})
     return result
 
 
@@ -379,19 +379,19 @@ def _pooled(
     if priors[0].family == "von_mises":
         return _pooled_angles(priors, matched, spread, free)
     before = np.array([prior.sigma**-2.0 for prior in priors])
-    after = np.array([each.sigma**-2.0 for each in matched])
+    after = np.array([match.sigma**-2.0 for match in matched])
     # precisions of a product of normals add up: the data's is the difference
     precision = after - before
     informed = precision > _INFORMS * before
-    weighted = np.array([each.mu for each in matched]) * after
+    weighted = np.array([match.mu for match in matched]) * after
     weighted -= np.array([prior.mu for prior in priors]) * before
     safe = np.where(informed, precision, 1.0)
     sd = np.where(informed, safe**-0.5, np.inf)
     widest = priors[int(before.argmin())]
-    found = population(
+    pooled = population(
         weighted / safe, sd, centre=widest.mu, width=widest.sigma, spread=spread * widest.sigma
     )
-    return found, 0.0
+    return pooled, 0.0
 
 
 def _pooled_angles(
@@ -402,31 +402,31 @@ def _pooled_angles(
     A ``free`` angle is uniform a priori: what its prior has of concentration is from the choice
     among a wheel's equal descriptions, and about the angle itself.
     """
-    towards = np.array([each.mu for each in matched])
+    towards = np.array([match.mu for match in matched])
     about = towards if free else np.array([prior.mu for prior in priors])
     before = np.array([prior.kappa for prior in priors]) * np.exp(1j * about)
-    said = np.array([each.kappa for each in matched]) * np.exp(1j * towards) - before
+    said = np.array([match.kappa for match in matched]) * np.exp(1j * towards) - before
     kappa = np.abs(said)
     informed = kappa > np.maximum(1.0, _INFORMS * np.abs(before))
     reference = float(np.angle((said * informed).sum())) if informed.any() else 0.0
     least = priors[int(np.abs(before).argmin())]
     width = _ANY_ANGLE if free else min(_ANY_ANGLE, max(least.kappa, 1e-9) ** -0.5)
     sd = np.where(informed, np.where(informed, kappa, 1.0) ** -0.5, np.inf)
-    found = population(
+    pooled = population(
         wrapped(np.angle(said) - reference), sd, width=width, spread=spread * width,
         centre=0.0 if free else float(wrapped(least.mu - reference)),
     )  # fmt: skip
-    return found, reference
+    return pooled, reference
 
 
 def _next_prior(
-    prior: Prior, found: Population, reference: float, *, sharpest: float = 1e6
+    prior: Prior, pooled: Population, reference: float, *, sharpest: float = 1e6
 ) -> dict[str, float]:
     """Return hyper-parameters with the median and 94 % interval of a robot without data.
 
     ``sharpest``: the largest concentration of a von Mises.
     """
-    middle, low, high = (found.next(q) for q in (_MIDDLE, *_ENDS))
+    middle, low, high = (pooled.next(q) for q in (_MIDDLE, *_ENDS))
     sigma = (high - low) / float(np.diff(norm.ppf(_ENDS))[0])
     if prior.family == "von_mises":
         return {"mu": float(wrapped(middle + reference)), "kappa": min(sigma**-2, sharpest)}
@@ -443,7 +443,7 @@ def _scene(
     for body in scenes[0].bodies:
         owners = (body.owner, body.name)  # of Table 1's parameters, and of its effects'
         others = [set(scene.body(body.name).effects) for scene in scenes]
-        kept = tuple(name for name in body.effects if all(name in own for own in others))
+        kept = tuple(name for name in body.effects if all(name in effects for effects in others))
         gone = {name for name, owner in dropped if owner in owners}
         prior = {name: hyper for name, hyper in body.prior if name not in gone}
         prior |= {

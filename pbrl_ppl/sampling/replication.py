@@ -131,11 +131,11 @@ def _trajectories(design: Problem, phi: Floats, sigma: Floats, seed: int, colour
     if design.likelihood.simulated:
         every = _simulations(design, phi)
         columns = list(design.observations.columns)
-        for states, own, rng in zip(every, sigma, rngs, strict=True):
-            states[..., columns] += own * coloured((*states.shape[:3], len(columns)), colour, rng)
+        for states, noise, rng in zip(every, sigma, rngs, strict=True):
+            states[..., columns] += noise * coloured((*states.shape[:3], len(columns)), colour, rng)
     else:
         drawn = zip(phi, sigma, rngs, strict=True)
-        every = np.array([simulated_trajectories(design, *each) for each in drawn])
+        every = np.array([simulated_trajectories(design, *draw) for draw in drawn])
     measured = np.isfinite(design.data.history.dataset["observed"].to_numpy())
     return np.where(measured, every, 0.0)
 

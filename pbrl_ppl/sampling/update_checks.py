@@ -37,15 +37,15 @@ def check_posterior(idata: Any, history: History) -> PosteriorRecord:
 
 def as_recorded(idata: Any, history: History) -> History:
     """Return the history without the unused velocities that the posterior leaves out."""
-    given = group(idata, "constant_data")
-    if "recorded_observed" not in given:
+    constants = group(idata, "constant_data")
+    if "recorded_observed" not in constants:
         return history
-    held = given["recorded_observed"].to_numpy()
-    left_out = ~np.isfinite(held).any(axis=(0, 1))
+    recorded = constants["recorded_observed"].to_numpy()
+    left_out = ~np.isfinite(recorded).any(axis=(0, 1))
     unused = [
-        each
-        for each in unused_velocities(history)
-        if left_out[history.bodies.index(each.body), STATE.index(each.state)]
+        velocity
+        for velocity in unused_velocities(history)
+        if left_out[history.bodies.index(velocity.body), STATE.index(velocity.state)]
     ]
     return measured_alone(history, unused)
 
@@ -100,8 +100,8 @@ def check_engine(
     whole = "smoothed" in group(idata, "constant_data")  # neighbours depend on each other
     some = {"transition": slice(None if whole else transitions)}
     few = {name: group(idata, name).isel(some) for name in ("observed_data", "constant_data")}
-    held = from_groups(few | {"posterior": group(idata, "posterior")}, idata.attrs)
-    first = problem_of(held, {attached.effect for attached in problem.physics.effects})
+    earlier = from_groups(few | {"posterior": group(idata, "posterior")}, idata.attrs)
+    first = problem_of(earlier, {attached.effect for attached in problem.physics.effects})
     phi, sigma = parameter_draws(problem, idata)
     now = first.log_density(first.residual(phi[0]), sigma[0], phi[0])
     then = group(idata, "log_likelihood")["next_state"].isel(chain=0, draw=0).to_numpy()
@@ -114,18 +114,20 @@ def check_engine(
         )
 
 
-def judgement(held: Floats, new: Floats, worse: float = 3.0) -> str:
+def judgement(earlier: Floats, new: Floats, worse: float = 3.0) -> str:
     """Return a text on whether new transitions may be of the same bodies as the posterior's.
 
     Parameters
     ----------
-    held, new : ndarray
+    earlier, new : ndarray
         Log-likelihoods of transitions, shape (..., transition), the draws first.
     worse : float
         Fall of the mean log-likelihood, in standard errors, from which new data are predicted
         worse.
     """
-    old, others = (each.reshape(-1, each.shape[-1]).mean(axis=0) for each in (held, new))
+    old, others = (
+        densities.reshape(-1, densities.shape[-1]).mean(axis=0) for densities in (earlier, new)
+    )
     error = float(np.sqrt(old.var() / len(old) + others.var() / len(others)))
     if not float(old.mean() - others.mean()) < worse * error:
         return "look whether they are of the same bodies, under the same conditions"

@@ -152,10 +152,10 @@ def _simulated(
     idata: Any, record: PosteriorRecord, history: History, effects: tuple[Effect, ...]
 ) -> Problem:
     """Return the problem of simulations of a posterior's data and new ones, not yet fitted."""
-    held = files.recorded(record.scene, group(idata, "constant_data"))
-    rows, new = held.to_dataframe(), history.to_dataframe()
-    for each, first in ((rows, 0), (new, held.n_trajectories)):
-        each["trajectory"] = first + pd.factorize(each["trajectory"])[0]
+    earlier = files.recorded(record.scene, group(idata, "constant_data"))
+    rows, new = earlier.to_dataframe(), history.to_dataframe()
+    for part, first in ((rows, 0), (new, earlier.n_trajectories)):
+        part["trajectory"] = first + pd.factorize(part["trajectory"])[0]
     attached = record.attached(effects)
     physics = Physics(record.scene, attached, substeps=record.substeps, together=record.together)
     both = History.from_dataframe(pd.concat([rows, new]), record.scene)
@@ -295,8 +295,8 @@ def _with_data(idata: Any, problem: Problem) -> dict[str, xr.Dataset]:
     segments, result = problem.segments, {}
     new = {"start": segments.start, "actions": problem.inputs, "next_state": problem.measured}
     for name in ("observed_data", "constant_data"):
-        held = group(idata, name)
-        old = held[[key for key in held.data_vars if key in new]].transpose("transition", ...)
+        earlier = group(idata, name)
+        old = earlier[[key for key in earlier.data_vars if key in new]].transpose("transition", ...)
         total = old.sizes["transition"] + segments.n
         both = {
             str(key): (
@@ -307,7 +307,7 @@ def _with_data(idata: Any, problem: Problem) -> dict[str, xr.Dataset]:
             for key, variable in old.data_vars.items()
         }
         coords = dict(old.drop_dims("transition").coords) | files.both_places(old, segments)
-        result[name] = xr.Dataset(both, coords | {"transition": np.arange(total)}, held.attrs)
+        result[name] = xr.Dataset(both, coords | {"transition": np.arange(total)}, earlier.attrs)
     more = files.both_recordings(group(idata, "constant_data"), files.recording(problem))
     result["constant_data"] = result["constant_data"].merge(more)
     return result

@@ -301,7 +301,7 @@ def test_refused_fits(apartment, monkeypatch) -> None:
             FitError, match="summed over exactly, or walked over by the method 'paper'; leave out"
         ):
             quick(model, **options)
-    monkeypatch.setattr("pbrl_ppl.modes.library_choice._MOST", 10)
+    monkeypatch.setattr("pbrl_ppl.modes.library_choice._Combinations.most", 10)
     with pytest.raises(FitError, match=r"2 combinations of parameter sets.*give some"):
         quick(model)
     with pytest.raises(ValueError, match="with horizon or library"):

@@ -152,15 +152,20 @@ class Biased(Posterior):
         return 1.03 * found + 0.25 * np.nanstd(found, axis=(0, 1, 2, 3))
 
 
+def never(log_weight) -> bool:
+    """Return that weights are not good enough to end with."""
+    return False
+
+
 #: What particles go through, or how often the engine must move them, by patches.
 ANNEALED = {"importance.adaptive_importance": no_weights}
 SURROGATE = ANNEALED | {"importance.Posterior.of_few_steps": Biased}
 WAYS = {
     "Gaussians": {},
     "annealed": ANNEALED,
-    "annealed by engine moves": ANNEALED | {"ensemble._WORTH": 2.0},
+    "annealed by engine moves": ANNEALED | {"ensemble._suffices": never},
     "a bad surrogate": SURROGATE,
-    "a bad surrogate, and engine moves": SURROGATE | {"ensemble._WORTH": 2.0},
+    "a bad surrogate, and engine moves": SURROGATE | {"ensemble._suffices": never},
 }
 
 
@@ -526,7 +531,7 @@ def test_weights_with_a_heavy_tail_are_warned_of(model, mode, monkeypatch) -> No
 def test_engine_moves_are_counted(model, mode, monkeypatch) -> None:
     """Where weights do not suffice the engine moves the particles, which then weigh alike."""
     monkeypatch.setattr("pbrl_ppl.sampling.importance.adaptive_importance", no_weights)
-    monkeypatch.setattr("pbrl_ppl.sampling.ensemble._WORTH", 2.0)
+    monkeypatch.setattr("pbrl_ppl.sampling.ensemble._suffices", never)
     idata = quiet(fit, model, seed=1, start=mode, **QUICK)
     assert idata.attrs["rungs"] >= 1
     assert 0.0 < idata.attrs["acceptance"] <= 1.0
