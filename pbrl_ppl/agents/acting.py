@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from pbrl_ppl.errors import GoalError
 from pbrl_ppl.history import History, from_segments
 from pbrl_ppl.planning import ActionSet, Goal, TransitionModel, plan, start_state
-from pbrl_ppl.posterior import scene_of
+from pbrl_ppl.posterior import Idata, scene_of
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats
 
@@ -53,7 +53,7 @@ class Acted:
 
 def act(
     world: Callable[[Floats], Floats],
-    idata: Any,
+    idata: Idata,
     start: Mapping[str, Sequence[float]] | ArrayLike,
     goal: Goal | Mapping[str, Sequence[float | None]],
     actions: ActionSet | None = None,

@@ -21,6 +21,7 @@ from pbrl_ppl.planning import (
     rollout,
     start_state,
 )
+from pbrl_ppl.posterior import Idata
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import THETA, Floats, wrapped
 
@@ -119,7 +120,7 @@ class Agent(ABC):
 
     #: Name in episodes and figures.
     name: ClassVar[str]
-    posterior: Any = None
+    posterior: Idata | None = None
     added: tuple[Revision, ...] = ()
 
     def __init__(self, task: Task, *, seed: int = 0, nodes: int = 20_000, **options: Any) -> None:

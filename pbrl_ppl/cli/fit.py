@@ -24,6 +24,7 @@ from pbrl_ppl.cli.terminal import (
 )
 from pbrl_ppl.errors import ConvergenceWarning, FitError, PosteriorError
 from pbrl_ppl.files import write_text
+from pbrl_ppl.posterior import Idata
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -157,7 +158,7 @@ def fit(
         raise typer.Exit(UNDECIDED)
 
 
-def _summary(idata: Any) -> pd.DataFrame:
+def _summary(idata: Idata) -> pd.DataFrame:
     """Return a row for each parameter; for a mode, its value alone."""
     from pbrl_ppl.posterior import PosteriorRecord, scalars
     from pbrl_ppl.reporting import summary

@@ -29,7 +29,7 @@ from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import FitError, OutputError
 from pbrl_ppl.files import json_values
 from pbrl_ppl.history import History, UnusedVelocity
-from pbrl_ppl.posterior import Comparison, Fit, Identifiability, save_posterior
+from pbrl_ppl.posterior import Comparison, Fit, Idata, Identifiability, save_posterior
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats
 
@@ -134,12 +134,12 @@ class Loop:
         return f"Loop(verdict={self.verdict!r}, added={added})"
 
     @property
-    def posterior_before(self) -> Any:
+    def posterior_before(self) -> Idata:
         """Posterior of the declared model, an InferenceData or a DataTree."""
         return self.declared.posterior
 
     @property
-    def posterior_after(self) -> Any:
+    def posterior_after(self) -> Idata:
         """Posterior of the revised model; that of the declared one if nothing was added."""
         return self.revised.posterior
 
@@ -156,7 +156,7 @@ class Loop:
         *,
         seed: int = 0,
         progress: Callable[[str], None] | None = None,
-    ) -> Any:
+    ) -> Idata:
         """Learn a force for the unexplained residual; the verdict and the added effects stay.
 
         Parameters

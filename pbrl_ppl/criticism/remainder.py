@@ -22,7 +22,7 @@ from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import ACCELERATION
 from pbrl_ppl.modes import Mode, trajectory_mode
-from pbrl_ppl.posterior import Fit, group
+from pbrl_ppl.posterior import Fit, Idata, group
 from pbrl_ppl.posterior import draws as posterior_draws
 from pbrl_ppl.sampling import sample
 from pbrl_ppl.scene import state_sizes
@@ -47,7 +47,7 @@ def check_scikit_learn() -> None:
 
 @one_blas_thread
 def learn_remainder(
-    posterior: Any,
+    posterior: Fit | Idata,
     body: str,
     *,
     catalogue: Iterable[Effect] = full_catalogue,
@@ -55,7 +55,7 @@ def learn_remainder(
     draws: int = 250,
     criteria: Criteria = DEFAULT,
     progress: Callable[[str], None] | None = None,
-) -> Any:
+) -> Idata:
     """Learn a residual force on a body, with its uncertainty, and refit the model with it.
 
     The residual acceleration of each step, times mass and moment of inertia, is a force and a
@@ -122,7 +122,7 @@ def learn_remainder(
     return fit.posterior
 
 
-def remainder_in_words(before: Any, after: Any) -> str:
+def remainder_in_words(before: Idata, after: Idata) -> str:
     """Return a sentence on what a learned remainder does, from both posteriors."""
     sizes = [posterior_draws(posterior)[ACCELERATION].mean(axis=0) for posterior in (before, after)]
     names = group(after, "posterior")[ACCELERATION]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from pbrl_ppl.criticism.selection import refitted
 from pbrl_ppl.effects import Attached, Effect, Noise
 from pbrl_ppl.errors import EffectError, PosteriorError
 from pbrl_ppl.modes import Mode, trajectory_mode
-from pbrl_ppl.posterior import Fit, PosteriorRecord, stored_fields
+from pbrl_ppl.posterior import Fit, Idata, PosteriorRecord, stored_fields
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats
 
@@ -50,7 +49,7 @@ class Rival:
         return f"{self.attached.effect.name}{_ON}{self.attached.body}"
 
 
-def keep_groups(posterior: Any, added: Iterable[Added]) -> None:
+def keep_groups(posterior: Idata, added: Iterable[Added]) -> None:
     """Record in a posterior's attributes which effects its recording cannot separate."""
     groups = tuple(
         tuple(
@@ -63,7 +62,7 @@ def keep_groups(posterior: Any, added: Iterable[Added]) -> None:
     replace(PosteriorRecord.of(posterior), not_separable=groups).write(posterior)
 
 
-def kept_groups(posterior: Any) -> list[tuple[str, ...]]:
+def kept_groups(posterior: Idata) -> list[tuple[str, ...]]:
     """Return the groups of effects that a posterior's recording cannot separate."""
     return list(stored_fields(posterior, ("not_separable",)).get("not_separable", ()))
 
@@ -126,7 +125,11 @@ def posterior_mode(fit: Fit) -> Mode:
 
 
 def fit_rivals(
-    posterior: Any, effects: Sequence[Attached], catalogue: Iterable[Effect], draws: int, seed: int
+    posterior: Idata,
+    effects: Sequence[Attached],
+    catalogue: Iterable[Effect],
+    draws: int,
+    seed: int,
 ) -> list[Rival]:
     """Fit a model with each of several effects to the recording that a posterior holds.
 

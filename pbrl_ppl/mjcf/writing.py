@@ -13,13 +13,13 @@ from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.errors import ConversionWarning, SceneError, warn
 from pbrl_ppl.history.mujoco import PLANES
 from pbrl_ppl.mjcf.reading import rotation, rounded
-from pbrl_ppl.posterior import labelled_draws, layout_of, scene_of
+from pbrl_ppl.posterior import Idata, labelled_draws, layout_of, scene_of
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene
 from pbrl_ppl.state import Floats
 
 
 def mjcf_ranges(
-    idata: Any,
+    idata: Idata,
     plane: str = "xy",
     *,
     probability: float = 0.9,

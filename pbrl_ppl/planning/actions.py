@@ -7,13 +7,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import GoalError
 from pbrl_ppl.planning.goals import read_tables, read_toml
+from pbrl_ppl.posterior import Idata
 from pbrl_ppl.scene import Scene, nearest
 from pbrl_ppl.state import THETA, WRENCH, Floats
 
@@ -135,7 +135,7 @@ class ActionSet:
 
     @classmethod
     def recorded(
-        cls, idata: Any, *, quantile: float = 0.9, intervals: tuple[int, ...] = (2, 5)
+        cls, idata: Idata, *, quantile: float = 0.9, intervals: tuple[int, ...] = (2, 5)
     ) -> ActionSet:
         """Return actions like those in the posterior's data, whose effects the model knows.
 

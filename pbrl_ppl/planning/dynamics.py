@@ -14,6 +14,7 @@ from pbrl_ppl.effects import Attached, Effect, attach, catalogue, needs_inputs
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.likelihood import Coordinates, degrees_of_freedom, next_state_random, tail_places
 from pbrl_ppl.physics import Physics, after_recording
+from pbrl_ppl.posterior import Idata
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE, WRENCH, Floats
 
@@ -209,7 +210,7 @@ class Dynamics:
     @classmethod
     def of(
         cls,
-        idata: Any,
+        idata: Idata,
         draws: int | None = None,
         *,
         seed: int = 0,

@@ -23,6 +23,7 @@ from pbrl_ppl.planning.dynamics import Dynamics, TransitionModel, rollout
 from pbrl_ppl.planning.goals import Goal
 from pbrl_ppl.planning.receding import mppi
 from pbrl_ppl.planning.search import NODES, Found, Task, tail_mean
+from pbrl_ppl.posterior import Idata
 from pbrl_ppl.scene import Scene, nearest
 from pbrl_ppl.state import POSE, STATE, WRENCH, Floats
 
@@ -141,7 +142,7 @@ class Plan:
 
 
 def plan(
-    idata: Any,
+    idata: Idata | TransitionModel,
     start: Mapping[str, Sequence[float]] | ArrayLike,
     goal: Goal | Mapping[str, Sequence[float | None]],
     actions: ActionSet | None = None,

@@ -44,6 +44,7 @@ from .record import vectors as vectors
 from .store import DATATREE as DATATREE
 from .store import HDI_PROB as HDI_PROB
 from .store import SIZE as SIZE
+from .store import Idata as Idata
 from .store import best_draw as best_draw
 from .store import convergence as convergence
 from .store import draws as draws

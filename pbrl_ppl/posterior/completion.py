@@ -31,7 +31,7 @@ from pbrl_ppl.posterior.data import placed, places, record_of, recording
 from pbrl_ppl.posterior.identifiability import uninformed
 from pbrl_ppl.posterior.mode import Point, packed_mode
 from pbrl_ppl.posterior.record import Linearisation, PosteriorRecord, vectors
-from pbrl_ppl.posterior.store import SIZE, convergence, from_groups, group, groups
+from pbrl_ppl.posterior.store import SIZE, Idata, convergence, from_groups, group, groups
 from pbrl_ppl.state import Floats, Ints
 
 #: Attributes of a trace of weighted proposals: their Pareto k, and log-likelihoods of transitions,
@@ -55,13 +55,13 @@ _Warned = tuple[type[Warning], str]
 
 def complete(
     problem: Problem,
-    trace: Any,
+    trace: Idata,
     *,
     seed: int,
     method: str,
     asked: tuple[int, int] | None = None,
     mode: Point | None = None,
-) -> Any:
+) -> Idata:
     """Return a posterior: a trace with likelihood, predictions, prior and the record of the fit.
 
     Parameters
@@ -182,7 +182,7 @@ def evaluate(
     return likelihood, np.array(predictive)
 
 
-def parameter_draws(problem: Problem, trace: Any) -> tuple[Floats, Floats]:
+def parameter_draws(problem: Problem, trace: Idata) -> tuple[Floats, Floats]:
     """Return a problem's draws as vectors: phi, shape (draw, p), and sigma, shape (draw, state)."""
     return vectors(trace, problem.layout, problem.noise_variables)
 
@@ -324,11 +324,11 @@ def linearisation(
 def checked(
     problem: Problem,
     record: PosteriorRecord,
-    idata: Any,
+    idata: Idata,
     asked: tuple[int, int] | None = None,
     *,
     least_draws: int = 4,
-) -> Any:
+) -> Idata:
     """Enter convergence and warnings in a posterior's record, and issue the warnings.
 
     Parameters
@@ -428,7 +428,7 @@ def _unconverged(
 
 
 def _of_parameters(
-    problem: Problem, idata: Any, *, stuck: float = 0.5, near: float = 0.01
+    problem: Problem, idata: Idata, *, stuck: float = 0.5, near: float = 0.01
 ) -> list[_Warned]:
     """Return warnings on parameters at a bound, and on those that the data say nothing about.
 
@@ -459,7 +459,7 @@ def _of_parameters(
     return warned
 
 
-def _folded(problem: Problem, trace: Any, seed: int | None) -> xr.Dataset:
+def _folded(problem: Problem, trace: Idata, seed: int | None) -> xr.Dataset:
     """Return the posterior with each wheel in one of its equal descriptions, in all chains.
 
     Between descriptions that the prior can tell apart, the draws are shared out by the prior.

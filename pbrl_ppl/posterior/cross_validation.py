@@ -12,7 +12,7 @@ import xarray as xr
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.likelihood import NEXT_STATE_DIMS
 from pbrl_ppl.posterior.data import SMOOTHED
-from pbrl_ppl.posterior.store import DATATREE, arviz, from_groups, group, groups, smoothed
+from pbrl_ppl.posterior.store import DATATREE, Idata, arviz, from_groups, group, groups, smoothed
 from pbrl_ppl.state import STATE, THETA, Floats, Ints, wrapped
 
 #: Fewest draws: with fewer, the Pareto distribution is fitted to a tail of fewer than twenty.
@@ -79,7 +79,7 @@ class Comparison:
         return vars(self) | {"before": vars(self.before), "after": vars(self.after)}
 
 
-def compare(before: Any, after: Any) -> Comparison | None:
+def compare(before: Idata, after: Idata) -> Comparison | None:
     """Compare two posteriors of the same data by leave-one-out cross-validation.
 
     For whole trajectories, one trajectory is left out at a time, see :func:`by_trajectory`.
@@ -143,12 +143,12 @@ def _summary(loo: Any) -> LeaveOneOut:
     return LeaveOneOut(float(elpd), float(loo.se), float(p), high, good)
 
 
-def left_out(idata: Any) -> str:
+def left_out(idata: Idata) -> str:
     """Return the unit that leave-one-out leaves out: ``trajectory`` or ``transition``."""
     return "trajectory" if SMOOTHED in groups(idata).get("constant_data", ()) else "transition"
 
 
-def by_trajectory(idata: Any) -> Any:
+def by_trajectory(idata: Idata) -> Idata:
     """Return a posterior for leave-one-trajectory-out by ``az.loo`` and ``az.compare``.
 
     In a likelihood of whole trajectories, each transition is conditional on those before it. To
@@ -178,12 +178,12 @@ def by_trajectory(idata: Any) -> Any:
     return from_groups(data, idata.attrs)
 
 
-def separate(idata: Any) -> Any:
+def separate(idata: Idata) -> Idata:
     """Return a posterior with one log-likelihood for each unit that is left out."""
     return by_trajectory(idata) if left_out(idata) == "trajectory" else idata
 
 
-def by_number(idata: Any) -> Any:
+def by_number(idata: Idata) -> Idata:
     """Return a posterior for ``az.loo_pit`` and ``az.plot_loo_pit``.
 
     These, and ``az.plot_ppc_pit`` of ArviZ 1.x, want predictions of all draws and a log-likelihood
@@ -251,7 +251,7 @@ def by_number(idata: Any) -> Any:
     )
 
 
-def loo_pit(idata: Any) -> xr.DataArray:
+def loo_pit(idata: Idata) -> xr.DataArray:
     """Return the leave-one-out probability integral transform of every measured number.
 
     The probability that the model, fitted without a transition, gives to values below the measured

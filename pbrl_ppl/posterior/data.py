@@ -29,7 +29,7 @@ from pbrl_ppl.likelihood import (
 )
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.posterior.record import PosteriorRecord, vectors
-from pbrl_ppl.posterior.store import best_draw, from_groups, group, groups
+from pbrl_ppl.posterior.store import Idata, best_draw, from_groups, group, groups
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import INPUT, STATE
 
@@ -91,7 +91,7 @@ def versions() -> dict[str, str]:
 
 
 def problem_of(
-    idata: Any, effects: Iterable[Effect] = catalogue, history: History | None = None
+    idata: Idata, effects: Iterable[Effect] = catalogue, history: History | None = None
 ) -> Problem:
     """Return the problem that a posterior was fitted to, from what the posterior holds.
 
@@ -153,7 +153,7 @@ def problem_of(
     return with_sensitivity(problem, phi[best], sigma[best])
 
 
-def linearised_as(problem: Problem, idata: Any) -> Problem:
+def linearised_as(problem: Problem, idata: Idata) -> Problem:
     """Return the problem with its trajectories linearised as in a posterior of the same data.
 
     Parameters
@@ -315,7 +315,7 @@ def both_places(earlier: xr.Dataset, segments: Segments) -> dict[str, xr.Variabl
     }
 
 
-def placed(idata: Any, coords: Mapping[Any, Any]) -> Any:
+def placed(idata: Idata, coords: Mapping[Any, Any]) -> Idata:
     """Return the posterior with the trajectory and time of these coordinates, and no others."""
     chosen = {name: coords[name] for name in _PLACES}
     data = {

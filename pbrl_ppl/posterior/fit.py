@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.posterior.completion import parameter_draws
 from pbrl_ppl.posterior.data import problem_of
 from pbrl_ppl.posterior.record import PosteriorRecord
-from pbrl_ppl.posterior.store import best_draw
+from pbrl_ppl.posterior.store import Idata, best_draw
 from pbrl_ppl.state import Floats
 
 
@@ -29,10 +28,10 @@ class Fit:
     """
 
     problem: Problem
-    posterior: Any
+    posterior: Idata
 
     @classmethod
-    def of(cls, posterior: Any, effects: Iterable[Effect] = catalogue) -> Fit:
+    def of(cls, posterior: Fit | Idata, effects: Iterable[Effect] = catalogue) -> Fit:
         """Return the fit that a posterior holds; one that is a fit already is returned itself.
 
         Parameters

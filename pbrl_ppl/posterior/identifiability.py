@@ -15,7 +15,7 @@ from pbrl_ppl.modes import Mode, posterior_slopes
 from pbrl_ppl.parameters import JOINT_INDICES, Layout, Prior, inside, nearest, wheels
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.posterior.record import PosteriorRecord, layout_of
-from pbrl_ppl.posterior.store import best_draw, group, labelled_draws
+from pbrl_ppl.posterior.store import Idata, best_draw, group, labelled_draws
 from pbrl_ppl.state import STATE, Floats
 
 INFORMED, WEAK, PRIOR_ONLY = "informed", "weak", "prior only"
@@ -201,7 +201,7 @@ def identify(
     return Identifiability(widths, silent, _directions(gram, labels))
 
 
-def uninformed(idata: Any, *, effects: Iterable[Effect] = catalogue) -> tuple[str, ...]:
+def uninformed(idata: Idata, *, effects: Iterable[Effect] = catalogue) -> tuple[str, ...]:
     """Return labels of the parameters that a posterior knows no better than the prior.
 
     Parameters
@@ -327,7 +327,7 @@ def _sparse(rows: Floats) -> Floats:
     return rows
 
 
-def _linearised(idata: Any, effects: tuple[Effect, ...]) -> tuple[Layout, Floats, Floats]:
+def _linearised(idata: Idata, effects: tuple[Effect, ...]) -> tuple[Layout, Floats, Floats]:
     """Return the layout, the best draw, and the whitened residual's derivative there."""
     record = PosteriorRecord.of(idata)
     physics = Physics(record.scene, record.attached(effects), record.substeps, threads=2)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -11,6 +10,7 @@ from pbrl_ppl.likelihood import Problem, log_posterior
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.parameters import nearest
 from pbrl_ppl.posterior.record import PosteriorRecord, StoredMode
+from pbrl_ppl.posterior.store import Idata
 from pbrl_ppl.state import Floats, Ints
 
 #: Rounds of a climb that starts near the mode.
@@ -124,7 +124,7 @@ def _packed(
     )
 
 
-def stored_mode(problem: Problem, idata: Any) -> Point:
+def stored_mode(problem: Problem, idata: Idata) -> Point:
     """Return the mode that a posterior holds, in the order of the problem's layout.
 
     Parameters

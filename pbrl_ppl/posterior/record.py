@@ -20,7 +20,7 @@ from pbrl_ppl.likelihood import (
 )
 from pbrl_ppl.parameters import Layout, ParameterLibrary
 from pbrl_ppl.physics import build_layout
-from pbrl_ppl.posterior.store import SCHEMA, check_schema, draws
+from pbrl_ppl.posterior.store import SCHEMA, Idata, check_schema, draws
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats, Ints
 
@@ -174,7 +174,7 @@ class PosteriorRecord:
     not_separable: tuple[tuple[str, ...], ...] | None = None
 
     @classmethod
-    def of(cls, idata: Any) -> PosteriorRecord:
+    def of(cls, idata: Idata) -> PosteriorRecord:
         """Return the record of a posterior.
 
         Raises
@@ -196,7 +196,7 @@ class PosteriorRecord:
         written = {name: _written(value) for name, value in values.items() if value is not None}
         return {"pbrl_ppl": "posterior", "schema": SCHEMA, **written}
 
-    def write(self, idata: Any) -> None:
+    def write(self, idata: Idata) -> None:
         """Write the record into the attributes of a posterior."""
         idata.attrs.update(self.attributes())
 
@@ -246,7 +246,7 @@ class PosteriorRecord:
 
 
 def vectors(
-    idata: Any, layout: Layout, variables: Mapping[str, tuple[str, ...]]
+    idata: Idata, layout: Layout, variables: Mapping[str, tuple[str, ...]]
 ) -> tuple[Floats, Floats]:
     """Return draws as vectors: phi, shape (draw, p), and sigma, shape (draw, noise parameter)."""
     named = draws(idata)
@@ -262,7 +262,7 @@ def _attached(scene: Scene, table: str | None, effects: Iterable[Effect]) -> tup
     return attach(scene, (), (*effects, *learned))
 
 
-def scene_of(idata: Any) -> Scene:
+def scene_of(idata: Idata) -> Scene:
     """Return the scene that a posterior was fitted with, added effects included.
 
     Raises
@@ -277,13 +277,13 @@ def scene_of(idata: Any) -> Scene:
     return scene
 
 
-def layout_of(idata: Any, effects: Iterable[Effect] = catalogue) -> Layout:
+def layout_of(idata: Idata, effects: Iterable[Effect] = catalogue) -> Layout:
     """Return the layout of a posterior's parameters."""
     scene, fields = scene_of(idata), stored_fields(idata, ("learned_remainder",))
     return build_layout(scene, _attached(scene, fields.get("learned_remainder"), effects))
 
 
-def stored_fields(idata: Any, names: Iterable[str] | None = None) -> dict[str, Any]:
+def stored_fields(idata: Idata, names: Iterable[str] | None = None) -> dict[str, Any]:
     """Return fields of the record that a posterior's attributes hold, all or some, by name."""
     kinds = _kinds(PosteriorRecord)
     return {

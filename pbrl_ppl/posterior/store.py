@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, cast
 
 import h5py
 import numpy as np
@@ -37,6 +37,21 @@ SCHEMA = 2
 _NEEDED = ("posterior", "sample_stats", "log_likelihood", "observed_data", "constant_data")
 
 
+class Idata(Protocol):
+    """A posterior or a trace: an InferenceData of ArviZ 0.x, or a DataTree of ArviZ 1.x."""
+
+    attrs: dict[Any, Any]
+
+    def sel(self, **indexers: Any) -> Idata:
+        """Select by labels in all groups."""
+
+    def copy(self) -> Idata:
+        """Copy all groups."""
+
+    def __getitem__(self, name: str) -> Any:
+        """Return a group, in 1.x a node of the tree."""
+
+
 def arviz() -> Any:
     """Return ArviZ, imported without the warning by which 0.23 announces 1.0."""
     with warnings.catch_warnings():
@@ -45,20 +60,20 @@ def arviz() -> Any:
     return arviz
 
 
-def groups(idata: Any) -> dict[str, xr.Dataset]:
+def groups(idata: Idata) -> dict[str, xr.Dataset]:
     """Return all groups of an InferenceData or DataTree as plain datasets."""
-    if DATATREE:
+    if isinstance(idata, xr.DataTree):
         return {name: node.to_dataset() for name, node in idata.children.items()}
-    return {name: idata[name] for name in idata.groups()}
+    return {name: idata[name] for name in idata.groups()}  # type: ignore[attr-defined]  # ArviZ 0.x
 
 
-def best_draw(idata: Any) -> int:
+def best_draw(idata: Idata) -> int:
     """Return the index of the draw of highest likelihood, in the order of :func:`draws`."""
     likelihood = group(idata, "log_likelihood")["next_state"].sum("transition")
     return int(likelihood.transpose("chain", "draw").to_numpy().argmax())
 
 
-def group(idata: Any, name: str) -> xr.Dataset:
+def group(idata: Idata, name: str) -> xr.Dataset:
     """Return one group as a plain dataset.
 
     Raises
@@ -75,18 +90,18 @@ def group(idata: Any, name: str) -> xr.Dataset:
     return stored[name]
 
 
-def from_groups(datasets: Mapping[str, xr.Dataset], attrs: Mapping[str, Any]) -> Any:
+def from_groups(datasets: Mapping[str, xr.Dataset], attrs: Mapping[str, Any]) -> Idata:
     """Build an InferenceData (ArviZ 0.x) or DataTree (1.x) from datasets by name."""
     if DATATREE:
         tree = xr.DataTree.from_dict({f"/{name}": data for name, data in datasets.items()})
         tree.attrs.update(attrs)
-        return tree
-    idata = arviz().InferenceData(**datasets)
+        return cast(Idata, tree)
+    idata: Idata = arviz().InferenceData(**datasets)
     idata.attrs.update(attrs)
     return idata
 
 
-def save_posterior(idata: Any, path: str | Path) -> None:
+def save_posterior(idata: Idata, path: str | Path) -> None:
     """Write a posterior to a NetCDF file, whole or not at all.
 
     Parameters
@@ -109,7 +124,7 @@ def save_posterior(idata: Any, path: str | Path) -> None:
     write_atomically(path, lambda temporary: _write(idata, temporary))
 
 
-def _write(idata: Any, path: Path) -> None:
+def _write(idata: Idata, path: Path) -> None:
     """Write NetCDF 4 with one group a dataset: the same file from both stacks."""
     xr.Dataset(attrs=dict(idata.attrs)).to_netcdf(path, mode="w", engine="h5netcdf")
     for name, data in groups(idata).items():
@@ -117,7 +132,7 @@ def _write(idata: Any, path: Path) -> None:
         data.to_netcdf(path, mode="a", group=name, engine="h5netcdf", encoding=encoding)
 
 
-def load_posterior(path: str | Path) -> Any:
+def load_posterior(path: str | Path) -> Idata:
     """Read a posterior file, written by either stack.
 
     Parameters
@@ -177,7 +192,7 @@ def check_schema(attrs: Mapping[str, Any], where: str) -> None:
         )
 
 
-def draws(idata: Any, n: int | None = None, seed: int = 0) -> dict[str, Floats]:
+def draws(idata: Idata, n: int | None = None, seed: int = 0) -> dict[str, Floats]:
     """Return posterior draws by name, chains joined.
 
     Parameters
@@ -209,7 +224,7 @@ def draws(idata: Any, n: int | None = None, seed: int = 0) -> dict[str, Floats]:
     return {str(name): stacked[name].values[chosen] for name in stacked.data_vars}
 
 
-def scalars(posterior: Any) -> xr.Dataset:
+def scalars(posterior: Idata) -> xr.Dataset:
     """Return one variable per scalar parameter, called ``name[coordinate]``.
 
     Parameters
@@ -236,12 +251,12 @@ def scalars(posterior: Any) -> xr.Dataset:
     return xr.Dataset(flat)
 
 
-def labelled_draws(idata: Any) -> dict[str, Floats]:
+def labelled_draws(idata: Idata) -> dict[str, Floats]:
     """Return posterior draws by label, such as ``mass[cart]``, shape (draw,), chains joined."""
     return {str(name): variable.to_numpy().ravel() for name, variable in scalars(idata).items()}
 
 
-def convergence(idata: Any) -> tuple[dict[str, float], dict[str, float]]:
+def convergence(idata: Idata) -> tuple[dict[str, float], dict[str, float]]:
     """Return R-hat, and the smaller of bulk and tail effective size, of every scalar parameter.
 
     Parameters

@@ -19,7 +19,7 @@ from pbrl_ppl.modes import NONE, index_law
 from pbrl_ppl.parameters import JOINT_INDICES, ParameterLibrary, Prior, nearest
 from pbrl_ppl.physics import index_priors
 from pbrl_ppl.posterior.record import layout_of, scene_of, stored_fields
-from pbrl_ppl.posterior.store import group, labelled_draws, scalars
+from pbrl_ppl.posterior.store import Idata, group, labelled_draws, scalars
 from pbrl_ppl.scene import Joint, Scene
 from pbrl_ppl.state import Floats
 
@@ -30,7 +30,7 @@ _OUTSIDE, _LEVEL = 5.0, 5.0
 _OTHERS = ("library_index", "sigma")
 
 
-def updated_scene(idata: Any, *, effects: Iterable[Effect] = catalogue) -> Scene:
+def updated_scene(idata: Idata, *, effects: Iterable[Effect] = catalogue) -> Scene:
     """Return the posterior's scene with the posterior as its prior.
 
     A fit of new data can start from it. It keeps each parameter's marginal distribution, in
@@ -93,7 +93,7 @@ def updated_scene(idata: Any, *, effects: Iterable[Effect] = catalogue) -> Scene
     return scene.replace(bodies=tuple(bodies), joints=_joints(idata, scene))
 
 
-def _joints(idata: Any, scene: Scene) -> tuple[Joint, ...]:
+def _joints(idata: Idata, scene: Scene) -> tuple[Joint, ...]:
     """Return the joints, those of unknown bodies with their indices' posterior probabilities."""
     rows = stored_fields(idata, ("configurations",)).get("configurations", ())
     joints = []
@@ -120,7 +120,7 @@ def _joints(idata: Any, scene: Scene) -> tuple[Joint, ...]:
     return tuple(joints)
 
 
-def joint_probabilities(idata: Any) -> dict[str, dict[str, float]]:
+def joint_probabilities(idata: Idata) -> dict[str, dict[str, float]]:
     """Return the posterior probabilities of the pairs that each joint connects.
 
     Parameters
@@ -273,7 +273,7 @@ def learned_library(
     return ParameterLibrary(sets, probabilities)
 
 
-def library_probabilities(idata: Any) -> pd.DataFrame:
+def library_probabilities(idata: Idata) -> pd.DataFrame:
     """Return the probability of every parameter set: one row a body or class, one column a set.
 
     Parameters

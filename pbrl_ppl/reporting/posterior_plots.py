@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import arviz as az
 import numpy as np
@@ -23,6 +23,7 @@ from pbrl_ppl.posterior import (
     DATATREE,
     HDI_PROB,
     SIZE,
+    Idata,
     convergence,
     from_groups,
     group,
@@ -47,7 +48,7 @@ from pbrl_ppl.sampling import Calibration, bins
 from pbrl_ppl.state import Floats
 
 
-def summary(posterior: Any) -> pd.DataFrame:
+def summary(posterior: Idata) -> pd.DataFrame:
     """Return ArviZ's summary of every scalar parameter, with the same columns on every ArviZ.
 
     Parameters
@@ -91,7 +92,7 @@ def most_interesting(table: pd.DataFrame, added: Iterable[str] = (), most: int =
 
 
 def plot_trace(
-    posterior: Any, parameters: Sequence[str] | None = None, width: float = WIDE
+    posterior: Idata, parameters: Sequence[str] | None = None, width: float = WIDE
 ) -> Figure:
     """Plot ArviZ's trace of some parameters, laid out alike on every ArviZ.
 
@@ -112,7 +113,7 @@ def plot_trace(
 
 
 def plot_rank(
-    posterior: Any, parameters: Sequence[str] | None = None, width: float = WIDE
+    posterior: Idata, parameters: Sequence[str] | None = None, width: float = WIDE
 ) -> Figure:
     """Plot how evenly the ranks of each chain's draws are spread; arguments as :func:`plot_trace`.
 
@@ -156,7 +157,7 @@ def _band(axes: Axes, size: float) -> float:
     return edge
 
 
-def _chosen(posterior: Any, parameters: Sequence[str] | None) -> xr.Dataset:
+def _chosen(posterior: Idata, parameters: Sequence[str] | None) -> xr.Dataset:
     """Return the draws of the parameters to show."""
     if parameters is None:
         parameters = most_interesting(summary(posterior))
@@ -190,7 +191,7 @@ def _trace(draws: xr.Dataset, width: float) -> Figure:
     return result
 
 
-def plot_prior(posterior: Any, parameters: Sequence[str], width: float = WIDE) -> Figure:
+def plot_prior(posterior: Idata, parameters: Sequence[str], width: float = WIDE) -> Figure:
     """Plot posterior densities over those of the prior.
 
     Parameters
@@ -234,7 +235,7 @@ def plot_prior(posterior: Any, parameters: Sequence[str], width: float = WIDE) -
     return figure
 
 
-def most_dependent(posterior: Any, most: int = 4) -> list[str]:
+def most_dependent(posterior: Idata, most: int = 4) -> list[str]:
     """Return the parameters whose draws depend most on each other, by rank correlation."""
     draws = scalars(posterior)
     names = [str(name) for name, v in draws.items() if float(v.max() - v.min()) > 0]
@@ -250,7 +251,7 @@ def most_dependent(posterior: Any, most: int = 4) -> list[str]:
 
 
 def plot_pairs(
-    posterior: Any, parameters: Sequence[str], width: float = WIDE, points: int = 800
+    posterior: Idata, parameters: Sequence[str], width: float = WIDE, points: int = 800
 ) -> Figure:
     """Plot some draws of each pair of parameters, with the rank correlation of all."""
     draws = scalars(posterior)
@@ -278,7 +279,7 @@ def plot_pairs(
     return figure
 
 
-def plot_predictions(posterior: Any, width: float = WIDE) -> Figure:
+def plot_predictions(posterior: Idata, width: float = WIDE) -> Figure:
     """Plot the calibration of leave-one-out predictions, one curve a state dimension.
 
     A curve is the share of measurements below each quantile, less what calibrated predictions give;
@@ -316,7 +317,7 @@ class Coverage(NamedTuple):
     measurements: int
 
 
-def coverage(posterior: Any) -> dict[str, Coverage]:
+def coverage(posterior: Idata) -> dict[str, Coverage]:
     """Return the coverage of leave-one-out predictions, by state dimension."""
     pit = loo_pit(posterior)
     result = {}
@@ -330,7 +331,7 @@ def coverage(posterior: Any) -> dict[str, Coverage]:
     return result
 
 
-def pareto_k(posterior: Any) -> tuple[Floats, float, str]:
+def pareto_k(posterior: Idata) -> tuple[Floats, float, str]:
     """Return Pareto k, the threshold above which it is bad, and the unit left out at a time.
 
     Raises
@@ -359,7 +360,7 @@ def plot_pareto(k: Floats, good: float, unit: str, width: float = WIDE) -> Figur
     return figure
 
 
-def prior_draws(posterior: Any) -> xr.Dataset:
+def prior_draws(posterior: Idata) -> xr.Dataset:
     """Return one variable per scalar parameter of the prior; none if there are no prior draws."""
     if "prior" not in groups(posterior):
         return xr.Dataset()

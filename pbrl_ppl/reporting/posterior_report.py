@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from pbrl_ppl.effects import Effect
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import PbrlError, PosteriorError
 from pbrl_ppl.posterior import (
+    Idata,
     Identifiability,
     PosteriorRecord,
     compare,
@@ -49,7 +50,7 @@ T = TypeVar("T")
 
 
 def render_posterior(
-    posterior: Any, effects: Iterable[Effect] = full_catalogue, source: Source | None = None
+    posterior: Idata, effects: Iterable[Effect] = full_catalogue, source: Source | None = None
 ) -> str:
     """Render the report of a posterior: one page of HTML that needs nothing else.
 
@@ -160,7 +161,7 @@ class AllParameters(Section):
 class Predictions(Section):
     """Coverage of leave-one-out predictions."""
 
-    posterior: Any
+    posterior: Idata
     covered: Mapping[str, Coverage]
     why_not: str
 
@@ -204,7 +205,7 @@ class Predictions(Section):
 class LeaveOneOut(Section):
     """Leave-one-out cross-validation, with its Pareto k."""
 
-    posterior: Any
+    posterior: Idata
     k: tuple[Floats, float, str] | None
     why_not: str
 
@@ -224,7 +225,7 @@ class LeaveOneOut(Section):
 class Origin(Section):
     """Commands that make the page and the posterior again; seed, data, versions, scene."""
 
-    posterior: Any
+    posterior: Idata
     source: Source
 
     template = "origin"
@@ -268,7 +269,7 @@ class PosteriorHeader(Section):
         }
 
 
-def _headline(posterior: Any, informed_by: Identifiability | None) -> str:
+def _headline(posterior: Idata, informed_by: Identifiability | None) -> str:
     record = PosteriorRecord.of(posterior)
     bodies = ", ".join(body.name for body in record.scene.dynamic)
     effects = [f"{plain(name)} of {body}" for name, body in record.effects]
@@ -285,7 +286,7 @@ def _headline(posterior: Any, informed_by: Identifiability | None) -> str:
     return f"{text}."
 
 
-def _warned(posterior: Any, identified: bool) -> list[str]:
+def _warned(posterior: Idata, identified: bool) -> list[str]:
     """Return the warnings of the fit, without those that other parts of the page cover."""
     every = PosteriorRecord.of(posterior).warnings or ()
     covered = (
@@ -296,7 +297,7 @@ def _warned(posterior: Any, identified: bool) -> list[str]:
     return [sentence for sentence in every if not any(words in sentence for words in covered)]
 
 
-def _about(posterior: Any) -> str:
+def _about(posterior: Idata) -> str:
     record, sizes = PosteriorRecord.of(posterior), group(posterior, "posterior").sizes
     transitions = group(posterior, "observed_data").sizes["transition"]
     names = {"trajectories": "whole trajectories", "transitions": "transitions, Eq. 11"}
@@ -310,7 +311,7 @@ def _about(posterior: Any) -> str:
     )
 
 
-def _refit(posterior: Any) -> str:
+def _refit(posterior: Idata) -> str:
     """Return the lines of Python that make the posterior again from its recording."""
     record, sizes = PosteriorRecord.of(posterior), group(posterior, "posterior").sizes
     options = []

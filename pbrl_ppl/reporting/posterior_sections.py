@@ -13,6 +13,7 @@ import pandas as pd
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.parameters import BODY_PARAMETERS, JOINT_ANCHORS
 from pbrl_ppl.posterior import (
+    Idata,
     Identifiability,
     group,
     interval,
@@ -108,7 +109,7 @@ class Parameters:
         Up to these they are good enough for a verdict, and for the first digits of an interval.
     """
 
-    posterior: Any
+    posterior: Idata
     effects: tuple[Effect, ...]
     first: tuple[str, ...] = ()
     good_r_hat: float = 1.01
@@ -241,7 +242,7 @@ def _weights_in_words(sampler: Mapping[str, Any]) -> str:
     )
 
 
-def recorded_poses(posterior: Any) -> Floats | None:
+def recorded_poses(posterior: Idata) -> Floats | None:
     """Return the recorded poses that a posterior holds, shape (trajectory, time, body, 3)."""
     if not stored_fields(posterior, ("scene",)):
         return None

@@ -25,6 +25,7 @@ from pbrl_ppl.posterior import (
     PARETO_K,
     SIZE,
     Fit,
+    Idata,
     Point,
     PosteriorRecord,
     complete,
@@ -65,9 +66,9 @@ def fit(
     thin: int | None = None,
     cores: int | None = None,
     start: Mode | None = None,
-    resume: Any = None,
+    resume: Idata | None = None,
     progress: bool = True,
-) -> Any:
+) -> Idata:
     """Sample the posterior of a model of :func:`pbrl_ppl.physics_model`.
 
     Draws come from importance sampling by default. They start about the modes, which multi-start
@@ -174,7 +175,7 @@ def sample(
     thin: int | None = None,
     cores: int | None = None,
     start: Mode | None = None,
-    resume: Any = None,
+    resume: Idata | None = None,
     progress: bool = False,
     declared: pm.Model | None = None,
 ) -> Fit:
@@ -253,7 +254,7 @@ def _drawn(
     if problem.layout.discrete.any():
         weighed = weigh(problem, seed=job.seed, progress=job.progress)
 
-        def of_configuration(mode: Mode) -> Any:
+        def of_configuration(mode: Mode) -> Idata:
             return _run(chosen, replace(job, problem=mode.problem, mode=mode))
 
         trace = mix(
@@ -283,7 +284,7 @@ def _at_mode(job: SamplerRun, start: Mode | None) -> SamplerRun:
 
 
 @one_blas_thread
-def _run(chosen: Method, job: SamplerRun) -> Any:
+def _run(chosen: Method, job: SamplerRun) -> Idata:
     """Return draws by a method, without what its processes warn of."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*fork.*", category=DeprecationWarning)
@@ -292,7 +293,7 @@ def _run(chosen: Method, job: SamplerRun) -> Any:
         return chosen.run(job)
 
 
-def _check(problem: Problem, method: str, start: Any, resume: Any) -> None:
+def _check(problem: Problem, method: str, start: Any, resume: Idata | None) -> None:
     """Refuse arguments of `fit` that do not go with a problem."""
     if method not in METHODS:
         raise FitError(f"fit: method is {method!r}, expected one of {', '.join(METHODS)}")
@@ -303,7 +304,9 @@ def _check(problem: Problem, method: str, start: Any, resume: Any) -> None:
             f"fit: start is a {type(start).__name__}, expected a Mode; pass a posterior to go on"
             " with as resume"
         )
-    names = [] if start is None else [other.likelihood.name for other in (start.problem, problem)]
+    names: list[str] = (
+        [] if start is None else [other.likelihood.name for other in (start.problem, problem)]
+    )
     if "simulation" in names and names[0] != names[1]:
         raise FitError(
             f"fit: start is a mode of the likelihood {names[0]}, the model's is {names[1]}; leave"
@@ -353,7 +356,7 @@ def _joined(problem: Problem, phi: Floats, sigma: Floats) -> Problem:
     return joined
 
 
-def _as_in(problem: Problem, idata: Any) -> Problem:
+def _as_in(problem: Problem, idata: Idata | None) -> Problem:
     """Return the problem with the parts and the linearisation that a posterior was sampled with."""
     if idata is None:
         return problem
@@ -363,7 +366,7 @@ def _as_in(problem: Problem, idata: Any) -> Problem:
     return linearised_as(problem, idata)
 
 
-def _appended(earlier: Any, trace: Any) -> Any:
+def _appended(earlier: Idata, trace: Idata) -> Idata:
     """Return the draws of two runs, the earlier ones first."""
     data = groups(trace)
     for name in ("posterior", "sample_stats"):
@@ -381,7 +384,7 @@ def _appended(earlier: Any, trace: Any) -> Any:
     return from_groups(data, attributes)
 
 
-def _size(idata: Any) -> float:
+def _size(idata: Idata) -> float:
     """Return the number of independent draws that a posterior's or a trace's draws are worth."""
     size = idata.attrs.get(SIZE)
     return min(convergence(idata)[1].values()) if size is None else float(size)

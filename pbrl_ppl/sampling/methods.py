@@ -27,6 +27,7 @@ from pbrl_ppl.posterior import (
     LIKELIHOOD,
     PARETO_K,
     SIZE,
+    Idata,
     from_groups,
     group,
     groups,
@@ -55,7 +56,7 @@ class Method:
         Chains.
     """
 
-    run: Callable[[SamplerRun], Any]
+    run: Callable[[SamplerRun], Idata]
     draws: int
     tune: int
     thin: int
@@ -82,7 +83,7 @@ class SamplerRun:
 
     problem: Problem
     mode: Mode | None
-    resume: Any
+    resume: Idata | None
     seed: int
     draws: int
     tune: int
@@ -134,13 +135,13 @@ class SamplerRun:
             raise FitError("fit: this method begins at a mode, and there is none")
         return self.mode
 
-    def sample(self, step: Any, steps_a_draw: int = 1) -> Any:
+    def sample(self, step: Any, steps_a_draw: int = 1) -> Idata:
         """Run ``pm.sample`` from the starts, without its checks of convergence."""
         import pymc as pm
 
         starts = self.starts()
         try:
-            trace = pm.sample(
+            trace: Idata = pm.sample(
                 draws=self.draws * steps_a_draw,
                 tune=self.tune,
                 chains=len(starts),
@@ -166,7 +167,7 @@ class SamplerRun:
         return from_groups(data, {})
 
 
-def _importance(job: SamplerRun, *, proposals: float = 1.4) -> Any:
+def _importance(job: SamplerRun, *, proposals: float = 1.4) -> Idata:
     """Weight proposals from a cheaper posterior; see `importance`.
 
     ``proposals``: weighted proposals a draw.
@@ -187,7 +188,7 @@ def _importance(job: SamplerRun, *, proposals: float = 1.4) -> Any:
     return trace
 
 
-def _metropolis(job: SamplerRun, *, most_walkers: int = 20, little: int = 2000) -> Any:
+def _metropolis(job: SamplerRun, *, most_walkers: int = 20, little: int = 2000) -> Idata:
     """Run the ensemble as chains; see `ensemble`. A chain is its walkers, one after another.
 
     ``most_walkers``: walkers of a chain of the ensemble.
@@ -239,7 +240,7 @@ def _metropolis(job: SamplerRun, *, most_walkers: int = 20, little: int = 2000) 
     return as_trace(job.problem, values, {"accept": chained(accept[..., None])[..., 0]})
 
 
-def _paper(job: SamplerRun) -> Any:
+def _paper(job: SamplerRun) -> Idata:
     """Run one random-walk Metropolis step a variable, as PyMC 2 did, and keep each n-th draw.
 
     The set of a library that each body has is proposed uniformly, body by body.
@@ -256,25 +257,25 @@ def _paper(job: SamplerRun) -> Any:
     return job.sample(steps, job.thin)
 
 
-def _demetropolisz(job: SamplerRun) -> Any:
+def _demetropolisz(job: SamplerRun) -> Idata:
     """Run differential evolution from each chain's past (ter Braak and Vrugt, 2008)."""
     import pymc as pm
 
     return job.sample(pm.DEMetropolisZ(job.model.free_RVs, model=job.model), job.thin)
 
 
-def _nuts(job: SamplerRun) -> Any:
+def _nuts(job: SamplerRun) -> Idata:
     """Run NUTS on the finite-difference gradient: where nothing slides to a stop or collides."""
     import pymc as pm
 
     return job.sample(pm.NUTS(job.model.free_RVs, model=job.model), job.thin)
 
 
-def _smc(job: SamplerRun) -> Any:
+def _smc(job: SamplerRun) -> Idata:
     """Run sequential Monte Carlo from the prior: for several modes and few parameters."""
     import pymc as pm
 
-    return pm.sample_smc(
+    trace: Idata = pm.sample_smc(
         draws=job.draws,
         chains=job.chains,
         cores=job.cores,
@@ -283,9 +284,10 @@ def _smc(job: SamplerRun) -> Any:
         compute_convergence_checks=False,
         model=job.model,
     )
+    return trace
 
 
-def _map(job: SamplerRun) -> Any:
+def _map(job: SamplerRun) -> Idata:
     """Return the mode alone, as a posterior of one draw."""
     mode = job.at_mode
     values = mode.problem.named(mode.phi, mode.sigma)
@@ -293,7 +295,7 @@ def _map(job: SamplerRun) -> Any:
     return as_trace(job.problem, draws, {"lp": np.array([[mode.log_posterior]])})
 
 
-def _laplace(job: SamplerRun) -> Any:
+def _laplace(job: SamplerRun) -> Idata:
     """Draw independently from the Gaussian at the mode; that of the noise is of its logarithm."""
     rng, mode = np.random.default_rng(job.seed), job.at_mode
     shape = job.chains, job.draws
@@ -305,7 +307,7 @@ def _laplace(job: SamplerRun) -> Any:
     return as_trace(job.problem, values, {"accept": np.ones(shape)})
 
 
-def as_trace(problem: Problem, draws: Mapping[str, Any], stats: Mapping[str, Any]) -> Any:
+def as_trace(problem: Problem, draws: Mapping[str, Any], stats: Mapping[str, Any]) -> Idata:
     """Return a trace in PyMC's form, of draws made without PyMC.
 
     Parameters

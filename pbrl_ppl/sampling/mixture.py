@@ -20,7 +20,7 @@ from pbrl_ppl.modes import (
     stored,
 )
 from pbrl_ppl.parameters import JOINT_ANCHORS, JOINT_INDICES, ParameterLibrary
-from pbrl_ppl.posterior import Point, from_groups, group, groups
+from pbrl_ppl.posterior import Idata, Point, from_groups, group, groups
 from pbrl_ppl.sampling.methods import as_trace, posterior_dataset
 from pbrl_ppl.state import Bools, Floats, Ints
 
@@ -36,7 +36,7 @@ def mix(
     draws: int,
     chains: int,
     seed: int,
-) -> Any:
+) -> Idata:
     """Sample each configuration that matters, and mix the draws by their probabilities.
 
     The number of draws of each is fixed, their order in the chains is random. A pair's
@@ -229,7 +229,7 @@ def summed(problem: Problem, draws: int, chains: int, seed: int) -> tuple[Any, P
     return as_trace(problem, values, {"accept": accepted}), _point(problem, best)
 
 
-def most_frequent(problem: Problem, trace: Any) -> Point:
+def most_frequent(problem: Problem, trace: Idata) -> Point:
     """Return the most frequent choice among the draws, jointly for bodies that meet.
 
     Parameters

@@ -9,7 +9,7 @@ import numpy as np
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import Mode, Space
-from pbrl_ppl.posterior import group, parameter_draws
+from pbrl_ppl.posterior import Idata, group, parameter_draws
 from pbrl_ppl.state import Floats
 
 
@@ -27,7 +27,7 @@ def dispersed(
     return [mode.problem.named(space.possible(one), space.split(one)[1]) for one in q]
 
 
-def last_draws(problem: Problem, idata: Any, walkers: int = 1) -> tuple[Floats, Floats]:
+def last_draws(problem: Problem, idata: Idata, walkers: int = 1) -> tuple[Floats, Floats]:
     """Return the last draws of each chain's walkers, which stand one after another in it.
 
     Shapes (chain * walker, p) and (chain * walker, parameter).

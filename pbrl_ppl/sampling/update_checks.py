@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from pbrl_ppl.errors import HistoryError, PosteriorError
 from pbrl_ppl.history import History, check_start, measured_alone, unused_velocities
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.posterior import (
+    Idata,
     PosteriorRecord,
     from_groups,
     group,
@@ -19,7 +18,7 @@ from pbrl_ppl.posterior import (
 from pbrl_ppl.state import STATE, Floats
 
 
-def check_posterior(idata: Any, history: History) -> PosteriorRecord:
+def check_posterior(idata: Idata, history: History) -> PosteriorRecord:
     """Return the record of a posterior; refuse posteriors and data that an update cannot use."""
     for name in ("log_likelihood", "posterior_predictive", "observed_data", "constant_data"):
         group(idata, name)
@@ -35,7 +34,7 @@ def check_posterior(idata: Any, history: History) -> PosteriorRecord:
     return record
 
 
-def as_recorded(idata: Any, history: History) -> History:
+def as_recorded(idata: Idata, history: History) -> History:
     """Return the history without the unused velocities that the posterior leaves out."""
     constants = group(idata, "constant_data")
     if "recorded_observed" not in constants:
@@ -50,7 +49,7 @@ def as_recorded(idata: Any, history: History) -> History:
     return measured_alone(history, unused)
 
 
-def check_history(idata: Any, record: PosteriorRecord, history: History) -> None:
+def check_history(idata: Idata, record: PosteriorRecord, history: History) -> None:
     """Refuse a history of other bodies, dimensions or time step, or without usable start."""
     scene, measured = record.scene, record.measured
     names = tuple(body.name for body in scene.moving)
@@ -82,7 +81,7 @@ def check_history(idata: Any, record: PosteriorRecord, history: History) -> None
 
 
 def check_engine(
-    idata: Any, problem: Problem, *, transitions: int = 50, tolerance: float = 0.01
+    idata: Idata, problem: Problem, *, transitions: int = 50, tolerance: float = 0.01
 ) -> None:
     """Refuse a posterior whose stored likelihoods are not what this problem's engine gives.
 

@@ -25,7 +25,7 @@ from pbrl_ppl.likelihood import (
 )
 from pbrl_ppl.modes import systematic
 from pbrl_ppl.physics import Physics
-from pbrl_ppl.posterior import PosteriorRecord, from_groups, group, groups, parameter_draws
+from pbrl_ppl.posterior import Idata, PosteriorRecord, from_groups, group, groups, parameter_draws
 from pbrl_ppl.sampling.fitting import sample
 from pbrl_ppl.sampling.update_checks import (
     as_recorded,
@@ -38,13 +38,13 @@ from pbrl_ppl.state import Floats
 
 
 def update(
-    idata: Any,
+    idata: Idata,
     history: History,
     *,
     effects: Iterable[Effect] = catalogue,
     seed: int = 0,
     progress: bool = True,
-) -> Any:
+) -> Idata:
     """Return a posterior updated with new transitions.
 
     The draws are weighted by the new transitions' likelihood and resampled within each chain, in
@@ -135,7 +135,9 @@ def update(
     return _entered(result, record, history, entry)
 
 
-def _entered(result: Any, record: PosteriorRecord, history: History, entry: dict[str, Any]) -> Any:
+def _entered(
+    result: Idata, record: PosteriorRecord, history: History, entry: dict[str, Any]
+) -> Idata:
     """Return an updated posterior, with the update entered in its record."""
     hashes = {"data_sha256": history.data_sha256, "before_sha256": record.data_sha256}
     chained = f"{record.data_sha256}{history.data_sha256}"
@@ -149,7 +151,7 @@ def _entered(result: Any, record: PosteriorRecord, history: History, entry: dict
 
 
 def _simulated(
-    idata: Any, record: PosteriorRecord, history: History, effects: tuple[Effect, ...]
+    idata: Idata, record: PosteriorRecord, history: History, effects: tuple[Effect, ...]
 ) -> Problem:
     """Return the problem of simulations of a posterior's data and new ones, not yet fitted."""
     earlier = files.recorded(record.scene, group(idata, "constant_data"))
@@ -215,7 +217,7 @@ class _Weighted:
 
 
 def _weighted(
-    idata: Any, record: PosteriorRecord, history: History, effects: tuple[Effect, ...]
+    idata: Idata, record: PosteriorRecord, history: History, effects: tuple[Effect, ...]
 ) -> _Weighted:
     """Weight the draws by the new transitions of a history."""
     problem = files.problem_of(idata, effects, history)
@@ -242,7 +244,7 @@ def _weighted(
     return _Weighted(whole, data, known, likelihood, weights, k, more_noise)
 
 
-def _reweighted(idata: Any, record: PosteriorRecord, new: _Weighted, seed: int) -> Any:
+def _reweighted(idata: Idata, record: PosteriorRecord, new: _Weighted, seed: int) -> Idata | None:
     """Return a posterior of resampled draws, or None where the weights are not good enough."""
     posterior = group(idata, "posterior").transpose("chain", "draw", ...)
     chains, n = posterior.sizes["chain"], posterior.sizes["draw"]
@@ -290,7 +292,7 @@ def _reweighted(idata: Any, record: PosteriorRecord, new: _Weighted, seed: int) 
     return files.placed(result, new.data["observed_data"].coords)
 
 
-def _with_data(idata: Any, problem: Problem) -> dict[str, xr.Dataset]:
+def _with_data(idata: Idata, problem: Problem) -> dict[str, xr.Dataset]:
     """Return the stored data and, after them, the problem's."""
     segments, result = problem.segments, {}
     new = {"start": segments.start, "actions": problem.inputs, "next_state": problem.measured}
