@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 from numpy.typing import NDArray
+from pytensor.tensor.variable import TensorVariable
 
 from pbrl_ppl.likelihood import (
     ACCELERATION,
@@ -26,6 +27,9 @@ from pbrl_ppl.model.table1 import random_variable
 from pbrl_ppl.parameters import Block, Layout, ParameterLibrary
 from pbrl_ppl.state import Floats
 
+if TYPE_CHECKING:
+    from pbrl_ppl.modes import Mode
+
 
 class PhysicsModel(pm.Model):  # type: ignore[misc]  # untyped
     """The pm.Model of an inference problem; see :func:`pbrl_ppl.physics_model`.
@@ -38,12 +42,12 @@ class PhysicsModel(pm.Model):  # type: ignore[misc]  # untyped
         The mode that trajectories are linearised at, where a fit may begin.
     """
 
-    def __init__(self, problem: Problem, mode: Any = None) -> None:
+    def __init__(self, problem: Problem, mode: Mode | None = None) -> None:
         super().__init__(coords=variable_coords(problem))
         self.problem, self.mode = problem, mode
 
 
-def build_model(problem: Problem, mode: Any = None) -> PhysicsModel:
+def build_model(problem: Problem, mode: Mode | None = None) -> PhysicsModel:
     """Declare the pm.Model of a problem; see :func:`pbrl_ppl.physics_model`.
 
     ``mode`` is that of :class:`PhysicsModel`.
@@ -55,7 +59,7 @@ def build_model(problem: Problem, mode: Any = None) -> PhysicsModel:
         start = pm.Data("start", segments.start, dims=START_DIMS)
         actions = pm.Data("actions", problem.inputs, dims=ACTION_DIMS)
         # Table 1
-        table1: dict[str, Any] = {}
+        table1: dict[str, TensorVariable] = {}
         if problem.library is not None:
             table1 = _chosen(problem, problem.library, dims)
         else:
@@ -122,7 +126,7 @@ def prior_predictive_draws(
 
 def _chosen(
     problem: Problem, library: ParameterLibrary, dims: Mapping[str, tuple[str, ...]]
-) -> dict[str, Any]:
+) -> dict[str, TensorVariable]:
     """Declare the parameter set of each body or class, and the parameters that follow from it."""
     names = tuple(problem.scene.owners)
     table = library.table(problem.layout, problem.scene)
@@ -136,7 +140,7 @@ def _chosen(
     return result
 
 
-def _noise(problem: Problem) -> Any:
+def _noise(problem: Problem) -> TensorVariable:
     """Declare the noise parameters, shape (parameter,)."""
     median, spread = problem.noise_prior
     if problem.scalar_sigma:
@@ -156,7 +160,7 @@ def _noise(problem: Problem) -> Any:
     return pt.concatenate(parts)
 
 
-def _index(block: Block, layout: Layout, variables: dict[str, Any]) -> Any:
+def _index(block: Block, layout: Layout, variables: dict[str, TensorVariable]) -> TensorVariable:
     """Return the index that selects each anchor's prior; 0 where the body is given."""
     name = f"i_{block.name[0]}"
     if not block.conditional or name not in variables:

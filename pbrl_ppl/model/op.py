@@ -10,7 +10,7 @@ from typing import Any, ClassVar, cast
 import numpy as np
 import pytensor.tensor as pt
 from pytensor.gradient import grad_undefined
-from pytensor.graph.basic import Apply
+from pytensor.graph.basic import Apply, Variable
 from pytensor.graph.op import Op
 from pytensor.link.numba.dispatch.basic import generate_fallback_impl, numba_funcify
 
@@ -38,13 +38,16 @@ class _BlackBoxOp(Op):
     differentiable: ClassVar[tuple[int, ...]]
     reason: ClassVar[str]
 
-    def perform(self, node: Apply, inputs: Sequence[Floats], outputs: Any) -> None:
+    def perform(self, node: Apply, inputs: Sequence[Floats], outputs: list[list[Floats]]) -> None:
         """Compute the output."""
         outputs[0][0] = self.evaluate(*inputs)
 
     def pullback(
-        self, inputs: Sequence[Any], outputs: Sequence[Any], cotangents: Sequence[Any]
-    ) -> list[Any]:
+        self,
+        inputs: Sequence[Variable],
+        outputs: Sequence[Variable],
+        cotangents: Sequence[Variable],
+    ) -> list[Variable]:
         """Return the vector-Jacobian products by the inputs."""
         gradients = _PullbackOp(self)(*inputs, cotangents[0], return_list=True)
         by = dict(zip(self.differentiable, gradients, strict=True))
@@ -64,14 +67,14 @@ class _PullbackOp(Op):
     def __init__(self, op: _BlackBoxOp) -> None:
         self.op = op
 
-    def make_node(self, *inputs: Any) -> Apply:
+    def make_node(self, *inputs: Variable) -> Apply:
         tensors = [pt.as_tensor_variable(value) for value in inputs]
         return Apply(self, tensors, [tensors[i].type() for i in self.op.differentiable])
 
     def infer_shape(self, *arguments: Any) -> list[tuple[Any, ...]]:
         return [arguments[-1][i] for i in self.op.differentiable]
 
-    def perform(self, node: Apply, inputs: Sequence[Floats], outputs: Any) -> None:
+    def perform(self, node: Apply, inputs: Sequence[Floats], outputs: list[list[Floats]]) -> None:
         for place, value in zip(outputs, self.op.pulled(*inputs), strict=True):
             place[0] = value
 
@@ -122,7 +125,7 @@ class SimulatorOp(_BlackBoxOp):
         self.physics = physics if engine is None else physics.changed(engine=engine)
         self.sensitivity, self.one_world = sensitivity, one_world
 
-    def make_node(self, phi: Any, start: Any, actions: Any) -> Apply:
+    def make_node(self, phi: Variable, start: Variable, actions: Variable) -> Apply:
         """Check the dimensions and static shapes of the inputs.
 
         Raises
@@ -214,7 +217,7 @@ class LogLikelihoodOp(_BlackBoxOp):
     def __init__(self, problem: Problem) -> None:
         self.problem, self._likelihood = problem, problem.likelihood
 
-    def make_node(self, *inputs: Any) -> Apply:
+    def make_node(self, *inputs: Variable) -> Apply:
         """Cast the inputs; shapes as in the class."""
         tensors = [pt.cast(pt.as_tensor_variable(value), "float64") for value in inputs]
         return Apply(self, tensors, [pt.vector(dtype="float64")])

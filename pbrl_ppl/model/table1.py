@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pymc as pm
+from pytensor.tensor.variable import TensorVariable
 from scipy.special import i0e
 
 from pbrl_ppl.parameters import Prior
@@ -21,8 +22,8 @@ def random_variable(
     priors: tuple[Prior, ...],
     dims: str | tuple[str, ...],
     conditional: tuple[tuple[Prior, ...], ...] = (),
-    index: Any = None,
-) -> Any:
+    index: TensorVariable | None = None,
+) -> TensorVariable:
     """Declare priors of one family in the PyMC model of the context, one an owner.
 
     Parameters
@@ -65,7 +66,7 @@ def random_variable(
     return pm.Categorical(name, p=p, dims=dims)
 
 
-def _von_mises(name: str, mu: Floats, kappa: Floats, dims: str | tuple[str, ...]) -> Any:
+def _von_mises(name: str, mu: Floats, kappa: Floats, dims: str | tuple[str, ...]) -> TensorVariable:
     """Declare PyMC's von Mises, or an equal density that does not overflow if it is sharp."""
     kappa = np.maximum(kappa, _LEVEL)
     if kappa.max() <= _SHARP:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.criticism import QUANTITIES, Loop, recorded_quantities
 from pbrl_ppl.likelihood import Problem
-from pbrl_ppl.posterior import Fit, stored_fields
+from pbrl_ppl.posterior import Fit, Idata
 from pbrl_ppl.reporting.style import acceleration_unit
 from pbrl_ppl.reporting.words import depends_on_records
 from pbrl_ppl.state import STATE, Bools, Floats, Ints
@@ -120,9 +119,9 @@ def find_evidence(loop: Loop) -> Evidence | None:
     )
 
 
-def recorded(*posteriors: Any) -> bool:
+def recorded(*posteriors: Idata) -> bool:
     """Return whether posteriors hold their recording, of whole trajectories."""
-    return all("cells" in stored_fields(posterior, ("cells",)) for posterior in posteriors)
+    return all("cells" in posterior.attrs for posterior in posteriors)
 
 
 def _log_density(fit: Fit) -> Floats:

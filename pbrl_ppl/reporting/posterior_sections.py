@@ -244,7 +244,7 @@ def _weights_in_words(sampler: Mapping[str, Any]) -> str:
 
 def recorded_poses(posterior: Idata) -> Floats | None:
     """Return the recorded poses that a posterior holds, shape (trajectory, time, body, 3)."""
-    if not stored_fields(posterior, ("scene",)):
+    if "scene" not in posterior.attrs:
         return None
     constants = group(posterior, "constant_data")
     if "recorded_start" in constants:

@@ -243,7 +243,7 @@ def sample(
 
 def _drawn(
     job: SamplerRun, chosen: Method, start: Mode | None, walks: bool
-) -> tuple[SamplerRun, Any, Point]:
+) -> tuple[SamplerRun, Idata, Point]:
     """Return the job on the problem that was sampled, its draws, and its mode."""
     problem = job.problem
     if walks:

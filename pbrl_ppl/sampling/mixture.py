@@ -31,7 +31,7 @@ NEGLIGIBLE = 1e-3
 def mix(
     problem: Problem,
     weighed: Sequence[Weighed],
-    sample: Callable[[Mode], Any],
+    sample: Callable[[Mode], Idata],
     *,
     draws: int,
     chains: int,
@@ -129,7 +129,7 @@ def allocate(probability: Floats, n: int) -> Ints:
 def _values(
     problem: Problem,
     weighed: Sequence[Weighed],
-    traces: Mapping[int, Any],
+    traces: Mapping[int, Idata],
     label: Ints,
     rng: np.random.Generator,
 ) -> dict[str, Floats]:
@@ -193,7 +193,7 @@ def _fill_anchors(problem: Problem, phi: Floats, rng: np.random.Generator | None
                 column[here] = prior.centre if rng is None else prior.sample(rng, n)
 
 
-def _stats(traces: Mapping[int, Any], label: Ints) -> xr.Dataset:
+def _stats(traces: Mapping[int, Idata], label: Ints) -> xr.Dataset:
     """Return the samplers' statistics of the draws; those that differ in shape are left out."""
     records = {
         i: group(t, "sample_stats").isel(draw=slice(label.shape[1])) for i, t in traces.items()
@@ -213,7 +213,7 @@ def _stats(traces: Mapping[int, Any], label: Ints) -> xr.Dataset:
     return xr.Dataset(mixed, first.coords)
 
 
-def summed(problem: Problem, draws: int, chains: int, seed: int) -> tuple[Any, Point]:
+def summed(problem: Problem, draws: int, chains: int, seed: int) -> tuple[Idata, Point]:
     """Return draws by summing over the choices, and the most probable choice.
 
     Parameters

@@ -21,7 +21,7 @@ from scipy.stats import chi2, norm
 from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.parameters import Layout, Prior, nearest, prior_draws, wheels
-from pbrl_ppl.posterior import HDI_PROB, labelled_draws, layout_of, moment_matched, scene_of
+from pbrl_ppl.posterior import HDI_PROB, Idata, labelled_draws, layout_of, moment_matched, scene_of
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Bools, Floats, wrapped
 
@@ -245,7 +245,7 @@ class Pooled:
 
 
 def pool(
-    posteriors: Mapping[str, Any],
+    posteriors: Mapping[str, Idata],
     *,
     spread: float = 0.5,
     effects: Iterable[Effect] = catalogue,
@@ -326,7 +326,7 @@ def _table1(layout: Layout) -> list[str]:
 
 
 def _drawn(
-    names: tuple[str, ...], posteriors: list[Any], layouts: list[Layout]
+    names: tuple[str, ...], posteriors: list[Idata], layouts: list[Layout]
 ) -> list[dict[str, Floats]]:
     """Return each robot's draws of its bodies' parameters; equal wheels are described alike."""
     result: list[dict[str, Floats]] = []
