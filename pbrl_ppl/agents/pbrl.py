@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Iterable
 from dataclasses import replace
 from itertools import combinations, compress
-from typing import TYPE_CHECKING, Any, ClassVar, final
+from typing import Any, ClassVar, final
 
 import numpy as np
 
@@ -15,18 +15,15 @@ from pbrl_ppl.agents.revision import select_effects
 from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import BoundWarning, FitError, UninformedWarning
-from pbrl_ppl.history import from_segments
-from pbrl_ppl.likelihood import Problem
+from pbrl_ppl.history import from_segments, with_units
+from pbrl_ppl.likelihood import Problem, TransitionLikelihood, declared_problem
 from pbrl_ppl.modes import Mode, find_mode
-from pbrl_ppl.physics import touching
+from pbrl_ppl.physics import Physics, touching
 from pbrl_ppl.planning import Dynamics
 from pbrl_ppl.posterior import group
-from pbrl_ppl.sampling import fit, physics_model
+from pbrl_ppl.sampling import sample, try_own_effects
 from pbrl_ppl.scene import body_sizes
 from pbrl_ppl.state import Bools, Floats
-
-if TYPE_CHECKING:
-    import pymc as pm
 
 #: Prediction errors up to this share of the natural sizes carry no information: they are the
 #: engine's.
@@ -106,7 +103,7 @@ class PBRLAgent(PhysicsAgent):
             )
         super().__init__(task, **options)
         self.draws, self.growth = draws, growth
-        self._noise, self.revise = sigma, revise
+        self._likelihood, self.revise = TransitionLikelihood.declare(sigma), revise
         self._catalogue = tuple(catalogue)
         self._declared = attach(task.scene, effects, self._catalogue)
         self._transitions: list[tuple[Floats, Floats, Floats]] = []
@@ -147,13 +144,13 @@ class PBRLAgent(PhysicsAgent):
         clock = np.repeat(clock[:, None], action.shape[1], axis=1)
         return state, np.concatenate([action, before, clock], axis=2), after
 
-    def _model(
+    def _problem(
         self,
         effects: tuple[Attached, ...],
         rows: Bools | slice = slice(None),
         bodies: Bools | None = None,
-    ) -> pm.Model:
-        """Return the PyMC model of some transitions, and of some bodies alone."""
+    ) -> Problem:
+        """Return the problem of some transitions, and of some bodies alone."""
         scene = self.task.scene
         state, inputs, after = (values[rows] for values in self._data())
         if bodies is not None:
@@ -166,7 +163,10 @@ class PBRLAgent(PhysicsAgent):
             for attached in effects
             if attached.body in declared and attached.effect.name not in declared[attached.body]
         ]
-        return physics_model(scene, history, beside, sigma=self._noise)
+        physics = Physics.declare(with_units(scene, history), beside)
+        if not self.fits:
+            try_own_effects(physics, history)
+        return declared_problem(physics, history, likelihood=self._likelihood)
 
     def _revised(self, *, least: int = 3, false_alarm: float = 0.01) -> Mode | None:
         """Criticise the declared model; return the mode found if it is of all data.
@@ -180,7 +180,7 @@ class PBRLAgent(PhysicsAgent):
             return None
 
         def search(effects: tuple[Attached, ...]) -> Mode:
-            return find_mode(self._model(effects, free).problem, seed=self.seed)
+            return find_mode(self._problem(effects, free), seed=self.seed)
 
         self.looks, self._looked = self.looks + 1, len(free)
         level = false_alarm / (self.looks * (self.looks + 1))
@@ -211,23 +211,24 @@ class PBRLAgent(PhysicsAgent):
             return None
         initial, free = None, ~touching(scene, state, after)
         if free.any():
-            apart = self._model(effects, free, moved).problem
+            apart = self._problem(effects, free, moved)
             initial = find_mode(apart, seed=self.seed).phi
-        part = self._model(effects, bodies=moved).problem
+        part = self._problem(effects, bodies=moved)
         mode = find_mode(part, seed=self.seed, initial=initial)
         return find_mode(whole, initial=whole.layout.from_layout(part.layout, mode.phi))
 
     def _fit(self) -> None:
         start = self._revised() if self.revise else None
         effects = (*self._declared, *(law.attached for law in self.added))
-        model = self._model(effects)
-        start = start or self._start(effects, model.problem)
+        problem = self._problem(effects)
+        start = start or self._start(effects, problem)
         method = "map" if self.draws is None else "laplace"
         with warnings.catch_warnings():
             # early in an episode the data do not inform all parameters
             warnings.simplefilter("ignore", UninformedWarning)
             warnings.simplefilter("ignore", BoundWarning)
-            self.posterior = fit(model, seed=self.seed, method=method, start=start, progress=False)
+            drawn = sample(problem, seed=self.seed, method=method, start=start)
+        self.posterior = drawn.posterior
         self._dynamics = Dynamics.of(
             self.posterior, self.draws, seed=self.seed, effects=self._catalogue, threads=1
         )

@@ -10,12 +10,14 @@ from .ends import End as End
 from .ends import strange_ends as strange_ends
 from .ends import trimmed as trimmed
 from .files import read_table as read_table
+from .files import table_of_arrays as table_of_arrays
 from .history import History as History
 from .history import Segments as Segments
 from .history import check_start as check_start
 from .history import from_segments as from_segments
 from .history import longest_gap as longest_gap
 from .history import unseen as unseen
+from .history import with_paths as with_paths
 from .kinematics import column_noise as column_noise
 from .kinematics import estimate_rates as estimate_rates
 from .kinematics import fill_hinges as fill_hinges

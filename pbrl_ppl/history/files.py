@@ -1,11 +1,12 @@
 """Files of histories: CSV, Parquet and NetCDF to a table, and back, written atomically."""
 
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pandas as pd
 import xarray as xr
 
@@ -13,7 +14,7 @@ from pbrl_ppl.errors import HistoryError, OutputError
 from pbrl_ppl.files import write_atomically
 from pbrl_ppl.history import bags
 from pbrl_ppl.scene import SEPARATORS, Recording
-from pbrl_ppl.state import STATE, WRENCH
+from pbrl_ppl.state import STATE, WRENCH, Floats
 
 COLUMNS = ("trajectory", "step", "time", "body", *STATE, *WRENCH)
 SUFFIXES = (".csv", ".parquet", ".nc")
@@ -176,18 +177,43 @@ def to_table(dataset: xr.Dataset) -> pd.DataFrame:
 
     Steps without a time are left out.
     """
-    clock, bodies = dataset["clock"].to_numpy(), dataset["body"].to_numpy()
-    trajectory, step = np.nonzero(~np.isnan(clock))
+    names = ("trajectory", "clock", "body", "observed", "action")
+    return table_of_arrays(*(dataset[name].to_numpy() for name in names))
+
+
+def table_of_arrays(
+    trajectory: npt.NDArray[Any],
+    clock: Floats,
+    bodies: Sequence[str] | npt.NDArray[Any],
+    states: Floats,
+    wrenches: Floats,
+) -> pd.DataFrame:
+    """Return one row for each (trajectory, step, body) that has a time.
+
+    Parameters
+    ----------
+    trajectory : ndarray
+        Labels, shape (trajectory,).
+    clock : ndarray
+        Times, NaN after a trajectory's end, shape (trajectory, time), s.
+    bodies : sequence of str
+        Names.
+    states : ndarray
+        Shape (trajectory, time, body, 6), m, m, rad, m/s, m/s, rad/s.
+    wrenches : ndarray
+        From each row to the next, shape (trajectory, time, body, 3), N, N, N m.
+    """
+    which, step = np.nonzero(~np.isnan(clock))
     k = len(bodies)
     columns = {
-        "trajectory": np.repeat(dataset["trajectory"].to_numpy()[trajectory], k),
+        "trajectory": np.repeat(trajectory[which], k),
         "step": np.repeat(step, k),
-        "time": np.repeat(clock[trajectory, step], k),
-        "body": np.tile(bodies.astype(object), len(step)),
+        "time": np.repeat(clock[which, step], k),
+        "body": np.tile(np.array(bodies, dtype=object), len(step)),
     }
-    for names, values in (("state", "observed"), ("wrench", "action")):
-        rows = dataset[values].to_numpy()[trajectory, step].reshape(len(step) * k, -1)
-        columns |= zip(map(str, dataset[names].to_numpy()), rows.T, strict=True)
+    for names, values in ((STATE, states), (WRENCH, wrenches)):
+        rows = values[which, step].reshape(len(step) * k, -1)
+        columns |= zip(names, rows.T, strict=True)
     return pd.DataFrame(columns)
 
 

@@ -533,6 +533,26 @@ def _cut(complete: Bools, intervals: Ints, horizon: int) -> tuple[Ints, Ints]:
     return places[:, 0], places[:, 1]
 
 
+def with_paths(scene: Scene, states: Floats, wrenches: Floats) -> tuple[Floats, Floats]:
+    """Return states and wrenches as a recording has them: kinematic bodies follow their paths.
+
+    Parameters
+    ----------
+    scene : Scene
+        Says which bodies are kinematic.
+    states : ndarray
+        Shape (trajectory, time, body, 6), SI units.
+    wrenches : ndarray
+        Shape (trajectory, time - 1, body, 3); of a kinematic body its velocities, for which it has
+        no wrench in the result.
+    """
+    states, wrenches, follows = states.copy(), wrenches.copy(), kinematic_bodies(scene)
+    path = scene.time_step * np.cumsum(wrenches[:, :, follows], axis=1)
+    states[:, 1:, follows, :3] = states[:, :1, follows, :3] + path
+    wrenches[:, :, follows] = np.nan
+    return states, wrenches
+
+
 def from_segments(scene: Scene, start: Floats, actions: Floats, observed: Floats) -> History:
     """Return a history with one trajectory a segment, each from its start state.
 
@@ -550,11 +570,7 @@ def from_segments(scene: Scene, start: Floats, actions: Floats, observed: Floats
         Next states, shape (n, H, body, 6), NaN where missing.
     """
     states = np.concatenate([start[:, None], observed], axis=1)
-    wrench = actions[..., : len(WRENCH)].copy()
-    follows = kinematic_bodies(scene)
-    path = scene.time_step * np.cumsum(wrench[:, :, follows], axis=1)
-    states[:, 1:, follows, :3] = start[:, None, follows, :3] + path
-    wrench[:, :, follows] = np.nan
+    states, wrench = with_paths(scene, states, actions[..., : len(WRENCH)])
     history = History.of_arrays(states, scene, wrench)
     if actions.shape[-1] == len(WRENCH):
         return history

@@ -7,15 +7,18 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import GoalError
 from pbrl_ppl.planning.goals import read_tables, read_toml
-from pbrl_ppl.posterior import Idata
 from pbrl_ppl.scene import Scene, nearest
 from pbrl_ppl.state import THETA, WRENCH, Floats
+
+if TYPE_CHECKING:
+    from pbrl_ppl.posterior import Idata
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping
 from copy import copy
 from dataclasses import dataclass
-from typing import Any, Protocol, Self, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 
@@ -14,9 +14,11 @@ from pbrl_ppl.effects import Attached, Effect, attach, catalogue, needs_inputs
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.likelihood import Coordinates, degrees_of_freedom, next_state_random, tail_places
 from pbrl_ppl.physics import Physics, after_recording
-from pbrl_ppl.posterior import Idata
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE, WRENCH, Floats
+
+if TYPE_CHECKING:
+    from pbrl_ppl.posterior import Idata
 
 
 @runtime_checkable

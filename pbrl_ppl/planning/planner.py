@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.errors import GoalError
 from pbrl_ppl.files import write_atomically
-from pbrl_ppl.history import from_segments
+from pbrl_ppl.history import table_of_arrays, with_paths
 from pbrl_ppl.physics import check_placement, overlap
 from pbrl_ppl.planning.actions import ActionSet
 from pbrl_ppl.planning.astar import astar
@@ -23,9 +23,11 @@ from pbrl_ppl.planning.dynamics import Dynamics, TransitionModel, rollout
 from pbrl_ppl.planning.goals import Goal
 from pbrl_ppl.planning.receding import mppi
 from pbrl_ppl.planning.search import NODES, Found, Task, tail_mean
-from pbrl_ppl.posterior import Idata
 from pbrl_ppl.scene import Scene, nearest
 from pbrl_ppl.state import POSE, STATE, WRENCH, Floats
+
+if TYPE_CHECKING:
+    from pbrl_ppl.posterior import Idata
 
 METHODS = ("astar", "mppi")
 
@@ -82,13 +84,13 @@ class Plan:
         DataFrame
             Columns as of :meth:`History.to_dataframe`; state cells after the start are missing.
         """
-        # a history has an interval at least, an empty plan none
-        wrenches = self.wrenches if len(self.wrenches) else np.zeros((1, *self.wrenches.shape[1:]))
-        nothing = np.full((1, len(wrenches), *self.start.shape), np.nan)
-        table = from_segments(self.scene, self.start[None], wrenches[None], nothing).to_dataframe()
-        if len(self.wrenches):
-            return table
-        return table[table["step"] == 0].assign(**dict.fromkeys(WRENCH, np.nan))
+        n, bodies = len(self.wrenches), [body.name for body in self.scene.moving]
+        states = np.full((1, n + 1, *self.start.shape), np.nan)
+        states[0, 0] = self.start
+        states, wrenches = with_paths(self.scene, states, self.wrenches[None])
+        wrenches = np.pad(wrenches, ((0, 0), (0, 1), (0, 0), (0, 0)), constant_values=np.nan)
+        clock = self.scene.time_step * np.arange(n + 1.0)[None]
+        return table_of_arrays(np.zeros(1, int), clock, bodies, states, wrenches)
 
     def save(self, path: str | Path) -> None:
         """Write the plan as a CSV file, whole or not at all.

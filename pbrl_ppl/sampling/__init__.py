@@ -2,6 +2,7 @@
 
 from .calibration import calibrate as calibrate
 from .declaration import physics_model as physics_model
+from .declaration import try_own_effects as try_own_effects
 from .fitting import DEFAULT as DEFAULT
 from .fitting import fit as fit
 from .fitting import sample as sample

@@ -142,7 +142,7 @@ def physics_model(
     physics = Physics.declare(
         with_units(scene, history), effects, substeps=substeps, threads=threads
     )
-    _try_own(physics, history)
+    try_own_effects(physics, history)
     problem = declared_problem(
         physics,
         history,
@@ -171,7 +171,7 @@ def physics_model(
     return model
 
 
-def _try_own(physics: Physics, history: History) -> None:
+def try_own_effects(physics: Physics, history: History) -> None:
     """Try the effects that are not of the catalogue; see :func:`pbrl_ppl.physics.try_effect`."""
     known = {effect.name for effect in catalogue} | {LEARNED_REMAINDER}
     effects = {attached.effect.name: attached.effect for attached in physics.effects}

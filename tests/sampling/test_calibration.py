@@ -4,6 +4,7 @@ import json
 import sys
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -269,16 +270,13 @@ def test_impossible_draws_are_redrawn_and_counted(puck: tuple[Scene, History]) -
     assert all(np.isfinite(truth.values).all() for truth in truths)
 
 
-def test_hopeless_prior_is_an_error(
-    puck: tuple[Scene, History], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_hopeless_prior_is_an_error(puck: tuple[Scene, History]) -> None:
     scene, history = puck
-    monkeypatch.setattr(replication, "_MOST_REDRAWN", 1)
     wild = scene.replace(
         bodies=(Body("puck", Shape.circle(0.2), prior={"mass": {"mu": 5000.0, "sigma": 1.0}}),)
     )
     with pytest.raises(FitError, match=r"0 of 3 draws .* make the scene's prior narrower"):
-        draw_truths(design_of(history, wild), 3, seed=1)
+        draw_truths(design_of(history, wild), 3, seed=1, most_redrawn=1)
 
 
 @pytest.mark.parametrize("horizon", [1, 2])
@@ -668,7 +666,8 @@ def test_command_interrupted(
 
 def test_whole_trajectories(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two replications: each noise is drawn, simulated along trajectories, fitted and ranked."""
-    monkeypatch.setattr(replication, "_AGAIN", 0)
+    once = partial(replication.replicate, most_repeats=0)
+    monkeypatch.setattr("pbrl_ppl.sampling.calibration.replicate", once)
     quick = QUICK | {"draws": 50, "tune": 50}
     prior = {"mass": {"mu": 0.7, "sigma": 0.3}}
     body = Body("puck", Shape.circle(0.2), known={"r": 0.2, "mu_c": 0.3}, prior=prior)
