@@ -41,3 +41,10 @@ def test_the_core_loads_neither_pymc_nor_matplotlib(first) -> None:
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "pbrl_ppl.likelihood" in said.stdout.split()
     assert not {"pymc", "pytensor", "arviz", "matplotlib"} & set(said.stdout.split())
+
+
+def test_commands_load_no_engine_before_they_run() -> None:
+    """So that ``pbrl-ppl --help`` and usage errors answer at once."""
+    code = "import sys, pbrl_ppl.cli; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert not {"numba", "scipy", "pymunk", "pymc", "arviz"} & set(done.stdout.split())

@@ -24,10 +24,11 @@ from pbrl_ppl.cli.terminal import (
 )
 from pbrl_ppl.errors import ConvergenceWarning, FitError, PosteriorError
 from pbrl_ppl.files import write_text
-from pbrl_ppl.posterior import Idata
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from pbrl_ppl.posterior import Idata
 
 
 @command("fit", 3, "pbrl-ppl fit scene.toml train.csv -o cart.nc")
