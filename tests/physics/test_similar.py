@@ -123,7 +123,7 @@ scales = st.tuples(*(st.floats(*ends) for ends in ((-3, 3), (-6, 6), (-3, 2))))
 @given(powers=scales)
 def test_similar_rigs_move_alike(name, engine, powers) -> None:
     length, mass, time = (10.0**power for power in powers)
-    if name == "discs":  # below, overlaps are corrected too slowly: see LEAST_LEFT in world.py
+    if name == "discs":  # below, overlaps are corrected too slowly: see `World`
         time = max(time, 1e-2)
     rig = RIGS[name]
     found = rig.similar(engine, (length, mass, time))
