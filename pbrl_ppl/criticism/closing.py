@@ -55,7 +55,7 @@ from pbrl_ppl.errors import (
     UninformedWarning,
     warn,
 )
-from pbrl_ppl.history import History, with_units, without_measurements
+from pbrl_ppl.history import History, UnusedVelocity, with_units, without_measurements
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.physics import Physics, try_effect
@@ -200,97 +200,153 @@ class _Search:
     steps: list[Step]
 
 
+@dataclass(frozen=True, eq=False)
+class _Recordings:
+    """Training and test history as they are used, and what of them is not."""
+
+    train: History
+    test: History
+    unused: tuple[UnusedVelocity, ...]
+    bad_frames: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Judged:
+    """The declared and the revised model with the tests of the latter's residual."""
+
+    search: _Search
+    recordings: _Recordings
+    held_out: HeldOut
+    before: UnexplainedAcceleration
+    after: UnexplainedAcceleration
+    misfit: Misfit
+    rollout: int
+
+
 def _closed(task: _Task, train: History, test: History, recorded: History) -> Loop:
     """Go through the stages of :func:`close_loop`; ``recorded`` is ``test`` as it was given."""
-    seed, criteria, say = task.seed, task.criteria, task.say
     if task.substeps is not None:
         task.scene.replace(substeps=task.substeps)  # it is checked there
-    train, test, unused, bad = checked_histories(task.scene, train, test)
-    scene = with_units(task.scene, train)
-    task = replace(task, scene=scene)
-    for sentence in (*(velocity.sentence for velocity in unused), *bad):
-        say(sentence)
+    recordings = _Recordings(*checked_histories(task.scene, train, test))
+    task = replace(task, scene=with_units(task.scene, recordings.train))
+    for sentence in (*(column.sentence for column in recordings.unused), *recordings.bad_frames):
+        task.say(sentence)
     for effect in task.catalogue:
         if effect not in full_catalogue:
-            try_effect(effect, scene, train)
-    selection = Selection(scene, task.catalogue, criteria, say)
-    effects = attach(scene, (), task.catalogue)
-    say(Stage.CHECK_PRIOR)
-    with background(partial(_compile, scene, train, effects)) as compiled:
-        prior = _prior_test(task, train, effects)
-        if not prior.passed:  # before the long fit: units may be wrong
-            hint = "the declared prior does not explain this recording"
-            hint = f"{hint}, unless a missing effect is why"
-            warn(f"{hint}: {prior.sentence}", PriorWarning)
-        say(Stage.FIT)
-        declared = declared_mode(scene, train, effects, seed, task.substeps, say, criteria)
-        compiled()
-    search = _searched(declared, selection)
-    # with the right noise model effects may show that were hidden before
-    for _ in range(criteria.noise_rounds):
-        train, frames = without_measurements(train, outliers(search.mode, criteria))
-        if frames:
-            for sentence in map(str, frames):
-                say(sentence)
-            bad += tuple(map(str, frames))
-            declared = declared_mode(scene, train, effects, seed, task.substeps, say, criteria)
-            search = _searched(declared, selection)
-            continue
-        correlated = with_correlated_errors(search.mode, criteria)
-        if correlated is None:
-            break
-        say(Stage.REPEAT)
-        declared = same_noise(search.declared, correlated)
-        search = _grown(replace(search, declared=declared, mode=correlated), selection)
-    declared = search.declared
-    revised, steps = search.mode, search.steps
-    held_out = HeldOut.of(revised, test)
-    tested = replace(revised, problem=held_out.problem)
-    test, frames = without_measurements(test, outliers(tested, criteria))
-    if frames:
-        held_out = HeldOut.of(revised, test)
-        tested = replace(revised, problem=held_out.problem)
-    bad += tuple(f"held out: {frame}" for frame in frames)
-    say(Stage.TEST)
-    before, after = (unexplained_acceleration(mode, criteria) for mode in (declared, revised))
-    horizon = rollout_horizon(train, scene)
-    with_added = prior
-    if steps and not prior.passed:  # the missing effect may be why
-        values = dict(zip(revised.problem.layout.labels, revised.phi.tolist(), strict=True))
-        added_values = {
-            label: values[label] for step in steps for label in step.signature.attached.labels
-        }
-        with_added = _prior_test(task, train, revised.problem.physics.effects, added_values)
-    misfit = find_misfit(revised, after, horizon=horizon, seed=seed).with_test(with_added)
-    if steps:
-        misfit = with_negligible_acceleration(misfit, revised, after)
-    longest = longest_rollout(test, horizon)
-    misfit = misfit.with_test(
-        held_out_forecasts(tested, noise_alone(revised, after), longest, criteria)
-    )
+            try_effect(effect, task.scene, recordings.train)
+    selection = Selection(task.scene, task.catalogue, task.criteria, task.say)
+    prior, declared = _declared(task, recordings.train)
+    search, recordings = _settled(task, _searched(declared, selection), recordings, selection)
+    judged = _judged(task, search, recordings, prior)
 
     def sampled(task: _Task) -> Loop:
-        say(Stage.SAMPLE)
-        fits = _fits(task, [declared, revised] if steps else [declared])
-        first = last = _Model(revised, after, fits[-1], held_out)
-        if revised is not declared:
-            first = _Model(declared, before, fits[0], HeldOut.of(declared, test))
-        say(Stage.COMPARE)
         return replace(
-            _put_together(task, train, first, last, steps, misfit, longest),
+            _sampled(task, judged),
             candidates=selection.explained(search.first),
             small=tuple(selection.small),
-            velocities_not_used=unused,
-            bad_frames=bad,
-            criteria=criteria,
             held_out=recorded,
-            catalogue=task.catalogue,
         )
 
     try:
         return sampled(task)
     except KeyboardInterrupt:
         raise LoopInterrupted(partial(sampled, replace(task, method="laplace"))) from None
+
+
+def _declared(task: _Task, train: History) -> tuple[ResidualTest, Mode]:
+    """Return the test of the declared prior, and the mode of the declared model."""
+    effects = attach(task.scene, (), task.catalogue)
+    task.say(Stage.CHECK_PRIOR)
+    with background(partial(_compile, task.scene, train, effects)) as compiled:
+        prior = _prior_test(task, train, effects)
+        if not prior.passed:  # before the long fit: units may be wrong
+            hint = "the declared prior does not explain this recording"
+            hint = f"{hint}, unless a missing effect is why"
+            warn(f"{hint}: {prior.sentence}", PriorWarning)
+        task.say(Stage.FIT)
+        mode = _fitted(task, train)
+        compiled()
+    return prior, mode
+
+
+def _fitted(task: _Task, train: History) -> Mode:
+    """Return the mode of the declared model."""
+    effects = attach(task.scene, (), task.catalogue)
+    return declared_mode(
+        task.scene, train, effects, task.seed, task.substeps, task.say, task.criteria
+    )
+
+
+def _settled(
+    task: _Task, search: _Search, recordings: _Recordings, selection: Selection
+) -> tuple[_Search, _Recordings]:
+    """Return the search and the recordings without outliers, and with the noise that they show.
+
+    With the right noise model effects may show that were hidden before.
+    """
+    for _ in range(task.criteria.noise_rounds):
+        train, frames = without_measurements(recordings.train, outliers(search.mode, task.criteria))
+        if frames:
+            said = tuple(map(str, frames))
+            for sentence in said:
+                task.say(sentence)
+            recordings = replace(
+                recordings, train=train, bad_frames=(*recordings.bad_frames, *said)
+            )
+            search = _searched(_fitted(task, train), selection)
+            continue
+        correlated = with_correlated_errors(search.mode, task.criteria)
+        if correlated is None:
+            break
+        task.say(Stage.REPEAT)
+        declared = same_noise(search.declared, correlated)
+        search = _grown(replace(search, declared=declared, mode=correlated), selection)
+    return search, recordings
+
+
+def _judged(task: _Task, search: _Search, recordings: _Recordings, prior: ResidualTest) -> _Judged:
+    """Test the residual of the revised model, on the training and on the test history."""
+    criteria, revised = task.criteria, search.mode
+    held_out = HeldOut.of(revised, recordings.test)
+    tested = replace(revised, problem=held_out.problem)
+    test, frames = without_measurements(recordings.test, outliers(tested, criteria))
+    if frames:
+        said = tuple(f"held out: {frame}" for frame in frames)
+        recordings = replace(recordings, test=test, bad_frames=(*recordings.bad_frames, *said))
+        held_out = HeldOut.of(revised, test)
+        tested = replace(revised, problem=held_out.problem)
+    task.say(Stage.TEST)
+    before, after = (
+        unexplained_acceleration(mode, criteria) for mode in (search.declared, revised)
+    )
+    horizon = rollout_horizon(recordings.train, task.scene)
+    if search.steps and not prior.passed:  # the missing effect may be why
+        values = dict(zip(revised.problem.layout.labels, revised.phi.tolist(), strict=True))
+        labels = (label for step in search.steps for label in step.signature.attached.labels)
+        added = {label: values[label] for label in labels}
+        prior = _prior_test(task, recordings.train, revised.problem.physics.effects, added)
+    misfit = find_misfit(revised, after, horizon=horizon, seed=task.seed).with_test(prior)
+    if search.steps:
+        misfit = with_negligible_acceleration(misfit, revised, after)
+    rollout = longest_rollout(test, horizon)
+    forecasts = held_out_forecasts(tested, noise_alone(revised, after), rollout, criteria)
+    return _Judged(
+        search, recordings, held_out, before, after, misfit.with_test(forecasts), rollout
+    )
+
+
+def _sampled(task: _Task, judged: _Judged) -> Loop:
+    """Sample the posteriors, and compare the models on the test history."""
+    search, recordings = judged.search, judged.recordings
+    declared, revised = search.declared, search.mode
+    task.say(Stage.SAMPLE)
+    fits = _fits(task, [declared, revised] if search.steps else [declared])
+    first = last = _Model(revised, judged.after, fits[-1], judged.held_out)
+    if revised is not declared:
+        held_out = HeldOut.of(declared, recordings.test)
+        first = _Model(declared, judged.before, fits[0], held_out)
+    task.say(Stage.COMPARE)
+    return _put_together(task, judged, first, last)
 
 
 def _compile(scene: Scene, train: History, effects: tuple[Attached, ...]) -> None:
@@ -409,16 +465,10 @@ def _converged(fit: Fit, criteria: Criteria) -> bool:
     return record.max_rhat <= criteria.worst_rhat and record.min_ess >= criteria.least_ess
 
 
-def _put_together(
-    task: _Task,
-    train: History,
-    declared: _Model,
-    revised: _Model,
-    steps: list[Step],
-    misfit: Misfit,
-    rollout: int,
-) -> Loop:
-    """Return the result of the stages; errors are forecasts of ``rollout`` intervals."""
+def _put_together(task: _Task, judged: _Judged, declared: _Model, revised: _Model) -> Loop:
+    """Return the result of the stages; errors are forecasts of ``judged.rollout`` intervals."""
+    recordings, steps = judged.recordings, judged.search.steps
+    train, misfit, rollout = recordings.train, judged.misfit, judged.rollout
     scene, held_out, criteria = task.scene, revised.held_out, task.criteria
     test = held_out.problem.data.history
     unit = measurement_noise(revised.mode, revised.excess)
@@ -480,6 +530,10 @@ def _put_together(
         growth=misfit.growth,
         identifiability=identify(revised.fit.posterior, mode=revised.mode),
         loo=compare(declared.fit.posterior, revised.fit.posterior),
+        velocities_not_used=recordings.unused,
+        bad_frames=recordings.bad_frames,
+        criteria=criteria,
+        catalogue=task.catalogue,
     )
 
 
