@@ -314,8 +314,12 @@ def smoothed(log_weights: Floats) -> tuple[Floats, float]:
         are too few different ones to say.
     """
     result, k = log_weights, np.inf
-    # ArviZ refuses a tail of equal values; a very long tail overflows
-    with contextlib.suppress(ValueError), np.errstate(over="ignore"):
+    # ArviZ refuses a tail of equal values; a very long tail overflows, and a tail of few different
+    # values makes its fit divide by zero
+    with (
+        contextlib.suppress(ValueError),
+        np.errstate(over="ignore", divide="ignore", invalid="ignore"),
+    ):
         if DATATREE:
             from arviz_stats.base import array_stats
 
@@ -324,7 +328,7 @@ def smoothed(log_weights: Floats) -> tuple[Floats, float]:
         else:
             result, k = arviz().psislw(log_weights)
     weights = np.exp(np.asarray(result) - np.max(result))
-    return weights / weights.sum(), float(k)
+    return weights / weights.sum(), np.inf if np.isnan(k) else float(k)
 
 
 def _dataset(value: Any) -> xr.Dataset:

@@ -528,6 +528,13 @@ def test_weights_with_a_heavy_tail_are_warned_of(model, mode, monkeypatch) -> No
     assert any("Pareto k" in each for each in json.loads(idata.attrs["warnings"]))
 
 
+def test_weights_of_which_one_is_all_have_an_infinite_tail() -> None:
+    """The fit of their tail divides by zero; there is no warning, and no NaN."""
+    weights, k = smoothed(np.random.default_rng(1).normal(-4e4, 8e3, 84))
+    assert k == np.inf
+    assert np.isfinite(weights).all() and weights.max() == pytest.approx(1.0)
+
+
 def test_engine_moves_are_counted(model, mode, monkeypatch) -> None:
     """Where weights do not suffice the engine moves the particles, which then weigh alike."""
     monkeypatch.setattr("pbrl_ppl.sampling.importance.adaptive_importance", no_weights)
