@@ -57,6 +57,7 @@ def unknown_pivot(request, make_history):
     return mode, rank_candidates(mode, candidates(scene, mode.problem.physics.effects, catalogue))
 
 
+@pytest.mark.one_stack
 def test_a_pivot_is_inferred_from_an_angle_alone(unknown_pivot) -> None:
     """Smoothed positions of the arm's centre diverged, and every score was NaN."""
     mode, ranked = unknown_pivot
@@ -72,6 +73,7 @@ def diverging():
     return replace(mode, phi=np.array([mode.phi[0], 1e80]))
 
 
+@pytest.mark.one_stack
 def test_errors_of_diverging_forecasts_are_infinite(diverging) -> None:
     made = forecast(diverging.problem, diverging.phi, diverging.sigma, 3)
     assert np.isposinf(made.error[:, made.dimension == 0]).all()
@@ -79,11 +81,13 @@ def test_errors_of_diverging_forecasts_are_infinite(diverging) -> None:
     assert np.isfinite(made.floor()["x"])
 
 
+@pytest.mark.one_stack
 def test_diverging_forecasts_fail_their_test(diverging) -> None:
     test, _ = _forecasts(diverging, diverging.sigma, 3, DEFAULT)
     assert not test.passed
 
 
+@pytest.mark.one_stack
 def test_diverging_forecasts_are_no_gain(diverging) -> None:
     """Their squares are left out whole: those that do not diverge would look like a gain."""
     fold = np.zeros(diverging.problem.segments.n, dtype=np.intp)

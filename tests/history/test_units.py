@@ -8,6 +8,8 @@ from pbrl_ppl.history import History, mass_contradictions, with_units
 from pbrl_ppl.history.units import shown_mass
 from pbrl_ppl.scene import Body, Scene, Shape, units_of
 
+pytestmark = pytest.mark.one_stack
+
 
 def scene(**options) -> Scene:
     return Scene(time_step=0.1, bodies=(Body("sled", Shape.circle(0.5), **options),))

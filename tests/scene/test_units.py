@@ -10,6 +10,8 @@ from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, motion_time, state_sizes, units_of
 from pbrl_ppl.scene.units import check_product
 
+pytestmark = pytest.mark.one_stack
+
 ARM = Body("arm", Shape.box(0.1, 0.4), known={"mass": 2.0})
 HINGE = Joint("hinge", ("arm", "world"), (0.0, 0.5), (0.0, 0.0))
 
