@@ -312,7 +312,7 @@ def _measurement_noise(
     ``still``: a coordinate that never moves has mean square changes of at most this many times
     those of its noise.
 
-    ``least_intervals``: over all times and up to this many intervals or more.
+    ``least_intervals``: that holds over all times and up to this many intervals or more.
     """
     noises = measurement_noise(history)
     observed = history.dataset["observed"].to_numpy()

@@ -89,7 +89,7 @@ class Observations:
 def least_noise(scene: Scene, *, share: float = 1e-9) -> Floats:
     """Return the least noise of each coordinate of a state, shape (6,).
 
-    ``share``: of the coordinate's typical size; for recordings without any noise.
+    ``share``: share of the coordinate's typical size, for recordings without any noise.
     """
     return share * state_sizes(scene)
 

@@ -33,7 +33,7 @@ def noise_medians(
     ``sensor_share``: median of the prior of errors of measuring, as a share of what states do in a
     step.
 
-    ``contact_share``: the same of contact accelerations.
+    ``contact_share``: the same share for contact accelerations.
     ``drift_share``: a correlated error is larger than this share of the range of what it measures
     with the same probability: an error that lasts follows whatever is smooth, too.
 

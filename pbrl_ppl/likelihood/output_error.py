@@ -230,7 +230,7 @@ class OutputErrorLikelihood(Likelihood):
         """Return the maximum-likelihood sigma of each dimension, shape (state,).
 
         ``least`` are the least that they may be, shape (state,), SI units.
-        ``rounds``: of sigma and projection, which depend on each other.
+        ``rounds``: rounds of sigma and projection, which depend on each other.
         """
         sigma = np.maximum(np.sqrt((residual**2).sum((0, 1, 2)) / self.starts.counts), least)
         for _ in range(rounds):

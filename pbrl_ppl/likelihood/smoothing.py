@@ -109,7 +109,7 @@ def smoothed(
     by the physics alone does not converge.
 
     ``settled``: largest change of states in the last round (standard deviations).
-    ``rounds``: at most.
+    ``rounds``: rounds, at most.
     ``stale``: a slope is taken anew where the state has moved by more than this (standard
     deviations).
 

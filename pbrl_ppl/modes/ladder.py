@@ -94,7 +94,7 @@ def lengths(longest: int, gap: int = 1, *, shortest: int = 4, ratio: int = 4) ->
 
     ``shortest``: intervals of the shortest pieces.
 
-    ``ratio``: of a length to the one before.
+    ``ratio``: ratio of a length to the one before.
 
     Examples
     --------
@@ -334,7 +334,7 @@ def corrected(mode: Mode) -> Mode:
 def refined(modes: Sequence[Mode], *, rounds: int = 10) -> list[Mode]:
     """Return modes with the last one fitted until it gains no more.
 
-    ``rounds``: of the fit.
+    ``rounds``: rounds of the fit.
     """
     return [*modes[:-1], fit_pieces(modes[-1].problem, modes[-1].phi, rounds=rounds)]
 

@@ -243,7 +243,7 @@ def tail_precision(
     """Return the curvature of the negative log-posterior in each tail parameter.
 
     ``least``: least curvature.
-    ``width``: of a second difference in the tails.
+    ``width``: step of a second difference in the tails.
     """
     tails = list(problem.tails)
     lower, upper = (end[tails] for end in box(problem.layout.priors))

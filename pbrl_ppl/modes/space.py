@@ -280,8 +280,8 @@ class Space:
         Its curvature is Gauss and Newton's. A density's mode moves with its coordinates: where the
         data say little, it is that of the prior here.
 
-        ``least_curvature``: a truncated prior's tails there are those of a logistic distribution.
-        ``width``: of differences of a prior's density in the unconstrained space.
+        ``least_curvature``: least curvature of the prior; a truncated one's tails are flat there.
+        ``width``: step of differences of a prior's density in the unconstrained space.
         """
         p, mean = self.phi_size, self.at(mode.phi, mode.sigma)
         about = self._about(mean)
@@ -332,7 +332,7 @@ class Space:
 
         At a kink, or with few contacts, the curvature overstates how well a parameter is known.
 
-        ``distances``: at which a posterior is evaluated (standard deviations).
+        ``distances``: distances at which a posterior is evaluated (standard deviations).
         ``outside``: the fall (nats) from which a point is outside; a Gaussian falls by 2 at the
         first distance.
         """

@@ -276,7 +276,7 @@ class _Search:
 
         ``tolerances``: distance from the goal at which cells have their usual size, in tolerances.
         ``least``: cells shrink nearer to the goal in proportion, down to this.
-        ``most``: and grow further away, up to this.
+        ``most``: cells grow further away, up to this.
         """
         mean = np.nan_to_num(states.mean(axis=0))
         mean[..., 2] = mean_angle(np.nan_to_num(states[..., 2]))

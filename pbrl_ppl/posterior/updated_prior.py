@@ -201,7 +201,7 @@ def moment_matched(prior: Prior, draws: Floats) -> Prior:
 def _concentration(resultant: float, *, limits: tuple[float, ...] = (1e-3, 1e6)) -> float:
     """Return kappa whose von Mises distribution has this mean resultant length, 0 to 1.
 
-    ``limits``: of a concentration: nearly uniform, and 0.001 rad.
+    ``limits``: limits of a concentration: nearly uniform, and 0.001 rad.
     """
     low, high = np.log(limits)
 

@@ -18,7 +18,7 @@ def dispersed(
 ) -> list[dict[str, Floats]]:
     """Draw starts about two posterior standard deviations from the mode, one a chain.
 
-    ``away``: posterior standard deviations from the mode.
+    ``away``: distance from the mode in posterior standard deviations.
     """
     space = Space.of(mode)
     mean, covariance = space.laplace(mode)
