@@ -257,7 +257,7 @@ def replicate(
             raise KeyboardInterrupt
         sizes = group(idata, "posterior").sizes
         likelihood = group(idata, "log_likelihood")["next_state"].sum("transition").values
-        drawn = _quantities(problem, *parameter_draws(problem, idata), likelihood.ravel())
+        drawn = quantities(problem, *parameter_draws(problem, idata), likelihood.ravel())
         shape = (sizes["chain"], sizes["draw"])
         data = {
             name: (("chain", "draw"), column.reshape(shape))
@@ -271,7 +271,7 @@ def replicate(
     problem = problem_of(idata, {attached.effect for attached in problem.physics.effects})
     residual = problem.residual(truth.phi)
     of_truth = problem.log_density(residual, truth.sigma, truth.phi).sum(keepdims=True)
-    true = _quantities(problem, truth.phi[None], truth.sigma[None], of_truth)[0]
+    true = quantities(problem, truth.phi[None], truth.sigma[None], of_truth)[0]
     ranks = [
         rank(column, value, effective)
         for column, value, effective in zip(drawn.T, true, ess.values(), strict=True)
@@ -285,7 +285,7 @@ def replicate(
     }
 
 
-def _quantities(problem: Problem, phi: Floats, sigma: Floats, likelihood: Floats) -> Floats:
+def quantities(problem: Problem, phi: Floats, sigma: Floats, likelihood: Floats) -> Floats:
     """Return the ranked quantities: folded phi, sigma, log-likelihood, shape (draw, quantity)."""
     sigma = problem.likelihood.free(sigma)
     return np.hstack([by_prior(problem.layout, phi, equal_alone=True), sigma, likelihood[:, None]])

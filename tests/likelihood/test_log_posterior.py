@@ -7,7 +7,7 @@ from pymc.model.transform.conditioning import remove_value_transforms
 from pbrl_ppl.likelihood import log_posterior, log_prior
 from pbrl_ppl.modes import Space, find_mode
 from pbrl_ppl.modes.noise import profile_sigma
-from pbrl_ppl.parameters import ParameterLibrary, prior_draws
+from pbrl_ppl.parameters import ParameterLibrary
 from pbrl_ppl.posterior import draws, parameter_draws, stored_mode, updated_mode
 from pbrl_ppl.sampling import fit, physics_model
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, state_sizes
@@ -70,10 +70,7 @@ def test_it_is_pymc_s(history, name) -> None:
     sigma = typical * np.exp(moved)
     choice = None
     if problem.library is None:
-        phi = prior_draws(problem.layout.priors, rng, n)
-        for place, index, conditional in problem.layout._conditional():
-            for i, row in enumerate(phi):
-                row[place] = conditional[int(phi[i, index])].sample(rng, 1)[0]
+        phi = problem.layout.prior_draws(rng, n)
     else:
         choice = rng.integers(4, size=(n, 1))
         phi = problem.library.table(problem.layout, problem.scene)[:, choice[:, 0]].T

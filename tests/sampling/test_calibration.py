@@ -340,13 +340,13 @@ def test_equal_wheels_have_equal_quantities(cart: tuple[Scene, History]) -> None
     turned = design.layout.to_vector(
         CART | {"w_theta": CART["w_theta"] - np.pi / 2, "mu_x": CART["mu_y"], "mu_y": CART["mu_x"]}
     )
-    rows = replication._quantities(
+    rows = replication.quantities(
         design, np.stack([phi, turned]), np.ones((2, 6)), np.array([3.0, 3.0])
     )
     np.testing.assert_allclose(rows[0], rows[1])
     np.testing.assert_allclose(rows[0], [*phi, *np.ones(6), 3.0])
     known = design_of(cart[1], cart_scene(prior=PRIOR))
-    two = replication._quantities(known, np.stack([phi, turned]), np.ones((2, 6)), np.zeros(2))
+    two = replication.quantities(known, np.stack([phi, turned]), np.ones((2, 6)), np.zeros(2))
     np.testing.assert_array_equal(two[:, : len(phi)], [phi, turned])
     assert len(replication.labels(design)) == rows.shape[1]
 
