@@ -28,6 +28,7 @@ from tests.helpers.histories import COLUMNS
 from tests.helpers.places import MODELS, load
 
 pytestmark = [
+    pytest.mark.one_stack,
     # a posterior of few draws is enough to test a verdict, and says that it is one
     pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning"),
     # a ball of which all is known but the drag cannot have fallen so

@@ -7,6 +7,7 @@ from pbrl_ppl.history import History
 from tests.helpers.free_puck import BOX, box2d
 
 
+@pytest.mark.one_stack
 def test_the_loop_is_finished_with_gaussians(make_history, monkeypatch) -> None:
     sample = closing.sample
 

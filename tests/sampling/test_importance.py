@@ -167,9 +167,13 @@ WAYS = {
     "a bad surrogate": SURROGATE,
     "a bad surrogate, and engine moves": SURROGATE | {"ensemble._suffices": never},
 }
+#: With a surrogate the engine does more, and ArviZ the same as without.
+EACH_WAY = [
+    pytest.param(way, marks=[pytest.mark.one_stack] if "surrogate" in way else []) for way in WAYS
+]
 
 
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("way", EACH_WAY)
 def test_draws_have_the_moments_of_the_posterior(simple, monkeypatch, way) -> None:
     """Drag and a scalar sigma against a grid, over 10 seeds, whatever particles go through.
 
@@ -236,6 +240,7 @@ def test_a_cart_s_posterior_is_that_of_chains() -> None:
 # -- several parts, several modes ------------------------------------------------------------------
 
 
+@pytest.mark.one_stack
 def test_independent_parts_share_the_noise_alone() -> None:
     """Two pucks with drag and masses, as by chains: 10 numbers, false alarm 2e-3."""
     scene = pucks("ab")
@@ -289,7 +294,7 @@ def shares(root, size, at=0.3) -> tuple[float, float, float]:
     return float((root > 0).mean()), expected, float(np.sqrt(expected * (1 - expected) / size))
 
 
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("way", EACH_WAY)
 def test_two_modes_have_their_shares(twofold, monkeypatch, way) -> None:
     """Over four seeds, each within 4 standard errors of the prior's share: false alarm 3e-4."""
     for name, value in WAYS[way].items():
