@@ -268,7 +268,7 @@ def _forecasts(before: Mode, after: Mode) -> tuple[Forecast, Forecast]:
     )
     both = np.isfinite(worse.error) & np.isfinite(better.error)
     worse, better = (
-        replace(mode, error=np.where(both, mode.error, np.nan)) for mode in (worse, better)
+        replace(made, error=np.where(both, made.error, np.nan)) for made in (worse, better)
     )
     return worse, better
 

@@ -271,7 +271,7 @@ class Dynamics:
             noise=noise,
             substeps=record.substeps,
             threads=threads,
-            declared=[effect.effect for effect in attached],
+            declared=[law.effect for law in attached],
         )
 
     @property

@@ -51,16 +51,16 @@ def record_of(problem: Problem, seed: int, method: str) -> PosteriorRecord:
     scene, attached, likelihood = problem.scene, problem.physics.effects, problem.likelihood
     for body in scene.dynamic:
         new = [
-            effect.effect.name
-            for effect in attached
-            if effect.body == body.name and effect.effect.name not in body.effects
+            law.effect.name
+            for law in attached
+            if law.body == body.name and law.effect.name not in body.effects
         ]
         scene = scene.with_effects(body.name, *new)
     median, spread = problem.noise_prior
     tables = [e.effect.table for e in attached if isinstance(e.effect, LearnedRemainder)]
     return PosteriorRecord(
         scene=scene,
-        effects=tuple((effect.effect.name, effect.body) for effect in attached),
+        effects=tuple((law.effect.name, law.body) for law in attached),
         horizon=problem.data.horizon,
         substeps=problem.physics.substeps,
         together=tuple(problem.physics.together),
