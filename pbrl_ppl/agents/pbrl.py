@@ -164,8 +164,7 @@ class PBRLAgent(PhysicsAgent):
             if attached.body in declared and attached.effect.name not in declared[attached.body]
         ]
         physics = Physics.declare(with_units(scene, history), beside)
-        if not self.fits:
-            try_own_effects(physics, history)
+        try_own_effects(physics, history)
         return declared_problem(physics, history, likelihood=self._likelihood)
 
     def _revised(self, *, least: int = 3, false_alarm: float = 0.01) -> Mode | None:

@@ -5,8 +5,9 @@ import pytest
 from episodes import World
 
 from pbrl_ppl.agents import PBRLAgent, Revision
-from pbrl_ppl.effects import catalogue
+from pbrl_ppl.effects import Effect, EffectParameter, Force, catalogue
 from pbrl_ppl.errors import EffectError
+from pbrl_ppl.parameters import Prior
 from tests.helpers.tasks import CART, CART_TRUTH
 
 pytestmark = pytest.mark.one_stack
@@ -77,6 +78,21 @@ def test_an_effect_that_it_knows_of() -> None:
     assert agent.added == ()
     with pytest.raises(EffectError, match="applies to no body"):
         PBRLAgent(CART, effects=(EFFECTS["pivot_friction"],))
+
+
+def _raises(state, command, parameters, wrench):
+    raise ZeroDivisionError("of course")
+
+
+def test_tries_an_own_effect_that_is_added_after_the_first_fit() -> None:
+    agent = PBRLAgent(CART, seed=1, growth=0.0)
+    pushed(agent, None, sigma=0.01, steps=5, seed=1)
+    assert agent.fits > 0
+    size = EffectParameter("size", "N", Prior("half_normal", sigma=1.0))
+    own = Effect("own", (size,), "made up", "a test", Force(_raises))
+    agent.added = (Revision(own.on("cart"), 4, 0.001, 10.0, 3.0, ()),)
+    with pytest.raises(EffectError, match="raised ZeroDivisionError when it was tried"):
+        pushed(agent, None, sigma=0.01, steps=5, seed=1)
 
 
 @pytest.mark.long
