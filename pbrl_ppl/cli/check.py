@@ -209,7 +209,7 @@ def criticise(
             )
         else:
             check_history(declared, loaded, loaded.segments(1))
-            attribution = criticism.criticise(
+            ranking = criticism.criticise(
                 declared, loaded, catalogue=catalogue, seed=seed, progress=progress
             )
     if simulate:
@@ -218,17 +218,17 @@ def criticise(
     if as_json:
         print_json(
             {
-                "candidates": [vars(candidate) for candidate in attribution.candidates],
-                "mode": attribution.mode,
-                "unexplained_acceleration": attribution.unexplained_acceleration,
-                "substeps": attribution.substeps,
+                "candidates": [vars(candidate) for candidate in ranking.candidates],
+                "mode": ranking.mode,
+                "unexplained_acceleration": ranking.unexplained_acceleration,
+                "substeps": ranking.substeps,
             }
         )
         return
     print_table(
         "what the declared model might lack, by the score test",
         ["effect", "<body", "S", "dof", "p (corrected)", "<first estimate"],
-        map(_candidate_row, attribution.candidates),
+        map(_candidate_row, ranking.candidates),
     )
     typer.echo(
         "small p: the residual looks like that effect's signature; close-loop says whether it is"

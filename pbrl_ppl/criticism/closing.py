@@ -179,6 +179,11 @@ class _Task:
     criteria: Criteria
     say: Callable[[str], None]
 
+    @property
+    def effects(self) -> tuple[Attached, ...]:
+        """Effects that the scene declares."""
+        return attach(self.scene, (), self.catalogue)
+
 
 @dataclass(frozen=True, eq=False)
 class _Model:
@@ -255,10 +260,9 @@ def _closed(task: _Task, train: History, test: History, recorded: History) -> Lo
 
 def _declared(task: _Task, train: History) -> tuple[ResidualTest, Mode]:
     """Return the test of the declared prior, and the mode of the declared model."""
-    effects = attach(task.scene, (), task.catalogue)
     task.say(Stage.CHECK_PRIOR)
-    with background(partial(_compile, task.scene, train, effects)) as compiled:
-        prior = _prior_test(task, train, effects)
+    with background(partial(_compile, task.scene, train, task.effects)) as compiled:
+        prior = _prior_test(task, train, task.effects)
         if not prior.passed:  # before the long fit: units may be wrong
             hint = "the declared prior does not explain this recording"
             hint = f"{hint}, unless a missing effect is why"
@@ -271,9 +275,8 @@ def _declared(task: _Task, train: History) -> tuple[ResidualTest, Mode]:
 
 def _fitted(task: _Task, train: History) -> Mode:
     """Return the mode of the declared model."""
-    effects = attach(task.scene, (), task.catalogue)
     return declared_mode(
-        task.scene, train, effects, task.seed, task.substeps, task.say, task.criteria
+        task.scene, train, task.effects, task.seed, task.substeps, task.say, task.criteria
     )
 
 

@@ -110,10 +110,10 @@ class Selection:
         scored = {signature.attached: signature for signature in ranked}
         self.tried = {_key(scored[known]): worth for known, worth in simulated.tried.items()}
         for attached, (nats, share) in simulated.tried.items():
-            sentences = (
+            sentence = (
                 f"takes {100 * share:.2g} % off the error of whole trajectories ({nats:.0f} nats)"
             )
-            self._note(scored[attached], sentences)
+            self._note(scored[attached], sentence)
         if not simulated.laws:
             return mode, []
         problem = mode.problem.with_physics(effects=simulated.after.problem.physics.effects)

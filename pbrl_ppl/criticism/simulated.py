@@ -317,7 +317,7 @@ class SimulatedSearch:
         leaders: dict[Attached, Floats] = {}
         for signatures in ranked:
             leading = 0
-            for signature in sorted(signatures, key=lambda scored: -scored.fall):
+            for signature in sorted(signatures, key=lambda signature: -signature.fall):
                 if 2 * signature.fall < limits.least_score or leading == limits.leaders:
                     break
                 if leaders.keys().isdisjoint((signature.attached, *same(signature.attached))):
@@ -346,14 +346,11 @@ class SimulatedSearch:
             both: list[dict[Attached, Floats]] = []
             some = [trial for trial in trials if trial.share >= self.criteria.negligible]
             for pair in combinations(some[: limits.paired], 2):
-                first, second = (scores[-1][candidate.laws[0]] for candidate in pair)
+                first, second = (scores[-1][trial.laws[0]] for trial in pair)
                 if twins(first, second, self.criteria):
                     continue
                 both.append(
-                    {
-                        candidate.laws[0]: sizes_of(candidate.modes[0], candidate.laws[0])
-                        for candidate in pair
-                    }
+                    {trial.laws[0]: sizes_of(trial.modes[0], trial.laws[0]) for trial in pair}
                 )
 
             def together(begin: dict[Attached, Floats]) -> _Trial:

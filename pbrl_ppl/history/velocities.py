@@ -388,8 +388,8 @@ def computed_by(runs: Runs, dt: float) -> Match | None:
     least, most = _noise_bounds(runs)
     noise = min(max(position_noise(runs, dt)[0], least), most)
     shown = sum(max(len(position) - 3, 0) for position, _ in runs) / _correlation([-1, 3, -3, 1])
-    exact = [_tested(candidate, runs, dt, noise, shown, total) for candidate in known_filters()]
-    if matches := [match for match in exact if match is not None]:
+    tested = [_tested(candidate, runs, dt, noise, shown, total) for candidate in known_filters()]
+    if matches := [match for match in tested if match is not None]:
         return min(matches, key=lambda match: match.misfit)
     for candidate in FITTED:
         if match := _tested(candidate, runs, dt, noise, shown, total):

@@ -353,20 +353,20 @@ def score(
         for a in range(d):
             for b in range(d):
                 step[kind[k], a, b] += state[a] * state[b] - known[a, b]
-        weight = slope[k]
+        transition = slope[k]
         for a in range(d):
             moved[a] = 0.0
             for b in range(d):
-                moved[a] += weight[b, a] * state[b]
+                moved[a] += transition[b, a] * state[b]
                 total = 0.0
                 for c in range(d):
-                    total += known[a, c] * weight[c, b]
+                    total += known[a, c] * transition[c, b]
                 pulled[a, b] = total
         for a in range(d):
             for b in range(a + 1):
                 total = 0.0
                 for c in range(d):
-                    total += weight[c, a] * pulled[c, b]
+                    total += transition[c, a] * pulled[c, b]
                 known[a, b] = known[b, a] = total
         for a in range(d):
             state[a] = moved[a]

@@ -365,7 +365,9 @@ def noise_labels(variables: dict[str, tuple[str, ...]], scalar: bool) -> tuple[s
     """Return labels of noise parameters, such as ``sigma[x]``; ``sigma`` for a scalar."""
     if scalar:
         return ("sigma",)
-    return tuple(f"{name}[{dimension}]" for name, names in variables.items() for dimension in names)
+    return tuple(
+        f"{name}[{dimension}]" for name, dimensions in variables.items() for dimension in dimensions
+    )
 
 
 def _finite(log_density: Floats) -> Floats:

@@ -91,9 +91,11 @@ def ranges(coordinates: Coordinates, history: History, states: Floats) -> Floats
 def _typical(coordinates: Coordinates, changes: list[Floats]) -> Floats:
     """Return the root mean square change of each state dimension, shape (6,)."""
     square = np.concatenate([change.reshape(len(change), -1) for change in changes]) ** 2
-    change = square.mean(axis=0)[coordinates.places]
+    mean_square = square.mean(axis=0)[coordinates.places]
     of = coordinates.places % len(STATE)
-    return np.array([np.sqrt(change[of == d].mean()) if (of == d).any() else 0.0 for d in range(6)])
+    return np.array(
+        [np.sqrt(mean_square[of == d].mean()) if (of == d).any() else 0.0 for d in range(6)]
+    )
 
 
 def _vectors(typical: Floats, rates: tuple[int, ...]) -> Floats:

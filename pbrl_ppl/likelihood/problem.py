@@ -178,12 +178,12 @@ class Problem:
                     sigma[:, i] = every[:, sensors.index(d)]
         matters = np.any(~(off <= same * sigma[:, None, None, None]), axis=(2, 3, 4))
         names = [body.name for body in self.scene.moving]
-        parts = [
+        meeting = [
             names[i] for i in np.flatnonzero((met & np.expand_dims(matters, -1)).any(axis=(0, 1)))
         ]
-        if not parts:
+        if not meeting:
             return self
-        return self.with_physics(together=tuple(dict.fromkeys((*self.physics.together, *parts))))
+        return self.with_physics(together=tuple(dict.fromkeys((*self.physics.together, *meeting))))
 
     @property
     def scene(self) -> Scene:

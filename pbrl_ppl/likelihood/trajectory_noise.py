@@ -163,7 +163,7 @@ class TrajectoryNoise:
         slices = [slice(i, i + a_thread) for i in range(0, len(rows), a_thread)]
         many = rows.size > threads_from
         parts = in_parallel(some, slices) if many else list(map(some, slices))
-        white, log_scale = (np.concatenate(a_thread) for a_thread in zip(*parts, strict=True))
+        white, log_scale = (np.concatenate(column) for column in zip(*parts, strict=True))
         return white[..., :d], log_scale
 
     def filtered(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
@@ -175,9 +175,8 @@ class TrajectoryNoise:
     def _filtered(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
         """Return the same as :meth:`filtered` in the filter's extended state."""
         extended, (gain, scale, *_) = self._extended, self._gains(sigma)
-        rows = np.ascontiguousarray(
-            extended.padded(residual)
-        )  # another layout would be compiled, too
+        # another layout would be compiled, too
+        rows = np.ascontiguousarray(extended.padded(residual))
         white, state = innovations(
             extended.slope, self.first, extended.seen, gain, scale, rows,
             extended.padded(self.begin), extended.padded(self.measured),

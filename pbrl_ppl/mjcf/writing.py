@@ -82,7 +82,7 @@ def mjcf_ranges(
     if not 0 < probability < 1:
         raise SceneError(f"probability is {probability!r}, expected between 0 and 1")
     scene, draws = scene_of(idata), labelled_draws(idata)
-    intervals: dict[str, dict[str, Floats]] = {}
+    known: dict[str, dict[str, Floats]] = {}
     for body in scene.moving:
         values: dict[str, Any] = dict(body.known)
         for block in layout_of(idata, effects).blocks:
@@ -92,19 +92,19 @@ def mjcf_ranges(
         if "mass" in values:
             scale = values.get("inertia_scale_scale", 1.0)
             values["inertia"] = values["mass"] * body.shape.unit_moment * scale
-        intervals[body.name] = values
+        known[body.name] = values
     tails = (1 - probability) / 2, (1 + probability) / 2
     ranges = {
         body: {
-            name: [float(end) for end in np.quantile(values_of, tails)]
-            for name, values_of in values.items()
-            if np.size(values_of) > 1
+            name: [float(end) for end in np.quantile(drawn, tails)]
+            for name, drawn in values.items()
+            if np.size(drawn) > 1
         }
-        for body, values in intervals.items()
+        for body, values in known.items()
     }
     means = {
-        body: {name: float(np.mean(values_of)) for name, values_of in values.items()}
-        for body, values in intervals.items()
+        body: {name: float(np.mean(drawn)) for name, drawn in values.items()}
+        for body, values in known.items()
     }
     text, left_out = _Writer(scene, means, PLANES[plane], depth).write()
     if left_out:

@@ -113,7 +113,7 @@ def alike(scene: Scene) -> tuple[Alike, ...]:
     for name, joint in zip(scene.joint_names, scene.joints, strict=True):
         if joint.bodies is None:
             groups.setdefault((joint.kind, *index_priors(scene, joint)), []).append(name)
-    joints = []
+    alikes = []
     for (_, *priors), names in groups.items():
         p_a, p_b = (prior.probabilities for prior in priors)
         both = np.outer(p_a, p_b)
@@ -123,8 +123,8 @@ def alike(scene: Scene) -> tuple[Alike, ...]:
             for i, j in pairs
         ]
         possible = [option for option in weighed if option[1] > 0]
-        joints.append(Alike(tuple(names), (*possible, (None, float(both.trace())))))
-    return tuple(joints)
+        alikes.append(Alike(tuple(names), (*possible, (None, float(both.trace())))))
+    return tuple(alikes)
 
 
 def index_law(pair: Pair, scene: Scene, p_a: Floats, p_b: Floats) -> Floats:

@@ -74,9 +74,9 @@ def trajectory_evidence(mode: Mode, unit: Sequence[int] = ()) -> float:
     if not len(unit):
         return value
     places, shown = list(unit), mode.problem.trajectory_noise.seen.any(axis=1).sum()
-    covariance = np.linalg.slogdet(2 * np.pi * mode.covariance[np.ix_(places, places)])[1]
+    log_det = np.linalg.slogdet(2 * np.pi * mode.covariance[np.ix_(places, places)])[1]
     prior = mode.problem.layout.log_prior(mode.phi)[places].sum()
-    return value - float(prior) - 0.5 * float(covariance + len(places) * np.log(shown))
+    return value - float(prior) - 0.5 * float(log_det + len(places) * np.log(shown))
 
 
 @dataclass(frozen=True, eq=False)

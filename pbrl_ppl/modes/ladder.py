@@ -170,11 +170,11 @@ def with_robust_covariance(mode: Mode, *, many: int = 8) -> Mode:
     seen, score = starts.seen_series, np.diag(slopes**2)
     lags = np.abs(np.subtract.outer(np.arange(seen.shape[1]), np.arange(seen.shape[1])))
     for d, white in enumerate(least_errors(problem) * weight):
-        slopes_of = by_phi[..., d, :]
-        errors = autocovariance(residual[..., d], seen[..., d], start[..., d, :], slopes_of)
+        of_dimension = by_phi[..., d, :]
+        errors = autocovariance(residual[..., d], seen[..., d], start[..., d, :], of_dimension)
         errors[0] += white**2
         score = score + np.einsum(
-            "arbp,rs,asbq->pq", slopes_of, errors[lags], slopes_of, optimize=True
+            "arbp,rs,asbq->pq", of_dimension, errors[lags], of_dimension, optimize=True
         )
     inverse = covariance_of((mode.jacobian.T @ mode.jacobian) + np.diag(slopes**2))
     robust = inverse @ score @ inverse

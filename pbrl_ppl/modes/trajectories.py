@@ -120,7 +120,7 @@ def nearby_mode(
     same : float
         A correction with which the log-posterior (nats) is as with many steps is the last.
     """
-    rounds: list[Mode] = []
+    modes: list[Mode] = []
     for _ in range(corrections):
         cheap = problem.corrected(phi)
         mode = _settled(cheap, phi, sigma)
@@ -129,10 +129,10 @@ def nearby_mode(
         problem = replace(mode.problem, physics=problem.physics, defect=None)
         moved, phi = _change(mode, phi), mode.phi
         sigma, height = profiled(problem, phi)
-        rounds.append(replace(mode, problem=problem, sigma=sigma, log_posterior=height, others=()))
+        modes.append(replace(mode, problem=problem, sigma=sigma, log_posterior=height, others=()))
         if moved < _SETTLED or abs(height - mode.log_posterior) < same:
             break
-    return max(rounds, key=lambda candidate: candidate.log_posterior)
+    return max(modes, key=lambda candidate: candidate.log_posterior)
 
 
 def _settled(problem: Problem, phi: Floats, sigma: Floats) -> Mode:
@@ -161,7 +161,7 @@ def following(mode: Mode) -> Mode:
     Mode
         Its problem's noise has a :class:`pbrl_ppl.model.Sensitivity`.
     """
-    rounds: list[tuple[float, Mode]] = []
+    modes: list[tuple[float, Mode]] = []
     problem, phi, sigma = mode.problem, mode.phi, mode.sigma
     for i in range(_ROUNDS):
         if i:
@@ -169,12 +169,12 @@ def following(mode: Mode) -> Mode:
         problem = with_sensitivity(problem, phi, sigma)
         # far from where it is linearised a climb may end anywhere: judged by where it began
         value = float(log_posterior(problem, phi, sigma))
-        rounds.append((value, find_mode(problem, initial=phi, rounds=_CLIMB)))
-        change = _change(rounds[-1][1], phi)
-        phi, sigma = rounds[-1][1].phi, rounds[-1][1].sigma
+        modes.append((value, find_mode(problem, initial=phi, rounds=_CLIMB)))
+        change = _change(modes[-1][1], phi)
+        phi, sigma = modes[-1][1].phi, modes[-1][1].sigma
         if change < _SETTLED:
             break
-    return max(rounds, key=lambda pair: pair[0])[1]
+    return max(modes, key=lambda pair: pair[0])[1]
 
 
 def _change(mode: Mode, phi: Floats) -> float:

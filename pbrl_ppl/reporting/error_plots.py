@@ -178,7 +178,7 @@ def _fit_to(axes: Axes, values: Floats) -> None:
 
 def _write(axes: Axes, notes: list[tuple[str, str]]) -> None:
     """Write notes in their colours at the top of a panel."""
-    for i, (colour, text) in enumerate((colour_of, said) for colour_of, said in notes if said):
+    for i, (colour, text) in enumerate(note for note in notes if note[1]):
         axes.text(
             0.98, 0.97 - 0.11 * i, text, color=colour, transform=axes.transAxes, ha="right",
             va="top", fontsize=8, bbox={"color": "white", "alpha": 0.7, "pad": 1.0},

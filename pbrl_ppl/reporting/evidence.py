@@ -284,10 +284,10 @@ def _residual_force(
         values = c * x + s * y if dimension == "forward speed" else c * y - s * x
     else:
         dimension = {"x": "vx", "y": "vy", "theta": "omega"}.get(dimension, dimension)
-        places = acceleration(dimension) if dimension in STATE else None
-        if places is None:
+        of_dimension = acceleration(dimension) if dimension in STATE else None
+        if of_dimension is None:
             return None
-        values = places
+        values = of_dimension
     moving = problem.scene.moving[body]
     sizes = dict(zip(problem.layout.labels, phi.tolist(), strict=True))
     mass = dict(moving.known).get("mass", sizes.get(f"mass[{moving.owner}]"))

@@ -36,7 +36,9 @@ def limits_in_words(candidate: Candidate, loop: Loop) -> str:
     effect = next((other for other in loop.catalogue if other.name == candidate.effect), None)
     if effect is not None:
         effect = effect.in_si(units_of(loop.scene, candidate.body))
-    priors = {} if effect is None else {other.name: other for other in effect.parameters}
+    priors = (
+        {} if effect is None else {parameter.name: parameter for parameter in effect.parameters}
+    )
     limits = {}
     for name in measured_parameters(candidate, loop):
         if name not in candidate.detectable:
@@ -218,7 +220,8 @@ def candidate_table(loop: Loop) -> Table:
         ],
         words=(4, 8, 9),
         marks=[
-            "added" if (effect.effect, effect.body) in added else "" for effect in loop.candidates
+            "added" if (candidate.effect, candidate.body) in added else ""
+            for candidate in loop.candidates
         ],
     )  # fmt: skip
 

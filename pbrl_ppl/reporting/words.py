@@ -308,7 +308,7 @@ def _sizes(added: Added) -> str:
 def _worst_error(loop: Loop) -> list[str]:
     """Write the held-out error far ahead that is worst, before and after if something was added."""
     before, after, floor = (
-        kind.rollout_rmse for kind in (loop.before, loop.after, loop.noise_floor)
+        errors.rollout_rmse for errors in (loop.before, loop.after, loop.noise_floor)
     )
 
     def times_floor(name: str) -> float:

@@ -87,7 +87,7 @@ def mix(
     return from_groups(data, {"configurations": stored(weighed)})
 
 
-def most_probable(problem: Problem, configurations: Sequence[Weighed]) -> Point:
+def most_probable(problem: Problem, weighed: Sequence[Weighed]) -> Point:
     """Return the mode of the most probable configuration, as a point of the whole model.
 
     Anchors of joints that join nothing are at the centre of their prior.
@@ -96,10 +96,10 @@ def most_probable(problem: Problem, configurations: Sequence[Weighed]) -> Point:
     ----------
     problem : Problem
         Of a scene with joints of unknown bodies.
-    configurations : sequence of Weighed
+    weighed : sequence of Weighed
         Configurations with their probabilities.
     """
-    best = max(configurations, key=lambda weighed: weighed.probability)
+    best = max(weighed, key=lambda configuration: configuration.probability)
     layout = problem.layout
     values = dict(zip(best.mode.problem.layout.labels, best.mode.phi.tolist(), strict=True))
     phi = np.array([values.get(label, np.nan) for label in layout.labels])[None]
@@ -245,8 +245,8 @@ def most_frequent(problem: Problem, trace: Idata) -> Point:
     best = np.zeros(index.shape[1], dtype=np.intp)
     for part in problem.simulator.parts:
         columns = [names.index(owner) for owner in part.physics.scene.owners]
-        rows, counts = np.unique(index[:, columns], axis=0, return_counts=True)
-        best[columns] = rows[counts.argmax()]
+        choices, counts = np.unique(index[:, columns], axis=0, return_counts=True)
+        best[columns] = choices[counts.argmax()]
     return _point(problem, best)
 
 
