@@ -201,6 +201,11 @@ def effect_entry(effect: Effect) -> str:
         f"- Stage: {_stage(effect)}.",
         f'- In a scene: `effects = ["{effect.name}"]`.',
     ]
+    if effect.log_odds:
+        text += [
+            f"- Prior odds: −{-effect.log_odds:g} nats beside common effects such as drag"
+            " (`log_odds`)."
+        ]
     for names, where in LOOK_ALIKES:
         if effect.name in names:
             others = ", ".join(f"[`{name}`](#{name})" for name in names if name != effect.name)

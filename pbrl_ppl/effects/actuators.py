@@ -130,6 +130,7 @@ dead_zone = Effect(
     "dead zone of an actuator (G. Tao and P. V. Kokotovic, 1994)",
     Command(_subtract_threshold),
     scan=_scan_dead_zones,
+    log_odds=-2.0,
 )
 
 
@@ -155,6 +156,7 @@ force_cutoff = Effect(
     "threshold of an actuator",
     Command(_cut_off),
     scan=_scan_cutoffs,
+    log_odds=-3.0,
 )
 
 
@@ -185,4 +187,5 @@ saturation = Effect(
     "saturation of an actuator",
     Command(_saturate),
     scan=_scan_limits,
+    log_odds=-2.0,
 )

@@ -69,4 +69,5 @@ magnus_force = Effect(
     " aside",
     "Magnus force, F = c omega x v",
     Force(_magnus),
+    log_odds=-4.0,
 )

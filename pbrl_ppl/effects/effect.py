@@ -120,13 +120,17 @@ class Effect:
         ``applies(scene, body) -> bool``.
     scan : callable, optional
         Grid of parameters to try if the derivative at the null vanishes; see :data:`Scan`.
+    log_odds : float
+        Logarithm of the prior odds that a rig has this effect, beside common ones such as drag,
+        friction or a constant force (nats, at most 0): part of the price of a law in a search.
     force : callable, optional
         Short for ``stage=Force(force)``.
 
     Raises
     ------
     EffectError
-        If it has no name, no parameters or no stage, or a null value outside its prior's support.
+        If it has no name, no parameters or no stage, positive log odds, or a null value outside its
+        prior's support.
 
     Examples
     --------
@@ -151,6 +155,7 @@ class Effect:
     stage: Stage = None  # type: ignore[assignment]  # never None once made
     applies: Callable[[Scene, Body], bool] = always
     scan: Scan | None = None
+    log_odds: float = 0.0
     force: InitVar[Law | None] = None
 
     def __post_init__(self, force: Law | None) -> None:
@@ -166,6 +171,11 @@ class Effect:
             raise EffectError(
                 f"effect {self.name}: stage is {self.stage!r}, expected one of {names}, or a law"
                 " as force="
+            )
+        if not self.log_odds <= 0.0:
+            raise EffectError(
+                f"effect {self.name}: log_odds is {self.log_odds}, expected 0 or less; 0 is as"
+                " common as drag"
             )
         for parameter in self.parameters:
             lower, upper = parameter.prior.support

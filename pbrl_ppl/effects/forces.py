@@ -63,6 +63,7 @@ body_force = Effect(
     "a steady push in one direction of the body itself, such as a motor that never quite stops",
     "Newton's second law with a force that turns with the body",
     Force(_body_force),
+    log_odds=-1.0,
 )
 
 
@@ -95,4 +96,5 @@ push_offset = Effect(
     "the push acts at a point beside the body's centre, and so turns it as well",
     "moment of a force about a point, tau = r x F",
     Force(_moment_of_push),
+    log_odds=-1.0,
 )

@@ -118,4 +118,5 @@ wheel = Effect(
     Properties(_add_wheel),
     applies=_lacks_wheel,
     scan=_scan_wheels,
+    log_odds=-2.0,
 )

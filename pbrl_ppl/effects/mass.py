@@ -23,6 +23,7 @@ inertia_scale = Effect(
     "the body is easier or harder to turn than its outline suggests: mass is not spread evenly",
     "moment of inertia about the centroid as a free parameter",
     Properties(_scale_moment),
+    log_odds=-2.0,
 )
 
 
@@ -40,6 +41,7 @@ com_offset = Effect(
     "the centre of mass is not in the middle of the outline: mass is not spread evenly",
     "centre of mass of a rigid body, in the body's frame",
     Properties(_shift_centre),
+    log_odds=-1.0,
 )
 
 
@@ -76,4 +78,5 @@ mass_change = Effect(
     "a change point in the mass",
     Properties(_scale_mass, timed=True),
     scan=_scan_begins,
+    log_odds=-8.0,
 )

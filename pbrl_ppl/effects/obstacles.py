@@ -137,4 +137,5 @@ hidden_obstacle = Effect(
     "contact with a static disc",
     Structure(_discs),
     scan=_scan,
+    log_odds=-8.0,
 )

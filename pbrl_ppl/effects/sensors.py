@@ -32,6 +32,7 @@ sensor_bias = Effect(
     "what is measured is off by a constant: a sensor is not zeroed, or not where it is thought",
     "additive sensor bias",
     Sensor(_add_bias, _subtract_bias),
+    log_odds=-2.0,
 )
 
 
@@ -60,6 +61,7 @@ sensor_scale = Effect(
     " scale is off",
     "scale factor error of a sensor",
     Sensor(_multiply, _divide),
+    log_odds=-4.0,
 )
 
 
@@ -85,6 +87,7 @@ frame_rotation = Effect(
     " the mocap is not aligned",
     "rotation between two frames",
     Sensor(_turn, _turn_back),
+    log_odds=-2.0,
 )
 
 

@@ -53,6 +53,7 @@ spring = Effect(
     Force(_spring),
     applies=is_unpivoted,
     scan=_scan_anchors,
+    log_odds=-3.0,
 )
 
 
@@ -88,6 +89,7 @@ torsion_spring = Effect(
     "Hooke's law of torsion",
     Force(_torsion_spring),
     scan=_scan_angles,
+    log_odds=-3.0,
 )
 
 
@@ -138,6 +140,7 @@ point_attractor = Effect(
     Force(_attraction),
     applies=is_unpivoted,
     scan=_scan_places,
+    log_odds=-8.0,
 )
 
 
@@ -225,4 +228,5 @@ distance_joint = Effect(
     Structure(rod=_rod),
     applies=is_unpivoted,
     scan=_scan_rods,
+    log_odds=-8.0,
 )
