@@ -5,10 +5,7 @@ from .attribution import attribute as attribute
 from .closing import LoopInterrupted as LoopInterrupted
 from .closing import close_loop as close_loop
 from .criteria import DEFAULT as DEFAULT
-from .criteria import TRIED as TRIED
 from .criteria import Criteria as Criteria
-from .cross_validation import Change as Change
-from .cross_validation import gain as gain
 from .dependence import QUANTITIES as QUANTITIES
 from .dependence import recorded_quantities as recorded_quantities
 from .forecast import whole_rollouts as whole_rollouts
@@ -26,7 +23,6 @@ from .prior_check import prior_predictive_check as prior_predictive_check
 from .prior_check import telling_horizon as telling_horizon
 from .ranking import Ranking as Ranking
 from .ranking import criticise as criticise
-from .refinement import with_effects as with_effects
 from .remainder import check_scikit_learn as check_scikit_learn
 from .remainder import learn_remainder as learn_remainder
 from .results import ONE_TRAJECTORY as ONE_TRAJECTORY
@@ -34,6 +30,7 @@ from .results import Added as Added
 from .results import Candidate as Candidate
 from .results import Errors as Errors
 from .results import Estimate as Estimate
+from .results import Law as Law
 from .results import Stage as Stage
 from .results import Unexplained as Unexplained
 from .results import diverged_after as diverged_after
@@ -42,7 +39,8 @@ from .rivals import fit_rivals as fit_rivals
 from .rivals import kept_groups as kept_groups
 from .rivals import named_effects as named_effects
 from .score import Signature as Signature
-from .score import inseparable as inseparable
 from .score import rank_candidates as rank_candidates
-from .score import twins as twins
-from .simulated import Law as Law
+from .score import same_physics as same_physics
+from .search import Evidence as Evidence
+from .search import Search as Search
+from .search import with_effects as with_effects

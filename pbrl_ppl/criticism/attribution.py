@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.ranking import checked_mode
-from pbrl_ppl.criticism.results import ONE_TRAJECTORY, Stage
-from pbrl_ppl.criticism.simulated import Law, SimulatedSearch
+from pbrl_ppl.criticism.results import ONE_TRAJECTORY, Law, Rung, Stage
+from pbrl_ppl.criticism.search import Search
 from pbrl_ppl.effects import Attached, Effect, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.history import History
@@ -25,7 +25,7 @@ class Attribution:
     Parameters
     ----------
     laws : tuple of Law
-        In the order in which they were found.
+        Those of most evidence first.
     before, after : dict of str to float
         Simulation error of the declared model and with the laws: root mean square of measured minus
         simulated over pieces of ``seconds``, by state dimension, SI units.
@@ -35,6 +35,10 @@ class Attribution:
         Length of the simulated pieces (s).
     trajectories : int
         How many there are.
+    rungs : tuple of Rung
+        What was found at each length of pieces.
+    rejected : dict of str to str
+        Why a law that was found on shorter pieces is not among them.
     """
 
     laws: tuple[Law, ...]
@@ -43,6 +47,8 @@ class Attribution:
     correlated: dict[str, float]
     seconds: float
     trajectories: int
+    rungs: tuple[Rung, ...] = ()
+    rejected: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def sentences(self) -> list[str]:
@@ -68,10 +74,11 @@ def attribute(
 ) -> Attribution:
     """Name the effects that take the simulation error of whole trajectories away.
 
-    The declared model is simulated from latent start states, without process noise, up a ladder of
-    lengths. Leading candidates and their pairs are refitted; one is added if the error's fall is
-    evidence by the effective sample size and at least a fifth of the error, and dropped if the
-    model does as well without it. There is no verdict and no held-out data: that is `close_loop`.
+    The declared model is simulated from latent start states, without process noise, in pieces of
+    four rows and then of longer ones. On each length one regression proposes which laws are missing
+    together; the best proposals are refitted, and one is added if the error's fall is evidence by
+    the effective sample size and large enough. A law that longer pieces do not need is dropped.
+    There is no verdict and no held-out data: that is `close_loop`.
 
     Parameters
     ----------
@@ -86,7 +93,7 @@ def attribute(
     substeps : int, optional
         Engine steps an interval to begin with; the scene's by default.
     criteria : Criteria
-        Thresholds; see :class:`SimulationCriteria`.
+        Thresholds; see :class:`SearchCriteria`.
     progress : callable, optional
         Called with the name of each stage and with each law found.
 
@@ -117,15 +124,16 @@ def attribute(
     def missing(now: Mode) -> tuple[Attached, ...]:
         return candidates(mode.problem.scene, now.problem.physics.effects, catalogue)
 
-    search = SimulatedSearch(missing, criteria, say)(mode)
-    before, after = search.declared, search.after
-    problem = after.problem
+    found = Search(missing, criteria, say)(mode)
+    problem = found.after.problem
     names, likelihood = problem.observations.names, output_error(problem)
     return Attribution(
-        laws=search.described(),
-        before=dict(zip(names, before.sigma.tolist(), strict=True)),
-        after=dict(zip(names, after.sigma.tolist(), strict=True)),
+        laws=tuple(found.laws.values()),
+        before=dict(zip(names, found.declared.sigma.tolist(), strict=True)),
+        after=dict(zip(names, found.after.sigma.tolist(), strict=True)),
         correlated=dict(zip(names, likelihood.tau, strict=True)),
         seconds=problem.data.horizon * problem.scene.time_step,
         trajectories=problem.data.history.n_trajectories,
+        rungs=found.rungs,
+        rejected={f"{law.effect.name} on {law.body}": why for law, why in found.rejected.items()},
     )

@@ -1,10 +1,9 @@
-"""The closed loop: fit, score, add effects, test the residual, compare on held-out data."""
+"""The closed loop as a chain: clean, fit, search, test, sample, verdict."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -20,33 +19,35 @@ from pbrl_ppl.criticism.misfit import (
     Misfit,
     find_misfit,
     held_out_forecasts,
+    score_test,
     with_negligible_acceleration,
 )
 from pbrl_ppl.criticism.prior_check import prior_predictive_check, telling_horizon
 from pbrl_ppl.criticism.ranking import declared_mode
 from pbrl_ppl.criticism.recordings import checked_histories, outliers
-from pbrl_ppl.criticism.refinement import same_noise, shift, with_correlated_errors
+from pbrl_ppl.criticism.refinement import shift
 from pbrl_ppl.criticism.results import (
     Acceleration,
     Added,
+    Candidate,
     Errors,
     Estimate,
+    Law,
     Numerical,
     ResidualTest,
     Stage,
     Unexplained,
 )
 from pbrl_ppl.criticism.rivals import keep_groups
-from pbrl_ppl.criticism.score import Signature, named_beside
-from pbrl_ppl.criticism.selection import Selection, Step
-from pbrl_ppl.criticism.simulated import SimulatedSearch
+from pbrl_ppl.criticism.score import Signature, rank_candidates
+from pbrl_ppl.criticism.search import Search, SearchResult, elpd_gain
 from pbrl_ppl.criticism.unexplained import (
     UnexplainedAcceleration,
     measurement_noise,
     noise_alone,
     unexplained_acceleration,
 )
-from pbrl_ppl.effects import Attached, Effect, attach
+from pbrl_ppl.effects import Attached, Effect, Noise, attach, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import (
     ConvergenceWarning,
@@ -56,10 +57,10 @@ from pbrl_ppl.errors import (
     warn,
 )
 from pbrl_ppl.history import History, UnusedVelocity, with_units, without_measurements
-from pbrl_ppl.likelihood import Problem
-from pbrl_ppl.modes import Mode
+from pbrl_ppl.likelihood import Problem, output_error, single_transitions
+from pbrl_ppl.modes import Mode, filtered_mode, find_mode, tempered_mode
 from pbrl_ppl.physics import Physics, try_effect
-from pbrl_ppl.posterior import MAX_PARETO_K, Fit, compare, identify, interval, versions
+from pbrl_ppl.posterior import MAX_PARETO_K, Comparison, Fit, compare, identify, interval, versions
 from pbrl_ppl.posterior import draws as posterior_draws
 from pbrl_ppl.sampling import sample
 from pbrl_ppl.scene import Scene
@@ -149,7 +150,17 @@ def close_loop(
     else:  # an effect from some trajectory on still acts in a later test
         after = float(train.dataset["number"].max()) + 1.0
         numbered = test.numbered(after) if scene.test_is_later else test
-    return _closed(task, train, numbered, test)
+    if substeps is not None:
+        scene.replace(substeps=substeps)  # it is checked there
+    cleaned = _cleaned(task, train, numbered)
+    task = replace(task, scene=with_units(scene, cleaned.train))
+    found = _searched(task, _fitted(task, cleaned))
+    judged = _tested(task, cleaned, found)
+    try:
+        return _sampled(task, judged, test)
+    except KeyboardInterrupt:
+        laplace = replace(task, method="laplace")
+        raise LoopInterrupted(partial(_sampled, laplace, judged, test)) from None
 
 
 class LoopInterrupted(KeyboardInterrupt):
@@ -184,29 +195,13 @@ class _Task:
         """Effects that the scene declares."""
         return attach(self.scene, (), self.catalogue)
 
-
-@dataclass(frozen=True, eq=False)
-class _Model:
-    """A fitted model: mode, unexplained acceleration, draws, and held-out trajectories."""
-
-    mode: Mode
-    excess: UnexplainedAcceleration
-    fit: Fit
-    held_out: HeldOut
+    def missing(self, mode: Mode) -> tuple[Attached, ...]:
+        """Return the candidate effects for a model."""
+        return candidates(self.scene, mode.problem.physics.effects, self.catalogue)
 
 
 @dataclass(frozen=True, eq=False)
-class _Search:
-    """Search for effects: declared model, ranking, model with effects, and the effects' steps."""
-
-    declared: Mode
-    first: list[Signature]
-    mode: Mode
-    steps: list[Step]
-
-
-@dataclass(frozen=True, eq=False)
-class _Recordings:
+class _Cleaned:
     """Training and test history as they are used, and what of them is not."""
 
     train: History
@@ -216,140 +211,180 @@ class _Recordings:
 
 
 @dataclass(frozen=True, eq=False)
+class _Fitted:
+    """The declared model: test of its prior, and its mode of whole trajectories."""
+
+    prior: ResidualTest
+    mode: Mode
+
+
+@dataclass(frozen=True, eq=False)
+class _Searched:
+    """The declared model, the laws that it lacks, and the scores of all candidates."""
+
+    declared: _Fitted
+    found: SearchResult
+    ranked: list[Signature]
+
+    @property
+    def laws(self) -> Mapping[Attached, Law]:
+        """The laws by effect and body."""
+        return self.found.laws
+
+
+@dataclass(frozen=True, eq=False)
+class _Model:
+    """A model: the mode that is sampled, its innovations, and what these leave unexplained.
+
+    Parameters
+    ----------
+    mode : Mode
+        Of simulated pieces, or of the innovations where nothing can be simulated.
+    innovations : Mode
+        The same parameters, with whole trajectories filtered.
+    excess : UnexplainedAcceleration
+        Process noise of the innovations.
+    held_out : HeldOut
+        The model on the test history.
+    """
+
+    mode: Mode
+    innovations: Mode
+    excess: UnexplainedAcceleration
+    held_out: HeldOut
+
+    @classmethod
+    def of(cls, mode: Mode, innovations: Mode, test: History, criteria: Criteria) -> _Model:
+        """Test a mode's innovations, and linearise it along the test history."""
+        if not mode.problem.likelihood.simulated:  # single transitions
+            mode = innovations
+        excess = unexplained_acceleration(innovations, criteria)
+        return cls(mode, innovations, excess, HeldOut.of(innovations, test))
+
+
+@dataclass(frozen=True, eq=False)
 class _Judged:
     """The declared and the revised model with the tests of the latter's residual."""
 
-    search: _Search
-    recordings: _Recordings
-    held_out: HeldOut
-    before: UnexplainedAcceleration
-    after: UnexplainedAcceleration
+    cleaned: _Cleaned
+    searched: _Searched
+    declared: _Model
+    revised: _Model
     misfit: Misfit
+    small: tuple[Candidate, ...]
     rollout: int
 
 
-def _closed(task: _Task, train: History, test: History, recorded: History) -> Loop:
-    """Go through the stages of :func:`close_loop`; ``recorded`` is ``test`` as it was given."""
-    if task.substeps is not None:
-        task.scene.replace(substeps=task.substeps)  # it is checked there
-    recordings = _Recordings(*checked_histories(task.scene, train, test))
-    task = replace(task, scene=with_units(task.scene, recordings.train))
-    for sentence in (*(column.sentence for column in recordings.unused), *recordings.bad_frames):
+def _cleaned(task: _Task, train: History, test: History) -> _Cleaned:
+    """Check the histories and the effects; leave out what no model should be fitted to."""
+    cleaned = _Cleaned(*checked_histories(task.scene, train, test))
+    for sentence in (*(column.sentence for column in cleaned.unused), *cleaned.bad_frames):
         task.say(sentence)
     for effect in task.catalogue:
         if effect not in full_catalogue:
-            try_effect(effect, task.scene, recordings.train)
-    selection = Selection(task.scene, task.catalogue, task.criteria, task.say)
-    prior, declared = _declared(task, recordings.train)
-    search, recordings = _settled(task, _searched(declared, selection), recordings, selection)
-    judged = _judged(task, search, recordings, prior)
-
-    def sampled(task: _Task) -> Loop:
-        return replace(
-            _sampled(task, judged),
-            candidates=selection.explained(search.first),
-            small=tuple(selection.small),
-            held_out=recorded,
-        )
-
-    try:
-        return sampled(task)
-    except KeyboardInterrupt:
-        raise LoopInterrupted(partial(sampled, replace(task, method="laplace"))) from None
+            try_effect(effect, with_units(task.scene, cleaned.train), cleaned.train)
+    return cleaned
 
 
-def _declared(task: _Task, train: History) -> tuple[ResidualTest, Mode]:
-    """Return the test of the declared prior, and the mode of the declared model."""
+def _fitted(task: _Task, cleaned: _Cleaned) -> _Fitted:
+    """Fit the declared model, and test whether its prior could have made the data."""
     task.say(Stage.CHECK_PRIOR)
-    with background(partial(_compile, task.scene, train, task.effects)) as compiled:
-        prior = _prior_test(task, train, task.effects)
+    with background(partial(_compile, task.scene, cleaned.train, task.effects)) as compiled:
+        prior = _prior_test(task, cleaned.train, task.effects)
         if not prior.passed:  # before the long fit: units may be wrong
             hint = "the declared prior does not explain this recording"
             hint = f"{hint}, unless a missing effect is why"
             warn(f"{hint}: {prior.sentence}", PriorWarning)
         task.say(Stage.FIT)
-        mode = _fitted(task, train)
+        mode = declared_mode(
+            task.scene, cleaned.train, task.effects, task.seed, task.substeps, task.say,
+            task.criteria,
+        )  # fmt: skip
         compiled()
-    return prior, mode
+    return _Fitted(prior, mode)
 
 
-def _fitted(task: _Task, train: History) -> Mode:
-    """Return the mode of the declared model."""
-    return declared_mode(
+def _searched(task: _Task, declared: _Fitted) -> _Searched:
+    """Search for the laws that the declared model lacks."""
+    task.say(Stage.SIMULATE)
+    search, mode = Search(task.missing, task.criteria, task.say), declared.mode
+    try:
+        found = search(mode)
+    except HistoryError:  # start states could follow all that was measured
+        found = search(find_mode(single_transitions(mode.problem), initial=mode.phi))
+    task.say(Stage.SCORE)
+    ranked = rank_candidates(declared.mode, task.missing(declared.mode), task.criteria)
+    return _Searched(declared, found, ranked)
+
+
+def _tested(task: _Task, cleaned: _Cleaned, searched: _Searched) -> _Judged:
+    """Test the innovations of the model found, on the training and on the test history."""
+    task.say(Stage.TEST)
+    criteria = task.criteria
+    innovations = _innovations(searched)
+    train, frames = without_measurements(cleaned.train, outliers(innovations, criteria))
+    if frames:  # the data change, not the laws
+        task.say("; ".join(map(str, frames)))
+        cleaned = replace(cleaned, train=train, bad_frames=(*cleaned.bad_frames, *map(str, frames)))
+        searched = _without_frames(task, searched, train)
+        innovations = _innovations(searched)
+    tested = HeldOut.of(innovations, cleaned.test)
+    off = outliers(replace(innovations, problem=tested.problem), criteria)
+    test, more = without_measurements(cleaned.test, off)
+    said = tuple(f"held out: {frame}" for frame in more)
+    cleaned = replace(cleaned, test=test, bad_frames=(*cleaned.bad_frames, *said))
+    found, fitted = searched.found, searched.declared
+    revised = declared = _Model.of(found.after, innovations, test, criteria)
+    if searched.laws:
+        declared = _Model.of(found.declared, fitted.mode, test, criteria)
+    prior = fitted.prior
+    if searched.laws and not prior.passed:  # the missing effect may be why
+        labels = [label for law in searched.laws for label in law.labels]
+        values = dict(zip(innovations.problem.layout.labels, innovations.phi, strict=True))
+        fixed = {label: float(values[label]) for label in labels}
+        effects = innovations.problem.physics.effects
+        prior = _prior_test(task, cleaned.train, effects, fixed)
+    horizon = rollout_horizon(cleaned.train, task.scene)
+    misfit = find_misfit(innovations, revised.excess, horizon=horizon, seed=task.seed)
+    misfit = misfit.with_test(prior)
+    if searched.laws:
+        misfit = with_negligible_acceleration(misfit, innovations, revised.excess)
+    rollout = longest_rollout(test, horizon)
+    noise = noise_alone(innovations, revised.excess)
+    at_test = replace(innovations, problem=revised.held_out.problem)
+    misfit = misfit.with_test(held_out_forecasts(at_test, noise, rollout, criteria))
+    ranked = searched.ranked
+    if searched.laws:
+        ranked = rank_candidates(innovations, task.missing(innovations), criteria)
+    misfit = misfit.with_test(score_test(innovations, ranked, criteria))
+    small = tuple(one.candidate for one in ranked[:1] if one.candidate.p_value < criteria.try_p)
+    return _Judged(cleaned, searched, declared, revised, misfit, small, rollout)
+
+
+def _innovations(searched: _Searched) -> Mode:
+    """Return the filtered whole trajectories of the model found."""
+    if not searched.laws:
+        return searched.declared.mode
+    return filtered_mode(searched.declared.mode, searched.found.after)
+
+
+def _without_frames(task: _Task, searched: _Searched, train: History) -> _Searched:
+    """Return the search with its models fitted again, to a history without bad frames."""
+    mode = declared_mode(
         task.scene, train, task.effects, task.seed, task.substeps, task.say, task.criteria
     )
+    fitted = replace(searched.declared, mode=mode)
+    return replace(searched, declared=fitted, found=searched.found.on(train))
 
 
-def _settled(
-    task: _Task, search: _Search, recordings: _Recordings, selection: Selection
-) -> tuple[_Search, _Recordings]:
-    """Return the search and the recordings without outliers, and with the noise that they show.
-
-    With the right noise model effects may show that were hidden before.
-    """
-    for _ in range(task.criteria.noise_rounds):
-        train, frames = without_measurements(recordings.train, outliers(search.mode, task.criteria))
-        if frames:
-            said = tuple(map(str, frames))
-            for sentence in said:
-                task.say(sentence)
-            recordings = replace(
-                recordings, train=train, bad_frames=(*recordings.bad_frames, *said)
-            )
-            search = _searched(_fitted(task, train), selection)
-            continue
-        correlated = with_correlated_errors(search.mode, task.criteria)
-        if correlated is None:
-            break
-        task.say(Stage.REPEAT)
-        declared = same_noise(search.declared, correlated)
-        search = _grown(replace(search, declared=declared, mode=correlated), selection)
-    return search, recordings
-
-
-def _judged(task: _Task, search: _Search, recordings: _Recordings, prior: ResidualTest) -> _Judged:
-    """Test the residual of the revised model, on the training and on the test history."""
-    criteria, revised = task.criteria, search.mode
-    held_out = HeldOut.of(revised, recordings.test)
-    tested = replace(revised, problem=held_out.problem)
-    test, frames = without_measurements(recordings.test, outliers(tested, criteria))
-    if frames:
-        said = tuple(f"held out: {frame}" for frame in frames)
-        recordings = replace(recordings, test=test, bad_frames=(*recordings.bad_frames, *said))
-        held_out = HeldOut.of(revised, test)
-        tested = replace(revised, problem=held_out.problem)
-    task.say(Stage.TEST)
-    before, after = (
-        unexplained_acceleration(mode, criteria) for mode in (search.declared, revised)
-    )
-    horizon = rollout_horizon(recordings.train, task.scene)
-    if search.steps and not prior.passed:  # the missing effect may be why
-        values = dict(zip(revised.problem.layout.labels, revised.phi.tolist(), strict=True))
-        labels = (label for step in search.steps for label in step.signature.attached.labels)
-        added = {label: values[label] for label in labels}
-        prior = _prior_test(task, recordings.train, revised.problem.physics.effects, added)
-    misfit = find_misfit(revised, after, horizon=horizon, seed=task.seed).with_test(prior)
-    if search.steps:
-        misfit = with_negligible_acceleration(misfit, revised, after)
-    rollout = longest_rollout(test, horizon)
-    forecasts = held_out_forecasts(tested, noise_alone(revised, after), rollout, criteria)
-    return _Judged(
-        search, recordings, held_out, before, after, misfit.with_test(forecasts), rollout
-    )
-
-
-def _sampled(task: _Task, judged: _Judged) -> Loop:
-    """Sample the posteriors, and compare the models on the test history."""
-    search, recordings = judged.search, judged.recordings
-    declared, revised = search.declared, search.mode
+def _sampled(task: _Task, judged: _Judged, recorded: History) -> Loop:
+    """Sample the posteriors, compare the models on the test history, and return the verdict."""
     task.say(Stage.SAMPLE)
-    fits = _fits(task, [declared, revised] if search.steps else [declared])
-    first = last = _Model(revised, judged.after, fits[-1], judged.held_out)
-    if revised is not declared:
-        held_out = HeldOut.of(declared, recordings.test)
-        first = _Model(declared, judged.before, fits[0], held_out)
+    declared, revised = judged.declared, judged.revised
+    models = [revised] if revised is declared else [declared, revised]
+    fits = _fits(task, [model.mode for model in models])
     task.say(Stage.COMPARE)
-    return _put_together(task, judged, first, last)
+    return _put_together(task, judged, fits[0], fits[-1], recorded)
 
 
 def _compile(scene: Scene, train: History, effects: tuple[Attached, ...]) -> None:
@@ -360,38 +395,6 @@ def _compile(scene: Scene, train: History, effects: tuple[Attached, ...]) -> Non
     Problem.of(physics, train).predict(phi)
 
 
-def _searched(declared: Mode, selection: Selection) -> _Search:
-    """Add the effects that simulations name, then smaller ones by innovations."""
-    say = selection.say
-    say(Stage.SIMULATE)
-    simulated = None
-    with suppress(HistoryError):  # start states could follow all that was measured
-        simulated = SimulatedSearch(selection.missing, selection.criteria, say)(declared)
-    say(Stage.SCORE)
-    first = selection.rank(declared)
-    mode, steps = selection.adopted(declared, simulated, first)
-    return _grown(_Search(declared, first, mode, steps), selection)
-
-
-def _grown(search: _Search, selection: Selection) -> _Search:
-    """Add effects by innovations, each ranked beside those before; drop what is then needless."""
-    criteria, say = selection.criteria, selection.say
-    mode, steps = search.mode, list(search.steps)
-    ranked = search.first if mode is search.declared else selection.rank(mode)
-    while ranked and len(steps) < criteria.most_added:
-        step = selection.best_addition(mode, ranked)
-        if step is None:
-            break
-        say(f"added {step.signature.candidate.effect} on {step.signature.candidate.body}")
-        steps.append(step)
-        mode = step.after
-        ranked = selection.rank(mode)
-    if len(steps) > 1:
-        say(Stage.PRUNE)
-        mode, steps = selection.prune(mode, steps)
-    return replace(search, mode=mode, steps=steps)
-
-
 def _prior_test(
     task: _Task,
     train: History,
@@ -399,7 +402,7 @@ def _prior_test(
     fixed: Mapping[str, float] | None = None,
 ) -> ResidualTest:
     """Test whether the prior, with some parameters held, could have made the data."""
-    horizon = telling_horizon(train, task.criteria.prior)
+    horizon = telling_horizon(train)
     problem = Problem.of(Physics(task.scene, effects, threads=2), train, horizon=horizon)
     checked = prior_predictive_check(
         problem, seed=task.seed, fixed=fixed, criteria=task.criteria.prior
@@ -439,6 +442,8 @@ def _fit(task: _Task, mode: Mode) -> tuple[Fit, list[Warning], list[str]]:
     """
     # one thread a chain: more would wait for each other
     mode = replace(mode, problem=mode.problem.with_physics(threads=1))
+    if mode.problem.likelihood.simulated:
+        mode = tempered_mode(mode)
     method, said = task.method, []
     for n in _DRAWS.get(method, _CHAIN_DRAWS) if task.draws is None else (task.draws,):
         tune = max(100, 5 * n // 8)
@@ -468,44 +473,41 @@ def _converged(fit: Fit, criteria: Criteria) -> bool:
     return record.max_rhat <= criteria.worst_rhat and record.min_ess >= criteria.least_ess
 
 
-def _put_together(task: _Task, judged: _Judged, declared: _Model, revised: _Model) -> Loop:
+def _put_together(task: _Task, judged: _Judged, before: Fit, after: Fit, recorded: History) -> Loop:
     """Return the result of the stages; errors are forecasts of ``judged.rollout`` intervals."""
-    recordings, steps = judged.recordings, judged.search.steps
-    train, misfit, rollout = recordings.train, judged.misfit, judged.rollout
-    scene, held_out, criteria = task.scene, revised.held_out, task.criteria
+    cleaned, misfit, rollout = judged.cleaned, judged.misfit, judged.rollout
+    declared, revised, laws = judged.declared, judged.revised, judged.searched.laws
+    scene, held_out = task.scene, revised.held_out
     test = held_out.problem.data.history
-    unit = measurement_noise(revised.mode, revised.excess)
-    before = declared.held_out.errors(held_out, declared.fit, rollout, task.seed, unit)
-    after = before
-    if revised is not declared:
-        after = held_out.errors(held_out, revised.fit, rollout, task.seed, unit)
-    verdict = EFFECTS_ADDED if steps else ADEQUATE
-    unexplained = misfit.unexplained
-    # added effects that leave an acceleration unexplained are at best near the right ones
-    if unexplained is not None and not (steps and misfit.predicts(criteria)):
-        verdict = UNEXPLAINED
-    if steps and after.normalised_rmse > (1.0 + criteria.negligible) * before.normalised_rmse:
-        verdict, unexplained = UNEXPLAINED, unexplained or _worse(before, after)
-    if not all(_converged(model.fit, criteria) for model in (declared, revised)):
-        verdict = NOT_CONVERGED
-    added = tuple(_added(step, revised) for step in steps)
-    keep_groups(revised.fit.posterior, added)
+    unit = measurement_noise(revised.innovations, revised.excess)
+    errors = [
+        model.held_out.errors(held_out, fit, rollout, task.seed, unit)
+        for model, fit in ((declared, before), (revised, after))[revised is declared :]
+    ]
+    verdict, unexplained = _verdict(
+        misfit, len(laws), errors[0], errors[-1],
+        all(_converged(fit, task.criteria) for fit in (before, after)), task.criteria,
+    )  # fmt: skip
+    added = _added(judged, after)
+    keep_groups(after.posterior, added)
     first, last = declared.excess, revised.excess
-    noise = noise_alone(revised.mode, last)
     return Loop(
         scene=scene,
         verdict=verdict,
         numerical=Numerical(
-            scene.substeps, revised.mode.problem.physics.substeps, shift(revised.mode)
+            scene.substeps,
+            revised.innovations.problem.physics.substeps,
+            shift(revised.innovations),
         ),
-        candidates=(),
+        candidates=_explained(judged),
         added=added,
         unexplained=unexplained,
-        before=before,
-        after=after,
-        noise_floor=held_out.noise_floor(noise, rollout),
-        declared=declared.fit,
-        revised=revised.fit,
+        before=errors[0],
+        after=errors[-1],
+        noise_floor=held_out.noise_floor(noise_alone(revised.innovations, last), rollout),
+        declared=before,
+        revised=after,
+        innovations=(declared.innovations, revised.innovations),
         residuals_before=declared.held_out.residuals(held_out),
         residuals_after=held_out.residuals(held_out),
         rollout=example_rollout(declared.held_out, held_out),
@@ -513,10 +515,10 @@ def _put_together(task: _Task, judged: _Judged, declared: _Model, revised: _Mode
         provenance={
             "seed": task.seed,
             "versions": versions(),
-            "data_sha256": train.data_sha256,
+            "data_sha256": cleaned.train.data_sha256,
             "test_sha256": test.data_sha256,
-            "transitions": train.n_transitions,
-            "trajectories": train.n_trajectories,
+            "transitions": cleaned.train.n_transitions,
+            "trajectories": cleaned.train.n_trajectories,
             "test_transitions": test.n_transitions,
             "rollout_horizon": rollout,
             "rollout_seconds": rollout * scene.time_step,
@@ -531,13 +533,47 @@ def _put_together(task: _Task, judged: _Judged, declared: _Model, revised: _Mode
         ),
         correlations=misfit.correlations,
         growth=misfit.growth,
-        identifiability=identify(revised.fit.posterior, mode=revised.mode),
-        loo=compare(declared.fit.posterior, revised.fit.posterior),
-        velocities_not_used=recordings.unused,
-        bad_frames=recordings.bad_frames,
-        criteria=criteria,
+        rungs=judged.searched.found.rungs,
+        small=judged.small,
+        identifiability=identify(after.posterior, mode=revised.mode),
+        loo=_compared(declared.mode, revised.mode, before, after),
+        velocities_not_used=cleaned.unused,
+        bad_frames=cleaned.bad_frames,
+        criteria=task.criteria,
+        held_out=recorded,
         catalogue=task.catalogue,
     )
+
+
+def _compared(declared: Mode, revised: Mode, before: Fit, after: Fit) -> Comparison | None:
+    """Compare the posteriors by cross-validation, where both temper their densities alike."""
+    times = [
+        np.array(output_error(mode.problem).tau)
+        if mode.problem.likelihood.simulated
+        else np.ones(1)
+        for mode in (declared, revised)
+    ]
+    alike = times[0].shape == times[1].shape and np.allclose(times[0], times[1], rtol=0.1)
+    return compare(before.posterior, after.posterior) if alike else None
+
+
+def _verdict(
+    misfit: Misfit, laws: int, before: Errors, after: Errors, converged: bool, criteria: Criteria
+) -> tuple[str, Unexplained | None]:
+    """Return the verdict and what is unexplained, from tests and held-out errors alone.
+
+    What remains beside named laws and is small, so that forecasts are at the noise floor, changes
+    no verdict; nor does an error below the noise, which says nothing of either model.
+    """
+    unexplained = misfit.unexplained
+    worse = after.normalised_rmse > (1.0 + criteria.negligible) * max(before.normalised_rmse, 1.0)
+    if laws and worse:
+        unexplained = unexplained or _worse(before, after)
+    if not converged:
+        return NOT_CONVERGED, unexplained
+    if (laws and worse) or (unexplained is not None and not (laws and misfit.predicts(criteria))):
+        return UNEXPLAINED, unexplained
+    return (EFFECTS_ADDED if laws else ADEQUATE), unexplained
 
 
 def _worse(before: Errors, after: Errors) -> Unexplained:
@@ -551,34 +587,63 @@ def _worse(before: Errors, after: Errors) -> Unexplained:
     return Unexplained("", "", NOTHING_RECORDED, 0.0, float("nan"), sentence)
 
 
-def _added(step: Step, revised: _Model) -> Added:
-    """Return an added effect with its posterior."""
-    candidate, effect = step.signature.candidate, step.signature.attached.effect
-    named = {
-        named_beside(law, step.signature.attached) for law in revised.mode.problem.physics.effects
-    }  # an effect that was added as well is told from it
-    drawn = posterior_draws(revised.fit.posterior)
-    bodies = [
-        attached.body
-        for attached in revised.mode.problem.physics.effects
-        if attached.effect.name == effect.name
-    ]
-    estimates = {}
-    for parameter in effect.parameters:
-        values = drawn[effect.variable(parameter)][:, bodies.index(candidate.body)]
-        estimates[parameter.name] = Estimate(
-            float(values.mean()), float(values.std()), interval(values), parameter.unit
+def _explained(judged: _Judged) -> tuple[Candidate, ...]:
+    """Return the candidates with what simulations say of each, and the decision on it."""
+    searched = judged.searched
+    found, result = searched.found, []
+    groups = {rival: law for law, rivals in found.confounded.items() for rival in rivals}
+    for signature in searched.ranked:
+        law, why = signature.attached, "takes too little off the error of simulated trajectories"
+        alone = found.tried.get(law)
+        if law in searched.laws:
+            why = "added"
+        elif law in groups:
+            why = f"explains these data as well as {groups[law].effect.name.replace('_', ' ')}"
+        elif law in found.rejected:
+            why = found.rejected[law]
+        elif isinstance(law.effect.stage, Noise):
+            why = "the noise's shape is scored and never added: declare it"
+        result.append(
+            replace(
+                signature.candidate,
+                why=why,
+                simulated_nats=alone.nats if alone else None,
+                simulated_share=alone.share if alone else None,
+            )
         )
-    return Added(
-        effect=candidate.effect,
-        body=candidate.body,
-        sentence=candidate.sentence,
-        statistic=candidate.statistic,
-        p_value=candidate.p_value,
-        parameters=estimates,
-        not_separable_from=tuple(n for n in step.not_separable_from if n not in named),
-        elpd_difference=step.elpd_difference,
-        elpd_difference_se=step.elpd_difference_se,
-        simulated_nats=step.simulated.nats if step.simulated else None,
-        simulated_share=step.simulated.share if step.simulated else None,
-    )
+    return tuple(result)
+
+
+def _added(judged: _Judged, revised: Fit) -> tuple[Added, ...]:
+    """Return the added effects with their posterior."""
+    searched, drawn = judged.searched, posterior_draws(revised.posterior)
+    found = searched.found
+    scored = {signature.attached: signature.candidate for signature in searched.ranked}
+    effects = judged.revised.mode.problem.physics.effects
+    added = []
+    for law, words in searched.laws.items():
+        bodies = [one.body for one in effects if one.effect.name == law.effect.name]
+        estimates = {}
+        for parameter in law.effect.parameters:
+            values = drawn[law.effect.variable(parameter)][:, bodies.index(law.body)]
+            estimates[parameter.name] = Estimate(
+                float(values.mean()), float(values.std()), interval(values), parameter.unit
+            )
+        gained, error = elpd_gain(found.without[law], found.after)
+        added.append(
+            Added(
+                effect=words.effect,
+                body=words.body,
+                sentence=words.sentence,
+                statistic=scored[law].statistic,
+                p_value=scored[law].p_value,
+                parameters=estimates,
+                not_separable_from=words.confounded,
+                elpd_difference=gained,
+                elpd_difference_se=error,
+                simulated_nats=words.nats,
+                simulated_share=words.share,
+                main=words.main,
+            )
+        )
+    return tuple(added)

@@ -18,6 +18,9 @@ from pbrl_ppl.criticism.unexplained import innovations_over_steps
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.state import STATE, WRENCH, Bools, Floats, Ints
 
+#: Intervals up to which innovations are correlated with earlier ones and with commands; a
+#: correlation counts if it is taken over more pairs than this.
+_LAGS, _LEAST_PAIRS = 5, 10
 _WHITENESS, _COMMANDS = "whiteness", "correlation with commands"
 
 
@@ -41,7 +44,7 @@ class _Correlation:
     @property
     def enough(self) -> Bools:
         """Return which were taken over enough pairs."""
-        return np.asarray(self.pairs > self.criteria.residual.least_pairs)
+        return np.asarray(self.pairs > _LEAST_PAIRS)
 
     @property
     def p_value(self) -> float:
@@ -102,7 +105,7 @@ def correlation_tests(
     if names:
         driven = _lagged(white, seen, number, series, criteria)
         values = driven.values
-        p_value = _regression_p_value(white, seen, number, series, criteria)
+        p_value = _regression_p_value(white, seen, number, series)
         if p_value is not None:
             commands = _test(driven, p_value, share, cells, names)
     return (whiteness, commands), Correlations(
@@ -115,7 +118,7 @@ def _lagged(
 ) -> _Correlation:
     """Return correlations with series some intervals before, or of each coordinate with itself."""
     values, pairs = [], []
-    for lag in range(1 if series is None else 0, criteria.residual.lags + 1):
+    for lag in range(1 if series is None else 0, _LAGS + 1):
         end = max(len(number) - lag, 0)
         same = number[lag:] == number[:end]
         later, counts = white[lag:][same][:, None], seen[lag:][same][:, None]
@@ -145,9 +148,7 @@ def _commands(mode: Mode) -> tuple[Floats, list[str]]:
     return np.array(columns).reshape(len(columns), segments.n).T, names
 
 
-def _regression_p_value(
-    white: Floats, seen: Bools, number: Ints, commands: Floats, criteria: Criteria
-) -> float | None:
+def _regression_p_value(white: Floats, seen: Bools, number: Ints, commands: Floats) -> float | None:
     """Return the p-value of the regression on commands of several lags; None if data are too few.
 
     Commands that are held are correlated over lags, so their correlations with innovations are not
@@ -155,7 +156,7 @@ def _regression_p_value(
     chi-squared.
     """
     lagged = []
-    for lag in range(criteria.residual.lags + 1):
+    for lag in range(_LAGS + 1):
         before = np.roll(commands, lag, axis=0)
         before[:lag] = 0.0
         lagged.append(np.where((number == np.roll(number, lag))[:, None], before, 0.0))
@@ -163,7 +164,7 @@ def _regression_p_value(
     statistic, count = 0.0, 0
     for cell in range(white.shape[1]):
         rows = seen[:, cell]
-        if rows.sum() <= criteria.residual.least_pairs * x.shape[1] // 2:
+        if rows.sum() <= _LEAST_PAIRS * x.shape[1] // 2:
             continue
         u, size, _ = np.linalg.svd(x[rows], full_matrices=False)
         u = u[:, size > 1e-6 * size.max(initial=0.0)]

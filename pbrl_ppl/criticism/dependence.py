@@ -8,7 +8,6 @@ import numpy as np
 from scipy.stats import rankdata
 
 from pbrl_ppl.criticism.criteria import Criteria
-from pbrl_ppl.criticism.cross_validation import folds
 from pbrl_ppl.criticism.results import ResidualTest, Unexplained
 from pbrl_ppl.criticism.unexplained import innovations_over_steps
 from pbrl_ppl.likelihood import Problem
@@ -62,12 +61,30 @@ PRODUCTS = {
 QUANTITIES = FEATURES | {name: f"{FEATURES[a]} {FEATURES[b]}" for name, (a, b) in PRODUCTS.items()}
 
 
+def folds(mode: Mode, least: int = 8) -> Ints:
+    """Return the fold of each transition, shape (transition,): its trajectory, or a run of it.
+
+    Given the measurements before, innovations of different runs are independent. There are at
+    ``least`` so many.
+    """
+    segments = mode.problem.segments
+    trajectory, step = segments.trajectory, segments.step
+    count = len(np.unique(trajectory))
+    if count >= least:
+        return np.unique(trajectory, return_inverse=True)[1].astype(np.intp)
+    runs = -(-least // count)
+    length = np.array([(trajectory == t).sum() for t in trajectory])
+    run = np.minimum(step * runs // np.maximum(length, 1), runs - 1)
+    return np.unique(trajectory * runs + run, return_inverse=True)[1].astype(np.intp)
+
+
 def find_dependence(
     mode: Mode,
     criteria: Criteria,
     *,
     seed: int = 0,
     permutations_a_body: int = 500,
+    least_transitions: int = 20,
     most_transitions: int = 1500,
 ) -> tuple[ResidualTest, Unexplained | None]:
     """Test whether the innovations of a fitted model depend on state, action or time.
@@ -86,6 +103,8 @@ def find_dependence(
         Seed of the permutations and the folds.
     permutations_a_body : int
         By default the smallest p-value is a fifth of the significance.
+    least_transitions : int
+        Transitions that the test needs.
     most_transitions : int
         Transitions of the test, at most: more take long and change nothing.
 
@@ -99,14 +118,14 @@ def find_dependence(
     rng = np.random.default_rng(seed)
     problem = mode.problem
     n, limits = problem.segments.n, criteria.residual
-    if n < limits.least_transitions:
+    if n < least_transitions:
         return ResidualTest.untested(DEPENDENCE, "too few transitions"), None
     tests = len(problem.scene.dynamic)
     permutations = permutations_a_body * tests - 1
     chosen = np.sort(rng.permutation(n)[:most_transitions])
     places = mode.problem.trajectory_noise.coordinates.places
     innovations = mode.whitened_residual[chosen]
-    groups = folds(mode, criteria)[chosen]
+    groups = folds(mode)[chosen]
     relative = innovations_over_steps(mode)
     best: Unexplained | None = None
     for i, body in enumerate(problem.scene.moving):

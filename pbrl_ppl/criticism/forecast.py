@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pbrl_ppl.likelihood import Problem, TrajectoryNoise
-from pbrl_ppl.modes import Mode
 from pbrl_ppl.state import STATE, Bools, Floats, Ints
 
 #: Rows after which a filter's covariance has settled.
@@ -241,38 +240,3 @@ def _first_spread(noise: TrajectoryNoise, sigma: Floats, first: int) -> Floats:
         seen = way[noise.seen[k]] / error[noise.seen[k], None]
         information += seen.T @ seen
     return np.asarray(scale[:, None] * np.linalg.inv(information) * scale)
-
-
-def forecast_change(before: Mode, after: Mode) -> float:
-    """Return the change of long forecasts over the motion in that time, of the worst coordinate.
-
-    Near the noise any share of an error is small beside the motion.
-    """
-    return _change(*_forecasts(before, after))
-
-
-def _change(worse: Forecast, better: Forecast) -> float:
-    """Return the change of forecasts over the motion, of the worst coordinate; 0 without any."""
-    if not len(worse.error):
-        return 0.0
-    change = _squares(worse.error - better.error)
-    motion = _squares(np.where(np.isnan(worse.error), np.nan, worse.motion))
-    return float(np.sqrt((change / np.maximum(motion, 1e-300)).max()))
-
-
-def _forecasts(before: Mode, after: Mode) -> tuple[Forecast, Forecast]:
-    """Return the longest forecasts of both models; errors are NaN where one diverges."""
-    intervals = longest_forecast(after.problem)
-    worse, better = (
-        forecast(mode.problem, mode.phi, mode.sigma, intervals) for mode in (before, after)
-    )
-    both = np.isfinite(worse.error) & np.isfinite(better.error)
-    worse, better = (
-        replace(made, error=np.where(both, made.error, np.nan)) for made in (worse, better)
-    )
-    return worse, better
-
-
-def _squares(values: Floats) -> Floats:
-    """Return sums of squares, shape (coordinate,), of values (start, coordinate) or NaN."""
-    return np.asarray(np.nansum(values**2, axis=0))

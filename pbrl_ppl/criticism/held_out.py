@@ -118,12 +118,11 @@ class HeldOut:
         mode, of_unit = self.mode, unit.problem.trajectory_noise
         seen = of_unit.seen
         whitened = self.whitened(unit) * of_unit.scale(unit.mode.sigma) / of_unit.scale(noise)
-        phi, sigma = fit.draws
+        phi = fit.draws[0]
         rng = np.random.default_rng(seed)
-        chosen = rng.choice(len(phi), min(most_draws, len(phi)), replace=False)
-        phi, sigma = phi[chosen], sigma[chosen]
+        phi = phi[rng.choice(len(phi), min(most_draws, len(phi)), replace=False)]
         residual = self.problem.residual(phi, self.problem.one_world)
-        density = self.problem.log_density(residual, sigma, phi)
+        density = self.problem.log_density(residual, np.tile(mode.sigma, (len(phi), 1)), phi)
         return Errors(
             one_step_rmse=forecast(self.problem, mode.phi, mode.sigma, 1).rmse(),
             rollout_rmse=forecast(self.problem, mode.phi, mode.sigma, rollout).rmse(),

@@ -22,6 +22,7 @@ from pbrl_ppl.criticism.results import (
     Numerical,
     ResidualTest,
     Rollout,
+    Rung,
     Unexplained,
 )
 from pbrl_ppl.effects import Effect
@@ -29,6 +30,7 @@ from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import FitError, OutputError
 from pbrl_ppl.files import json_values
 from pbrl_ppl.history import History, UnusedVelocity
+from pbrl_ppl.modes import Mode
 from pbrl_ppl.posterior import Comparison, Fit, Idata, Identifiability, save_posterior
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats
@@ -54,7 +56,7 @@ class Loop:
     numerical : Numerical
         Engine substeps, and the numerical error that is left.
     candidates : tuple of Candidate
-        All candidates of the first round, best first.
+        All candidates, by their score tests at the declared model, best first.
     added : tuple of Added
         Effects added, in order.
     unexplained : Unexplained or None
@@ -63,6 +65,8 @@ class Loop:
         Held-out errors of the declared model, of the revised one, and of the noise alone.
     declared, revised : Fit
         Both models with their posteriors; the same object twice if nothing was added.
+    innovations : tuple of Mode
+        Both models with whole trajectories filtered, which the tests are made with.
     residuals_before, residuals_after : dict of str to ndarray
         Held-out residuals in units of noise per state dimension, 1-d arrays.
     rollout : Rollout
@@ -79,8 +83,10 @@ class Loop:
         Correlations of the revised model's innovations.
     growth : Growth
         Growth of the revised model's forecast errors.
+    rungs : tuple of Rung
+        What the search found on pieces of each length.
     small : tuple of Candidate
-        Effects that are significant and negligible; they were not added.
+        Effect that is significant in the innovations and was not added, if there is one.
     identifiability : Identifiability or None
         Which parameters of the revised model the data inform.
     loo : Comparison or None
@@ -110,6 +116,7 @@ class Loop:
     noise_floor: Errors
     declared: Fit
     revised: Fit
+    innovations: tuple[Mode, Mode]
     residuals_before: Mapping[str, Floats]
     residuals_after: Mapping[str, Floats]
     rollout: Rollout
@@ -119,6 +126,7 @@ class Loop:
     acceleration: Acceleration
     correlations: Correlations
     growth: Growth
+    rungs: tuple[Rung, ...] = ()
     small: tuple[Candidate, ...] = ()
     identifiability: Identifiability | None = None
     loo: Comparison | None = None
@@ -148,7 +156,7 @@ class Loop:
         """Return in a sentence what the learned remainder does; empty without one."""
         if self.remainder is None:
             return ""
-        return remainder_in_words(self.posterior_after, self.remainder)
+        return remainder_in_words(self.innovations[-1], self.remainder)
 
     def learn_remainder(
         self,
@@ -207,6 +215,7 @@ class Loop:
                 "added": [_fields(added, "sentence") for added in self.added],
                 "candidates": [_fields(item, "sentence", "units") for item in self.candidates],
                 "small": [[candidate.effect, candidate.body] for candidate in self.small],
+                "search": self.rungs,
                 "tests": self.tests,
                 "unexplained_acceleration": self.acceleration,
                 "unexplained": self.unexplained,

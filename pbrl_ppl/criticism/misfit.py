@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +13,9 @@ from pbrl_ppl.criticism.criteria import Criteria
 from pbrl_ppl.criticism.dependence import find_dependence
 from pbrl_ppl.criticism.forecast import forecast
 from pbrl_ppl.criticism.results import Correlations, Growth, ResidualTest, Unexplained
+from pbrl_ppl.criticism.score import Signature
 from pbrl_ppl.criticism.unexplained import UnexplainedAcceleration, noise_alone
+from pbrl_ppl.effects import Noise
 from pbrl_ppl.likelihood import bodies_acceleration
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.state import STATE, Floats
@@ -20,6 +23,8 @@ from pbrl_ppl.state import STATE, Floats
 #: Names of the tests that a model must pass to predict well.
 ACCELERATION, FORECASTS, PRIOR = "unexplained acceleration", "forecasts", "prior"
 HELD_OUT = "held-out forecasts"
+#: Name of the test for effects of the catalogue.
+CANDIDATES = "effects of the catalogue"
 #: What an unexplained residual depends on where no quantity predicts it.
 NOTHING_RECORDED = "nothing that was recorded"
 #: Shares of the bodies' acceleration from here on are of bodies that hardly accelerate.
@@ -178,12 +183,41 @@ def held_out_forecasts(mode: Mode, sigma: Floats, horizon: int, criteria: Criter
     return replace(test, name=HELD_OUT, sentence=f"held out: {test.sentence}")
 
 
+def score_test(mode: Mode, ranked: Sequence[Signature], criteria: Criteria) -> ResidualTest:
+    """Return the test of the innovations for effects of the catalogue that the model lacks.
+
+    It fails where one is significant and would take more than a negligible share off them.
+    """
+    square = float((mode.whitened_residual**2).sum())
+    scored = [one.candidate for one in ranked if not isinstance(one.attached.effect.stage, Noise)]
+    if not scored or not square > 0.0:
+        return ResidualTest.untested(CANDIDATES, "no effect of the catalogue is left")
+    first = min(scored, key=lambda candidate: candidate.p_value)
+    share = 1.0 - float(np.sqrt(max(1.0 - first.statistic / square, 0.0)))
+    certain = first.p_value < criteria.false_alarm
+    name = f"{first.effect.replace('_', ' ')} on {first.body}"
+    sentence = "no effect of the catalogue is significant in the innovations"
+    if certain:
+        sentence = f"{name} would take {100 * share:.2g} % off the innovations"
+        sentence += ", which is negligible" if share < criteria.negligible else ""
+    passed = not certain or share < criteria.negligible
+    return ResidualTest(CANDIDATES, first.p_value, share, passed, sentence, body=first.body)
+
+
 def _forecasts(
-    mode: Mode, sigma: Floats, horizon: int, criteria: Criteria, most_lengths: int = 6
+    mode: Mode,
+    sigma: Floats,
+    horizon: int,
+    criteria: Criteria,
+    *,
+    most_lengths: int = 6,
+    most_error: float = 3.0,
 ) -> tuple[ResidualTest, Growth]:
     """Return the test of forecasts' errors against those of noise and a negligible acceleration.
 
-    A picture shows their growth over at most ``most_lengths`` lengths.
+    A picture shows their growth over at most ``most_lengths`` lengths. An error counts for no more
+    than ``most_error`` times its expected size: a single one that a bad frame or a grazing contact
+    spoils is no misfit.
     """
     noise = mode.problem.trajectory_noise
     lengths = np.diff(np.append(np.flatnonzero(noise.first), len(noise.first)))
@@ -202,7 +236,7 @@ def _forecasts(
         if not z.size:
             continue
         # forecasts overlap by half, so half of them count
-        total = np.minimum(z, criteria.residual.most_error**2).sum() / 2
+        total = np.minimum(z, most_error**2).sum() / 2
         chance = len(dimensions) * float(chi2.sf(total, max(z.size / 2, 1)))
         if np.sqrt(z.mean()) > worst:
             worst, p_value, name = float(np.sqrt(z.mean())), min(1.0, chance), STATE[d]

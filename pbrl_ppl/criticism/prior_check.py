@@ -79,7 +79,7 @@ class PriorCheck:
                 if chance > limits.chance:
                     continue
                 # a position changes mostly by the velocity before, which is in the same units
-                factor = "" if str(state) in POSE else _unit(changes["factor"], limits)
+                factor = "" if str(state) in POSE else _unit(changes["factor"])
                 sentences.append(
                     f"{state} of {body} changes by up to {float(changes['measured_largest']):.3g}"
                     f" {unit} in {self.seconds:g} s; under the prior 94 % of changes are within"
@@ -108,6 +108,8 @@ def prior_predictive_check(
     fixed: Mapping[str, float] | None = None,
     criteria: PriorCriteria = DEFAULT.prior,
     chunk: int = 16,
+    slack: float = 0.25,
+    least_draws: int = 50,
 ) -> PriorCheck:
     """Compare measured changes over a segment with predictions under the prior.
 
@@ -131,6 +133,10 @@ def prior_predictive_check(
         When the prior could not have made the data.
     chunk : int
         Draws simulated at once.
+    slack : float
+        Share of the usual change by which draws may miss where velocities were not measured.
+    least_draws : int
+        Draws that the check needs.
 
     Returns
     -------
@@ -155,8 +161,8 @@ def prior_predictive_check(
     problem = getattr(model, "problem", model)
     if not isinstance(problem, Problem):
         raise FitError("prior check: this pm.Model was not made by physics_model; make it so")
-    if draws < criteria.least_draws:
-        raise ValueError(f"draws is {draws}, expected at least {criteria.least_draws}")
+    if draws < least_draws:
+        raise ValueError(f"draws is {draws}, expected at least {least_draws}")
     rng = np.random.default_rng(seed)
     observations, segments = problem.observations, problem.segments
     columns = list(observations.columns)
@@ -198,7 +204,7 @@ def prior_predictive_check(
     derived = np.ones(measured.shape[1:])
     for i, d in enumerate(columns):
         derived[:, i] = ~recorded[:, d if d >= len(POSE) else d + len(POSE)]
-    dataset = _compare(observations.wrapped(predicted - first), measured, criteria.slack * derived)
+    dataset = _compare(observations.wrapped(predicted - first), measured, slack * derived)
     dataset = dataset.merge(_factors(exact, measured))
     coords = {
         "body": [body.name for body in problem.scene.moving],
@@ -226,15 +232,18 @@ def _factors(exact: Floats, measured: Floats) -> xr.Dataset:
     return xr.Dataset({"factor": (("quantile", "body", "state"), quantiles)})
 
 
-def _unit(factor: xr.DataArray, criteria: PriorCriteria) -> str:
-    """Return a hint if measured changes are a factor of wrong units larger or smaller."""
+def _unit(factor: xr.DataArray, beyond: float = 1.5) -> str:
+    """Return a hint if measured changes are a factor of wrong units larger or smaller.
+
+    ``beyond``: such a factor may lie this far beyond the range of the prior's.
+    """
     low, middle, high = (float(factor[i]) for i in (0, len(QUANTILES) // 2, -1))
     if not low > 0:  # nothing was predicted, or motion the other way
         return ""
     over, size = ("", middle) if middle > 1 else ("1/", 1 / middle)
     if middle <= 1:
         low, high = 1 / high, 1 / low
-    low, high = low / criteria.unit_factor, high * criteria.unit_factor
+    low, high = low / beyond, high * beyond
     near = [factor_of_units for factor_of_units in _UNITS if low < factor_of_units < high]
     if low < 1 or not near:
         return ""
@@ -254,7 +263,7 @@ def _at(states: Floats, step: Ints) -> Floats:
     return np.asarray(np.take_along_axis(states, picked, axis=-3)[..., 0, :, :])
 
 
-def telling_horizon(history: History, criteria: PriorCriteria = DEFAULT.prior) -> int:
+def telling_horizon(history: History, signal: float = 5.0) -> int:
     """Return the intervals in which bodies move well beyond the measurement noise: often one.
 
     In a fast recording an interval shows hardly more than noise, which does not depend on the
@@ -264,8 +273,8 @@ def telling_horizon(history: History, criteria: PriorCriteria = DEFAULT.prior) -
     ----------
     history : History
         The recording.
-    criteria : PriorCriteria
-        How far beyond the noise.
+    signal : float
+        Changes are this many times the measurement errors.
     """
     observed = history.dataset["observed"].to_numpy()[..., : len(POSE)]
     places = observed.transpose(0, 2, 3, 1).reshape(-1, observed.shape[1])
@@ -277,7 +286,7 @@ def telling_horizon(history: History, criteria: PriorCriteria = DEFAULT.prior) -
         steps.append(min(2 * steps[-1], longest))
     noise = _mean_square(places, angle, 1, 3) / 20.0
     changes = np.array([_mean_square(places, angle, step, 1) for step in steps])
-    telling = changes >= criteria.signal**2 * noise
+    telling = changes >= signal**2 * noise
     moves = (telling & (changes > 0.0)).any(
         axis=0
     )  # what never moves beyond its noise does not decide

@@ -87,7 +87,15 @@ def checked_histories(
     return train, test, unused, (*map(str, bad), *held_out)
 
 
-def outliers(mode: Mode, criteria: Criteria = DEFAULT) -> Floats:
+def outliers(
+    mode: Mode,
+    criteria: Criteria = DEFAULT,
+    *,
+    errors_off: float = 4.0,
+    neighbours: float = 2.0,
+    most: float = 0.05,
+    least_measurements: int = 12,
+) -> Floats:
     """Return errors of single measurements that a fitted model and all others contradict.
 
     They are judged by the residual given all other measurements (auxiliary residuals), without any
@@ -99,14 +107,22 @@ def outliers(mode: Mode, criteria: Criteria = DEFAULT) -> Floats:
     mode : Mode
         Fitted to whole trajectories.
     criteria : Criteria
-        When a measurement is left out.
+        How far off a measurement is to be left out.
+    errors_off : float
+        It is this many measurement errors from the smoothed state, which it attracts.
+    neighbours : float
+        It is this many times as far off as its neighbours, which an event that lasts moves, too.
+    most : float
+        If a larger share of a coordinate's measurements is far off, none is left out.
+    least_measurements : int
+        Measurements of a coordinate that are needed to call one far off.
 
     Returns
     -------
     ndarray
         Measured minus smoothed, shape (trajectory, time, body, 6), SI units; NaN elsewhere.
     """
-    problem, limits = mode.problem, criteria.outliers
+    problem = mode.problem
     noise, segments = problem.trajectory_noise, problem.segments
     residual = noise.coordinates.of_residual(problem.residual(mode.phi))
     sigma = without_acceleration(mode).sigma
@@ -122,12 +138,12 @@ def outliers(mode: Mode, criteria: Criteria = DEFAULT) -> Floats:
     for cell, place in enumerate(noise.coordinates.places):
         sizes = size[:, cell]
         count = np.isfinite(sizes).sum()
-        if noise.coordinates.sensor[cell] < 0 or count < limits.least_measurements:
+        if noise.coordinates.sensor[cell] < 0 or count < least_measurements:
             continue
-        far = sizes > limits.deviations * np.nanmedian(sizes) / norm.isf(0.25)
-        far &= np.abs(off[:, cell]) > limits.errors * error[cell]
-        far &= sizes > limits.neighbours * np.nan_to_num(_beside(sizes, trajectory, row))
-        if 0 < far.sum() <= max(limits.most * count, 1):
+        far = sizes > criteria.outlier_deviations * np.nanmedian(sizes) / norm.isf(0.25)
+        far &= np.abs(off[:, cell]) > errors_off * error[cell]
+        far &= sizes > neighbours * np.nan_to_num(_beside(sizes, trajectory, row))
+        if 0 < far.sum() <= max(most * count, 1):
             flat[trajectory[far], row[far], place] = off[far, cell]
     return errors
 

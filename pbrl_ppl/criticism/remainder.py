@@ -12,16 +12,15 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
-from pbrl_ppl.criticism.cross_validation import gain
-from pbrl_ppl.criticism.refinement import with_effects
 from pbrl_ppl.criticism.results import Stage
 from pbrl_ppl.criticism.rivals import posterior_mode
+from pbrl_ppl.criticism.search import with_effects
 from pbrl_ppl.criticism.unexplained import unexplained_acceleration
 from pbrl_ppl.effects import LEARNED_REMAINDER, Effect, LearnedRemainder, learned_remainder
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import ACCELERATION
-from pbrl_ppl.modes import Mode, trajectory_mode
+from pbrl_ppl.modes import Mode, trajectory_evidence, trajectory_mode
 from pbrl_ppl.posterior import Fit, Idata, group
 from pbrl_ppl.posterior import draws as posterior_draws
 from pbrl_ppl.sampling import sample
@@ -94,8 +93,8 @@ def learn_remainder(
     Raises
     ------
     FitError
-        If no force depends on the velocity, or none improves cross-validated predictions; if the
-        posterior has a learned remainder already, or scikit-learn is missing.
+        If no force depends on the velocity, or none is worth its parameters; if the posterior has a
+        learned remainder already, or scikit-learn is missing.
     PosteriorError
         If the posterior is of single transitions.
     """
@@ -109,22 +108,24 @@ def learn_remainder(
     effect = _learned(mode, body, seed, criteria)
     say(Stage.REFIT)
     attached = effect.on(body)
-    start = with_effects(mode, (*mode.problem.physics.effects, attached), {attached: 0.0})
+    start = with_effects(
+        mode, (*mode.problem.physics.effects, attached), {attached: np.zeros(len(attached.labels))}
+    )
     refitted = trajectory_mode(*start, mode.sigma)
-    gained = gain(mode, refitted, criteria)
-    if gained.total < criteria.min_elpd or not gained.certain(criteria.min_elpd_se):
+    if trajectory_evidence(refitted) - trajectory_evidence(mode) < criteria.min_remainder:
         raise FitError(
-            f"nothing to learn: a force on {body} that follows its velocity does not help on"
-            " trajectories that were left out"
+            f"nothing to learn: a force on {body} that follows its velocity is not worth its"
+            " parameters (log-evidence)"
         )
     problem = refitted.problem.with_physics(threads=1)
     fit = sample(problem, method="laplace", seed=seed, draws=draws, start=refitted)
     return fit.posterior
 
 
-def remainder_in_words(before: Idata, after: Idata) -> str:
-    """Return a sentence on what a learned remainder does, from both posteriors."""
-    sizes = [posterior_draws(posterior)[ACCELERATION].mean(axis=0) for posterior in (before, after)]
+def remainder_in_words(before: Mode, after: Idata) -> str:
+    """Return a sentence on what a learned remainder does, from the innovations before it."""
+    places = before.problem.trajectory_noise.coordinates.accelerations
+    sizes = before.sigma[places], posterior_draws(after)[ACCELERATION].mean(axis=0)
     names = group(after, "posterior")[ACCELERATION]
     worst = int(np.argmax(sizes[0] - sizes[1]))
     name = str(names[names.dims[-1]].values[worst])

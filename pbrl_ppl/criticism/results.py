@@ -50,8 +50,9 @@ class Candidate:
     why : str
         Why the loop added it or did not; empty if it did not decide.
     simulated_nats, simulated_share : float or None
-        The same candidate by simulation: net log-evidence (nats) of a refit to whole trajectories,
-        and the share of their simulation error that it takes away; None if it was not refitted.
+        The same candidate by simulation, alone, to first order, on the shortest pieces: net
+        log-evidence (nats), and the share of their error that it takes away; None if it is not
+        among the leading ones.
     """
 
     effect: str
@@ -69,6 +70,87 @@ class Candidate:
     why: str = ""
     simulated_nats: float | None = None
     simulated_share: float | None = None
+
+
+@dataclass(frozen=True)
+class Law:
+    """A law that the simulation error of trajectories shows.
+
+    Parameters
+    ----------
+    effect, body, sentence : str
+        Names of the effect and of the body, and the effect in words.
+    estimate, sd, units : dict of str to float or str
+        Most probable value of each parameter, its standard deviation, which allows for the
+        residual's correlation, and its unit.
+    nats : float
+        Log-evidence that is lost without it, less its price.
+    share : float
+        Share of the simulation error (root mean square) that it takes away.
+    main : bool
+        Whether it is a main law: one that takes a large share away.
+    confounded : tuple of str
+        Effects that explain these data as well.
+    """
+
+    effect: str
+    body: str
+    sentence: str
+    estimate: Mapping[str, float]
+    sd: Mapping[str, float]
+    units: Mapping[str, str]
+    nats: float
+    share: float
+    main: bool = True
+    confounded: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class LawsOfSize:
+    """The best subset of laws of one size, to first order.
+
+    Parameters
+    ----------
+    laws : tuple of str
+        Names of effects and bodies.
+    nats : float
+        Log-evidence less its price.
+    error : float
+        Simulation error with them over that without.
+    """
+
+    laws: tuple[str, ...]
+    nats: float
+    error: float
+
+
+@dataclass(frozen=True)
+class Rung:
+    """A search on pieces of one length.
+
+    Parameters
+    ----------
+    rows : int
+        Intervals of a piece.
+    seconds : float
+        Its length (s).
+    error : dict of str to float
+        Simulation error (root mean square) of the model before, by dimension, SI units.
+    path : tuple of LawsOfSize
+        The best subset of further laws of each size, the smallest first.
+    accepted, dropped : tuple of str
+        Laws that were added, and those found needless beside them.
+    correlated : dict of str to float
+        Integrated autocorrelation time of the last residual, in rows: 1 if it is white.
+    """
+
+    rows: int
+    seconds: float
+    error: Mapping[str, float]
+    path: tuple[LawsOfSize, ...]
+    accepted: tuple[str, ...]
+    dropped: tuple[str, ...]
+    correlated: Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -190,16 +272,19 @@ class Added:
     effect, body, sentence : str
         Names of the effect and of the body, and the effect in words.
     statistic, p_value : float
-        Score test in the round in which it was found.
+        Score test at the declared model.
     parameters : dict of str to Estimate
         Posterior of each of its parameters.
     not_separable_from : tuple of str
         Effects that would explain these data as well.
     elpd_difference, elpd_difference_se : float
-        Gain of log predictive density on held-out transitions, and its standard error.
+        Gain of expected log predictive density over the model without it, and its standard error
+        (nats).
     simulated_nats, simulated_share : float or None
         What the simulation error of whole trajectories loses without it: net log-evidence (nats),
-        and the share of that error; None if innovations alone named it.
+        and the share of that error.
+    main : bool
+        Whether it is a main law; a small correction may stand for something else.
     """
 
     effect: str
@@ -213,6 +298,7 @@ class Added:
     elpd_difference_se: float
     simulated_nats: float | None = None
     simulated_share: float | None = None
+    main: bool = True
 
     @property
     def chance(self) -> float:
@@ -331,8 +417,8 @@ class Stage(StrEnum):
     Attributes
     ----------
     share : float or None
-        Share of the whole time at which the stage usually begins (measured on a pendulum with four
-        added effects); None for stages that are not always there.
+        Share of the whole time at which the stage usually begins (measured on a cart); None for
+        stages that are not always there.
     """
 
     share: float | None
@@ -345,11 +431,9 @@ class Stage(StrEnum):
 
     CHECK_PRIOR = "comparing the data with the prior", 0.02
     FIT = "fitting the declared model", 0.03
-    REPEAT = "measurement noise is correlated: going on with that"
-    SCORE = "scoring what the model might lack", 0.04
-    PRUNE = "checking that each added effect is still needed", 0.29
-    TEST = "testing the residual", 0.38
-    SIMULATE = "simulating whole trajectories with what the model might lack"
+    SIMULATE = "simulating whole trajectories with what the model might lack", 0.2
+    SCORE = "scoring what the model might lack"
+    TEST = "testing the residual", 0.4
     SAMPLE = "sampling the posteriors", 0.5
     COMPARE = "comparing errors on held-out data", 0.99
     LEARN = "learning a force for the residual"

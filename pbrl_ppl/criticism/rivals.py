@@ -8,10 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pbrl_ppl.criticism.refinement import with_effects
 from pbrl_ppl.criticism.results import Added
 from pbrl_ppl.criticism.score import rank_candidates
-from pbrl_ppl.criticism.selection import refitted
+from pbrl_ppl.criticism.search import with_effects
 from pbrl_ppl.effects import Attached, Effect, Noise
 from pbrl_ppl.errors import EffectError, PosteriorError
 from pbrl_ppl.modes import Mode, trajectory_mode
@@ -35,7 +34,7 @@ class Rival:
     draws : ndarray
         Draws from its posterior, shape (draw, p).
     sigma : ndarray
-        Noise parameters of the posterior that all rivals come from, shape (parameter,).
+        Noise parameters of the model that all rivals come from, shape (parameter,).
     """
 
     attached: Attached
@@ -156,7 +155,7 @@ def fit_rivals(
     fit = Fit.of(posterior, catalogue)
     declared = posterior_mode(fit)
     problem = declared.problem
-    phi, sigma = fit.draws
+    phi = fit.draws[0]
     if not 1 <= draws <= len(phi):
         raise PosteriorError(f"posterior: {draws} draws were asked for, expected 1 to {len(phi)}")
     rng = np.random.default_rng(seed)
@@ -165,14 +164,15 @@ def fit_rivals(
     if present:
         others = tuple(one for one in problem.physics.effects if one not in effects)
         base = trajectory_mode(*with_effects(declared, others), declared.sigma)
-    noise = np.median(sigma, axis=0)
     fits = []
     for attached in effects:
         if present == [attached]:
             chosen = phi[rng.choice(len(phi), draws, replace=False)]
-            fits.append(Rival(attached, declared, chosen, noise))
+            fits.append(Rival(attached, declared, chosen, declared.sigma))
             continue
         (signature,) = rank_candidates(base, [attached])
-        mode = refitted(base, signature)
-        fits.append(Rival(attached, mode, mode.draws(rng, draws), noise))
+        sizes = {attached: np.array(list(signature.candidate.estimate.values()))}
+        start = with_effects(base, (*base.problem.physics.effects, attached), sizes)
+        mode = trajectory_mode(*start, base.sigma)
+        fits.append(Rival(attached, mode, mode.draws(rng, draws), declared.sigma))
     return fits

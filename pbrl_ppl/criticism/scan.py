@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import norm
 
-from pbrl_ppl.criticism.criteria import ScoreCriteria
+from pbrl_ppl.criticism.criteria import ResidualCriteria
 from pbrl_ppl.effects import Attached, Effect
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.state import Floats
@@ -129,7 +129,7 @@ def detection_limits_of_scan(
     points: Sequence[GridPoint],
     units: Sequence[Floats],
     candidates: int,
-    criteria: ScoreCriteria,
+    criteria: ResidualCriteria,
 ) -> dict[str, float]:
     """Return the smallest detectable sizes of a scanned effect, each at its best grid point.
 
@@ -147,7 +147,7 @@ def detection_limits_of_scan(
         change, in units of noise.
     candidates : int
         Number of tests that the p-value is corrected for, beside the grid points.
-    criteria : ScoreCriteria
+    criteria : ResidualCriteria
         P-value and power of the limit.
     """
     tried = candidates * len(points)
@@ -175,12 +175,12 @@ def caps(effect: Effect, points: Sequence[GridPoint]) -> bool:
     )
 
 
-def _needed(tried: int, criteria: ScoreCriteria) -> float:
+def _needed(tried: int, criteria: ResidualCriteria) -> float:
     """Return the detectable change in units of noise, for a two-sided test."""
     return float(norm.isf(criteria.detection_p / 2 / tried) + norm.ppf(criteria.detection_power))
 
 
-def detectable_sizes(unit: Floats, tried: int, criteria: ScoreCriteria) -> list[float]:
+def detectable_sizes(unit: Floats, tried: int, criteria: ResidualCriteria) -> list[float]:
     """Return the smallest detectable size of each column, the others at their null values.
 
     Parameters
@@ -189,7 +189,7 @@ def detectable_sizes(unit: Floats, tried: int, criteria: ScoreCriteria) -> list[
         Change of the prediction by one unit of each column, in units of noise, shape (column,).
     tried : int
         Number of tests that the p-value is corrected for.
-    criteria : ScoreCriteria
+    criteria : ResidualCriteria
         P-value and power of the limit.
     """
     with np.errstate(divide="ignore"):

@@ -25,6 +25,11 @@ from pbrl_ppl.parameters import prior_residual, prior_slopes
 from pbrl_ppl.state import Floats, Ints
 from pbrl_ppl.threads import in_parallel
 
+#: Where the declared parameters leave less than this share of a signature they absorb it.
+ABSORBED = 1e-3
+#: A change below this, in units of noise, is the engine's rounding.
+VISIBLE = 1e-3
+
 
 @dataclass(frozen=True, eq=False)
 class Signature:
@@ -44,8 +49,8 @@ class Signature:
         Unit vector of the fitted signature, shape (n,); zero if there is none.
     absorbed : ndarray
         Change of the declared parameters with the effect of the estimated size, shape (p,).
-    fall : float
-        Share by which the innovations fall, to first order.
+    linear : tuple of Linearisation
+        At the null value, or at the leading grid points of a scan, best first.
     """
 
     attached: Attached
@@ -54,13 +59,53 @@ class Signature:
     basis: Floats
     direction: Floats
     absorbed: Floats
-    fall: float
+    linear: tuple[Linearisation, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Linearisation:
+    """Predictions of a candidate near one point, to first order.
+
+    Parameters
+    ----------
+    values : ndarray
+        The effect's parameters there, shape (q,).
+    columns : tuple of int
+        Parameters by which it is linear; none for a whole change, as by a threshold.
+    basis : ndarray
+        Orthonormal basis of the change of whitened predictions, without what declared parameters
+        absorb, shape (n, direction).
+    back : ndarray
+        From coordinates in the basis to sizes of the columns (or of the whole change, which is 1),
+        shape (column, direction).
+    """
+
+    values: Floats
+    columns: tuple[int, ...]
+    basis: Floats
+    back: Floats
+
+    def sizes(self, coordinates: Floats) -> Floats:
+        """Return the effect's parameters, shape (q,), at coordinates in the basis."""
+        values = self.values.copy()
+        values[list(self.columns)] += (self.back @ coordinates)[: len(self.columns)]
+        return values
 
 
 def rank_candidates(
     mode: Mode, candidates: Sequence[Attached], criteria: Criteria = DEFAULT
 ) -> list[Signature]:
     """Score every candidate effect at the mode of the model that lacks it, best first.
+
+    See :func:`score_candidates`.
+    """
+    return score_candidates(mode, candidates, criteria)[1]
+
+
+def score_candidates(
+    mode: Mode, candidates: Sequence[Attached], criteria: Criteria = DEFAULT
+) -> tuple[Floats, list[Signature]]:
+    """Return the whitened residual without what parameters absorb, and candidates, best first.
 
     With whitened residual r, Jacobian J of the declared parameters and signature D of a candidate
     (its derivative at the value where it vanishes), both r and D are projected off J: what the
@@ -78,12 +123,12 @@ def rank_candidates(
 
     Returns
     -------
+    residual : ndarray
+        Shape (n,).
     list of Signature
         Smallest p-value first; of equal ones, the earlier in the catalogue. Effects of the noise
         stage come last.
     """
-    if not candidates:
-        return []
     smooth = [one for one in candidates if one.effect.scan is None and not _of_noise(one)]
     residual, jacobian, signatures = _signatures(mode, smooth)
     scale = 1.0 / np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
@@ -98,9 +143,11 @@ def rank_candidates(
         if _of_noise(attached):
             return _tail_score(mode, attached, test)
         if attached in derived:
-            evidence = test.evidence(derived[attached], _sides(attached), _scales(attached))
-            values = np.array(attached.effect.null) + evidence.size
-            return _signature(attached, evidence, values, 1, test)
+            sides = null_sides(attached)
+            evidence = test.evidence(derived[attached], sides, _scales(attached))
+            null = np.array(attached.effect.null)
+            linear = (evidence.about(null, tuple(range(len(null)))),)
+            return _signature(attached, evidence, null + evidence.size, 1, test, linear)
         return _best_grid_point(mode, attached, test)
 
     # the noise's shape comes last: any missing effect makes tails heavy; p-values of the same
@@ -108,7 +155,7 @@ def rank_candidates(
     def order(signature: Signature) -> tuple[bool, float]:
         return _of_noise(signature.attached), round(signature.log_p, 3)
 
-    return sorted(in_parallel(score, candidates), key=order)
+    return test.residual, sorted(in_parallel(score, candidates), key=order)
 
 
 def _signatures(mode: Mode, candidates: Sequence[Attached]) -> tuple[Floats, Floats, list[Floats]]:
@@ -171,12 +218,17 @@ class _Evidence:
     direction: Floats
     unit: Floats
     absorbed: Floats
+    back: Floats
+
+    def about(self, values: Floats, columns: tuple[int, ...]) -> Linearisation:
+        """Return the linearisation of a signature that was taken at some values, shape (q,)."""
+        return Linearisation(values, columns, self.basis, self.back)
 
 
 def _none(n: int, p: int) -> _Evidence:
     """Return no evidence for one column, over n whitened residuals and p parameters."""
     nothing = np.zeros(1), np.zeros((n, 0)), np.zeros(n), np.zeros(1), np.zeros(p)
-    return _Evidence(0.0, 0.0, 0.0, *nothing)
+    return _Evidence(0.0, 0.0, 0.0, *nothing, np.zeros((1, 0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,19 +272,19 @@ class _Test:
         total = (signature**2).sum()
         share = float((projected**2).sum() / total) if total > 0 else 0.0
         n, columns = signature.shape
-        limits = self.criteria.score
         size, statistic, log_p = np.zeros(columns), 0.0, 0.0
         unit = np.zeros(columns)
-        basis, direction = np.zeros((n, 0)), np.zeros(n)
-        if share > limits.absorbed:
+        basis, direction, back = np.zeros((n, 0)), np.zeros(n), np.zeros((columns, 0))
+        if share > ABSORBED:
             u, s, vt = np.linalg.svd(projected, full_matrices=False)
             whole = np.linalg.norm(signature @ vt.T, axis=0)  # before the projection
-            keep = (s > 1e-6 * s.max()) & (s >= min(limits.visible, s.max()))
-            keep &= s**2 > limits.absorbed * whole**2
+            keep = (s > 1e-6 * s.max()) & (s >= min(VISIBLE, s.max()))
+            keep &= s**2 > ABSORBED * whole**2
             basis = u[:, keep]
             unit = np.sqrt((projected**2).sum(axis=0)) / scales
             coordinates = basis.T @ self.residual
-            size = scales * (vt[keep].T @ (coordinates / s[keep]))
+            back = scales[:, None] * vt[keep].T / s[keep]
+            size = back @ coordinates
             statistic = float(coordinates @ coordinates)
             log_p = float(chi2.logsf(statistic, max(1, int(keep.sum()))))
             seen = int(np.argmax(np.abs(vt[0])))
@@ -244,10 +296,10 @@ class _Test:
             if statistic > 0:
                 direction = basis @ coordinates / np.sqrt(statistic)
         absorbed = -self.back @ (self.q.T @ (signature @ (size / scales)))
-        return _Evidence(statistic, log_p, share, size, basis, direction, unit, absorbed)
+        return _Evidence(statistic, log_p, share, size, basis, direction, unit, absorbed, back)
 
 
-def _sides(attached: Attached) -> Ints:
+def null_sides(attached: Attached) -> Ints:
     """Return the side of its null value on which each parameter must be; 0 if on any."""
     supports = [(p.null, *p.prior.support) for p in attached.effect.parameters]
     return np.array([int(null == low) - int(null == high) for null, low, high in supports])
@@ -259,13 +311,18 @@ def _scales(attached: Attached) -> Floats:
 
 
 def _signature(
-    attached: Attached, evidence: _Evidence, values: Floats, n_points: int, test: _Test
+    attached: Attached,
+    evidence: _Evidence,
+    values: Floats,
+    n_points: int,
+    test: _Test,
+    linear: tuple[Linearisation, ...] = (),
 ) -> Signature:
     """Return a candidate's signature, its p-value corrected for grid points and candidates."""
     effect, limits = attached.effect, {}
     names = [parameter.name for parameter in effect.parameters]
     if effect.scan is None:
-        sizes = detectable_sizes(evidence.unit, test.candidates, test.criteria.score)
+        sizes = detectable_sizes(evidence.unit, test.candidates, test.criteria.residual)
         limits = dict(zip(names, sizes, strict=True))
     log_p = min(0.0, evidence.log_p + np.log(max(1, n_points)))
     candidate = Candidate(
@@ -281,9 +338,8 @@ def _signature(
         looks=n_points,
         detectable=limits,
     )
-    fall = 0.5 * evidence.statistic / max(float(test.residual @ test.residual), 1e-300)
     return Signature(
-        attached, candidate, log_p, evidence.basis, evidence.direction, evidence.absorbed, fall
+        attached, candidate, log_p, evidence.basis, evidence.direction, evidence.absorbed, linear
     )
 
 
@@ -297,7 +353,7 @@ def _best_grid_point(mode: Mode, attached: Attached, test: _Test, again: int = 4
     def evidence(point: GridPoint) -> _Evidence:
         rows = np.pad(point.signature, ((0, n - len(point.signature)), (0, 0)))
         columns = list(point.columns)
-        sides = _sides(attached)[columns] if columns else np.ones(1, dtype=np.intp)
+        sides = null_sides(attached)[columns] if columns else np.ones(1, dtype=np.intp)
         scales = _scales(attached)[columns] if columns else np.ones(1)
         return test.evidence(rows, sides, scales)
 
@@ -309,18 +365,19 @@ def _best_grid_point(mode: Mode, attached: Attached, test: _Test, again: int = 4
     finer: list[GridPoint] = []
     if leading and scores[leading[0]].log_p < 0.0:
         finer = grid_points(mode, attached, np.array([tried[i].proposed for i in leading]))
+    linear: tuple[Linearisation, ...] = ()
     if finer:  # with more engine steps a body may pass by
-        best, point = min(
-            ((evidence(trial), trial) for trial in finer), key=lambda pair: pair[0].log_p
-        )
+        judged = sorted(((evidence(trial), trial) for trial in finer), key=lambda x: x[0].log_p)
+        linear = tuple(one.about(at.values, at.columns) for one, at in judged if one.statistic > 0)
+        best, point = judged[0]
         values = point.values.copy()
         for column, size in zip(point.columns, best.size, strict=False):
             values[column] += size
-    signature = _signature(attached, best, values, len(tried), test)
+    signature = _signature(attached, best, values, len(tried), test, linear)
     candidate = replace(
         signature.candidate,
         detectable=detection_limits_of_scan(
-            effect, tried, units, test.candidates, test.criteria.score
+            effect, tried, units, test.candidates, test.criteria.residual
         ),
         caps=caps(effect, tried),
     )
@@ -344,7 +401,7 @@ def _tail_score(mode: Mode, attached: Attached, test: _Test) -> Signature:
     seen = problem.trajectory_noise.seen if along else problem.observations.measured
     whitened = test.residual[: seen.size].reshape(seen.shape)
     # coordinates that never move have no noise, and would make all others look heavy-tailed
-    loud = seen & (np.abs(whitened).max(axis=0) > test.criteria.score.visible)
+    loud = seen & (np.abs(whitened).max(axis=0) > VISIBLE)
     z = whitened[loud] if problem.nu(mode.phi) is None else np.zeros(0)
     z = z / max(float(np.sqrt(np.mean(z**2))), 1e-300) if len(z) else z
     score, variance = float((z**4 - 6 * z**2 + 3).sum() / 4), 1.5 * max(len(z), 1)
@@ -362,37 +419,12 @@ def _tail_score(mode: Mode, attached: Attached, test: _Test) -> Signature:
     return _signature(attached, evidence, values, 1, test)
 
 
-def twins(first: Signature, second: Signature, criteria: Criteria = DEFAULT) -> bool:
+def same_physics(first: Signature, second: Signature, cosine: float = 0.9999) -> bool:
     """Return whether two candidates are the same physics here, as two drags on one pendulum."""
     if first.basis.shape != second.basis.shape or first.candidate.dof != second.candidate.dof:
         return False
     overlap = np.linalg.svd(first.basis.T @ second.basis, compute_uv=False)
-    return bool(overlap.size and overlap.min() > criteria.score.same)
-
-
-def inseparable(
-    leader: Signature, others: Sequence[Signature], criteria: Criteria = DEFAULT
-) -> tuple[str, ...]:
-    """Return the effects that the data cannot separate from the leader, by name.
-
-    Parameters
-    ----------
-    leader : Signature
-        The effect to be added.
-    others : sequence of Signature
-        All ranked candidates.
-    criteria : Criteria
-        Which signatures are separable.
-    """
-    limits, names = criteria.score, []
-    for signature in others:
-        if signature is leader or signature.basis.shape[1] == 0:
-            continue
-        cosine = float(np.linalg.norm(signature.basis.T @ leader.direction))
-        behind = leader.candidate.statistic - signature.candidate.statistic
-        if cosine > limits.parallel and behind < limits.decisive:
-            names.append(named_beside(signature.attached, leader.attached))
-    return tuple(names)
+    return bool(overlap.size and overlap.min() > cosine)
 
 
 def named_beside(attached: Attached, leader: Attached) -> str:

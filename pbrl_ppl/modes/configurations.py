@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from pbrl_ppl.likelihood import Problem
-from pbrl_ppl.modes.evidence import Evidence
+from pbrl_ppl.modes.evidence import Marginal
 from pbrl_ppl.modes.laplace import Mode
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.physics import index_priors
@@ -79,7 +79,7 @@ class Weighed:
         What is joined.
     mode : Mode
         Of its problem.
-    evidence : Evidence
+    evidence : Marginal
         Of its problem.
     probability : float
         Among all configurations.
@@ -87,7 +87,7 @@ class Weighed:
 
     configuration: Configuration
     mode: Mode
-    evidence: Evidence
+    evidence: Marginal
     probability: float
 
 

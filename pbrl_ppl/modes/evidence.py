@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +16,7 @@ from pbrl_ppl.state import Floats
 
 
 @dataclass(frozen=True)
-class Evidence:
+class Marginal:
     """Log-evidence with its standard error.
 
     Parameters
@@ -35,7 +34,7 @@ class Evidence:
     ess: float | None = None
 
 
-def laplace(mode: Mode) -> Evidence:
+def laplace(mode: Mode) -> Marginal:
     """Return the Laplace approximation of the evidence, with a Gauss-Newton curvature.
 
     Parameters
@@ -47,10 +46,10 @@ def laplace(mode: Mode) -> Evidence:
     centre, covariance = space.laplace(mode)
     loud = space.loud
     log_det = np.linalg.slogdet(2 * np.pi * covariance[np.ix_(loud, loud)])[1]
-    return Evidence(float(space.log_density(centre[None])[0] + 0.5 * log_det))
+    return Marginal(float(space.log_density(centre[None])[0] + 0.5 * log_det))
 
 
-def trajectory_evidence(mode: Mode, unit: Sequence[int] = ()) -> float:
+def trajectory_evidence(mode: Mode) -> float:
     """Return the Laplace approximation of the log-evidence of whole trajectories.
 
     States are integrated out by the filter; of the noise parameters the logarithm is normal, as an
@@ -60,23 +59,13 @@ def trajectory_evidence(mode: Mode, unit: Sequence[int] = ()) -> float:
     ----------
     mode : Mode
         Of whole trajectories.
-    unit : sequence of int, optional
-        Places of parameters whose prior counts as worth one measured row, whatever its scale (R. E.
-        Kass and L. Wasserman, Journal of the American Statistical Association 90, 1995): effects
-        are of bodies of any size.
     """
     centre, of_noise = mode.noise_gaussian()
     value = float(log_posterior(mode.problem, mode.phi, np.exp(centre)) + centre.sum())
     log_dets = (
         np.linalg.slogdet(2 * np.pi * covariance)[1] for covariance in (of_noise, mode.covariance)
     )
-    value += 0.5 * float(sum(log_dets))
-    if not len(unit):
-        return value
-    places, shown = list(unit), mode.problem.trajectory_noise.seen.any(axis=1).sum()
-    log_det = np.linalg.slogdet(2 * np.pi * mode.covariance[np.ix_(places, places)])[1]
-    prior = mode.problem.layout.log_prior(mode.phi)[places].sum()
-    return value - float(prior) - 0.5 * float(log_det + len(places) * np.log(shown))
+    return value + 0.5 * float(sum(log_dets))
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +107,7 @@ class _StudentT:
 
 def importance(
     mode: Mode, rng: np.random.Generator, *, draws: int = 1000, rounds: int = 12, enough: int = 200
-) -> Evidence:
+) -> Marginal:
     """Return the evidence by adaptive importance sampling from a Student-t.
 
     It begins with the Laplace approximation. It sees what is about one mode: other modes, and a
@@ -148,4 +137,4 @@ def importance(
         most_batches=rounds, trial_batches=rounds,
     )  # fmt: skip
     error = float(np.sqrt(max(1.0 / max(proposals.ess, 1.0) - 1.0 / len(proposals.q), 0.0)))
-    return Evidence(proposals.log_z, error, proposals.ess)
+    return Marginal(proposals.log_z, error, proposals.ess)

@@ -22,7 +22,7 @@ from pbrl_ppl.modes.configurations import (
     number,
     one_more,
 )
-from pbrl_ppl.modes.evidence import Evidence, importance, laplace
+from pbrl_ppl.modes.evidence import Marginal, importance, laplace
 from pbrl_ppl.modes.laplace import Mode
 from pbrl_ppl.modes.search import find_mode, find_modes
 from pbrl_ppl.parameters import JOINT_ANCHORS, inside, prior_draws
@@ -104,7 +104,7 @@ def weigh(
 
 def _tried(
     problem: Problem, seed: int, console: Console, progress: bool, *, breadth: int = 4
-) -> tuple[dict[Configuration, Mode], dict[Configuration, Evidence]]:
+) -> tuple[dict[Configuration, Mode], dict[Configuration, Marginal]]:
     """Return modes and Laplace evidence of the configurations that a search reaches.
 
     ``breadth``: configurations to which further joints are added, at most.
@@ -168,12 +168,12 @@ def _worth(modes: Mapping[Configuration, Mode], *, hopeless: float = 300.0) -> f
     return max(mode.log_posterior for mode in modes.values()) - hopeless
 
 
-def _score(configuration: Configuration, evidence: Evidence) -> float:
+def _score(configuration: Configuration, evidence: Marginal) -> float:
     return configuration.log_prior + evidence.log_z
 
 
 def _leading(
-    evidence: dict[Configuration, Evidence], within: float, at_least: int = 1
+    evidence: dict[Configuration, Marginal], within: float, at_least: int = 1
 ) -> list[Configuration]:
     """Return configurations with a log-weight near the best, or among the first."""
     order = sorted(

@@ -7,9 +7,8 @@ simulated there.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,8 +25,9 @@ from pbrl_ppl.likelihood import (
 )
 from pbrl_ppl.modes.laplace import Mode, covariance_of
 from pbrl_ppl.modes.noise import finite
+from pbrl_ppl.modes.search import find_mode
 from pbrl_ppl.parameters import box, inside, prior_residual, prior_slopes
-from pbrl_ppl.state import Floats, Ints
+from pbrl_ppl.state import Floats
 from pbrl_ppl.threads import one_blas_thread
 
 #: A start state that is magnified by more than this, beyond growth in proportion to time, makes a
@@ -37,8 +37,6 @@ MOST_GROWTH = 30.0
 _OF_PHI = 0.5
 #: The least and the largest of them, as shares of each scale.
 _LEAST, _MOST = 1e-6, 2e-2
-#: Gain (nats) that ends a fit, and a candidate's first one at lower lengths.
-_TIGHT, _LOOSE = 0.1, 1.0
 
 
 @one_blas_thread
@@ -60,24 +58,9 @@ def ladder(mode: Mode) -> list[Mode]:
     HistoryError
         If no trajectory has three rows, or start states can follow all that was measured.
     """
-    history = mode.problem.data.history
-    longest = int(history.dataset["n_rows"].max()) - 1
-    if longest < 2:
-        raise HistoryError(
-            f"history: its longest trajectory has {longest + 1} rows, a simulation is judged by at"
-            " least 3; record longer trajectories"
-        )
     modes: list[Mode] = []
     states, phi = mode.problem.data.smoothed_states, mode.phi
-    starts = output_error(in_pieces(mode.problem, longest, states)).starts
-    measured, unknown = int(starts.counts.sum()), int((~starts.given).sum()) + len(phi)
-    if measured <= unknown:
-        raise HistoryError(
-            f"history: it has {measured} measurements, and simulations of its trajectories have"
-            f" {unknown} unknown start coordinates and parameters; record more rows of each"
-            " trajectory"
-        )
-    for length in lengths(longest, longest_gap(history)):
+    for length in piece_lengths(mode):
         problem = in_pieces(mode.problem, length, states)
         fitted = fit_pieces(problem, phi)
         if modes and growth(fitted.problem) > MOST_GROWTH:
@@ -85,6 +68,34 @@ def ladder(mode: Mode) -> list[Mode]:
         modes.append(fitted)
         phi, states = fitted.phi, simulated_states(fitted)
     return [*modes[:-1], with_robust_covariance(modes[-1])]
+
+
+def piece_lengths(mode: Mode) -> list[int]:
+    """Return the lengths of pieces of a mode's trajectories, the shortest first.
+
+    Raises
+    ------
+    HistoryError
+        If no trajectory has three rows, or start states can follow all that was measured.
+    """
+    history = mode.problem.data.history
+    longest = int(history.dataset["n_rows"].max()) - 1
+    if longest < 2:
+        raise HistoryError(
+            f"history: its longest trajectory has {longest + 1} rows, a simulation is judged by at"
+            " least 3; record longer trajectories"
+        )
+    starts = output_error(
+        in_pieces(mode.problem, longest, mode.problem.data.smoothed_states)
+    ).starts
+    measured, unknown = int(starts.counts.sum()), int((~starts.given).sum()) + len(mode.phi)
+    if measured <= unknown:
+        raise HistoryError(
+            f"history: it has {measured} measurements, and simulations of its trajectories have"
+            f" {unknown} unknown start coordinates and parameters; record more rows of each"
+            " trajectory"
+        )
+    return lengths(longest, longest_gap(history))
 
 
 def lengths(longest: int, gap: int = 1, *, shortest: int = 4, ratio: int = 4) -> list[int]:
@@ -106,48 +117,6 @@ def lengths(longest: int, gap: int = 1, *, shortest: int = 4, ratio: int = 4) ->
         shorter.append(length)
         length *= ratio
     return [*shorter, longest]
-
-
-def climb_ladder(
-    start: Sequence[tuple[Problem, Floats]],
-    parents: Sequence[Linear],
-    *,
-    few: int = 4,
-    fewer: int = 2,
-) -> list[Mode]:
-    """Return first modes of another model at the lengths of its parent, after few rounds.
-
-    Parameters
-    ----------
-    start : sequence of (Problem, ndarray)
-        The model's problem at each length, linearised at the parent's start states, and where it
-        may begin, shape (p,).
-    parents : sequence of Linear
-        Result of :func:`derivatives` of the parent at each length: those by the parameters that
-        both models have, and by the start states, are not taken anew.
-    few : int
-        Rounds of a candidate's first fit at the greatest length.
-    fewer : int
-        Rounds at lower lengths.
-    """
-    modes: list[Mode] = []
-    for i, ((problem, phi), parent) in enumerate(zip(start, parents, strict=True)):
-        begins = [(problem, phi)]
-        if modes:
-            begins += [(problem, modes[-1].phi), (_along(problem, modes[-1]), modes[-1].phi)]
-        costs = [_start_cost(*begin) for begin in begins]
-        known = parent.of(problem.layout.labels)
-        last = i + 1 == len(start)  # it corrects those before
-        rounds, tolerance = (few, _TIGHT) if last else (fewer, _LOOSE)
-        modes.append(fit_pieces(*begins[int(np.argmin(costs))], rounds, tolerance, known))
-    return modes
-
-
-def _along(problem: Problem, shorter: Mode) -> Problem:
-    """Return the problem of pieces that begin on the simulations of shorter ones."""
-    segments, likelihood = problem.segments, output_error(problem)
-    start = simulated_states(shorter)[segments.trajectory, segments.step]
-    return linearised_pieces(problem, start, likelihood.starts.slope, np.array(likelihood.tau))
 
 
 def with_robust_covariance(mode: Mode, *, many: int = 8) -> Mode:
@@ -196,53 +165,24 @@ class Linear:
 
     Parameters
     ----------
-    labels : tuple of str
-        Labels of the parameters.
     residual : ndarray
         Measured minus simulated, shape (piece, H, body, state), SI units.
     by_phi, by_start : ndarray
         Derivatives of the simulated states, shapes (piece, H, body, state, p) and (piece, H, body,
         state, cell).
-    unknown : ndarray of int
-        Places of parameters whose derivatives are missing.
     """
 
-    labels: tuple[str, ...]
     residual: Floats
     by_phi: Floats
     by_start: Floats
-    unknown: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
-
-    def of(self, labels: tuple[str, ...]) -> Linear:
-        """Return the same with the parameters of another model, new ones unknown."""
-        known = [i for i, label in enumerate(labels) if label in self.labels]
-        by_phi = np.zeros((*self.residual.shape, len(labels)))
-        by_phi[..., known] = self.by_phi[..., [self.labels.index(labels[i]) for i in known]]
-        unknown = np.setdiff1d(np.arange(len(labels)), known)
-        return replace(self, labels=labels, by_phi=by_phi, unknown=unknown)
 
 
 @one_blas_thread
-def derivatives(mode: Mode) -> Linear:
-    """Return residual and derivatives of simulated pieces at their mode."""
-    problem, slope = mode.problem, output_error(mode.problem).starts.slope
-    none = np.zeros((*slope.shape[:-1], len(mode.phi)))
-    labels, every = problem.layout.labels, np.arange(len(mode.phi))
-    slopes = prior_slopes(problem.layout.priors, mode.phi) if len(every) else np.zeros(0)
-    precision = (mode.jacobian**2).sum(axis=0) + slopes**2
-    scale = problem.layout.scale(mode.phi)
-    width = np.clip(_OF_PHI / np.sqrt(np.maximum(precision, 1e-300)), _LEAST * scale, _MOST * scale)
-    steps = np.where(problem.layout.discrete, 0.0, width), np.zeros(0)
-    known = Linear(labels, slope[..., 0], none, slope, every)
-    return _linearise(problem, mode.phi, problem.segments.start, steps, known)
-
-
 def fit_pieces(
     problem: Problem,
     phi: Floats,
     rounds: int = 20,
-    tolerance: float = _TIGHT,
-    known: Linear | None = None,
+    tolerance: float = 0.1,
     *,
     n_steps: int = 2,
     much: float = 0.2,
@@ -263,8 +203,6 @@ def fit_pieces(
         Linearisations, at most.
     tolerance : float
         Gain in log-posterior (nats) below which it ends.
-    known : Linear, optional
-        Derivatives that are not taken anew, of a smaller model nearby.
     n_steps : int
         Steps from one linearisation.
     much : float
@@ -278,15 +216,13 @@ def fit_pieces(
     first_width : float
         First steps of derivatives, as shares of each scale.
     """
-    priors, layout, exact = problem.layout.priors, problem.layout, problem
+    priors, layout = problem.layout.priors, problem.layout
     scale, sizes = layout.scale(phi), output_error(problem).starts.coordinates.sizes(problem.scene)
     phi, start = inside(priors, phi), problem.segments.start
-    if known is not None:
-        problem = problem.coarse.corrected_to(problem.rough, phi)
     steps = first_width * np.where(layout.discrete, 0.0, scale), first_width * sizes
     damping, failed = 1e-3, 0
     for _ in range(rounds):
-        linear = _linearise(problem, phi, start, steps, known)
+        linear = _linearise(problem, phi, start, steps)
         problem, sigma = _with_noise(problem, start, linear)
         step = _Step(problem, linear, sigma, phi, start)
         if not failed:
@@ -309,13 +245,12 @@ def fit_pieces(
         if gained > tolerance:
             failed = 0
             continue
-        if known is not None or failed == len(wider):
+        if failed == len(wider):
             break
         # friction makes kinks: over another width the derivative sees others
         steps = steps[0] * wider[failed], steps[1] * wider[failed]
         damping, failed = 1e-3, failed + 1
-    problem = replace(problem, physics=exact.physics, defect=None)
-    linear = _linearise(problem, phi, start, steps, known)
+    linear = _linearise(problem, phi, start, steps)
     problem, sigma = _with_noise(problem, start, linear)
     step = _Step(problem, linear, sigma, phi, start)
     problem = linearised_pieces(problem, start, linear.by_start, _tau(problem))
@@ -325,25 +260,36 @@ def fit_pieces(
     )  # fmt: skip
 
 
+@one_blas_thread
+def fit_pieces_closely(
+    problem: Problem,
+    phi: Floats,
+    rounds: int = 8,
+    tolerance: float = 0.5,
+    *,
+    repeats: int = 2,
+    worth: float = 1.0,
+) -> Mode:
+    """Return a mode of simulated pieces that climbs from the linearised start states confirm.
+
+    Friction makes kinks, at which Gauss-Newton steps of parameters and start states end. Climbs of
+    the parameters alone go on from there, and the start states follow. ``repeats`` of both, until
+    they gain less than ``worth`` (nats); other arguments as of :func:`fit_pieces`.
+    """
+    mode = fit_pieces(problem, phi, rounds, tolerance)
+    for _ in range(repeats):
+        climbed = find_mode(mode.problem, initial=mode.phi, rounds=5)
+        better = fit_pieces(mode.problem, climbed.phi, rounds, tolerance)
+        if better.log_posterior < mode.log_posterior + worth:
+            break
+        mode = better
+    return mode
+
+
 def corrected(mode: Mode) -> Mode:
     """Return a mode of simulated pieces with few engine steps, whose error there is corrected."""
     problem = mode.problem
     return replace(mode, problem=problem.coarse.corrected_to(problem.rough, mode.phi))
-
-
-def refined(modes: Sequence[Mode], *, rounds: int = 10) -> list[Mode]:
-    """Return modes with the last one fitted until it gains no more.
-
-    ``rounds``: rounds of the fit.
-    """
-    return [*modes[:-1], fit_pieces(modes[-1].problem, modes[-1].phi, rounds=rounds)]
-
-
-def _start_cost(problem: Problem, phi: Floats) -> float:
-    """Return the cost at phi with the start states taken along to first order."""
-    likelihood = output_error(problem)
-    residual = _residual(problem, phi[None], problem.segments.start[None])[0]
-    return _cost(problem, likelihood.profile(residual, least_errors(problem)), phi)
 
 
 def _tau(problem: Problem) -> Floats:
@@ -360,36 +306,27 @@ def _residual(problem: Problem, points: Floats, starts: Floats) -> Floats:
 
 
 def _linearise(
-    problem: Problem,
-    phi: Floats,
-    start: Floats,
-    steps: tuple[Floats, Floats],
-    known: Linear | None = None,
+    problem: Problem, phi: Floats, start: Floats, steps: tuple[Floats, Floats]
 ) -> Linear:
     """Return residual and derivatives by central differences, all in one call of the engine."""
     coordinates = output_error(problem).starts.coordinates
     lower, upper = box(problem.layout.priors)
     ahead, behind = np.minimum(phi + steps[0], upper), np.maximum(phi - steps[0], lower)
-    new = np.arange(len(phi)) if known is None else known.unknown
-    p, c = len(new), len(coordinates.places) if known is None else 0
+    p, c = len(phi), len(coordinates.places)
     points = np.tile(phi, (1 + 2 * p + 2 * c, 1))
-    points[1 + np.arange(p), new] = ahead[new]
-    points[1 + p + np.arange(p), new] = behind[new]
+    np.fill_diagonal(points[1 : 1 + p], ahead)
+    np.fill_diagonal(points[1 + p : 1 + 2 * p], behind)
     starts = np.tile(start, (len(points), 1, 1, 1))
     flat = starts.reshape(len(points), len(start), -1)
     for i, place in enumerate(coordinates.places[:c]):
         flat[1 + 2 * p + i, :, place] += steps[1][i]
         flat[1 + 2 * p + c + i, :, place] -= steps[1][i]
     residual = _residual(problem, points, coordinates.completed(problem.scene, starts))
-    width = np.maximum(ahead - behind, 1e-300)[new]
+    width = np.maximum(ahead - behind, 1e-300)
     by_phi = np.moveaxis(residual[1 : 1 + p] - residual[1 + p : 1 + 2 * p], 0, -1) / -width
-    if known is not None:
-        by_every = known.by_phi.copy()
-        by_every[..., new] = by_phi
-        return replace(known, residual=residual[0], by_phi=by_every)
     begun = residual[1 + 2 * p :]
     by_start = np.moveaxis(begun[:c] - begun[c:], 0, -1) / (-2 * steps[1])
-    return Linear(problem.layout.labels, residual[0], by_phi, by_start)
+    return Linear(residual[0], by_phi, by_start)
 
 
 def _with_noise(problem: Problem, start: Floats, linear: Linear) -> tuple[Problem, Floats]:

@@ -49,9 +49,16 @@ def simulation_mode(mode: Mode, prior: NoisePrior | None = None, *, rounds: int 
         Its problem has an :class:`pbrl_ppl.likelihood.OutputErrorLikelihood`, linearised at its
         start states, and the prior of sigma fixed.
     """
-    last = ladder(mode)[-1]
+    return tempered_mode(ladder(mode)[-1], prior, rounds=rounds)
+
+
+def tempered_mode(mode: Mode, prior: NoisePrior | None = None, *, rounds: int = 5) -> Mode:
+    """Return a mode of simulated pieces as the mode of their posterior; arguments as above.
+
+    The density of each dimension is divided by its autocorrelation time.
+    """
     if prior is None:
-        median, spread = last.problem.noise_prior
+        median, spread = mode.problem.noise_prior
         prior = tuple(median.tolist()), spread
-    problem = last.problem.with_likelihood(prior=prior)
-    return with_robust_covariance(find_mode(problem, initial=last.phi, rounds=rounds))
+    problem = mode.problem.with_likelihood(prior=prior)
+    return with_robust_covariance(find_mode(problem, initial=mode.phi, rounds=rounds))

@@ -14,7 +14,7 @@ from pbrl_ppl.likelihood import (
     smoothed,
     with_sensitivity,
 )
-from pbrl_ppl.modes.laplace import Mode, profiled
+from pbrl_ppl.modes.laplace import LocalMode, Mode, finish, profiled
 from pbrl_ppl.modes.search import find_mode
 from pbrl_ppl.parameters import change_from, inside
 from pbrl_ppl.state import Floats
@@ -99,6 +99,38 @@ def trajectory_mode(
             key=lambda candidate: candidate.log_posterior,
         )
     return mode
+
+
+@one_blas_thread
+def filtered_mode(mode: Mode, other: Mode, *, share: float = 0.1, rounds: int = 3) -> Mode:
+    """Return the mode of whole trajectories at another mode's parameters.
+
+    Noise and smoothed states are fitted in turn, from two sizes of the unexplained acceleration as
+    in :func:`trajectory_mode`; the parameters stay.
+
+    Parameters
+    ----------
+    mode : Mode
+        Of whole trajectories.
+    other : Mode
+        Of a model of the same recording, under any likelihood.
+    share, rounds : float, int
+        Second size of the unexplained acceleration, as a share of its prior's median; rounds.
+    """
+    physics, phi = other.problem.physics, other.phi
+    coordinates = mode.problem.trajectory_noise.coordinates
+    problem = mode.problem.with_physics(effects=physics.effects, substeps=physics.substeps)
+    rough = along_trajectories(problem.rough, phi, coordinates=coordinates)
+    problem = replace(rough, physics=problem.physics)
+    sigma = problem.trajectory_noise.sigma
+    ends: list[tuple[Problem, LocalMode]] = []
+    for begin in (sigma, problem.quiet(sigma, share)):
+        sigma, there = begin, problem
+        for _ in range(rounds):
+            there = smoothed(there, phi, sigma)
+            sigma, value = profiled(there, phi)
+        ends.append((there, LocalMode(phi, sigma, value)))
+    return finish(*max(ends, key=lambda end: end[1].log_posterior))
 
 
 def nearby_mode(

@@ -7,7 +7,6 @@ import pytest
 
 from pbrl_ppl.criticism import close_loop
 from pbrl_ppl.criticism.criteria import DEFAULT
-from pbrl_ppl.criticism.cross_validation import LeftOut, forecast_squares
 from pbrl_ppl.criticism.forecast import forecast
 from pbrl_ppl.criticism.misfit import _forecasts
 from pbrl_ppl.criticism.score import rank_candidates
@@ -85,12 +84,3 @@ def test_errors_of_diverging_forecasts_are_infinite(diverging) -> None:
 def test_diverging_forecasts_fail_their_test(diverging) -> None:
     test, _ = _forecasts(diverging, diverging.sigma, 3, DEFAULT)
     assert not test.passed
-
-
-@pytest.mark.one_stack
-def test_diverging_forecasts_are_no_gain(diverging) -> None:
-    """Their squares are left out whole: those that do not diverge would look like a gain."""
-    fold = np.zeros(diverging.problem.segments.n, dtype=np.intp)
-    left_out = LeftOut(np.zeros(1), diverging.phi[None], diverging.sigma[None])
-    squares = forecast_squares(diverging, fold, left_out, 3)
-    assert np.isnan(squares[:, diverging.problem.trajectory_noise.coordinates.places == 0]).all()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
 
-from pbrl_ppl.criticism.score import inseparable, rank_candidates, twins
+from pbrl_ppl.criticism.score import rank_candidates, same_physics
 from pbrl_ppl.effects import attach, candidates, catalogue
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem, single_transitions
@@ -193,10 +193,9 @@ def test_drags_of_a_single_pendulum_are_twins(make_history) -> None:
     train, _ = make_history.simulate(seed=9, setup=setup, pivot_damping=0.02)
     found = ranked(scene, train)
     by_name = {each.attached.effect.name: each for each in found}
-    assert twins(by_name["pivot_damping"], by_name["angular_drag"])
-    assert twins(by_name["pivot_damping"], by_name["linear_drag"])
-    assert not twins(by_name["pivot_damping"], by_name["constant_torque"])
-    assert "angular_drag" in inseparable(by_name["pivot_damping"], found)
+    assert same_physics(by_name["pivot_damping"], by_name["angular_drag"])
+    assert same_physics(by_name["pivot_damping"], by_name["linear_drag"])
+    assert not same_physics(by_name["pivot_damping"], by_name["constant_torque"])
     assert found[0].attached.effect.name in ("pivot_damping", "angular_drag", "linear_drag")
 
 

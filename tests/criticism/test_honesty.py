@@ -12,18 +12,15 @@ import pytest
 import pbrl_ppl as pp
 from pbrl_ppl.criticism import close_loop
 from pbrl_ppl.criticism.criteria import DEFAULT
-from pbrl_ppl.criticism.cross_validation import Change, relative_fall
 from pbrl_ppl.criticism.dependence import find_dependence
 from pbrl_ppl.criticism.misfit import ACCELERATION, find_misfit
 from pbrl_ppl.criticism.refinement import with_enough_substeps
-from pbrl_ppl.criticism.score import rank_candidates
-from pbrl_ppl.criticism.selection import Selection
 from pbrl_ppl.criticism.unexplained import unexplained_acceleration
 from pbrl_ppl.effects import attach
 from pbrl_ppl.likelihood import Problem, bodies_acceleration, smoothed
 from pbrl_ppl.modes import Mode, find_mode, trajectory_mode
 from pbrl_ppl.physics import Physics
-from tests.helpers.free_puck import BOX, DISC, MASS, Disc, box2d, fitted
+from tests.helpers.free_puck import BOX, DISC, MASS, Disc, box2d, fitted, searched
 from tests.helpers.histories import COLUMNS
 from tests.helpers.places import MODELS, load
 
@@ -169,38 +166,8 @@ def test_a_size_many_prior_scales_out_is_not_accepted(make_history) -> None:
     mode = fitted(BOX, box2d(make_history, 5, linear_drag=3.0)[0])
     drags = tuple(effect for effect in pp.catalogue if effect.name == "linear_drag")
 
-    def why(far_out: float) -> str:
-        selection = Selection(BOX, drags, replace(DEFAULT, far_out=far_out), quiet)
-        ranked = rank_candidates(mode, selection.missing(mode))
-        selection.best_addition(mode, ranked)
-        return selection.explained(ranked)[0].why
-
-    assert why(DEFAULT.far_out) == "added"
-    assert "prior scales out" in why(0.1)
-
-
-def test_few_folds_need_more_standard_errors() -> None:
-    gains = np.random.default_rng(1).normal(1.0, 1.0, 400)
-    many, few = Change.of(gains), Change.of(gains[:8])
-    assert many.needed(2.0) == pytest.approx(2.0 * many.error, rel=0.01)
-    assert few.needed(2.0) == pytest.approx(2.43 * few.error, rel=0.01)  # Student's t, 7 degrees
-    assert Change.of(gains[:1]).needed(2.0) == np.inf
-
-
-def test_a_fold_that_gains_most_makes_no_gain_less_certain() -> None:
-    gains = np.array([9.0, 7.0, 10.0, 8.0, 9.5, 11.0, 8.5, 7.5, 190.0])
-    change = Change.of(gains)
-    assert change.total < change.needed(2.0)
-    assert change.certain(2.0)
-    assert not Change.of(gains - 40.0).certain(2.0)  # most folds lose
-    assert not Change.of(np.zeros(8)).certain(2.0)
-
-
-def test_the_fall_of_forecasts_is_a_share_of_each_quantitys_error() -> None:
-    before = np.array([[4.0, 100.0], [4.0, np.nan], [np.nan, np.nan]])
-    change = relative_fall(before, 0.81 * before)
-    assert change.folds == 2
-    assert change.total == pytest.approx((1 - 0.81) / 2)
+    assert searched(mode, drags).laws
+    assert not searched(mode, drags, replace(DEFAULT, far_out=0.1)).laws
 
 
 @pytest.mark.slow

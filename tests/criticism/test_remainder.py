@@ -13,6 +13,7 @@ from pbrl_ppl import criticism
 from pbrl_ppl.cli import main
 from pbrl_ppl.criticism import learn_remainder
 from pbrl_ppl.criticism.results import Unexplained
+from pbrl_ppl.criticism.rivals import posterior_mode
 from pbrl_ppl.effects import LEARNED_REMAINDER
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.posterior import Fit, group, scene_of
@@ -40,9 +41,10 @@ def unexplained(posterior) -> pp.Loop:
     """A loop that found no name for what is missing, without the search."""
     left = Unexplained("puck", "vx", "speed", 0.5, 0.001, "vx of puck depends on its speed")
     fitted = Fit.of(posterior)
+    mode = posterior_mode(fitted)
     return replace(
         made_up("unexplained"), scene=BOX, candidates=(), unexplained=left,
-        declared=fitted, revised=fitted,
+        declared=fitted, revised=fitted, innovations=(mode, mode),
     )  # fmt: skip
 
 

@@ -1,14 +1,10 @@
 """Pendulums: one that was measured, and one of another engine."""
 
-import numpy as np
 import pytest
 
 from pbrl_ppl.criticism import close_loop
-from pbrl_ppl.criticism.criteria import DEFAULT
-from pbrl_ppl.criticism.score import rank_candidates
-from pbrl_ppl.criticism.selection import Selection
 from pbrl_ppl.effects import catalogue
-from tests.helpers.free_puck import fitted
+from tests.helpers.free_puck import fitted, searched
 from tests.helpers.places import MODELS, load
 
 # a posterior of few draws is enough to test a verdict, and says that it is one
@@ -21,16 +17,11 @@ FOLDER = MODELS / "pendulum"
 def test_friction_of_a_pivot_of_another_engine_is_chosen() -> None:
     """Without draws: the mode and its covariance say what the posterior will."""
     scene, train, _ = load(FOLDER, FOLDER / "recorded")
-    mode = fitted(scene, train)
-    selection = Selection(scene, catalogue, DEFAULT, lambda stage: None)
-    step = selection.best_addition(mode, rank_candidates(mode, selection.missing(mode)))
-    assert step.signature.candidate.effect == "pivot_friction"
-    place = step.after.problem.layout.labels.index("pivot_friction_torque[arm]")
-    spread = np.sqrt(step.after.covariance[place, place])
-    assert abs(step.after.phi[place] - 0.015) < 4 * spread  # a false alarm in 1e-4
+    (law,) = searched(fitted(scene, train), catalogue).laws.values()
+    assert law.effect == "pivot_friction"
+    size, spread = law.estimate["torque"], law.sd["torque"]
+    assert abs(size - 0.015) < 4 * spread  # a false alarm in 1e-4
     assert spread < 0.001
-    # what a step adds falls to nothing: nothing else is missing
-    assert step.after.sigma[-1] < 0.05 * mode.sigma[-1]
 
 
 @pytest.mark.long

@@ -8,6 +8,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from pbrl_ppl.criticism import DEFAULT, Criteria, Search
+from pbrl_ppl.criticism.search import SearchResult
+from pbrl_ppl.effects import candidates
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem, along_trajectories, with_measurements
 from pbrl_ppl.modes import Mode, find_mode, trajectory_mode
@@ -48,6 +51,14 @@ def box2d(
     if near:
         setup = replace(setup, start_range=(1.0, 1.0, 3.14159))
     return make_history.simulate(seed, setup, **hidden)
+
+
+def searched(mode: Mode, catalogue: Any, criteria: Criteria = DEFAULT) -> SearchResult:
+    """What the loop's search finds missing."""
+    scene = mode.problem.scene
+    return Search(lambda now: candidates(scene, now.problem.physics.effects, catalogue), criteria)(
+        mode
+    )
 
 
 def fitted(scene: Scene, history: History | pd.DataFrame, effects: Any = ()) -> Mode:

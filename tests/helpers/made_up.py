@@ -164,6 +164,7 @@ def made_up(verdict: str = "effects-added", stuck: bool = False) -> Loop:
         noise_floor=made_up_errors(1.0),
         declared=fit,
         revised=fit,
+        innovations=(None, None),  # nor is a mode
         residuals_before=noise if verdict == "adequate" else grown,
         residuals_after=noise if found else grown,
         rollout=Rollout(

@@ -10,6 +10,7 @@ from pbrl_ppl.criticism.loop import Loop
 from pbrl_ppl.criticism.results import Added, Estimate, Unexplained
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.history import History
+from pbrl_ppl.modes import trajectory_mode
 from pbrl_ppl.posterior import Fit
 from pbrl_ppl.posterior.store import from_groups, groups
 from pbrl_ppl.sampling import fit, physics_model
@@ -37,6 +38,7 @@ def revised() -> Loop:
     before, after = (
         Fit(m.problem, fit(m, method="laplace", seed=1, draws=100, progress=False)) for m in models
     )
+    modes = tuple(trajectory_mode(one.problem, *one.best) for one in (before, after))
     size = Estimate(DRAG, 0.01, (DRAG - 0.02, DRAG + 0.02), "kg/s")
     added = Added("linear_drag", "puck", "a drag", 99.0, 1e-9, {"coefficient": size}, (), 9.0, 1.0)
     found = made_up()
@@ -47,6 +49,7 @@ def revised() -> Loop:
         added=(added,),
         declared=before,
         revised=after,
+        innovations=modes,
         held_out=test,
     )
 
@@ -63,6 +66,7 @@ def unexplained() -> Loop:
         unexplained=left,
         declared=before,
         revised=before,
+        innovations=revised().innovations[:1] * 2,
         held_out=revised().held_out,
     )
 
@@ -71,6 +75,9 @@ def unexplained() -> Loop:
 def diverging() -> Loop:
     """The same as revised, with a drag that pushes, so that the revised model diverges."""
     found = revised()
+    before, after = found.innovations
+    drag = after.problem.layout.labels.index("linear_drag_coefficient[puck]")
+    far_off = np.where(np.arange(len(after.phi)) == drag, -60.0, after.phi)
     datasets = groups(found.posterior_after)
     draws = datasets["posterior"]
     name = "linear_drag_coefficient"
@@ -87,6 +94,7 @@ def diverging() -> Loop:
             found.revised.problem,
             from_groups(datasets | {"posterior": pushed}, dict(found.posterior_after.attrs)),
         ),
+        innovations=(before, replace(after, phi=far_off)),
         after=replace(found.after, rollout_rmse=far),
         rollout=replace(rollout, after=lost),
         growth=growth,

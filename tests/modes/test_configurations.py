@@ -25,7 +25,7 @@ from pbrl_ppl.modes.configurations import (
     number,
     stored,
 )
-from pbrl_ppl.modes.evidence import Evidence, importance, laplace
+from pbrl_ppl.modes.evidence import Marginal, importance, laplace
 from pbrl_ppl.physics import Physics, Simulator
 from pbrl_ppl.planning import Dynamics
 from pbrl_ppl.posterior import (
@@ -347,7 +347,7 @@ def weighed(model: pm.Model) -> list[Weighed]:
         nothing = np.zeros((0, 0))
         mode = Mode(own, phi, np.full(6, 0.1), nothing, nothing, 0.0)
         probability = WEIGHTS.get(each.pairs[0][1], 0.0)
-        found.append(Weighed(each, mode, Evidence(0.0), probability))
+        found.append(Weighed(each, mode, Marginal(0.0), probability))
     return found
 
 
@@ -436,7 +436,7 @@ def test_an_interrupt_with_others_to_come_ends_the_fit(rod) -> None:
 )
 def test_rough_evidence_is_said(rod, error, ess, rough) -> None:
     """A standard error of 0.2 moves a probability of 0.6 by a tenth; one of 0.01 by nothing."""
-    found = [replace(each, evidence=Evidence(0.0, error, ess)) for each in weighed(rod)]
+    found = [replace(each, evidence=Marginal(0.0, error, ess)) for each in weighed(rod)]
     said = doubts(stored(found))
     assert (said is not None) == rough
     if rough:

@@ -16,7 +16,7 @@ from pbrl_ppl.modes.configurations import (
     one_more,
     stored,
 )
-from pbrl_ppl.modes.evidence import Evidence
+from pbrl_ppl.modes.evidence import Marginal
 from pbrl_ppl.physics import build_layout, index_priors
 from pbrl_ppl.posterior import draws, from_groups, group, updated_scene
 from pbrl_ppl.sampling import mixture, physics_model
@@ -163,7 +163,7 @@ def test_draws_have_each_order_s_share() -> None:
         phi = np.array([0.1, 0.2, -0.1, -0.2])[: own.layout.size]
         mode = Mode(own, phi, np.full(6, 0.1), np.zeros((0, 0)), np.zeros((0, 0)), 0.0)
         weight = probability.get(each.pairs[0][1], 0.0)
-        found.append(Weighed(each, mode, Evidence(0.0), weight))
+        found.append(Weighed(each, mode, Marginal(0.0), weight))
 
     def constant(mode):
         named = mode.problem.named(mode.phi, mode.sigma)

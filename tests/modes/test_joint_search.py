@@ -110,7 +110,7 @@ def tried_of(free: Scene, monkeypatch, height):
     monkeypatch.setattr(joint_search, "_apart", lambda problem, seed: Found(0.0))
     monkeypatch.setattr(joint_search, "_joint", joint)
     monkeypatch.setattr(
-        joint_search, "laplace", lambda mode: joint_search.Evidence(mode.log_posterior)
+        joint_search, "laplace", lambda mode: joint_search.Marginal(mode.log_posterior)
     )
     history = simulated_history(scene(), {}, seed=1, trajectories=1, intervals=2)
     modes, _ = joint_search._tried(

@@ -9,16 +9,14 @@ import pytest
 
 import pbrl_ppl as pp
 from pbrl_ppl.cli import main
-from pbrl_ppl.criticism import Rival, fit_rivals, kept_groups, named_effects, rank_candidates
-from pbrl_ppl.criticism.criteria import DEFAULT
-from pbrl_ppl.criticism.results import Added
+from pbrl_ppl.criticism import Rival, fit_rivals, kept_groups, named_effects
+from pbrl_ppl.criticism.results import Added, Law
 from pbrl_ppl.criticism.rivals import keep_groups
-from pbrl_ppl.criticism.selection import Selection, Step
 from pbrl_ppl.errors import EffectError, GoalError, PosteriorError
 from pbrl_ppl.planning import rollout
 from pbrl_ppl.planning.experiments import Separation
 from pbrl_ppl.posterior.record import scene_of
-from tests.helpers.free_puck import BOX, fitted
+from tests.helpers.free_puck import BOX, fitted, searched
 from tests.helpers.one_speed import SIZE, at_one_speed, record
 from tests.helpers.stacks import file
 
@@ -35,13 +33,10 @@ pytestmark = [
 ]
 
 
-def selected(frame: pd.DataFrame) -> Step:
+def selected(frame: pd.DataFrame) -> Law:
     """What the loop adds to the model of a box without drag."""
-    mode = fitted(BOX, frame)
-    selection = Selection(BOX, tuple(LOOKED), DEFAULT, lambda stage: None)
-    step = selection.best_addition(mode, rank_candidates(mode, selection.missing(mode)))
-    assert step is not None
-    return step
+    (law,) = searched(fitted(BOX, frame), tuple(LOOKED)).laws.values()
+    return law
 
 
 def posterior_of(frame: pd.DataFrame, effect: str):
@@ -74,17 +69,17 @@ def test_the_suggested_experiment_separates_what_a_first_recording_cannot(
 ) -> None:
     """The truth is Box2D's; the suggestion is made where the other drag is taken for it."""
     first = at_one_speed(make_history, 1, **{truth: SIZE})
-    step = selected(first)
-    assert {step.signature.attached.effect.name, *step.not_separable_from} == {*DRAGS}
+    law = selected(first)
+    assert {law.effect, *law.confounded} == {*DRAGS}
     if truth == "linear_drag":
         known = posterior_of(first, "quadratic_drag")
         suggestion = pp.suggest_actions(known, REST, BOUNDS, steps=12, seed=1)
     wrenches = suggestion.wrenches.sel(body="puck").to_numpy()
     assert (np.abs(wrenches) <= (6.0, 6.0, 0.0)).all()
     second = record(make_history, suggestion.start[0], wrenches, 6, 1, **{truth: SIZE})
-    step = selected(pd.concat([first, second], ignore_index=True))
-    assert step.signature.attached.effect.name == truth
-    assert step.not_separable_from == ()
+    law = selected(pd.concat([first, second], ignore_index=True))
+    assert law.effect == truth
+    assert law.confounded == ()
 
 
 @pytest.mark.one_stack

@@ -1,0 +1,683 @@
+"""Search for missing laws by simulation error, from short pieces to whole trajectories.
+
+Without process noise, which would follow whatever is smooth, a missing law piles up along a
+trajectory. On short pieces that error is nearly linear in all laws, so that one regression proposes
+which of them are missing together; a few proposals are refitted there, and longer pieces are
+simulated with the laws found so far (output error: L. Ljung, System Identification, 1999).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import numpy as np
+from scipy.stats import norm
+
+from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
+from pbrl_ppl.criticism.results import Law, LawsOfSize, Rung
+from pbrl_ppl.criticism.score import named_beside, rank_candidates
+from pbrl_ppl.criticism.subsets import Regression, Subset, best_subsets
+from pbrl_ppl.effects import Attached, Noise, Structure
+from pbrl_ppl.history import History
+from pbrl_ppl.likelihood import Problem, in_pieces, output_error
+from pbrl_ppl.modes import (
+    MOST_GROWTH,
+    Mode,
+    corrected,
+    filtered_mode,
+    find_mode,
+    fit_pieces,
+    fit_pieces_closely,
+    growth,
+    piece_lengths,
+    simulated_states,
+    with_robust_covariance,
+)
+from pbrl_ppl.parameters import inside, prior_residual, prior_slopes
+from pbrl_ppl.scene import state_sizes
+from pbrl_ppl.state import Floats
+from pbrl_ppl.threads import in_parallel
+
+#: Share of the joint sizes from which refits begin a second time.
+_SHORTER = 0.3
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Evidence of a model beside one with fewer laws.
+
+    Parameters
+    ----------
+    nats : float
+        Log-evidence less its price: parameters, their prior, and what was tried.
+    share : float
+        Share of the simulation error (root mean square) that is gone.
+    """
+
+    nats: float
+    share: float
+
+    @classmethod
+    def of(
+        cls, before: Mode, after: Mode, price: float = 0.0, weight: Floats | None = None
+    ) -> Evidence:
+        """Compare two modes on the same pieces.
+
+        ``sum over dimensions of n / tau log(sigma_before / sigma_after)``, with the integrated
+        autocorrelation time tau of the residual of ``after``, or with other ``weight``, shape
+        (state,).
+        """
+        weight = weights(after) if weight is None else weight
+        gained, n = float((weight * np.log(before.sigma / after.sigma)).sum()), weight.sum()
+        paid = 0.5 * _more_informed(before, after) * np.log(max(n, 2.0)) + price
+        paid += max(_prior_cost(after) - _prior_cost(before), 0.0)
+        return cls(gained - float(paid), 1.0 - float(np.exp(-gained / max(n, 1.0))))
+
+
+def weights(mode: Mode, *, still: float = 1e-4) -> Floats:
+    """Return the effective number of measurements of each dimension, shape (state,).
+
+    ``still``: a dimension that moves by less than this share of its natural size counts for none.
+    """
+    observations = mode.problem.observations
+    natural = state_sizes(mode.problem.scene)[list(observations.columns)]
+    moves = np.nanstd(observations.values, axis=(0, 1, 2)) > still * natural
+    return np.where(moves, mode.problem.likelihood.counts(observations), 0.0)
+
+
+def _more_informed(before: Mode, after: Mode, informed: float = 0.7) -> int:
+    """Return how many of a model's further parameters the data inform; all that are scanned.
+
+    ``informed``: share of the prior's width below which a posterior is informed.
+    """
+    layout = after.problem.layout
+    width = np.sqrt(np.maximum(np.diag(after.covariance), 0.0))
+    narrow = width * np.abs(prior_slopes(layout.priors, after.phi)) < informed
+    return sum(
+        attached.effect.scan is not None or bool(narrow[place])
+        for attached in after.problem.physics.effects
+        if attached not in before.problem.physics.effects
+        for place in layout.places(attached.labels)
+    )
+
+
+def _prior_cost(mode: Mode) -> float:
+    """Return the negative log-prior of a mode's parameters, up to a constant."""
+    return 0.5 * float((prior_residual(mode.problem.layout.priors, mode.phi) ** 2).sum())
+
+
+def with_effects(
+    mode: Mode,
+    effects: tuple[Attached, ...],
+    sizes: Mapping[Attached, Floats] | None = None,
+) -> tuple[Problem, Floats]:
+    """Return a mode's problem with other effects, and where a search for its mode begins.
+
+    Parameters
+    ----------
+    mode : Mode
+        A mode of the model with the effects so far.
+    effects : tuple of Attached
+        All effects of the new model.
+    sizes : mapping, optional
+        Where the parameters of an effect begin; by default at the mode, or the prior's centre.
+    """
+    problem = mode.problem.with_physics(effects=effects)
+    layout = problem.layout
+    phi = layout.from_layout(mode.problem.layout, mode.phi)
+    for attached, values in (sizes or {}).items():
+        phi[layout.places(attached.labels)] = values
+    return problem, inside(layout.priors, phi)
+
+
+def refit(mode: Mode, effects: tuple[Attached, ...], sizes: Mapping[Attached, Floats]) -> Mode:
+    """Return the mode with other effects, under the same likelihood, from first sizes."""
+    problem, phi = with_effects(mode, effects, sizes)
+    if not problem.likelihood.simulated:
+        return find_mode(problem, initial=phi)
+    return fit_pieces(problem, phi, rounds=8, tolerance=0.5)
+
+
+def drop(mode: Mode, law: Attached) -> Mode:
+    """Return the mode without a law."""
+    return refit(mode, tuple(one for one in mode.problem.physics.effects if one != law), {})
+
+
+def sizes_of(mode: Mode, law: Attached) -> Floats:
+    """Return the parameters of a law at a mode, shape (q,)."""
+    return mode.phi[mode.problem.layout.places(law.labels)]
+
+
+@dataclass(frozen=True, eq=False)
+class SearchResult:
+    """Laws that a search names.
+
+    Parameters
+    ----------
+    declared, after : Mode
+        The declared model and the one with the laws, on the longest pieces.
+    laws : dict of Attached to Law
+        The laws with what each is worth there, those of most evidence first.
+    without : dict of Attached to Mode
+        The model without each law, refitted.
+    confounded : dict of Attached to tuple of Attached
+        Effects that explain the data as well as a law.
+    rungs : tuple of Rung
+        What was found at each length of pieces.
+    tried : dict of Attached to Evidence
+        What each candidate alone is worth to first order, on the shortest pieces.
+    rejected : dict of Attached to str
+        Why a law that was found on shorter pieces is not among them.
+    """
+
+    declared: Mode
+    after: Mode
+    laws: Mapping[Attached, Law] = field(default_factory=dict)
+    without: Mapping[Attached, Mode] = field(default_factory=dict)
+    confounded: Mapping[Attached, tuple[Attached, ...]] = field(default_factory=dict)
+    rungs: tuple[Rung, ...] = ()
+    tried: Mapping[Attached, Evidence] = field(default_factory=dict)
+    rejected: Mapping[Attached, str] = field(default_factory=dict)
+
+    def on(self, history: History) -> SearchResult:
+        """Return the same laws with their models refitted to another history."""
+
+        def refitted(mode: Mode) -> Mode:
+            problem = mode.problem.with_data(history=history)
+            if not problem.likelihood.simulated:
+                return find_mode(problem, initial=mode.phi)
+            pieces = in_pieces(problem, problem.data.horizon, problem.data.smoothed_states)
+            return with_robust_covariance(fit_pieces_closely(pieces, mode.phi))
+
+        without = {law: refitted(mode) for law, mode in self.without.items()}
+        after = refitted(self.after)
+        declared = after if self.declared is self.after else refitted(self.declared)
+        return replace(self, declared=declared, after=after, without=without)
+
+
+@dataclass(frozen=True, eq=False)
+class _Model:
+    """A model on the way up.
+
+    Parameters
+    ----------
+    mode : Mode
+        At this length of pieces.
+    earlier : dict of Attached to float
+        Evidence of each law, summed over shorter lengths, less its price (nats).
+    rivals : dict of Attached to dict
+        Sizes of effects that explained the data as well as a law where it was found.
+    without : dict of Attached to Mode
+        The model without each law, once it is fitted.
+    """
+
+    mode: Mode
+    earlier: Mapping[Attached, float] = field(default_factory=dict)
+    rivals: Mapping[Attached, Mapping[Attached, Floats]] = field(default_factory=dict)
+    without: Mapping[Attached, Mode] = field(default_factory=dict)
+
+    @property
+    def evidence(self) -> dict[Attached, Evidence]:
+        """Evidence of each law at this length, beside the others."""
+        return {law: Evidence.of(mode, self.mode) for law, mode in self.without.items()}
+
+    @property
+    def nats(self) -> dict[Attached, float]:
+        """Evidence of each law, summed over lengths, less its price."""
+        return {law: self.earlier[law] + one.nats for law, one in self.evidence.items()}
+
+    def fitted(self) -> _Model:
+        """Return the model with each law dropped in turn."""
+        smaller = in_parallel(partial(drop, self.mode), self.earlier)
+        return replace(self, without=dict(zip(self.earlier, smaller, strict=True)))
+
+    def dropped(self, law: Attached) -> _Model:
+        """Return the model without a law."""
+        earlier = {one: nats for one, nats in self.earlier.items() if one != law}
+        return _Model(self.without[law], earlier, self.rivals).fitted()
+
+    def at(self, mode: Mode) -> _Model:
+        """Return the model on longer pieces."""
+        return _Model(mode, self.nats, self.rivals)
+
+
+@dataclass(eq=False)
+class Search:
+    """Search for the laws that a model lacks.
+
+    Parameters
+    ----------
+    missing : callable
+        Returns the candidate effects of a model, given its mode.
+    criteria : Criteria
+        Thresholds.
+    say : callable
+        Called with what was found.
+    """
+
+    missing: Callable[[Mode], Sequence[Attached]]
+    criteria: Criteria = DEFAULT
+    say: Callable[[str], None] = field(default=lambda sentence: None)
+
+    def __call__(self, mode: Mode) -> SearchResult:
+        """Return the laws that a model's simulation error shows.
+
+        Parameters
+        ----------
+        mode : Mode
+            Of the declared model: of whole trajectories, which are cut into pieces, or of single
+            transitions, which are judged as they are.
+
+        Raises
+        ------
+        HistoryError
+            If no trajectory has three rows, or start states can follow all that was measured.
+        """
+        if mode.problem.likelihood.independent:
+            model, rung, before, regression = self._at_length(_Model(mode))
+            found = self._judged(mode, model, regression, (rung,), _alone(before))
+            return replace(found, declared=mode)
+        first, *longer = piece_lengths(mode)
+        pieces = in_pieces(mode.problem, first, mode.problem.data.smoothed_states)
+        model = _Model(fit_pieces(pieces, mode.phi))
+        begin = model.mode.phi
+        model, rung, before, regression = self._at_length(model)
+        tried, rungs = _alone(before), [rung]
+        for length in longer:
+            higher = _carried(model.mode, length)
+            if _is_lost(model.mode, higher):
+                # out of phase: what is significant and takes little away is taken on trial
+                trial = self._grown(model, regression, least_share=0.0)
+                if trial is model:
+                    break
+                higher = _carried(trial.mode, length)
+                if _is_lost(trial.mode, higher):
+                    break
+                model = trial
+            model, rung, _, regression = self._at_length(model.at(higher))
+            rungs.append(rung)
+        found = self._judged(mode, model, regression, tuple(rungs), tried)
+        if not found.laws:
+            return found
+        declared = _without_all(found, begin)
+        share = Evidence.of(declared, found.after).share
+        if mode.problem.data.history.n_trajectories > 1 or share >= self.criteria.search.alone:
+            return replace(found, declared=declared)
+        # a lasting error of the sensor or a random force follows a single trajectory as well
+        why = f"takes {100 * share:.2g} % off the error of a single trajectory, which is too little"
+        rejected = {**found.rejected, **dict.fromkeys(found.laws, why)}
+        return SearchResult(declared, declared, rungs=tuple(rungs), tried=tried, rejected=rejected)
+
+    def _at_length(
+        self, model: _Model, rounds: int = 3
+    ) -> tuple[_Model, Rung, Regression, Regression]:
+        """Return the model with laws that one length of pieces shows, without needless ones.
+
+        With what was found, and the regressions before and after that.
+
+        ``rounds``: rounds of proposals, at most.
+        """
+        limits, error = self.criteria.search, _error(model.mode)
+        before = tuple(model.earlier)
+        model = self._pruned(model.fitted())
+        regression = first = self._regression(model.mode)
+        for _ in range(rounds):
+            better = self._grown(model, regression, limits.least_share)
+            if better is model:
+                break
+            model = better
+            regression = self._regression(model.mode)
+        data, mode = model.mode.problem.data, model.mode
+        times = output_error(mode.problem).tau if mode.problem.likelihood.simulated else ()
+        rung = Rung(
+            rows=data.horizon,
+            seconds=data.horizon * mode.problem.scene.time_step,
+            error=error,
+            path=tuple(map(_described, first.path)),
+            accepted=tuple(_name(law) for law in model.earlier if law not in before),
+            dropped=tuple(_name(law) for law in before if law not in model.earlier),
+            correlated=dict(zip(mode.problem.observations.names, times, strict=False)),
+        )
+        return model, rung, first, regression
+
+    def _regression(self, mode: Mode) -> Regression:
+        """Return the subsets of what a model lacks, the noise's shape aside."""
+        candidates = [one for one in self.missing(mode) if not isinstance(one.effect.stage, Noise)]
+        cheap = corrected(mode) if mode.problem.likelihood.simulated else mode
+        return best_subsets(cheap, candidates, self.criteria)
+
+    def _grown(self, model: _Model, regression: Regression, least_share: float) -> _Model:
+        """Return the model with the best subset that takes enough away, or the model itself."""
+        limits, mode = self.criteria.search, model.mode
+        proposals = _proposals(regression, limits.refits, limits.singles, least_share)
+        if not proposals:
+            return model
+        fits = in_parallel(partial(_with_subset, mode), proposals)
+        shares = [Evidence.of(mode, fitted).share for fitted in fits]
+        if not any(map(_keeps_promise, proposals, shares)):
+            again = in_parallel(partial(_with_subset, mode, sizes=_SHORTER), proposals)
+            fits = [
+                max(pair, key=lambda one: Evidence.of(mode, one).share)
+                for pair in zip(fits, again, strict=True)
+            ]
+            shares = [Evidence.of(mode, fitted).share for fitted in fits]
+        weight = weights(fits[int(np.argmax(shares))])
+        judged = [
+            (Evidence.of(mode, fitted, sum(subset.prices.values()), weight), subset, fitted)
+            for subset, fitted in zip(proposals, fits, strict=True)
+        ]
+        enough = [
+            one for one in judged
+            if one[0].nats >= limits.least_nats
+            and one[0].share >= least_share
+            and _far_out(one[2], one[1].laws) < self.criteria.far_out
+        ]  # fmt: skip
+        if not enough:
+            return model
+        top = max(one[0].nats for one in enough)
+        tied = [one for one in enough if one[0].nats > top - limits.least_nats]
+        _, subset, fitted = min(tied, key=lambda one: (len(one[2].phi), -one[0].nats))
+        self.say(f"simulations name {' and '.join(map(_name, subset.laws))}")
+        rivals = {
+            law: _rivals(regression, subset, law, limits.least_nats) for law in subset.laws
+        }  # each law has to be worth its price
+        paid = {law: -price for law, price in subset.prices.items()}
+        grown = _Model(fitted, {**model.earlier, **paid}, {**model.rivals, **rivals})
+        pruned = self._pruned(grown.fitted())
+        return pruned if set(pruned.earlier) - set(model.earlier) else model
+
+    def _pruned(self, model: _Model) -> _Model:
+        """Drop laws whose evidence, summed over lengths, does not pay their price."""
+        while nats := model.nats:
+            law = min(nats, key=lambda one: nats[one])
+            if nats[law] >= 0.0:
+                break
+            model = model.dropped(law)
+        return model
+
+    def _judged(
+        self,
+        declared: Mode,
+        model: _Model,
+        regression: Regression,
+        rungs: tuple[Rung, ...],
+        tried: Mapping[Attached, Evidence],
+    ) -> SearchResult:
+        """Return the laws that are worth it on the longest pieces, and what each is worth.
+
+        A main law takes a large share of the simulation error away there. A small correction may
+        stand for something else: innovations of ``declared``'s trajectories must not contradict it.
+        """
+        least, rejected = self.criteria.search.least_nats, dict[Attached, str]()
+        while model.earlier:
+            nats, worth = model.nats, model.evidence
+            weak = {
+                law: nats[law] if self._is_main(one) else min(nats[law], one.nats)
+                for law, one in worth.items()
+            }
+            law: Attached | None = min(weak, key=lambda one: weak[one])
+            if law is not None and weak[law] < least:
+                why = f"longer simulations do not need it ({weak[law]:.1f} nats)"
+            else:
+                law, why = self._unconfirmed(declared, model)
+            if law is None:
+                break
+            model, rejected[law] = model.dropped(law), why
+        absorbed = {one.attached for one in regression.signatures if not one.basis.shape[1]}
+        model, confounded = self._confounded(model, absorbed)
+        worth, mode = model.evidence, model.mode
+        if mode.problem.likelihood.simulated:
+            mode = with_robust_covariance(fit_pieces_closely(mode.problem, mode.phi))
+        laws = {
+            law: law_of(mode, law, worth[law], self._is_main(worth[law]), confounded[law])
+            for law in sorted(worth, key=lambda law: -worth[law].nats)
+        }
+        return SearchResult(mode, mode, laws, model.without, confounded, rungs, tried, rejected)
+
+    def _is_main(self, evidence: Evidence) -> bool:
+        """Return whether a law is a main one."""
+        return evidence.share >= self.criteria.search.main_share
+
+    def _unconfirmed(
+        self, declared: Mode, model: _Model, *, contradicted: float = 0.1
+    ) -> tuple[Attached | None, str]:
+        """Return a small correction that innovations contradict, and why; None if they do not.
+
+        They would show a law of its size by its score, and do not. Where process noise swallows
+        the law they say nothing.
+
+        ``contradicted``: p-value of such a law's score above which they do not show it; one of 40
+        that are there has a larger one.
+        """
+        if not declared.problem.likelihood.filtered:
+            return None, ""
+        limits = self.criteria.residual
+        power = (norm.isf(limits.detection_p) + norm.ppf(limits.detection_power)) ** 2
+        for law in (law for law, one in model.evidence.items() if not self._is_main(one)):
+            innovations = filtered_mode(declared, model.without[law])
+            (scored,) = rank_candidates(innovations, [law], self.criteria)
+            if not scored.linear:
+                continue
+            at = scored.linear[0]
+            change = (sizes_of(model.mode, law) - at.values)[list(at.columns)]
+            size = np.linalg.lstsq(at.back, change, rcond=None)[0] if at.columns else np.ones(1)
+            likely = float(np.exp(scored.log_p))
+            if likely > contradicted and (size**2).sum() > power:
+                return law, f"small, and innovations do not show it (p = {likely:.2g})"
+        return None, ""
+
+    def _confounded(
+        self, model: _Model, absorbed: set[Attached], *, most: int = 2
+    ) -> tuple[_Model, dict[Attached, tuple[Attached, ...]]]:
+        """Return the model, and by law the effects that explain the longest pieces as well.
+
+        Those that the model absorbs there are the same physics; of others at ``most`` so many are
+        refitted in a law's place. One that explains the pieces better by as much as a law needs
+        takes the place.
+        """
+        limits = self.criteria.search
+        groups: dict[Attached, tuple[Attached, ...]] = {}
+        for law in tuple(model.earlier):
+            mode = model.mode
+            rivals = [one for one in model.rivals.get(law, {}) if one not in model.earlier]
+            same = [one for one in rivals if one in absorbed]
+            rivals = [one for one in rivals if one not in absorbed][:most]
+            swaps = in_parallel(partial(_swapped, mode, law, model.rivals.get(law, {})), rivals)
+            gains = [
+                float((weights(mode) * np.log(mode.sigma / other.sigma)).sum())
+                + _prior_cost(mode) - _prior_cost(other)
+                for other in swaps
+            ]  # fmt: skip
+            net = [
+                gain + rival.effect.log_odds - law.effect.log_odds
+                for gain, rival in zip(gains, rivals, strict=True)
+            ]
+            close = {
+                rival: gain for rival, gain in zip(rivals, gains, strict=True)
+                if gain > -limits.least_nats
+            }  # fmt: skip
+            if net and max(net) > limits.least_nats:
+                place = int(np.argmax(net))
+                better = rivals[place]
+                self.say(f"{_name(better)} explains whole trajectories better than {_name(law)}")
+                earlier = {better if one == law else one: v for one, v in model.earlier.items()}
+                model = _Model(swaps[place], earlier, model.rivals).fitted()
+                close = {law: 0.0} if gains[place] < limits.least_nats else {}
+                law = better
+            groups[law] = (*same, *close)
+        return model, groups
+
+
+def _carried(mode: Mode, length: int) -> Mode:
+    """Return the mode on longer pieces, which begin on the simulations of shorter ones."""
+    return fit_pieces(in_pieces(mode.problem, length, simulated_states(mode)), mode.phi)
+
+
+def _proposals(
+    regression: Regression, refits: int, singles: int, least_share: float, likely: float = 0.7
+) -> list[Subset]:
+    """Return the subsets to refit: the best, and single laws, of those that may be accepted.
+
+    ``likely``: a refit takes a share of ``least_share`` away if the regression says this of it.
+    """
+    least = 1.0 - (1.0 - likely * least_share) ** 2
+    subsets = [one for one in regression.subsets if one.nats > 0]
+    # structures cost contact in the engine: they are refitted where they lead
+    first = _structures(subsets[0]) if subsets else set()
+    subsets = [one for one in subsets if _structures(one) <= first]
+    leading = [one for one in subsets if one.share >= least][:refits]
+    alone = [one for one in subsets if len(one.laws) == 1][:singles] if leading else []
+    return list({frozenset(one.laws): one for one in (*leading, *alone)}.values())
+
+
+def _without_all(found: SearchResult, begin: Floats) -> Mode:
+    """Return the mode without any law, from where it was on the shortest pieces or is with them."""
+    mode = found.after
+    kept = tuple(one for one in mode.problem.physics.effects if one not in found.laws)
+    problem, near = with_effects(mode, kept)
+    fits = in_parallel(partial(fit_pieces, problem), [begin, near])
+    weight = weights(mode)
+    best = min(fits, key=lambda fitted: float((weight * np.log(fitted.sigma)).sum()))
+    return with_robust_covariance(best)
+
+
+def elpd_gain(before: Mode, after: Mode) -> tuple[float, float]:
+    """Return the gain in expected log predictive density, and its standard error.
+
+    The gain in log-density at the modes, less one nat for each further parameter that the data
+    inform (to first order that of leave-one-out cross-validation: M. Stone, Journal of the Royal
+    Statistical Society B 39, 1977). Both count correlated residuals as ``after`` does. The error is
+    that of a sum over pieces or transitions; NaN for a single one.
+    """
+
+    def densities(mode: Mode) -> Floats:
+        problem = mode.problem
+        residual = problem.residual(mode.phi)
+        if not problem.likelihood.simulated:
+            return np.asarray(problem.log_density(residual, mode.sigma, mode.phi))
+        likelihood = output_error(problem)
+        starts, tau = likelihood.starts, np.array(output_error(after.problem).tau)
+        rows, begin = likelihood.unwhitened(residual, mode.sigma)
+        sensed = starts.column >= 0
+        of_start = np.eye(len(mode.sigma))[starts.column[sensed]]
+        square = (rows**2).sum((1, 2)) + begin[:, sensed] ** 2 @ of_start
+        count = starts.seen.sum((1, 2)) + np.isfinite(starts.begin)[:, sensed] @ of_start
+        density = count * np.log(mode.sigma) + 0.5 * square / mode.sigma**2
+        return np.asarray(-(density / tau).sum(axis=1))
+
+    gains = densities(after) - densities(before)
+    n, total = len(gains), float(gains.sum()) - _more_informed(before, after)
+    return total, float(np.sqrt(n) * gains.std(ddof=1)) if n > 1 else float("nan")
+
+
+def law_of(
+    mode: Mode, law: Attached, evidence: Evidence, main: bool, confounded: Sequence[Attached]
+) -> Law:
+    """Return a law of a mode in words and numbers."""
+    effect, places = law.effect, mode.problem.layout.places(law.labels)
+    sd = np.sqrt(np.diag(mode.covariance)[places])
+    names = [parameter.name for parameter in effect.parameters]
+    return Law(
+        effect=effect.name,
+        body=law.body,
+        sentence=effect.sentence,
+        estimate=dict(zip(names, mode.phi[places].tolist(), strict=True)),
+        sd=dict(zip(names, sd.tolist(), strict=True)),
+        units={parameter.name: parameter.unit for parameter in effect.parameters},
+        nats=evidence.nats,
+        share=evidence.share,
+        main=main,
+        confounded=tuple(named_beside(rival, law) for rival in confounded),
+    )
+
+
+def _with_subset(mode: Mode, subset: Subset, sizes: float = 1.0) -> Mode:
+    """Return the refit with a subset's laws, from their joint sizes or this share of them."""
+    begin = dict(subset.sizes)
+    for law, size in begin.items():
+        if law.effect.scan is None:
+            null = np.array(law.effect.null, dtype=float)
+            begin[law] = null + sizes * (size - null)
+    return refit(mode, (*mode.problem.physics.effects, *subset.laws), begin)
+
+
+def _keeps_promise(subset: Subset, share: float, *, kept: float = 0.5) -> bool:
+    """Return whether a refit took enough of what the regression says off the squared error."""
+    return 1.0 - (1.0 - share) ** 2 >= kept * subset.share
+
+
+def _swapped(mode: Mode, law: Attached, sizes: Mapping[Attached, Floats], rival: Attached) -> Mode:
+    """Return the refit with another law in the place of one."""
+    effects = tuple(rival if one == law else one for one in mode.problem.physics.effects)
+    return refit(mode, effects, {rival: sizes[rival]})
+
+
+def _rivals(
+    regression: Regression, subset: Subset, law: Attached, within: float
+) -> dict[Attached, Floats]:
+    """Return effects that explain the residual as well as one law of a subset, and their sizes."""
+    scored = {one.attached: one.candidate for one in regression.signatures}
+
+    def size(one: Attached) -> Floats:
+        return np.array(list(scored[one].estimate.values()))
+
+    rivals = {twin: size(twin) for twin in regression.same[law]}
+    for alternative in regression.alternatives(subset, law, within):
+        (other,) = set(alternative.laws) - set(subset.laws)
+        rivals.setdefault(other, alternative.sizes[other])
+        rivals |= {twin: size(twin) for twin in regression.same[other] if twin not in rivals}
+    return rivals
+
+
+def _far_out(mode: Mode, laws: Sequence[Attached]) -> float:
+    """Return how many prior scales the sizes of laws lie from their priors' centres, at most."""
+    layout = mode.problem.layout
+    places = [place for law in laws for place in layout.places(law.labels)]
+    return float(np.abs(prior_residual(layout.priors, mode.phi)[places]).max(initial=0.0))
+
+
+def _structures(subset: Subset) -> set[Attached]:
+    """Return the laws of a subset that add to the scene."""
+    return {law for law in subset.laws if isinstance(law.effect.stage, Structure)}
+
+
+def _alone(regression: Regression) -> dict[Attached, Evidence]:
+    """Return what each candidate alone is worth to first order, share of the error's size."""
+    alone: dict[Attached, Evidence] = {}
+    for subset in regression.subsets:
+        if len(subset.laws) == 1:
+            (law,) = subset.laws
+            for one in (law, *regression.same[law]):
+                share = 1.0 - float(np.sqrt(1.0 - subset.share))
+                alone.setdefault(one, Evidence(subset.nats, share))
+    return alone
+
+
+def _is_lost(shorter: Mode, mode: Mode, *, far: float = 0.2, more: float = 3.0) -> bool:
+    """Return whether pieces are too long to tell a law from.
+
+    Their starts are magnified, or the error nears the motion's size, where it is out of phase.
+    """
+    if growth(mode.problem) > MOST_GROWTH:
+        return True
+    values = mode.problem.observations.values
+    motion = np.nanstd(values, axis=(0, 1, 2))
+    return bool(((mode.sigma > far * motion) & (mode.sigma > more * shorter.sigma)).any())
+
+
+def _error(mode: Mode) -> dict[str, float]:
+    """Return the simulation error by dimension, SI units."""
+    return dict(zip(mode.problem.observations.names, mode.sigma.tolist(), strict=True))
+
+
+def _name(law: Attached) -> str:
+    """Return the names of an effect and its body."""
+    return f"{law.effect.name} on {law.body}"
+
+
+def _described(subset: Subset) -> LawsOfSize:
+    """Return a subset by names."""
+    names = tuple(map(_name, subset.laws))
+    return LawsOfSize(names, subset.nats, float(np.sqrt(1.0 - subset.share)))

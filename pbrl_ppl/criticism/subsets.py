@@ -1,0 +1,272 @@
+"""Best subsets of candidate laws by one linear regression at a mode, without a refit.
+
+Sparse identification of dynamics (Brunton, Proctor and Kutz, PNAS 113, 2016) by best subsets
+(Bertsimas and Gurnee, Nonlinear Dynamics 111, 2023), with the simulator's derivatives as the
+library: nothing is differentiated from data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
+from pbrl_ppl.criticism.score import (
+    Linearisation,
+    Signature,
+    null_sides,
+    same_physics,
+    score_candidates,
+)
+from pbrl_ppl.effects import Attached
+from pbrl_ppl.modes import Mode
+from pbrl_ppl.state import Floats, Ints
+
+#: A whole change, as by an obstacle, is of size 1: it is at least this share of it in a subset.
+_LEAST_CHANGE = 0.5
+#: A scanned effect's linearisations are tried jointly, this many of each set of laws' leaders.
+_MOST_POINTS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Subset:
+    """Laws that explain a residual together, to first order.
+
+    Parameters
+    ----------
+    sizes : dict of Attached to ndarray
+        Parameters of each law by the joint regression, shape (q,) each.
+    nats : float
+        Log-evidence less its price.
+    share : float
+        Share of the squared whitened residual that they take away.
+    prices : dict of Attached to float
+        Logarithm of the number of candidates and grid points that each was chosen from, less the
+        logarithm of its prior odds (nats).
+    """
+
+    sizes: Mapping[Attached, Floats]
+    nats: float
+    share: float
+    prices: Mapping[Attached, float]
+
+    @property
+    def laws(self) -> tuple[Attached, ...]:
+        """The laws, in the order of the catalogue."""
+        return tuple(self.sizes)
+
+
+@dataclass(frozen=True, eq=False)
+class Regression:
+    """Subsets of a model's candidates, best first.
+
+    Parameters
+    ----------
+    subsets : tuple of Subset
+        Every subset that was tried.
+    same : dict of Attached to tuple of Attached
+        Candidates that are the same physics here, by the one that is tried for them.
+    signatures : tuple of Signature
+        Score tests of all candidates.
+    """
+
+    subsets: tuple[Subset, ...]
+    same: Mapping[Attached, tuple[Attached, ...]]
+    signatures: tuple[Signature, ...]
+
+    @property
+    def path(self) -> tuple[Subset, ...]:
+        """The best subset of each size, the smallest first."""
+        best: dict[int, Subset] = {}
+        for subset in self.subsets:
+            best.setdefault(len(subset.laws), subset)
+        return tuple(best[size] for size in sorted(best))
+
+    def alternatives(self, subset: Subset, law: Attached, within: float) -> list[Subset]:
+        """Return subsets that differ by one law and are worth as much, prior odds aside."""
+        rest = set(subset.laws) - {law}
+
+        def worth(one: Subset) -> float:
+            return one.nats - sum(member.effect.log_odds for member in one.laws)
+
+        return [
+            other for other in self.subsets
+            if len(other.laws) == len(subset.laws)
+            and law not in other.laws and rest < set(other.laws)
+            and worth(other) > worth(subset) - within
+        ]  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Term:
+    """A law linearised at one point, and its columns in the regression."""
+
+    law: Attached
+    linear: Linearisation
+    columns: Ints
+    price: float
+
+    def sizes(self, coordinates: Floats, most: float) -> Floats | None:
+        """Return the law's parameters; None where one breaks a sign, or a whole change its size."""
+        change = self.linear.back @ coordinates
+        free = list(self.linear.columns)
+        if not free and not _LEAST_CHANGE < change[0] < 1.0 / _LEAST_CHANGE:
+            return None
+        if len(free) == 1 and null_sides(self.law)[free[0]] * change[0] < 0:
+            return None
+        effect, sizes = self.law.effect, self.linear.sizes(coordinates)
+        reach = most * np.array([parameter.prior.scale for parameter in effect.parameters])
+        near = np.clip(sizes, self.linear.values - reach, self.linear.values + reach)
+        return np.where(np.isin(np.arange(len(sizes)), free), near, sizes)
+
+
+def best_subsets(
+    mode: Mode,
+    candidates: Sequence[Attached],
+    criteria: Criteria = DEFAULT,
+    *,
+    leaders: int = 14,
+    beside: int = 8,
+    beam: int = 12,
+    largest: int = 4,
+    independent: float = 1e-5,
+) -> Regression:
+    """Search the subsets of a few laws that explain the residual of a mode.
+
+    A subset S of laws with q columns is worth ``-n/2 log(1 - |P_S r|^2 / |r|^2) - q/2 log n`` less
+    its price, with the whitened residual r, the projection P_S on the laws' signatures, both
+    without what parameters and start states absorb, and n measurements over their autocorrelation
+    times. Subsets whose least-squares sizes break a sign that a prior sets are left out.
+
+    Parameters
+    ----------
+    mode : Mode
+        Of a model that lacks the candidates.
+    candidates : sequence of Attached
+        Effects to choose from.
+    criteria : Criteria
+        How large an effect may be.
+    leaders : int
+        Candidates that take most of the residual away, of which subsets are made.
+    beside : int
+        Further ones, which take most away beside the first.
+    beam : int
+        Subsets of each size that are enlarged.
+    largest : int
+        Laws in a subset, at most.
+    independent : float
+        Least ratio of the eigenvalues of a subset's normal equations.
+    """
+    residual, signatures = score_candidates(mode, candidates, criteria)
+    total = float(residual @ residual)
+    n = max(float(mode.problem.likelihood.counts(mode.problem.observations).sum()), 2.0)
+    distinct, same = _distinct(signatures, candidates)
+    if not distinct or total <= 0.0:
+        return Regression((), same, tuple(signatures))
+    leading = _leading(distinct, residual, leaders, beside)
+    terms: list[_Term] = []
+    width = 0
+    for signature in leading:
+        law = signature.attached
+        price = np.log(len(distinct) * signature.candidate.looks) - law.effect.log_odds
+        for linear in signature.linear[:_MOST_POINTS]:
+            columns = np.arange(width, width + linear.basis.shape[1])
+            terms.append(_Term(law, linear, columns, float(price)))
+            width += len(columns)
+    basis = np.hstack([term.linear.basis for term in terms])
+    gram, towards = basis.T @ basis, basis.T @ residual
+
+    def joint(chosen: tuple[int, ...]) -> Subset | None:
+        columns = np.concatenate([terms[i].columns for i in chosen])
+        square = gram[np.ix_(columns, columns)]
+        values, vectors = np.linalg.eigh(square)
+        if values[0] < independent * values[-1]:
+            return None
+        coordinates = vectors @ ((vectors.T @ towards[columns]) / values)
+        sizes, begin = {}, 0
+        for i in chosen:
+            term = terms[i]
+            end = begin + len(term.columns)
+            size = term.sizes(coordinates[begin:end], criteria.far_out)
+            if size is None:
+                return None
+            sizes[term.law], begin = size, end
+        share = min(float(coordinates @ towards[columns]) / total, 1.0 - 1e-12)
+        prices = {terms[i].law: terms[i].price for i in chosen}
+        worth = -0.5 * n * np.log(1.0 - share) - 0.5 * len(columns) * np.log(n)
+        return Subset(sizes, float(worth) - sum(prices.values()), share, prices)
+
+    order = {law: place for place, law in enumerate(candidates)}
+    level: dict[tuple[int, ...], Subset] = {
+        (i,): one for i in range(len(terms)) if (one := joint((i,))) is not None
+    }
+    tried = dict(level)
+    for _ in range(largest - 1):
+        grown: dict[tuple[int, ...], Subset] = {}
+        # all pairs are tried
+        best = sorted(level, key=lambda chosen: -level[chosen].nats)
+        for chosen in best if len(next(iter(level), ())) == 1 else best[:beam]:
+            laws = {terms[i].law for i in chosen}
+            for i, term in enumerate(terms):
+                more = tuple(sorted((*chosen, i), key=lambda i: (order[terms[i].law], i)))
+                if term.law in laws or more in tried or more in grown:
+                    continue
+                if (one := joint(more)) is not None:
+                    grown[more] = one
+        if not grown:
+            break
+        tried |= grown
+        level = grown
+    return Regression(
+        tuple(sorted(tried.values(), key=lambda subset: -subset.nats)), same, tuple(signatures)
+    )
+
+
+def _distinct(
+    signatures: Sequence[Signature], candidates: Sequence[Attached]
+) -> tuple[list[Signature], dict[Attached, tuple[Attached, ...]]]:
+    """Return the visible candidates, one of each physics, and those that it stands for.
+
+    The most common one with the fewest parameters stands for the others, then the first.
+    """
+    order = {law: place for place, law in enumerate(candidates)}
+
+    def simple(signature: Signature) -> tuple[float, int]:
+        law = signature.attached
+        return 2 * len(law.labels) - law.effect.log_odds, order[law]
+
+    distinct: list[Signature] = []
+    same: dict[Attached, tuple[Attached, ...]] = {}
+    for signature in sorted(signatures, key=simple):
+        if not signature.linear or not signature.basis.shape[1]:
+            continue
+        first = next((one for one in distinct if same_physics(one, signature)), None)
+        if first is not None:
+            same[first.attached] = (*same[first.attached], signature.attached)
+        elif signature.candidate.statistic > 0:
+            distinct.append(signature)
+            same[signature.attached] = ()
+    return distinct, same
+
+
+def _leading(
+    distinct: Sequence[Signature], residual: Floats, leaders: int, beside: int
+) -> list[Signature]:
+    """Return the candidates that take most away, alone and beside the first of them."""
+
+    def taken(signature: Signature, residual: Floats) -> float:
+        return float(((signature.basis.T @ residual) ** 2).sum())
+
+    leading = sorted(distinct, key=lambda one: -taken(one, residual))[:leaders]
+    first = leading[0].basis
+    left = residual - first @ (first.T @ residual)
+
+    def taken_beside(signature: Signature) -> float:
+        rest = signature.basis - first @ (first.T @ signature.basis)
+        q, r = np.linalg.qr(rest)
+        return float(((q[:, np.abs(np.diag(r)) > 1e-3].T @ left) ** 2).sum())
+
+    second = sorted(distinct, key=lambda one: -taken_beside(one))[:beside]
+    return list(dict.fromkeys([*leading, *second]))
