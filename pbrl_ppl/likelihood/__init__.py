@@ -3,7 +3,6 @@
 from .autocovariance import autocovariance as autocovariance
 from .coordinates import ACCELERATION as ACCELERATION
 from .coordinates import CONTACT as CONTACT
-from .coordinates import DRIFT as DRIFT
 from .coordinates import Coordinates as Coordinates
 from .coordinates import check_moves as check_moves
 from .coordinates import first_states as first_states
@@ -31,7 +30,6 @@ from .log_posterior import noise_law as noise_law
 from .log_posterior import noise_prior_slope as noise_prior_slope
 from .noise_scales import bodies_acceleration as bodies_acceleration
 from .noise_scales import noise_medians as noise_medians
-from .noise_scales import ranges as ranges
 from .output_error import OutputErrorLikelihood as OutputErrorLikelihood
 from .output_error import in_pieces as in_pieces
 from .output_error import least_errors as least_errors

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
 
@@ -19,8 +19,6 @@ from pbrl_ppl.state import STATE, THETA, VELOCITY, Bools, Floats, Ints, wrapped
 ACCELERATION = "unexplained_acceleration"
 #: Variable of the process noise that contacts add.
 CONTACT = "contact_acceleration"
-#: Variable of measurement noise that is correlated from row to row, as of a tracker.
-DRIFT = "correlated_error"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -43,11 +41,9 @@ class Coordinates:
         velocity, shape (push, coordinate).
     pushed : ndarray of int
         Place of the noise parameter that scales each row, shape (push,).
-    sensors, rates, contacts, drifts : tuple of int
+    sensors, rates, contacts : tuple of int
         State dimensions of the noise parameters: measurement noise, unexplained accelerations,
-        accelerations that contacts add, correlated measurement noise.
-    memory : float
-        Correlation of the last from one row to the next.
+        accelerations that contacts add.
     """
 
     places: Ints
@@ -59,8 +55,6 @@ class Coordinates:
     sensors: tuple[int, ...]
     rates: tuple[int, ...]
     contacts: tuple[int, ...] = ()
-    drifts: tuple[int, ...] = ()
-    memory: float = 0.0
 
     @property
     def variables(self) -> dict[str, tuple[str, ...]]:
@@ -69,7 +63,6 @@ class Coordinates:
             "sigma": self.sensors,
             ACCELERATION: self.rates,
             CONTACT: self.contacts,
-            DRIFT: self.drifts,
         }
         return {
             name: tuple(STATE[d] for d in places) for name, places in dimensions.items() if places
@@ -80,35 +73,17 @@ class Coordinates:
         """Places of the noise parameters that are unexplained accelerations."""
         return range(len(self.sensors), len(self.sensors) + len(self.rates))
 
-    @property
-    def drift_parameters(self) -> range:
-        """Places of the noise parameters of correlated measurement noise."""
-        first = len(self.sensors) + len(self.rates) + len(self.contacts)
-        return range(first, first + len(self.drifts))
-
-    def drifting(self, memory: float) -> Coordinates:
-        """Return the same with correlated measurement noise of positions."""
-        return replace(self, drifts=tuple(d for d in self.sensors if d <= THETA), memory=memory)
-
-    @cached_property
-    def drifted(self) -> tuple[Ints, Ints]:
-        """Coordinates with correlated measurement noise, and the place of its noise parameter."""
-        dimension = self.places % len(STATE)
-        coordinates = np.flatnonzero(np.isin(dimension, self.drifts) & (self.sensor >= 0))
-        order = np.searchsorted(self.drifts, dimension[coordinates])
-        return coordinates, self.drift_parameters.start + order
-
     @cached_property
     def always(self) -> Bools:
         """Mask of the rows that act in every step, not only in contact, shape (push,)."""
         return self.pushed < self.accelerations.stop
 
     def steps(self, sigma: Floats) -> Floats:
-        """Return the process noise of a step without and with contact.
+        """Return the process noise of a step without and with contact, at sigma (..., parameter).
 
-        Shape (2, coordinate, coordinate).
+        Shape (..., 2, coordinate, coordinate).
         """
-        return step_covariances(self.push, sigma[self.pushed], self.always)
+        return step_covariances(self.push, sigma[..., self.pushed], self.always)
 
     def pushes(self, sigma: Floats, touching: Bools, rng: np.random.Generator) -> Floats:
         """Draw process noise of the coordinates, shape (*touching.shape, coordinate).
@@ -122,16 +97,9 @@ class Coordinates:
         """Return typical sizes of the coordinates, shape (coordinate,); see :func:`state_sizes`."""
         return state_sizes(scene)[self.places % len(STATE)]
 
-    def white(self, sigma: Floats) -> Floats:
-        """Return the uncorrelated measurement noise of each coordinate, shape (..., coordinate)."""
-        return np.where(self.sensor >= 0, sigma[..., self.sensor], self.fixed)
-
     def errors(self, sigma: Floats) -> Floats:
-        """Return the whole measurement noise of each coordinate, shape (coordinate,)."""
-        square = self.white(sigma) ** 2
-        coordinates, parameters = self.drifted
-        square[coordinates] += sigma[parameters] ** 2
-        return np.sqrt(square)
+        """Return the measurement noise of each coordinate, shape (..., coordinate)."""
+        return np.where(self.sensor >= 0, sigma[..., self.sensor], self.fixed)
 
     def of(self, values: Floats) -> Floats:
         """Return the coordinates of values (..., body, 6), shape (..., coordinate)."""

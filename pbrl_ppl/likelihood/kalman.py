@@ -51,8 +51,13 @@ def _forward(p: Floats, slope: Floats, step: Floats, moved: Floats) -> None:
 
 @numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _take(p: Floats, i: int, sensor: float, gain: Floats) -> float:
-    """Take in a measurement of cell i; return its innovation's variance, and fill its gain."""
+    """Take in a measurement of cell i; return its innovation's variance, and fill its gain.
+
+    A cell that hardly varies may get a variance below zero by rounding: it counts as zero.
+    """
     d = len(p)
+    if p[i, i] < 0.0:
+        p[i, i] = 0.0
     variance: float = p[i, i] + sensor
     for a in range(d):
         gain[a] = p[a, i] / variance
@@ -61,6 +66,8 @@ def _take(p: Floats, i: int, sensor: float, gain: Floats) -> float:
         for b in range(a + 1):
             p[a, b] -= share * gain[b]
     for a in range(d):
+        if p[a, a] < 0.0:
+            p[a, a] = 0.0
         for b in range(a):
             p[b, a] = p[a, b]
     return variance

@@ -306,10 +306,9 @@ class TrajectoryLikelihood(Likelihood):
         return self.noise.coordinates.variables
 
     def exponential(self, n: int) -> Bools:
-        """Return a mask of the unexplained accelerations and the correlated errors."""
+        """Return a mask of the unexplained accelerations."""
         mask = super().exponential(n)
-        coordinates = self.noise.coordinates
-        mask[[*coordinates.accelerations, *coordinates.drift_parameters]] = True
+        mask[list(self.noise.coordinates.accelerations)] = True
         return mask
 
     def of_parameters(self) -> TrajectoryLikelihood:

@@ -25,7 +25,6 @@ def noise_medians(
     *,
     sensor_share: float = 0.1,
     contact_share: float = 0.1,
-    drift_share: float = 0.01,
     acceleration_share: float = 0.1,
 ) -> Floats:
     """Return the medians of the noise priors, shape (parameter,), from changes of the states.
@@ -34,9 +33,6 @@ def noise_medians(
     step.
 
     ``contact_share``: the same share for contact accelerations.
-    ``drift_share``: a correlated error is larger than this share of the range of what it measures
-    with the same probability: an error that lasts follows whatever is smooth, too.
-
     ``acceleration_share``: an unexplained acceleration is larger than this share of the bodies'
     with a probability of 1 %: physics is nearly deterministic, and a random force follows whatever
     is smooth.
@@ -55,37 +51,12 @@ def noise_medians(
     sensors = sensor_share * seen[list(coordinates.sensors)]
     steps = acceleration_share * _MEDIAN * _vectors(typical, coordinates.rates) / dt
     contacts = contact_share * typical[list(coordinates.contacts)] / dt
-    drifts = drift_share * _MEDIAN * ranges(coordinates, history, states)
     medians = [
         np.maximum(sensors, least[list(coordinates.sensors)]),
         np.maximum(steps, least[list(coordinates.rates)] / dt),
         np.maximum(contacts, least[list(coordinates.contacts)] / dt),
-        np.maximum(drifts, least[list(coordinates.drifts)]),
     ]
     return np.concatenate(medians)
-
-
-def ranges(coordinates: Coordinates, history: History, states: Floats) -> Floats:
-    """Return the range of each dimension with correlated errors, shape (drift,).
-
-    Of x and y the larger one: a sensor of places is as far off in both.
-
-    Parameters
-    ----------
-    coordinates : Coordinates
-        Says which dimensions those are.
-    history : History
-        Says which rows there are.
-    states : ndarray
-        Shape (trajectory, time, body, 6), SI units.
-    """
-    real = np.isfinite(history.dataset["clock"].to_numpy())
-    values = states[real].reshape(-1, states.shape[2] * len(STATE))[:, coordinates.places]
-    extent = np.ptp(values, axis=0)
-    dimension = coordinates.places % len(STATE)
-    turns = dimension % VELOCITY == THETA
-    place = dimension < VELOCITY
-    return np.array([extent[place & (turns == (d == THETA))].max() for d in coordinates.drifts])
 
 
 def _typical(coordinates: Coordinates, changes: list[Floats]) -> Floats:

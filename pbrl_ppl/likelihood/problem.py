@@ -11,7 +11,7 @@ import numpy as np
 
 from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.history import History, Segments
-from pbrl_ppl.likelihood.coordinates import ACCELERATION, CONTACT, DRIFT
+from pbrl_ppl.likelihood.coordinates import ACCELERATION, CONTACT
 from pbrl_ppl.likelihood.data import Data, Observations, sigma_prior
 from pbrl_ppl.likelihood.likelihood import (
     Likelihood,
@@ -28,7 +28,7 @@ from pbrl_ppl.state import INPUT, STATE, Floats
 
 #: Dimensions of the noise variables along trajectories.
 _NOISE_DIMS = {
-    "sigma": "sensor", ACCELERATION: "velocity", CONTACT: "velocity", DRIFT: "position",
+    "sigma": "sensor", ACCELERATION: "velocity", CONTACT: "velocity",
 }  # fmt: skip
 #: Dimensions of measured next states, and of the data that they are predicted from.
 NEXT_STATE_DIMS = ("transition", "step", "body", "state")

@@ -240,7 +240,6 @@ def _guess(problem: Problem, coordinates: Coordinates, phi: Floats) -> Floats:
     guess += [
         by_dimension[d] / np.sqrt(2) / dt for d in (*coordinates.rates, *coordinates.contacts)
     ]
-    guess += [by_dimension[d] / np.sqrt(2) for d in coordinates.drifts]
     return np.maximum(guess, problem.noise_prior[0] * 0.01)
 
 

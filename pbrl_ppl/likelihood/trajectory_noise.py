@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import numpy as np
 
-from pbrl_ppl.likelihood.coordinates import Coordinates, step_covariances
+from pbrl_ppl.likelihood.coordinates import Coordinates
 from pbrl_ppl.likelihood.kalman import adjoint, gains, innovations, score, whitened
 from pbrl_ppl.likelihood.sensitivity import Sensitivity
 from pbrl_ppl.physics import Memory
@@ -22,12 +21,8 @@ class TrajectoryNoise:
     Neighbouring transitions share a measured state, so their residuals are correlated. Whitened
     along the trajectory they are the innovations of a Kalman filter. The noise parameters are the
     standard deviations of a measurement, R, one a measured state dimension, followed by those of an
-    unexplained acceleration, held over an interval, Q, one a velocity, of what comes on top of it
-    where bodies touch: how they part depends on more than any engine knows; and of errors of
-    measuring that are correlated from row to row.
-
-    The filter's state is the coordinates as measured without a row's own error, which is the state
-    plus the correlated errors, followed by those errors: each measurement then is of one of them.
+    unexplained acceleration, held over an interval, Q, one a velocity, and of what comes on top of
+    it where bodies touch: how they part depends on more than any engine knows.
 
     Parameters
     ----------
@@ -70,11 +65,6 @@ class TrajectoryNoise:
     sensitivity: Sensitivity | None = None
     memory: Memory = field(default_factory=Memory, init=False, repr=False)
 
-    @cached_property
-    def _extended(self) -> Extended:
-        """The filter's linear model."""
-        return Extended.of(self.coordinates, self.slope, self.seen)
-
     def _gains(self, sigma: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """Gain, scale and covariance of the filter at noise parameters, and the log of the scale.
 
@@ -83,20 +73,19 @@ class TrajectoryNoise:
         return self.memory.recall((sigma,), self._filter_gains)
 
     def _filter_gains(self, sigma: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        extended = self._extended
         gain, scale, after = gains(
-            extended.slope, self.first, extended.seen, self._begin(sigma),
-            extended.padded(self.coordinates.white(sigma) ** 2), extended.steps(sigma), self.kind,
+            self.slope, self.first, self.seen, self._begin(sigma),
+            self.coordinates.errors(sigma) ** 2, self.coordinates.steps(sigma), self.kind,
         )  # fmt: skip
         return gain, scale, after, np.log(scale).sum(axis=1)
 
     def scale(self, sigma: Floats) -> Floats:
         """Standard deviation of each innovation (transition, coordinate); 1 where not seen."""
-        return self._gains(sigma)[1][:, : len(self.coordinates.places)]
+        return self._gains(sigma)[1]
 
     def covariance(self, sigma: Floats) -> Floats:
         """Covariance of filtered states, shape (transition, coordinate, coordinate)."""
-        return self._extended.covariance(self.coordinates, self._gains(sigma)[2])
+        return self._gains(sigma)[2]
 
     @property
     def last(self) -> Bools:
@@ -146,16 +135,14 @@ class TrajectoryNoise:
 
         ``threads_from``: numbers to filter from which threads pay.
         """
-        extended, d = self._extended, len(self.coordinates.places)
-        sensor = extended.padded(self.coordinates.white(sigmas) ** 2)
-        variance, step = self._begin(sigmas), extended.steps(sigmas)
-        begin, measured = extended.padded(self.begin), extended.padded(self.measured)
+        sensor = self.coordinates.errors(sigmas) ** 2
+        variance, step = self._begin(sigmas), self.coordinates.steps(sigmas)
 
         def some(chosen: slice) -> tuple[Floats, Floats]:
-            residual = np.ascontiguousarray(extended.padded(rows[chosen]))
+            residual = np.ascontiguousarray(rows[chosen])
             result: tuple[Floats, Floats] = whitened(
-                extended.slope, self.first, extended.seen, variance[chosen], sensor[chosen],
-                step[chosen], self.kind, residual, begin, measured,
+                self.slope, self.first, self.seen, variance[chosen], sensor[chosen],
+                step[chosen], self.kind, residual, self.begin, self.measured,
             )  # fmt: skip
             return result
 
@@ -164,23 +151,15 @@ class TrajectoryNoise:
         many = rows.size > threads_from
         parts = in_parallel(some, slices) if many else list(map(some, slices))
         white, log_scale = (np.concatenate(column) for column in zip(*parts, strict=True))
-        return white[..., :d], log_scale
+        return white, log_scale
 
     def filtered(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
         """Return whitened innovations and filtered deviations of residuals."""
-        white, state = self._filtered(residual, sigma)
-        coordinates = self.coordinates
-        return white[..., : len(coordinates.places)], self._extended.states(coordinates, state)
-
-    def _filtered(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
-        """Return the same as :meth:`filtered` in the filter's extended state."""
-        extended, (gain, scale, *_) = self._extended, self._gains(sigma)
-        # another layout would be compiled, too
-        rows = np.ascontiguousarray(extended.padded(residual))
+        gain, scale, *_ = self._gains(sigma)
+        rows = np.ascontiguousarray(residual)  # another layout would be compiled, too
         white, state = innovations(
-            extended.slope, self.first, extended.seen, gain, scale, rows,
-            extended.padded(self.begin), extended.padded(self.measured),
-        )  # fmt: skip
+            self.slope, self.first, self.seen, gain, scale, rows, self.begin, self.measured
+        )
         return white, state
 
     def of_coordinates(
@@ -197,23 +176,20 @@ class TrajectoryNoise:
 
     def smoothed(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
         """Return smoothed deviations (transition, coordinate) before and after transitions."""
-        extended, coordinates = self._extended, self.coordinates
-        white, filtered = self._filtered(residual[None], sigma)
+        white, filtered = self.filtered(residual[None], sigma)
         before, _, after = self._pulled(white[0], sigma)
-        begin = extended.padded(self.begin) - self._begin(sigma) * before
-        end = filtered[0] - np.einsum("kab,kb->ka", self._gains(sigma)[2], after)
-        return extended.states(coordinates, begin), extended.states(coordinates, end)
+        begin = self.begin - self._begin(sigma) * before
+        return begin, filtered[0] - np.einsum("kab,kb->ka", self._gains(sigma)[2], after)
 
     def pulled(self, weighted: Floats, sigma: Floats) -> Floats:
         """Return the derivative of weighted innovations by predictions (transition, coordinate)."""
-        padded = self._extended.padded(weighted)
-        return self._pulled(padded, sigma)[1][:, : weighted.shape[1]]
+        return self._pulled(weighted, sigma)[1]
 
     def _pulled(self, weighted: Floats, sigma: Floats) -> tuple[Floats, Floats, Floats]:
         """Return :func:`kalman.adjoint` of weighted innovations."""
-        extended, (gain, scale, *_) = self._extended, self._gains(sigma)
+        gain, scale, *_ = self._gains(sigma)
         pulled: tuple[Floats, Floats, Floats] = adjoint(
-            extended.slope, self.last, extended.seen, gain, scale, weighted
+            self.slope, self.last, self.seen, gain, scale, weighted
         )
         return pulled
 
@@ -227,23 +203,20 @@ class TrajectoryNoise:
         sigma : ndarray
             Shape (parameter,).
         """
-        extended, coordinates, d = self._extended, self.coordinates, len(self.coordinates.places)
-        white = self._filtered(coordinates.of_residual(residual)[None], sigma)[0][0]
+        coordinates = self.coordinates
+        white = self.filtered(coordinates.of_residual(residual)[None], sigma)[0][0]
         gain, scale, _, log_scale = self._gains(sigma)
         sensor, step, begin, _ = score(
-            extended.slope, self.last, extended.seen, gain, scale, white, self.kind
+            self.slope, self.last, self.seen, gain, scale, white, self.kind
         )
         # measured states begin a trajectory: their error is that of measuring
-        began = np.where(self.first[:, None], begin, 0.0)
-        measured = np.where(self.wide > 0, 0.0, began[:, :d]).sum(axis=0)
+        measured = np.where(self.first[:, None] & ~(self.wide > 0), begin, 0.0).sum(axis=0)
         slope = np.zeros(len(sigma))
         free = coordinates.sensor >= 0
-        np.add.at(slope, coordinates.sensor[free], (sensor[:d] + measured)[free])
-        np.add.at(slope, coordinates.drifted[1], began[:, d:].sum(axis=0))
-        steps = np.where(extended.always[:, None, None], step.sum(axis=0), step[1])
-        np.add.at(
-            slope, extended.pushed, np.einsum("ja,jab,jb->j", extended.push, steps, extended.push)
-        )
+        np.add.at(slope, coordinates.sensor[free], (sensor + measured)[free])
+        steps = np.where(coordinates.always[:, None, None], step.sum(axis=0), step[1])
+        push = coordinates.push
+        np.add.at(slope, coordinates.pushed, np.einsum("ja,jab,jb->j", push, steps, push))
         norm = -0.5 * np.log(2 * np.pi) * self.seen.sum()
         value = norm - 0.5 * float((white**2).sum()) - float(log_scale.sum())
         return value, sigma**2 * slope
@@ -264,10 +237,9 @@ class TrajectoryNoise:
             At a transition's end, and before the first of a trajectory, shape (transition,
             coordinate) each; 0 where nothing was measured.
         """
-        extended, (gain, scale, *_) = self._extended, self._gains(sigma)
-        white = self._filtered(residual[None], sigma)[0][0]
-        every = score(extended.slope, self.last, extended.seen, gain, scale, white, self.kind)[3]
-        end, begin = every[..., : residual.shape[1]]
+        gain, scale, *_ = self._gains(sigma)
+        white = self.filtered(residual[None], sigma)[0][0]
+        end, begin = score(self.slope, self.last, self.seen, gain, scale, white, self.kind)[3]
         return end, np.where(self.first[:, None] & ~(self.wide > 0), begin, 0.0)
 
     def predictive(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
@@ -285,18 +257,16 @@ class TrajectoryNoise:
         mean, covariance : ndarray
             Shapes (transition, coordinate) and (transition, coordinate, coordinate).
         """
-        extended, d, first = self._extended, len(self.coordinates.places), self.first[:, None]
-        after, filtered = self._gains(sigma)[2], self._filtered(residual[None], sigma)[1][0]
-        state = np.where(first, extended.padded(self.begin), np.roll(filtered, 1, axis=0))
-        begin = self._begin(sigma)[:, :, None] * np.eye(extended.slope.shape[1])
+        first, coordinates = self.first[:, None], self.coordinates
+        after, filtered = self._gains(sigma)[2], self.filtered(residual[None], sigma)[1][0]
+        state = np.where(first, self.begin, np.roll(filtered, 1, axis=0))
+        begin = self._begin(sigma)[:, :, None] * np.eye(len(coordinates.places))
         known = np.where(first[..., None], begin, np.roll(after, 1, axis=0))
-        covariance = (
-            extended.slope @ known @ extended.slope.transpose(0, 2, 1)
-            + extended.steps(sigma)[self.kind]
-        )
+        covariance = self.slope @ known @ self.slope.transpose(0, 2, 1)
+        covariance += coordinates.steps(sigma)[self.kind]
         return (
-            np.einsum("kab,kb->ka", extended.slope, state)[:, :d] - residual,
-            covariance[:, :d, :d] + np.diag(self.coordinates.white(sigma) ** 2),
+            np.einsum("kab,kb->ka", self.slope, state) - residual,
+            covariance + np.diag(coordinates.errors(sigma) ** 2),
         )
 
     def random(
@@ -324,89 +294,7 @@ class TrajectoryNoise:
     def _begin(self, sigma: Floats) -> Floats:
         """Return the variance of the filter's first states at sigma (..., parameter).
 
-        Shape (..., transition, extended).
+        Shape (..., transition, coordinate).
         """
-        sensor = self.coordinates.white(sigma)[..., None, :] ** 2
-        state = np.where(self.wide > 0, self.wide, sensor)
-        error = sigma[..., None, self.coordinates.drifted[1]] ** 2
-        error = np.broadcast_to(error, (*state.shape[:-1], error.shape[-1]))
-        return np.concatenate([state, error], axis=-1)
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Extended:
-    """Linear model of the filter: coordinates plus their correlated errors, then those errors.
-
-    A correlated error e follows ``e' = rho e + u`` (Harvey, Forecasting, Structural Time Series
-    Models and the Kalman Filter, 1989, section 3.2). With ``z = x + e`` and ``x' = F x + w``,
-    ``z' = F z + (rho - F) e + w + u``, and each measurement is of one coordinate of z. Without
-    correlated errors it is that of the coordinates.
-
-    Parameters
-    ----------
-    slope : ndarray
-        Shape (transition, extended, extended).
-    seen : ndarray of bool
-        Shape (transition, extended).
-    push : ndarray
-        What a unit of each noise parameter's acceleration or error adds, shape (push, extended).
-    pushed : ndarray of int
-        Which noise parameter each row is of, shape (push,).
-    always : ndarray of bool
-        Which rows act in every step, shape (push,).
-    """
-
-    slope: Floats
-    seen: Bools
-    push: Floats
-    pushed: Ints
-    always: Bools
-
-    @classmethod
-    def of(cls, coordinates: Coordinates, slope: Floats, seen: Bools) -> Extended:
-        """Return the extended model of the coordinates; arguments as of `TrajectoryNoise`."""
-        at, parameters = coordinates.drifted
-        if not len(at):
-            return cls(slope, seen, coordinates.push, coordinates.pushed, coordinates.always)
-        (n, d), k, rho = seen.shape, len(at), coordinates.memory
-        chosen = np.zeros((d, k))
-        chosen[at, np.arange(k)] = 1.0
-        whole = np.zeros((n, d + k, d + k))
-        whole[:, :d, :d] = slope
-        whole[:, :d, d:] = rho * chosen - slope @ chosen
-        whole[:, d:, d:] = rho * np.eye(k)
-        new = np.sqrt(1.0 - rho**2) * np.hstack([chosen.T, np.eye(k)])
-        push = np.vstack([np.pad(coordinates.push, ((0, 0), (0, k))), new])
-        return cls(
-            whole,
-            np.pad(seen, ((0, 0), (0, k))),
-            push,
-            np.concatenate([coordinates.pushed, parameters]),
-            np.concatenate([coordinates.always, np.ones(k, dtype=bool)]),
-        )
-
-    def steps(self, sigma: Floats) -> Floats:
-        """Return the process noise of a step without and with contact, at sigma (..., parameter).
-
-        Shape (..., 2, extended, extended).
-        """
-        return step_covariances(self.push, sigma[..., self.pushed], self.always)
-
-    def padded(self, values: Floats) -> Floats:
-        """Return values of coordinates (..., coordinate), padded with zeros for the errors."""
-        more = self.slope.shape[1] - values.shape[-1]
-        return np.pad(values, (*[(0, 0)] * (values.ndim - 1), (0, more))) if more else values
-
-    def states(self, coordinates: Coordinates, extended: Floats) -> Floats:
-        """Return coordinates without their errors, shape (..., coordinate)."""
-        at, d = coordinates.drifted[0], len(coordinates.places)
-        if not len(at):
-            return extended
-        result = extended[..., :d].copy()
-        result[..., at] -= extended[..., d:]
-        return result
-
-    def covariance(self, coordinates: Coordinates, whole: Floats) -> Floats:
-        """Return the covariance (transition, coordinate, coordinate) without errors."""
-        half = self.states(coordinates, whole)
-        return self.states(coordinates, half.swapaxes(-1, -2))
+        sensor = self.coordinates.errors(sigma)[..., None, :] ** 2
+        return np.where(self.wide > 0, self.wide, sensor)

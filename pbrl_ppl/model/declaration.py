@@ -15,7 +15,6 @@ from pytensor.tensor.variable import TensorVariable
 from pbrl_ppl.likelihood import (
     ACCELERATION,
     ACTION_DIMS,
-    DRIFT,
     NEXT_STATE_DIMS,
     START_DIMS,
     Problem,
@@ -151,7 +150,7 @@ def _noise(problem: Problem) -> TensorVariable:
     parts, mu = [pt.zeros(0)], np.log(median)
     for name, names in problem.noise_variables.items():
         centre, dims = mu[: len(names)], variable_dims(problem)[name]
-        if name in (ACCELERATION, DRIFT):
+        if name == ACCELERATION:
             variable = pm.Exponential(name, scale=np.exp(centre) / np.log(2.0), dims=dims)
         else:
             variable = pm.LogNormal(name, mu=centre, sigma=spread, dims=dims)

@@ -18,7 +18,6 @@ from pbrl_ppl.errors import (
 from pbrl_ppl.likelihood import (
     ACCELERATION,
     CONTACT,
-    DRIFT,
     NEXT_STATE_DIMS,
     Problem,
     exponential,
@@ -481,7 +480,6 @@ def _with_units(problem: Problem, posterior: xr.Dataset) -> xr.Dataset:
     units["sigma"] = "the unit of each state dimension"
     if problem.likelihood.filtered:
         units |= dict.fromkeys((ACCELERATION, CONTACT), "m/s^2, of omega rad/s^2")
-        units[DRIFT] = "the unit of each position"
     for name in units.keys() & set(posterior.data_vars):
         posterior[str(name)].attrs["units"] = units[str(name)]
     return posterior

@@ -211,8 +211,6 @@ def recording(problem: Problem) -> xr.Dataset:
     noise = problem.trajectory_noise
     kept["slope"] = (("transition", "cell_after", "cell_before"), noise.slope)
     kept["linearised_at"] = (("noise_parameter",), noise.sigma)
-    if noise.coordinates.drifts:
-        kept["memory"] = noise.coordinates.memory
     if noise.sensitivity is not None:
         kept[_ORIGIN] = (("transition", "parameter"), noise.sensitivity.phi)
         dims = ("transition", "cell_before", "parameter")
@@ -264,10 +262,7 @@ def recorded(scene: Scene, constants: xr.Dataset, data_sha256: str = "") -> Hist
 
 def recorded_coordinates(scene: Scene, constants: xr.Dataset) -> Any:
     """Return the coordinates of the history that a posterior's constant data hold."""
-    coordinates = observed_coordinates(scene, recorded(scene, constants))
-    return (
-        coordinates.drifting(float(constants["memory"])) if "memory" in constants else coordinates
-    )
+    return observed_coordinates(scene, recorded(scene, constants))
 
 
 def both_recordings(earlier: xr.Dataset, new: xr.Dataset) -> xr.Dataset:
@@ -276,7 +271,7 @@ def both_recordings(earlier: xr.Dataset, new: xr.Dataset) -> xr.Dataset:
         return xr.Dataset()
     by_transition = [name for name in ("slope", _ORIGIN, _SENSITIVITY) if name in new]
     whole = [str(name) for name in new.data_vars if f"{_PREFIX}trajectory" in new[name].dims]
-    result = new[[name for name in ("linearised_at", "memory") if name in new]]
+    result = new[[name for name in ("linearised_at",) if name in new]]
     result = result.drop_vars([str(name) for name in result.coords])
     for names, dim in ((by_transition, "transition"), (whole, f"{_PREFIX}trajectory")):
         parts = [dataset[names].reset_coords(drop=True) for dataset in (earlier, new)]

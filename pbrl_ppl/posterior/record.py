@@ -319,7 +319,9 @@ def _from_json(kind: Any, value: Any) -> Any:
     """Return a value of a type from what JSON holds of it."""
     if is_dataclass(kind):
         kinds = _kinds(kind)  # type: ignore[arg-type]  # a type, not an instance
-        values = {name: _from_json(kinds[name], entry) for name, entry in value.items()}
+        values = {
+            name: _from_json(kinds[name], entry) for name, entry in value.items() if name in kinds
+        }  # of earlier versions there may be more
         if kind is Coordinates:  # no row has no columns in JSON
             values["push"] = values["push"].reshape(-1, len(values["places"]))
         return kind(**values)  # type: ignore[operator]

@@ -287,8 +287,6 @@ CELLS = Coordinates(
     pushed=np.array([1]),
     sensors=(0,),
     rates=(3,),
-    drifts=(0,),
-    memory=0.3,
 )
 #: A value of each field that may be left out.
 OPTIONAL = {
