@@ -15,12 +15,14 @@ from pbrl_ppl.errors import FitError, MeetingWarning, warn
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import (
     Mode,
+    covariance_of,
     find_mode,
     find_simulation_mode,
     find_trajectory_mode,
     following,
     weigh,
 )
+from pbrl_ppl.parameters import inside, prior_slopes
 from pbrl_ppl.posterior import (
     PARETO_K,
     SIZE,
@@ -264,7 +266,10 @@ def _drawn(
     if job.resume is not None:
         return job, _run(chosen, job), stored_mode(problem, job.resume)
     job = _at_mode(job, start)
-    return job, _run(chosen, job), Point(job.at_mode.phi, job.at_mode.sigma)
+    trace = _run(chosen, job)
+    if problem.likelihood.simulated and chosen not in (METHODS["laplace"], METHODS["map"]):
+        trace = _with_robust_width(job, trace)
+    return job, trace, Point(job.at_mode.phi, job.at_mode.sigma)
 
 
 def _at_mode(job: SamplerRun, start: Mode | None) -> SamplerRun:
@@ -281,6 +286,30 @@ def _at_mode(job: SamplerRun, start: Mode | None) -> SamplerRun:
         if joined is problem:
             return replace(job, problem=problem, mode=replace(mode, problem=problem))
         job, start = replace(job, problem=joined), None
+
+
+def _with_robust_width(job: SamplerRun, trace: Idata) -> Idata:
+    """Return draws about their mean with the mode's robust covariance in place of the Laplace one.
+
+    Tempering keeps a correlated residual from counting as many measurements, and not exactly (the
+    open-faced sandwich: B. A. Shaby, Journal of Computational and Graphical Statistics 23, 2014).
+    """
+    problem, mode = job.problem, job.at_mode
+    priors = problem.layout.priors
+    if not priors:
+        return trace
+    precision = mode.jacobian.T @ mode.jacobian + np.diag(prior_slopes(priors, mode.phi) ** 2)
+    plain = replace(mode, covariance=covariance_of(precision))
+    posterior = group(trace, "posterior")
+    phi, sigma = parameter_draws(problem, trace)
+    off = np.linalg.solve(plain.factor, (phi - phi.mean(axis=0)).T)
+    wider = inside(priors, phi.mean(axis=0) + (mode.factor @ off).T)
+    values = problem.named(wider, sigma)
+    held = {
+        name: posterior[name].copy(data=np.reshape(values[name], posterior[name].shape))
+        for name in values.keys() & set(posterior.data_vars)
+    }
+    return from_groups(groups(trace) | {"posterior": posterior.assign(held)}, trace.attrs)
 
 
 @one_blas_thread
