@@ -99,13 +99,17 @@ def act(
     if intervals < 1 or (every is not None and every < 1):
         raise GoalError(f"act: every is {every} and intervals {intervals}, expected 1 or more")
     scene = idata.scene if isinstance(idata, TransitionModel) else scene_of(idata)
-    goal = goal if isinstance(goal, Goal) else Goal.of(goal)
-    goal.check(scene)
+    target = goal if isinstance(goal, Goal) else Goal.of(goal)
+    target.check(scene)
+
+    def is_reached(state: Floats) -> bool:
+        return bool(target.shortfall(scene, state) <= 1.0)
+
     states, plans = [start_state(scene, start)], 0
     played: list[Floats] = []
-    while len(played) < intervals and not _is_reached(scene, goal, states[-1]):
-        before = played[-1] if played else None
-        ahead = plan(idata, states[-1], goal, actions, before=before, **options)
+    while len(played) < intervals and not is_reached(states[-1]):
+        last = played[-1] if played else None
+        ahead = plan(idata, states[-1], target, actions, before=last, **options)
         plans += 1
         for wrench in ahead.wrenches[: intervals - len(played)][:every]:
             state = np.asarray(world(wrench), dtype=float)
@@ -116,17 +120,10 @@ def act(
                 )
             states.append(state)
             played.append(wrench)
-            if every is not None and _is_reached(scene, goal, state):
+            if every is not None and is_reached(state):
                 break
         if every is None or not len(ahead.wrenches):
             break
     wrenches = np.array(played).reshape(-1, len(states[0]), 3)
-    distance = float(goal.distance(scene, states[-1]))
-    return Acted(
-        scene, np.array(states), wrenches, _is_reached(scene, goal, states[-1]), distance, plans
-    )
-
-
-def _is_reached(scene: Scene, goal: Goal, state: Floats) -> bool:
-    """Return whether a state (body, 6) is within the goal's tolerances."""
-    return bool(goal.shortfall(scene, state) <= 1.0)
+    distance = float(target.distance(scene, states[-1]))
+    return Acted(scene, np.array(states), wrenches, is_reached(states[-1]), distance, plans)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any, ClassVar, final
 
 import numpy as np
@@ -12,18 +13,11 @@ import numpy as np
 from pbrl_ppl.agents.revision import Revision
 from pbrl_ppl.errors import GoalError
 from pbrl_ppl.oomdp import LWR, OOLWR
-from pbrl_ppl.planning import (
-    ActionSet,
-    Dynamics,
-    Goal,
-    TransitionModel,
-    plan,
-    rollout,
-    start_state,
-)
+from pbrl_ppl.physics import touching
+from pbrl_ppl.planning import ActionSet, Dynamics, Goal, TransitionModel, plan, rollout, start_state
 from pbrl_ppl.posterior import Idata
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import THETA, Floats, wrapped
+from pbrl_ppl.state import THETA, Bools, Floats, wrapped
 
 
 @dataclass(frozen=True)
@@ -110,6 +104,8 @@ class Agent(ABC):
 
     Attributes
     ----------
+    model : TransitionModel or None
+        What it plans with; None before anything was learned.
     planned : bool
         Whether the last action was planned rather than random.
     posterior : InferenceData or DataTree or None
@@ -120,6 +116,7 @@ class Agent(ABC):
 
     #: Name in episodes and figures.
     name: ClassVar[str]
+    model: TransitionModel | None = None
     posterior: Idata | None = None
     added: tuple[Revision, ...] = ()
 
@@ -130,11 +127,6 @@ class Agent(ABC):
         self._ahead = np.empty((0, len(task.scene.moving), 3))
         self._last = np.zeros((len(task.scene.moving), 3))  # for actuators with memory
         self.planned = False
-
-    @property
-    @abstractmethod
-    def model(self) -> TransitionModel | None:
-        """Return the model to plan with; None before anything was learned."""
 
     @abstractmethod
     def observe(self, state: Floats, action: Floats, next_state: Floats) -> None:
@@ -174,8 +166,7 @@ class Agent(ABC):
         KeyboardInterrupt
             If the search was interrupted.
         """
-        wrenches = self.task.wrenches(state)
-        model = self.model
+        wrenches, model = self.task.wrenches(state), self.model
         self._ahead = self._ahead[:0] if model is None else self._planned(model, state)
         self.planned = len(self._ahead) > 0
         if self.planned:
@@ -205,19 +196,14 @@ class Agent(ABC):
 class PhysicsAgent(Agent):
     """Agent whose model is :class:`pbrl_ppl.Dynamics` of estimated parameters."""
 
-    _dynamics: Dynamics | None = None
-
-    @property
-    def model(self) -> Dynamics | None:
-        """Return Eq. 7 with the estimated parameters; None before the first estimate."""
-        return self._dynamics
+    model: Dynamics | None = None
 
     @property
     def estimates(self) -> Mapping[str, float]:
         """Return parameters by label, SI units: the mode, or the draw nearest to the mean."""
-        if self._dynamics is None:
+        if self.model is None:
             return {}
-        middle = self._dynamics.single()
+        middle = self.model.single()
         return dict(zip(middle.layout.labels, middle.phi[0].tolist(), strict=True))
 
 
@@ -241,6 +227,25 @@ def prediction_errors(
     return np.asarray(error)
 
 
+def meetings(scene: Scene, moved: Bools, state: Floats, after: Floats) -> Iterator[list[int]]:
+    """Yield the places of every two moving bodies that touch in a transition, or nearly do.
+
+    Parameters
+    ----------
+    scene : Scene
+        Orders the bodies.
+    moved : ndarray of bool
+        Bodies of which one is among the two, shape (body,); what a caller adds to them counts for
+        later pairs.
+    state, after : ndarray
+        States at the ends of the intervals, shape (n, body, 6), SI units.
+    """
+    for i, j in combinations(range(len(scene.moving)), 2):
+        pair = scene.subset([scene.moving[i].name, scene.moving[j].name]).replace(walls=())
+        if moved[[i, j]].any() and touching(pair, state[:, [i, j]], after[:, [i, j]]).any():
+            yield [i, j]
+
+
 class _RegressionAgent(Agent):
     """Agent that learns a regression as it observes."""
 
@@ -252,14 +257,10 @@ class _RegressionAgent(Agent):
         super().__init__(task, **options)
         self._learner = self._regression(task.scene, **(learner or {}))
 
-    @property
-    def model(self) -> LWR | OOLWR | None:
-        """Return the regression; None before it has any data."""
-        return self._learner if self._learner.transitions else None
-
     def observe(self, state: Floats, action: Floats, next_state: Floats) -> None:
         """Learn from a transition; arguments as for :meth:`Agent.observe`."""
         self._learner.observe(state, action, next_state)
+        self.model = self._learner
 
 
 @final
@@ -339,12 +340,7 @@ class TrueModelAgent(Agent):
         self, task: Task, parameters: Mapping[str, object], effects: Any = (), **options: Any
     ) -> None:
         super().__init__(task, **options)
-        self._dynamics = Dynamics.known(task.scene, parameters, effects, threads=1)
-
-    @property
-    def model(self) -> Dynamics:
-        """Return the true dynamics."""
-        return self._dynamics
+        self.model = Dynamics.known(task.scene, parameters, effects, threads=1)
 
     def observe(self, state: Floats, action: Floats, next_state: Floats) -> None:
         """Do nothing: there is nothing to learn."""

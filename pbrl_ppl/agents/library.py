@@ -8,19 +8,18 @@ from typing import Any, ClassVar, final
 import numpy as np
 import pandas as pd
 
-from pbrl_ppl.agents.agent import PhysicsAgent, Task, prediction_errors
+from pbrl_ppl.agents.agent import PhysicsAgent, Task, meetings, prediction_errors
 from pbrl_ppl.agents.pbrl import NEGLIGIBLE
 from pbrl_ppl.errors import ConvergenceWarning, FitError
 from pbrl_ppl.history import from_segments
 from pbrl_ppl.likelihood import Problem, TransitionLikelihood
-from pbrl_ppl.model import build_model
 from pbrl_ppl.modes import choose_from_library
 from pbrl_ppl.parameters import Layout, ParameterLibrary
-from pbrl_ppl.physics import Physics, build_layout, touching
+from pbrl_ppl.physics import Physics, build_layout
 from pbrl_ppl.planning import Dynamics
 from pbrl_ppl.posterior import group
-from pbrl_ppl.sampling import fit
-from pbrl_ppl.scene import Scene, body_sizes
+from pbrl_ppl.sampling import sample
+from pbrl_ppl.scene import body_sizes
 from pbrl_ppl.state import Floats
 
 
@@ -74,26 +73,16 @@ class LibraryAgent(PhysicsAgent):
         if method not in ("exact", "paper"):
             raise ValueError(f"method is {method!r}, expected 'exact' or 'paper'")
         super().__init__(task, **options)
-        self.method = method
-        scene = task.scene
+        self.method, scene = method, task.scene
         if any(body.effects or body.kinematic for body in scene.bodies):
             raise FitError("PBRL: no library is for effects or kinematic bodies; take PBRLAgent")
         self.library, self.fits = library, 0
         self._layout = build_layout(scene)
         self._table = library.table(self._layout, scene)
         rng = np.random.default_rng([self.seed, 2])
-        names = [body.name for body in scene.moving]
         self._probability = {owner: library.prior(owner) for owner in scene.owners}
         self._choice = {name: int(rng.choice(len(p), p=p)) for name, p in self._probability.items()}
-        self._scenes = {owner: scene.subset(bodies) for owner, bodies in scene.owners.items()}
-        self._pairs = {
-            (a, b): scene.subset([a, b]).replace(walls=())
-            for i, a in enumerate(names)
-            for b in names[i + 1 :]
-        }
-        self._seen: dict[str, list[tuple[Floats, Floats, Floats]]] = {
-            key: [] for key in scene.owners
-        }
+        self._seen = {owner: list[tuple[Floats, Floats, Floats]]() for owner in scene.owners}
         self._fitted = dict.fromkeys(scene.owners, 0)
 
     @property
@@ -104,15 +93,11 @@ class LibraryAgent(PhysicsAgent):
     def observe(self, state: Floats, action: Floats, next_state: Floats) -> None:
         """Store a transition of each body that it informs; see :meth:`Agent.observe`."""
         moved = action.any(axis=1) | state[:, 3:].any(axis=1) | (next_state != state).any(axis=1)
-        names = [body.name for body in self.task.scene.moving]
-        alone = moved.copy()
-        for pair, scene in self._pairs.items():
-            i, j = (names.index(name) for name in pair)
-            if moved[i] or moved[j]:
-                both = [i, j]
-                if touching(scene, state[None, both], next_state[None, both])[0]:
-                    alone[both] = False
-        for owner, bodies in self.task.scene.owners.items():
+        alone, scene = moved.copy(), self.task.scene
+        for pair in meetings(scene, moved, state[None], next_state[None]):
+            alone[pair] = False
+        names = [body.name for body in scene.moving]
+        for owner, bodies in scene.owners.items():
             rows = [names.index(name) for name in bodies]
             used = alone[rows, None]
             if used.any():  # other bodies of the class are at rest and count as not measured
@@ -131,58 +116,44 @@ class LibraryAgent(PhysicsAgent):
             grown = len(seen) > fitted and len(seen) >= (1.0 + growth) * fitted
             if grown and (not fitted or self._surprised(name)):
                 self._choose(name)
-        if self._dynamics is None or self.fits > before:
-            self._dynamics = Dynamics(self.task.scene, self._phi(self._layout), threads=1)
+        if self.model is None or self.fits > before:
+            self.model = Dynamics(self.task.scene, self._phi(self._layout), threads=1)
 
     def _surprised(self, name: str) -> bool:
-        scene, (state, action, after) = self._scenes[name], self._data(name)
+        scene = self.task.scene.subset(self.task.scene.owners[name])
         dynamics = Dynamics(scene, self._phi(build_layout(scene)), threads=1)
-        error = prediction_errors(dynamics, state, action, after)
+        error = prediction_errors(dynamics, *map(np.array, zip(*self._seen[name], strict=True)))
         return bool((error > NEGLIGIBLE * body_sizes(scene)).any())
-
-    def _data(self, name: str) -> tuple[Floats, Floats, Floats]:
-        """Return states, wrenches and next states of a body or class."""
-        state, action, after = (np.array(column) for column in zip(*self._seen[name], strict=True))
-        return state, action, after
 
     def _phi(self, layout: Layout) -> Floats:
         """Return the chosen parameters in a layout's order."""
-        known = {
-            label: self._table[i, self._choice[label.partition("[")[2].rstrip("]")]]
-            for i, label in enumerate(self._layout.labels)
-        }
-        return np.array([known[label] for label in layout.labels])
+        owners = [label.partition("[")[2].rstrip("]") for label in layout.labels]
+        chosen = [self._choice[owner] for owner in owners]
+        return np.asarray(self._table[self._layout.places(layout.labels), chosen])
 
     def _choose(self, name: str) -> None:
-        scene, (state, action, after) = self._scenes[name], self._data(name)
+        scene = self.task.scene.subset(self.task.scene.owners[name])
+        state, action, after = map(np.array, zip(*self._seen[name], strict=True))
         history = from_segments(scene, state, action[:, None], after[:, None])
-        among = _restricted(self.library, scene, name)
+        wanted = {block.name for block in build_layout(scene).blocks}
+        prior = dict(zip(self.library.names, self.library.prior(name).tolist(), strict=True))
+        sets = {
+            label: {key: value for key, value in dict(values).items() if key in wanted}
+            for label, values in self.library.sets
+            if prior[label] > 0
+        }
+        among = ParameterLibrary(sets, {label: prior[label] for label in sets})
         noise = TransitionLikelihood(scalar=True)
         problem = Problem.of(Physics(scene), history, likelihood=noise, library=among)
         if self.method == "paper":
             with warnings.catch_warnings():  # one chain, as in the paper
                 warnings.simplefilter("ignore", ConvergenceWarning)
-                idata = fit(build_model(problem), method="paper", seed=self.seed, progress=False)
-            index = group(idata, "posterior")["library_index"].to_numpy()
+                posterior = sample(problem, method="paper", seed=self.seed).posterior
+            index = group(posterior, "posterior")["library_index"].to_numpy()
         else:
             # as many draws as the paper's schedule gives
             _, _, index, _, _ = choose_from_library(problem, 400, 1, self.seed)
-        share = np.bincount(index[..., 0].ravel(), minlength=len(among.names)) / index[..., 0].size
-        shares = dict(zip(among.names, share.tolist(), strict=True))
-        self._probability[name] = np.array(
-            [shares.get(set_name, 0.0) for set_name in self.library.names]
-        )
+        drawn = np.array(among.names)[index[..., 0].ravel()]
+        self._probability[name] = np.array([(drawn == one).mean() for one in self.library.names])
         self._choice[name] = int(self._probability[name].argmax())
         self._fitted[name], self.fits = len(state), self.fits + 1
-
-
-def _restricted(library: ParameterLibrary, scene: Scene, name: str) -> ParameterLibrary:
-    """Return the sets that one body or class may have, with its parameters only."""
-    wanted = {block.name for block in build_layout(scene).blocks}
-    prior = dict(zip(library.names, library.prior(name).tolist(), strict=True))
-    sets = {
-        label: {key: value for key, value in dict(values).items() if key in wanted}
-        for label, values in library.sets
-        if prior[label] > 0
-    }
-    return ParameterLibrary(sets, {label: prior[label] for label in sets})

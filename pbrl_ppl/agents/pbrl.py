@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable
-from dataclasses import replace
-from itertools import combinations, compress
+from itertools import compress
 from typing import Any, ClassVar, final
 
 import numpy as np
 
-from pbrl_ppl.agents.agent import PhysicsAgent, Task, prediction_errors
-from pbrl_ppl.agents.revision import select_effects
+from pbrl_ppl.agents.agent import PhysicsAgent, Task, meetings, prediction_errors
+from pbrl_ppl.agents.revision import revise
 from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import BoundWarning, FitError, UninformedWarning
@@ -76,7 +75,7 @@ class PBRLAgent(PhysicsAgent):
         Latest posterior, as made by :func:`pbrl_ppl.fit`.
     fits : int
         Number of fits.
-    looks : int
+    criticisms : int
         Number of criticisms.
     added : tuple of Revision
         Effects added to the model, with the evidence for each; their parameters are among the
@@ -98,42 +97,32 @@ class PBRLAgent(PhysicsAgent):
         **options: Any,
     ) -> None:
         if (draws is not None and draws < 1) or not growth >= 0:
-            raise FitError(
-                f"PBRL: draws is {draws} and growth {growth}, expected 1 or more and 0 or more"
-            )
+            raise FitError(f"PBRL: draws is {draws}, growth {growth}; expected at least 1 and 0")
         super().__init__(task, **options)
         self.draws, self.growth = draws, growth
         self._likelihood, self.revise = TransitionLikelihood.declare(sigma), revise
         self._catalogue = tuple(catalogue)
-        self._declared = attach(task.scene, effects, self._catalogue)
+        declared = sum(len(body.effects) for body in task.scene.dynamic)
+        self._given = attach(task.scene, effects, self._catalogue)[declared:]
         self._transitions: list[tuple[Floats, Floats, Floats]] = []
         self._sigma = np.empty(0)
         self._negligible = NEGLIGIBLE * body_sizes(task.scene)
-        self.fits = self._fitted = self.looks = self._looked = 0
+        self.fits = self._fitted = self.criticisms = self._criticised = 0
 
     def observe(self, state: Floats, action: Floats, next_state: Floats) -> None:
         """Store a transition; arguments as for :meth:`Agent.observe`."""
         self._transitions.append((state, action, next_state))
 
-    def update(self) -> None:
-        """Refit the posterior if new transitions are informative."""
-        if self._is_informed():
-            self._fit()
-
     def _is_informed(self, surprise: float = 4.0) -> bool:
         """Return whether new transitions inform: there are many, or errors above so many sigma."""
-        if len(self._transitions) == self._fitted or self._dynamics is None:
+        if len(self._transitions) == self._fitted or self.model is None:
             return len(self._transitions) > self._fitted
         state, inputs, after = (array[self._fitted :] for array in self._data())
         action, previous = inputs[..., :3], inputs[..., 3:6]
-        error = prediction_errors(self._dynamics, state, action, after, previous)
-        if (error <= self._negligible).all():
-            return False
-        surprised = not (error <= np.maximum(surprise * self._sigma, self._negligible)).all()
-        return self._grown(self._fitted) or surprised
-
-    def _grown(self, since: int) -> bool:
-        return len(self._transitions) >= (1.0 + self.growth) * since
+        error = prediction_errors(self.model, state, action, after, previous)
+        grown = len(self._transitions) >= (1.0 + self.growth) * self._fitted
+        expected = 0.0 if grown else surprise * self._sigma
+        return not (error <= np.maximum(expected, self._negligible)).all()
 
     def _data(self) -> tuple[Floats, Floats, Floats]:
         """Return states, inputs as in `pbrl_ppl.state.INPUT`, and next states."""
@@ -149,25 +138,26 @@ class PBRLAgent(PhysicsAgent):
         effects: tuple[Attached, ...],
         rows: Bools | slice = slice(None),
         bodies: Bools | None = None,
+        step: Floats | None = None,
     ) -> Problem:
-        """Return the problem of some transitions, and of some bodies alone."""
+        """Return the problem of some transitions, and of some bodies alone.
+
+        ``step``: measurements are rounded to multiples of it, shape (body, 6).
+        """
         scene = self.task.scene
         state, inputs, after = (values[rows] for values in self._data())
+        if step is not None:
+            after = step * np.round(after / step)
         if bodies is not None:
             scene = scene.subset([body.name for body in compress(scene.moving, bodies)])
             state, inputs, after = (values[:, bodies] for values in (state, inputs, after))
         history = from_segments(scene, state, inputs[:, None], after[:, None])
-        declared = {body.name: body.effects for body in scene.moving}
-        beside = [
-            attached
-            for attached in effects
-            if attached.body in declared and attached.effect.name not in declared[attached.body]
-        ]
-        physics = Physics.declare(with_units(scene, history), beside)
+        there = [one for one in effects if one.body in {body.name for body in scene.moving}]
+        physics = Physics.declare(with_units(scene, history), there)
         try_own_effects(physics, history)
         return declared_problem(physics, history, likelihood=self._likelihood)
 
-    def _revised(self, *, least: int = 3, false_alarm: float = 0.01) -> Mode | None:
+    def _criticise(self, *, least: int = 3, false_alarm: float = 0.01) -> Mode | None:
         """Criticise the declared model; return the mode found if it is of all data.
 
         ``least``: fewest transitions for criticism.
@@ -175,52 +165,45 @@ class PBRLAgent(PhysicsAgent):
         """
         state, _, after = self._data()
         free = ~touching(self.task.scene, state, after)
-        if free.sum() < least or not self._grown(self._looked):
+        if free.sum() < least or len(free) < (1.0 + self.growth) * self._criticised:
             return None
-
-        def search(effects: tuple[Attached, ...]) -> Mode:
-            return find_mode(self._problem(effects, free), seed=self.seed)
-
-        self.looks, self._looked = self.looks + 1, len(free)
-        level = false_alarm / (self.looks * (self.looks + 1))
-        selected, mode = select_effects(
-            search, self._declared, self.added, self._catalogue, level=level, floor=self._negligible
-        )
-        known = {revision.attached: revision.transitions for revision in self.added}
-        self.added = tuple(
-            replace(law, transitions=known.get(law.attached, len(free))) for law in selected
-        )
+        self.criticisms, self._criticised = self.criticisms + 1, len(free)
+        level = false_alarm / (self.criticisms * (self.criticisms + 1))
+        # one sigma is of all dimensions, and so is then the coarsest precision
+        step = 2.0 * np.maximum(self._negligible, self._likelihood.scalar * self._negligible.max())
+        problem = self._problem(self._given, free, step=step)
+        self.added, mode = revise(problem, self.added, self._catalogue, level, step, self.seed)
         return mode if free.all() else None
 
-    def _start(self, effects: tuple[Attached, ...], whole: Problem) -> Mode | None:
-        """Return the mode found from that of the bodies that moved; None if all moved.
+    def _of_moved(self, effects: tuple[Attached, ...]) -> Mode | None:
+        """Return the mode of the bodies that moved alone; None if all did, or none.
 
         Bodies that nothing moved or touched keep their prior. Those that moved are fitted first to
         the transitions without contact, whose likelihood is smooth, then to all.
         """
         scene, (state, inputs, after) = self.task.scene, self._data()
-        names = [body.name for body in scene.moving]
         moved = (state != state[0]).any(axis=(0, 2)) | state[0, :, 3:].any(axis=1)
         moved |= inputs[..., :3].any(axis=(0, 2))
-        for i, j in combinations(range(len(names)), 2):
-            pair = scene.subset([names[i], names[j]]).replace(walls=())
-            if moved[[i, j]].any() and touching(pair, state[:, [i, j]], after[:, [i, j]]).any():
-                moved[[i, j]] = True
+        for pair in meetings(scene, moved, state, after):
+            moved[pair] = True
         if moved.all() or not moved.any():
             return None
         initial, free = None, ~touching(scene, state, after)
         if free.any():
-            apart = self._problem(effects, free, moved)
-            initial = find_mode(apart, seed=self.seed).phi
-        part = self._problem(effects, bodies=moved)
-        mode = find_mode(part, seed=self.seed, initial=initial)
-        return find_mode(whole, initial=whole.layout.from_layout(part.layout, mode.phi))
+            initial = find_mode(self._problem(effects, free, moved), seed=self.seed).phi
+        return find_mode(self._problem(effects, bodies=moved), seed=self.seed, initial=initial)
 
-    def _fit(self) -> None:
-        start = self._revised() if self.revise else None
-        effects = (*self._declared, *(law.attached for law in self.added))
-        problem = self._problem(effects)
-        start = start or self._start(effects, problem)
+    def update(self) -> None:
+        """Refit the posterior if new transitions are informative."""
+        if not self._is_informed():
+            return
+        near = self._criticise() if self.revise else None
+        effects = (*self._given, *(law.attached for law in self.added))
+        problem, near = self._problem(effects), near or self._of_moved(effects)
+        start = None
+        if near is not None:
+            initial = problem.layout.from_layout(near.problem.layout, near.phi)
+            start = find_mode(problem, initial=initial)
         method = "map" if self.draws is None else "laplace"
         with warnings.catch_warnings():
             # early in an episode the data do not inform all parameters
@@ -228,7 +211,7 @@ class PBRLAgent(PhysicsAgent):
             warnings.simplefilter("ignore", BoundWarning)
             drawn = sample(problem, seed=self.seed, method=method, start=start)
         self.posterior = drawn.posterior
-        self._dynamics = Dynamics.of(
+        self.model = Dynamics.of(
             self.posterior, self.draws, seed=self.seed, effects=self._catalogue, threads=1
         )
         self._sigma = np.median(group(self.posterior, "posterior")["sigma"].to_numpy(), axis=(0, 1))

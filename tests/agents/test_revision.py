@@ -42,31 +42,34 @@ def pushed(agent: PBRLAgent, effect: str | None, *, sigma: float, steps: int, se
 
 
 @pytest.mark.parametrize("effect", ["constant_force", "actuator_rotation"])
-def test_names_what_is_missing(effect) -> None:
-    agent = PBRLAgent(CART, seed=2, revise=True, growth=0.5)
-    seen = pushed(agent, effect, sigma=0.0, steps=8, seed=2)
+@pytest.mark.parametrize("seed", [1, 2])
+def test_names_what_is_missing(effect, seed) -> None:
+    """Of seeds 0 to 4 it does in all."""
+    agent = PBRLAgent(CART, seed=seed, revise=True, growth=0.5)
+    seen = pushed(agent, effect, sigma=0.0, steps=8, seed=seed)
     assert seen[-1] == [effect]
     (found,) = agent.added
-    assert found.body == "cart" and 4 <= found.transitions <= 8 and found.p_value < 0.01
-    assert found.elpd_difference > 2 * found.elpd_difference_se
+    assert found.body == "cart" and 4 <= found.transitions <= 8
+    assert found.nats > 10.0 and found.share > 0.5
     for label, size in SIZES[effect].items():
         assert agent.estimates[f"{label}[cart]"] == pytest.approx(size, rel=0.01, abs=0.01)
 
 
-def test_adds_nothing_to_a_true_model() -> None:
-    agent = PBRLAgent(CART, seed=2, revise=True, growth=0.5)
-    seen = pushed(agent, None, sigma=0.01, steps=6, seed=2)
-    assert not any(seen) and agent.looks == 2
+@pytest.mark.parametrize("seed", [1, 2])
+def test_adds_nothing_to_a_true_model(seed) -> None:
+    agent = PBRLAgent(CART, seed=seed, revise=True, growth=0.5)
+    seen = pushed(agent, None, sigma=0.01, steps=6, seed=seed)
+    assert not any(seen) and agent.criticisms >= 1
 
 
 def test_drops_what_later_data_do_not_bear_out() -> None:
     agent = PBRLAgent(CART, seed=1, revise=True, growth=10.0)
     drag = EFFECTS["quadratic_drag"].on("cart")
-    agent.added = (Revision(drag, 4, 0.001, 10.0, 3.0, ()),)
+    agent.added = (Revision(drag, 4, 10.0, 0.5),)
     pushed(agent, "linear_drag", sigma=0.0, steps=5, seed=1)
     assert [each.effect for each in agent.added] == ["linear_drag"]
     agent = PBRLAgent(CART, seed=1, revise=True, growth=10.0)
-    agent.added = (Revision(drag, 4, 0.001, 10.0, 3.0, ()),)
+    agent.added = (Revision(drag, 4, 10.0, 0.5),)
     pushed(agent, None, sigma=0.01, steps=5, seed=1)
     assert agent.added == () and "quadratic_drag_coefficient[cart]" not in agent.estimates
 
@@ -90,7 +93,7 @@ def test_tries_an_own_effect_that_is_added_after_the_first_fit() -> None:
     assert agent.fits > 0
     size = EffectParameter("size", "N", Prior("half_normal", sigma=1.0))
     own = Effect("own", (size,), "made up", "a test", Force(_raises))
-    agent.added = (Revision(own.on("cart"), 4, 0.001, 10.0, 3.0, ()),)
+    agent.added = (Revision(own.on("cart"), 4, 10.0, 0.5),)
     with pytest.raises(EffectError, match="raised ZeroDivisionError when it was tried"):
         pushed(agent, None, sigma=0.01, steps=5, seed=1)
 

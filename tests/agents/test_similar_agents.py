@@ -22,9 +22,9 @@ def test_an_agent_is_surprised_by_an_error_of_any_dimension(rig, dimension) -> N
     action = task.wrenches(task.start)[0]
     for size, surprised in ((0.5e-4, False), (2e-4, True)):
         agent = PBRLAgent(task)
-        agent._dynamics = Dynamics.known(task.scene, rig.parameters(CART_TRUTH), threads=1)
+        agent.model = Dynamics.known(task.scene, rig.parameters(CART_TRUTH), threads=1)
         agent._sigma = np.zeros(6)
-        after = agent._dynamics.step(task.start[None, None], action[None])[0, 0]
+        after = agent.model.step(task.start[None, None], action[None])[0, 0]
         after[:, dimension] += size * body_sizes(task.scene)[:, dimension]
         agent.observe(task.start, action, after)
         assert agent._is_informed() == surprised

@@ -205,7 +205,7 @@ class Believing(TrueModelAgent):
                 warnings.simplefilter("ignore", UninformedWarning)
                 model = physics_model(PUCK.scene, history, sigma="scalar")
                 self.posterior = fit(model, seed=1, method="map", progress=False)
-            self.added = (Revision(drag.on("puck"), 1, 0.001, 10.0, 3.0, ()),)
+            self.added = (Revision(drag.on("puck"), 1, 10.0, 0.5),)
 
 
 def test_what_an_agent_believed_is_kept(tmp_path) -> None:

@@ -110,7 +110,7 @@ def wrong_model(script, monkeypatch) -> ModuleType:
     def agent(kind: str, effect: str, seed: int) -> pp.Agent:
         made = pp.LWRAgent(module.TASK, seed=seed, nodes=20)
         if kind == "revising":
-            made.added = (Revision(module.EFFECTS[effect].on("cart"), 4, 0.01, 9.0, 2.0, ()),)
+            made.added = (Revision(module.EFFECTS[effect].on("cart"), 4, 9.0, 0.5),)
         return made
 
     monkeypatch.setattr(module, "agent", agent)
