@@ -183,7 +183,7 @@ def criticise(
         bool,
         typer.Option(
             "--simulate",
-            help="Simulate whole trajectories, and name effects that take the error away.",
+            help="Search for missing laws by simulation error, on short pieces, then longer ones.",
         ),
     ] = False,
     as_json: options.AsJson = False,
@@ -192,8 +192,9 @@ def criticise(
     """Rank the effects that the declared model might lack by the score test: no refit, no verdict.
 
     The score test says which effect's signature the residual looks like; close-loop finds out
-    whether that effect helps on data that it has not seen. With --simulate, effects are refitted
-    one by one and in pairs, and named if they take at least a fifth off the simulation error.
+    whether that effect helps on data that it has not seen. With --simulate, pieces of trajectories
+    are simulated without process noise: on each length a regression proposes the best subset of
+    laws, and refits decide. A main law takes at least a fifth off the error of the longest pieces.
     """
     with interruptible(), stages(quiet) as progress:
         progress("reading the scene and the history")
@@ -237,17 +238,22 @@ def criticise(
 
 
 def _print_laws(attribution: Attribution, as_json: bool) -> None:
-    """Print the laws that simulation names, and the simulation error."""
+    """Print the search on each length of pieces, the laws found, and the simulation error."""
     if as_json:
-        print_json({**vars(attribution), "laws": [vars(law) for law in attribution.laws]})
+        print_json(vars(attribution))
         return
+    for rung in attribution.rungs:
+        print_table(
+            f"best subsets of laws on pieces of {rung.seconds:.3g} s, intervals: {rung.rows}",
+            ["laws", "nats", "error relative to none"],
+            ([", ".join(best.laws), f"{best.nats:.1f}", f"{best.error:.3f}"] for best in rung.path),
+        )
+        typer.echo(f"accepted: {', '.join(rung.accepted) or 'none'}")
+        typer.echo(f"dropped: {', '.join(rung.dropped) or 'none'}\n")
     print_table(
-        "effects that the simulation error of trajectories shows",
-        ["effect", "<body", "nats", "share of error", "<size"],
-        (
-            [law.effect, law.body, f"{law.nats:.0f}", f"{100 * law.share:.2g} %", _sizes(law)]
-            for law in attribution.laws
-        ),
+        "laws that the simulation error of trajectories shows",
+        ["law", "<body", "<kind", "nats", "share of error", "<size"],
+        map(_law_row, attribution.laws),
     )
     print_table(
         f"simulation error over {attribution.seconds:.3g} s (SI)",
@@ -262,16 +268,19 @@ def _print_laws(attribution: Attribution, as_json: bool) -> None:
             for name, error in attribution.before.items()
         ),
     )
-    for sentence in attribution.sentences:
+    rejected = (f"rejected {law}: {why}" for law, why in attribution.rejected.items())
+    for sentence in (*attribution.sentences, *rejected):
         typer.echo(sentence)
 
 
-def _sizes(law: Law) -> str:
-    """Return the parameters of a law with their standard deviations and units."""
-    return ", ".join(
+def _law_row(law: Law) -> list[str]:
+    sizes = (
         f"{name} {value:.3g} ± {law.sd[name]:.2g} {law.units[name].removesuffix('1')}".rstrip()
         for name, value in law.estimate.items()
     )
+    numbers = [f"{law.nats:.1f}", f"{100 * law.share:.2g} %"]
+    kind = "main" if law.main else "small"
+    return [law.effect, law.body, kind, *numbers, ", ".join(sizes)]
 
 
 def _candidate_row(candidate: Candidate) -> list[str]:

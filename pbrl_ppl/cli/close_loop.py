@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from pbrl_ppl.scene import Scene
 
 
-#: How sentences on found effects begin.
-_FOUND = ("simulations name", "added")
+#: How a sentence on laws that were found begins.
+_FOUND = "simulations name"
 
 
 class Method(StrEnum):

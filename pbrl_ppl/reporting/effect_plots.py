@@ -1,22 +1,25 @@
-"""Plots of effects: candidates' scores, added effects, their evidence, residual forces."""
+"""Plots of effects: their search, scores, posteriors and evidence; residual forces."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import cycle
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
 from scipy.stats import chi2, gaussian_kde
 
 from pbrl_ppl.criticism import Loop
 from pbrl_ppl.posterior import scalars
 from pbrl_ppl.reporting.evidence import Evidence, Law, bin_means
 from pbrl_ppl.reporting.style import AFTER, BEFORE, PLAIN, WIDE, blank_figure, label, legend
-from pbrl_ppl.reporting.words import plain
+from pbrl_ppl.reporting.words import accepted, plain
 from pbrl_ppl.scene import units_of
 from pbrl_ppl.state import Floats
 
@@ -67,11 +70,27 @@ def plot_candidates(loop: Loop, width: float = WIDE, level: float = 0.01) -> Fig
     return figure
 
 
+def plot_search(loop: Loop, width: float = WIDE) -> Figure:
+    """Plot the simulation error over the number of further laws, one line a length of pieces."""
+    figure, (axes,) = blank_figure(width, 3.2, 1, 1)
+    shades = colormaps["Blues"](np.linspace(1.0, 0.4, len(loop.rungs)))[::-1]
+    for rung, shade, mark in zip(loop.rungs, shades, cycle("o^sDv"), strict=False):
+        sizes = [0, *(len(best.laws) for best in rung.path)]
+        errors = [1.0, *(best.error for best in rung.path)]
+        name = f"{rung.seconds:.3g} s" + f", {len(rung.accepted)} accepted" * bool(rung.accepted)
+        axes.plot(sizes, errors, color=shade, marker=mark, label=name)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set(xlabel="further laws in the best subset", ylabel="simulation error / error without")
+    axes.set_ylim(0.0, 1.05)
+    legend(figure, axes.lines)
+    return figure
+
+
 def plot_added(loop: Loop, width: float = WIDE, most: int = 12) -> Figure:
     """Plot the posterior of the added effects' parameters, and the values that mean no effect."""
     shown = [
         (added, name, estimate)
-        for added in loop.added
+        for added in accepted(loop)
         for name, estimate in added.parameters.items()
     ][:most]
     columns = min(max(len(shown), 1), 2)
@@ -102,7 +121,8 @@ def plot_added(loop: Loop, width: float = WIDE, most: int = 12) -> Figure:
             _mark_null(axes, null, estimate.mean, max(estimate.sd, least), top)
         axes.set_ylim(-0.14 * top, 1.15 * top)
         axes.set_yticks([])
-        axes.set_title(f"{plain(added.effect)} on {added.body}", fontsize=10)
+        small = "" if added.main else " (small)"
+        axes.set_title(f"{plain(added.effect)} on {added.body}{small}", fontsize=10)
         axes.set_xlabel(f"{plain(name)} ({estimate.unit})")
     return figure
 

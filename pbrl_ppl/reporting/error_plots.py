@@ -204,37 +204,29 @@ def _beside(line: Floats, measured: Floats) -> Floats:
 
 def plot_correlations(loop: Loop, width: float = WIDE) -> Figure:
     """Plot correlations of errors with earlier errors and with commands."""
-    correlations = loop.correlations
-    figure, axes = blank_figure(width, 3.2, 1, 2 if correlations.commands else 1)
-    lags = np.arange(1, len(correlations.own) + 1)
-    _plot_correlations(
-        axes[0], lags, correlations.own, correlations.pairs, list(correlations.cells)
-    )
-    axes[0].set_xlabel("intervals before")
-    axes[0].set_title("with itself", fontsize="medium")
-    if correlations.commands:
-        lags = np.arange(len(correlations.driven))
-        names = [
-            f"{cell}, {command.replace('_', ' ')}"
-            for command in correlations.commands
-            for cell in correlations.cells
-        ]
-        pairs = np.full((len(lags), len(names)), max(float(correlations.pairs.max(initial=1)), 1.0))
-        _plot_correlations(axes[1], lags, correlations.driven.reshape(len(lags), -1), pairs, names)
-        axes[1].set_xlabel("intervals before")
-        axes[1].set_title("with commands", fontsize="medium")
-    axes[0].set_ylabel("correlation of errors")
+    own, driven, pairs = loop.correlations.own, loop.correlations.driven, loop.correlations.pairs
+    cells, commands = loop.correlations.cells, loop.correlations.commands
+    figure, panels = blank_figure(width, 3.2, 1, 2 if commands else 1)
+    panels[0].set_title("with itself", fontsize="medium")
+    panels[0].set_ylabel("correlation of errors")
+    fewest = pairs[pairs > 1].min(initial=pairs.max(initial=1))  # some cells were not measured
+    _plot_correlations(panels[0], np.arange(1, len(own) + 1), own, fewest, list(cells))
+    for axes in panels[1:]:
+        axes.set_title("with commands", fontsize="medium")
+        names = [f"{cell}, {command.replace('_', ' ')}" for command in commands for cell in cells]
+        values = driven.reshape(len(driven), -1)
+        _plot_correlations(axes, np.arange(len(driven)), values, pairs.max(initial=1), names)
     return figure
 
 
 def _plot_correlations(
-    axes: Axes, lags: Ints, values: Floats, pairs: Floats, names: list[str], most: int = 4
+    axes: Axes, lags: Ints, values: Floats, pairs: float, names: list[str], most: int = 4
 ) -> None:
     """Draw correlations over lags; name the largest that leave the band of noise alone.
 
     Noise alone puts any curve of a panel outside the band once in 100 times.
     """
-    edge = norm.isf(0.01 / 2 / max(values.size, 1)) / np.sqrt(np.maximum(pairs, 1)).min()
+    edge = norm.isf(0.01 / 2 / max(values.size, 1)) / np.sqrt(max(pairs, 1))
     axes.axhspan(-edge, edge, color=BAND, zorder=0)
     axes.axhline(0.0, color="black", linewidth=0.8, zorder=1)
     largest = np.abs(values).max(axis=0)
@@ -248,6 +240,7 @@ def _plot_correlations(
         axes.legend(frameon=False, fontsize="small")
     axes.set_ylim(-max(1.3 * edge, 1.1 * largest.max()), max(1.3 * edge, 1.1 * largest.max()))
     axes.set_xticks(lags)
+    axes.set_xlabel("intervals before")
 
 
 def plot_growth(loop: Loop, width: float = WIDE) -> Figure:

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.criticism import QUANTITIES, Loop, recorded_quantities
 from pbrl_ppl.likelihood import Problem
-from pbrl_ppl.posterior import Fit, Idata
+from pbrl_ppl.modes import Mode
 from pbrl_ppl.reporting.style import acceleration_unit
-from pbrl_ppl.reporting.words import depends_on_records
 from pbrl_ppl.state import STATE, Bools, Floats, Ints
 
 
@@ -24,7 +23,7 @@ class Evidence:
     ----------
     nats : ndarray
         Log-likelihood that each measured number gains given those before it, shape (transition,
-        coordinate), each model with its noise, at its draw of highest likelihood.
+        coordinate), each model with its noise, at its mode, whole trajectories filtered.
     names : tuple of str
         Names of the observed coordinates: dimension and, with several bodies, body.
     body : str
@@ -89,12 +88,13 @@ class Evidence:
 def find_evidence(loop: Loop) -> Evidence | None:
     """Return the gain of the revised model by measured number.
 
-    None where nothing was added, or a posterior does not hold its recording.
+    None where nothing was added.
     """
-    if not loop.added or not recorded(loop.posterior_before, loop.posterior_after):
+    before, last = loop.innovations
+    if last is before:
         return None
-    after = loop.revised.problem
-    nats = _log_density(loop.revised) - _log_density(loop.declared)
+    after = last.problem
+    nats = _log_density(last) - _log_density(before)
     noise, segments = after.trajectory_noise, after.segments
     moving = [body.name for body in after.scene.moving]
     body = loop.added[0].body
@@ -119,14 +119,9 @@ def find_evidence(loop: Loop) -> Evidence | None:
     )
 
 
-def recorded(*posteriors: Idata) -> bool:
-    """Return whether posteriors hold their recording, of whole trajectories."""
-    return all("cells" in posterior.attrs for posterior in posteriors)
-
-
-def _log_density(fit: Fit) -> Floats:
+def _log_density(mode: Mode) -> Floats:
     """Return the log-likelihood of each measured number given those before it."""
-    problem, (phi, sigma) = fit.problem, fit.best
+    problem, phi, sigma = mode.problem, mode.phi, mode.sigma
     noise = problem.trajectory_noise
     cells = -0.5 * problem.robust(phi, sigma) ** 2 - np.log(noise.scale(sigma))
     whole = problem.log_density(problem.residual(phi), sigma, phi)
@@ -142,13 +137,10 @@ class Bins:
 
     Parameters
     ----------
-    which : ndarray of int
-        Bin of each value, shape (n,).
     centre, mean, error : ndarray
         Median of x, mean of y, and its standard error (NaN for a single value), shape (bin,).
     """
 
-    which: Ints
     centre: Floats
     mean: Floats
     error: Floats
@@ -165,7 +157,6 @@ def bin_means(x: Floats, y: Floats, most: int = 10, least: int = 8) -> Bins:
     _, which = np.unique(np.searchsorted(edges, x, side="left"), return_inverse=True)
     means = pd.DataFrame({"x": x, "y": y}).groupby(which)
     return Bins(
-        which,
         centre=means["x"].median().to_numpy(),
         mean=means["y"].mean().to_numpy(),
         error=np.asarray(means["y"].sem(), dtype=float),
@@ -215,8 +206,6 @@ class Law:
         That quantity at each transition, shape (transition,).
     bins : Bins
         Means of the residual in bins of x.
-    share : float
-        Share of the residual's variance that the means explain, corrected for their number.
     curve : Curve
         The simplest curve that follows the residual.
     """
@@ -226,7 +215,6 @@ class Law:
     unit: str
     x: Floats
     bins: Bins
-    share: float
     curve: Curve
 
 
@@ -234,19 +222,16 @@ def find_laws(loop: Loop, most: int = 3, least: float = 0.02) -> list[Law]:
     """Return the residual force against the quantity that it depends on, then against others.
 
     The residual force is the process noise that each step adds to the smoothed states, over the
-    time step, times the body's mass or moment of inertia at the draw of highest likelihood.
+    time step, times the body's mass or moment of inertia at the mode.
 
-    Of the others, those whose bins explain at least the share ``least`` of the residual.
+    Of the others, those whose curve explains at least the share ``least`` of the residual.
 
-    Empty where the test of dependence passed, no body is named, or the posterior does not hold
-    its recording.
+    Empty where the test of dependence passed, or no body is named.
     """
     remains = loop.unexplained
-    if remains is None or not remains.body or not depends_on_records(loop):
+    if remains is None or not remains.body or remains.depends_on not in QUANTITIES:
         return []
-    if not recorded(loop.posterior_after):
-        return []
-    problem, phi = loop.revised.problem, loop.revised.best[0]
+    problem, phi = loop.innovations[-1].problem, loop.innovations[-1].phi
     body = [moving.name for moving in problem.scene.moving].index(remains.body)
     residual = _residual_force(problem, phi, body, remains.dimension)
     if residual is None:
@@ -261,7 +246,7 @@ def find_laws(loop: Loop, most: int = 3, least: float = 0.02) -> list[Law]:
     laws.sort(key=lambda law: (law.quantity != remains.depends_on, -law.curve.share))
     if not laws or laws[0].quantity != remains.depends_on:
         return []
-    return [laws[0], *(law for law in laws[1:most] if law.share > least)]
+    return [laws[0], *(law for law in laws[1:most] if law.curve.share > least)]
 
 
 def _residual_force(
@@ -270,24 +255,17 @@ def _residual_force(
     """Return the process noise of a body's velocity over the time step, times its inertia."""
     coordinates = problem.trajectory_noise.coordinates
     added = coordinates.of_residual(problem.residual(phi)) / problem.scene.time_step
-    column = {int(place): i for i, place in enumerate(coordinates.places)}
-
-    def acceleration(name: str) -> Floats | None:
-        place = body * len(STATE) + STATE.index(name)
-        return added[:, column[place]] if place in column else None
-
-    if dimension in ("forward speed", "sideways speed"):
-        x, y, theta = acceleration("vx"), acceleration("vy"), problem.segments.start[:, body, 2]
-        if x is None or y is None:
-            return None
+    places = zip(*np.divmod(coordinates.places, len(STATE)), strict=True)
+    parts = {STATE[cell]: added[:, i] for i, (which, cell) in enumerate(places) if which == body}
+    if {"vx", "vy"} <= set(parts):
+        theta = problem.segments.start[:, body, 2]
         c, s = np.cos(theta), np.sin(theta)
-        values = c * x + s * y if dimension == "forward speed" else c * y - s * x
-    else:
-        dimension = {"x": "vx", "y": "vy", "theta": "omega"}.get(dimension, dimension)
-        of_dimension = acceleration(dimension) if dimension in STATE else None
-        if of_dimension is None:
-            return None
-        values = of_dimension
+        parts["forward speed"] = c * parts["vx"] + s * parts["vy"]
+        parts["sideways speed"] = c * parts["vy"] - s * parts["vx"]
+    dimension = {"x": "vx", "y": "vy", "theta": "omega"}.get(dimension, dimension)
+    if dimension not in parts:
+        return None
+    values = parts[dimension]
     moving = problem.scene.moving[body]
     sizes = dict(zip(problem.layout.labels, phi.tolist(), strict=True))
     mass = dict(moving.known).get("mass", sizes.get(f"mass[{moving.owner}]"))
@@ -302,12 +280,8 @@ def _residual_force(
 
 def _law(residual: ResidualForce, quantity: str, unit: str, x: Floats) -> Law:
     """Return the means in bins of a quantity, and the simplest curve that follows them."""
-    y, bins = residual.values, bin_means(x, residual.values)
-    total = float(((y - y.mean()) ** 2).sum())
-    inside = float(((y - bins.mean[bins.which]) ** 2).sum())
-    spare = max(len(y) - len(bins.mean), 1)
-    share = 1.0 - (inside / spare) / (total / max(len(y) - 1, 1)) if total > 0 else 0.0
-    return Law(residual, quantity, unit, x, bins, share, _simplest(x, y))
+    y = residual.values
+    return Law(residual, quantity, unit, x, bin_means(x, y), _simplest(x, y))
 
 
 def _simplest(x: Floats, y: Floats) -> Curve:

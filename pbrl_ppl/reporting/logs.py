@@ -331,6 +331,7 @@ def row_of(log: Log, folder: Path, inputs: str) -> Row | None:
             "verdict": report["verdict"],
             "effects": [
                 {key: added[key] for key in ("effect", "body", "parameters", "p_value")}
+                | {"main": added.get("main", True)}
                 for added in report["added"]
             ],
             "detectable": {

@@ -100,6 +100,7 @@ def loop_sections(
         motions and HeldOutMotions(loop, motions),
         Rollout(loop),
         None if poses is None else Recording(loop.scene, poses, later),
+        loop.rungs and Search(loop),
         None if evidence is None else EvidenceByTransition(evidence),
         loop.unexplained and UnexplainedResidual(loop, find_laws(loop)),
         HeldOutErrors(loop),
@@ -175,6 +176,20 @@ class Rollout(LoopSection):
 
     def pictures(self) -> Mapping[str, Draw]:
         return {"rollout": partial(error_plots.plot_rollout, self.loop)}
+
+
+class Search(LoopSection):
+    """Best subsets of missing laws on simulated pieces of each length, and what was accepted."""
+
+    template = "search"
+    title = "Search for missing laws"
+    link = "Search"
+
+    def context(self) -> Mapping[str, object]:
+        return {**super().context(), "tables": loop_tables.search_tables(self.loop)}
+
+    def pictures(self) -> Mapping[str, Draw]:
+        return {"search": partial(effect_plots.plot_search, self.loop)}
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,12 +33,12 @@ def limits_in_words(candidate: Candidate, loop: Loop) -> str:
 
     A limit beyond what the effect's prior allows is left out: no plausible size would be found.
     """
-    effect = next((other for other in loop.catalogue if other.name == candidate.effect), None)
-    if effect is not None:
-        effect = effect.in_si(units_of(loop.scene, candidate.body))
-    priors = (
-        {} if effect is None else {parameter.name: parameter for parameter in effect.parameters}
-    )
+    priors = {
+        parameter.name: parameter
+        for effect in loop.catalogue
+        if effect.name == candidate.effect
+        for parameter in effect.in_si(units_of(loop.scene, candidate.body)).parameters
+    }
     limits = {}
     for name in measured_parameters(candidate, loop):
         if name not in candidate.detectable:
@@ -77,25 +77,19 @@ def _draws(prior: Prior) -> Floats:
 
 def error_tables(loop: Loop) -> list[Table]:
     """Tabulate the held-out errors, one interval and a rollout ahead, and overall."""
-    tables = []
+    tables, errors = [], (loop.before, loop.after, loop.noise_floor)
     seconds = loop.rollout_horizon * loop.scene.time_step
     kinds = [
         ("one_step_rmse", f"One interval ahead, {loop.scene.time_step:g} s"),
         ("rollout_rmse", f"{loop.rollout_horizon} intervals ahead, {number(seconds)} s"),
     ]
     for kind, title in kinds:
-        before, after, floor = (
-            getattr(errors, kind) for errors in (loop.before, loop.after, loop.noise_floor)
-        )
-        if before:
-            rows = [
-                _row(loop, name, (before[name], after.get(name), floor.get(name)), UNITS[name])
-                for name in before
-            ]
+        sizes = [getattr(each, kind) for each in errors]
+        if sizes[0]:
+            rows = [_row(loop, d, [size.get(d) for size in sizes], UNITS[d]) for d in sizes[0]]
             caption = f"{title} (root mean square error)"
             tables.append(_before_after(loop, caption, "State dimension", rows, "Unit"))
-    errors = (loop.before, loop.after, loop.noise_floor)
-    nrmse, elpd = [error.normalised_rmse for error in errors], [error.elpd for error in errors]
+    nrmse, elpd = [each.normalised_rmse for each in errors], [each.elpd for each in errors]
     rows = [
         _row(loop, "Error in units of the noise", nrmse),
         _row(loop, "Log predictive density in nats (more is better)", elpd, digits=4),
@@ -149,29 +143,24 @@ def loo_table(loo: Comparison, columns: Sequence[str]) -> Table:
 
 def acceleration_table(loop: Loop) -> Table:
     """Tabulate the unexplained acceleration and its share of the bodies' acceleration."""
-    left = loop.acceleration
-    rows = []
-    for name, before in left.before.items():
-        shares = [left.relative_before[name], left.relative_after[name]]
-        values = [before, left.after[name]]
-        if not loop.added:
-            shares, values = shares[1:], values[:1]
-        rows.append(
+    left, models = loop.acceleration, models_of(loop)
+    shown = [(left.before, left.relative_before), (left.after, left.relative_after)]
+    shown = shown[-len(models) :]
+    shares = ("Before, share", "After, share") if loop.added else ("Share",)
+    return Table(
+        "Unexplained acceleration (standard deviation in an interval)",
+        ("Velocity", *models, *shares, "Unit", "Significant"),
+        [
             (
                 name,
-                *(number(value) for value in values),
-                *(share(relative) for relative in shares),
+                *(number(sizes[name]) for sizes, _ in shown),
+                *(share(relative[name]) for _, relative in shown),
                 acceleration_unit(name),
                 "yes" if left.certain_after.get(name) else "no",
             )
-        )
-    both = models_of(loop)
-    shared = ("Before, share", "After, share") if loop.added else ("Share",)
-    return Table(
-        "Unexplained acceleration (standard deviation in an interval)",
-        ("Velocity", *both, *shared, "Unit", "Significant"),
-        rows,
-        words=(1 + len(both) + len(shared), 2 + len(both) + len(shared)),
+            for name in left.before
+        ],
+        words=(1 + 2 * len(models), 2 + 2 * len(models)),
     )
 
 
@@ -196,13 +185,13 @@ def residual_test_table(loop: Loop) -> Table:
 
 
 def candidate_table(loop: Loop) -> Table:
-    """Tabulate the candidates of the first round."""
+    """Tabulate the candidates: scores, the search's regression for each alone, the decision."""
     added = {(effect.effect, effect.body) for effect in loop.added}
     return Table(
-        "Candidates of the first round, best first",
+        "All candidates, those of the largest score first",
         ("Effect", "Score", "Degrees of freedom", "p (corrected)", "First estimate",
-         "Identifiable", "Simulation error taken", "Its evidence (nats)", "Detection limit",
-         "Decision"),
+         "Identifiable", "Alone: share of simulation error", "Alone: evidence (nats)",
+         "Detection limit", "Decision"),
         [
             (
                 (plain(candidate.effect), candidate.body),
@@ -211,8 +200,8 @@ def candidate_table(loop: Loop) -> Table:
                 chance(candidate.p_value),
                 _estimates(candidate, measured_parameters(candidate, loop)),
                 percent(candidate.identifiable),
-                "–" if candidate.simulated_share is None else percent(candidate.simulated_share),
-                "–" if candidate.simulated_nats is None else number(candidate.simulated_nats),
+                percent(candidate.simulated_share),
+                number(candidate.simulated_nats),
                 limits_in_words(candidate, loop) or "–",
                 candidate.why or "–",
             )
@@ -224,6 +213,22 @@ def candidate_table(loop: Loop) -> Table:
             for candidate in loop.candidates
         ],
     )  # fmt: skip
+
+
+def search_tables(loop: Loop) -> list[Table]:
+    """Tabulate the best subset of laws of each size, one table a length of simulated pieces."""
+    return [
+        Table(
+            f"Pieces of {rung.rows} interval{'s' * (rung.rows > 1)}, {rung.seconds:.3g} s",
+            ("Best subset", "Evidence (nats)", "Error relative to none"),
+            [
+                (", ".join(map(plain, best.laws)), number(best.nats), number(best.error))
+                for best in rung.path
+            ],
+            marks=["added" if {*best.laws} == {*rung.accepted} else "" for best in rung.path],
+        )
+        for rung in loop.rungs
+    ]
 
 
 def _estimates(candidate: Candidate, names: Iterable[str]) -> str:

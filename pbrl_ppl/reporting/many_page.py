@@ -180,8 +180,7 @@ def _logs(rows: Iterable[Row]) -> Table:
         status = row["status"]
         words, numbers = row.get("message", ""), ["", "", "", ""]
         if status == "done":
-            effects = (f"{plain(e['effect'])} on the {plain(e['body'])}" for e in row["effects"])
-            words = joined(effects) or words
+            words = joined(map(_named, row["effects"])) or words
             numbers = [number(row["error_before"]), number(row["error_after"]),
                        str(len(row["warnings"]) or ""), number(row["seconds"])]  # fmt: skip
         verdict = _verdict(row.get("verdict", status))
@@ -229,6 +228,12 @@ def _pooled(pooled: Pooled, kind: str) -> Table:
 
 def _verdict(name: str) -> str:
     return name.replace("-", " ")
+
+
+def _named(effect: Row) -> str:
+    """Return an effect and its body in words, with a mark where it is a small correction."""
+    small = "" if effect["main"] else " (small)"
+    return f"{plain(effect['effect'])} on the {plain(effect['body'])}{small}"
 
 
 def _title(effect: str, body: str) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 from pbrl_ppl.criticism import Loop, diverged_after, whole_rollouts
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import along_trajectories
-from pbrl_ppl.posterior import Fit
+from pbrl_ppl.modes import Mode
 from pbrl_ppl.reporting.words import number
 from pbrl_ppl.scene import Scene, Shape
 from pbrl_ppl.state import Floats, wrapped
@@ -45,13 +45,13 @@ def held_out_motions(loop: Loop, most: int = 6, most_rows: int = 3000) -> list[M
     Those of which the new model's prediction diverges come before them. At most ``most``
     trajectories, with at most ``most_rows`` rows together.
 
-    Each posterior predicts with its draw of highest likelihood.
+    Each model predicts with the parameters of its mode.
     """
     if loop.held_out is None:
         return []
-    before = after = _predicted(loop.declared, loop.held_out)
-    if loop.revised is not loop.declared:
-        after = _predicted(loop.revised, loop.held_out)
+    first_mode, last_mode = loop.innovations
+    before = _predicted(first_mode, loop.held_out)
+    after = before if last_mode is first_mode else _predicted(last_mode, loop.held_out)
     dataset = loop.held_out.dataset
     known = dataset["start"].to_numpy()[..., :3]
     labels = [str(label) for label in dataset["trajectory"].to_numpy()]
@@ -107,13 +107,12 @@ def divergence_in_words(motions: Sequence[Motion]) -> str:
     return f"{text[:1].upper()}{text[1:]}." if text else ""
 
 
-def _predicted(fit: Fit, history: History) -> dict[int, Floats]:
-    """Return the poses that a fitted model predicts of whole trajectories, by trajectory."""
-    phi, sigma = fit.best
-    cells = fit.problem.trajectory_noise.coordinates
-    problem = fit.problem.with_data(history=history, states=None)
-    problem = along_trajectories(problem, phi, sigma, cells)
-    whole = whole_rollouts(problem, phi, sigma)
+def _predicted(mode: Mode, history: History) -> dict[int, Floats]:
+    """Return the poses that a model predicts of whole trajectories, by trajectory."""
+    cells = mode.problem.trajectory_noise.coordinates
+    problem = mode.problem.with_data(history=history, states=None)
+    problem = along_trajectories(problem, mode.phi, mode.sigma, cells)
+    whole = whole_rollouts(problem, mode.phi, mode.sigma)
     return {trajectory: states[..., :3] for trajectory, states in whole.items()}
 
 

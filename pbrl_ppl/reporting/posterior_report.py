@@ -182,13 +182,8 @@ class Predictions(Section):
 
     def context(self) -> Mapping[str, object]:
         rows = [
-            (
-                name,
-                f"{100 * coverage.half:.1f} %",
-                f"{100 * coverage.wide:.1f} %",
-                str(coverage.measurements),
-            )
-            for name, coverage in self.covered.items()
+            (name, f"{100 * one.half:.1f} %", f"{100 * one.wide:.1f} %", str(one.measurements))
+            for name, one in self.covered.items()
         ]
         table = Table(
             "Measurements inside leave-one-out predictions",
@@ -289,11 +284,7 @@ def _headline(posterior: Idata, informed_by: Identifiability | None) -> str:
 def _warned(posterior: Idata, identified: bool) -> list[str]:
     """Return the warnings of the fit, without those that other parts of the page cover."""
     every = PosteriorRecord.of(posterior).warnings or ()
-    covered = (
-        "have not converged",
-        "draws are too few",
-        *(("say nothing about",) if identified else ()),
-    )
+    covered = ["have not converged", "draws are too few", *["say nothing about"] * identified]
     return [sentence for sentence in every if not any(words in sentence for words in covered)]
 
 

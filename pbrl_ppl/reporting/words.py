@@ -12,7 +12,6 @@ from pbrl_ppl.criticism import (
     LARGEST_SHARE,
     NOT_CONVERGED,
     ONE_TRAJECTORY,
-    TRIED,
     UNEXPLAINED,
     Added,
     Estimate,
@@ -22,6 +21,8 @@ from pbrl_ppl.criticism import (
 )
 from pbrl_ppl.reporting.style import UNITS
 
+#: Candidates and bad frames that are listed one by one.
+_LISTED = 4
 #: A held-out error above this many times the noise needs an explanation.
 _TOO_LARGE = 1.5
 
@@ -32,7 +33,7 @@ def verdict_in_words(loop: Loop) -> str:
     It is the first line of the report and of the summary in a terminal.
     """
     if loop.verdict == NOT_CONVERGED:
-        named = [_named(one) for one in loop.added]
+        named = [_named(one) for one in main_laws(loop)]
         so_far = f" (found so far: {_listed(named, 'and')})" if named else ""
         return (
             f"No verdict: the chains have not converged{so_far}; take more draws (--draws),"
@@ -42,17 +43,20 @@ def verdict_in_words(loop: Loop) -> str:
 
 
 def _found(loop: Loop) -> str:
-    """Name what was found, with its size if it is one effect that the data can tell."""
+    """Name the main laws that were found, with the size of one that the data can tell."""
     if not loop.added:
         if loop.verdict == UNEXPLAINED:
             return "No effect in the catalogue explains the residual"
         matters = " that matters" if loop.small or remaining_acceleration(loop) else ""
         return f"Nothing{matters} was found missing"
-    if len(loop.added) == 1:
-        sentence = f"{_named(loop.added[0])}{_size(loop.added[0])}"
-    else:
-        sentence = _listed([_named(one) for one in loop.added], "and")
-    return f"{sentence[0].upper()}{sentence[1:]}"
+    first, *more = main_laws(loop)
+    sentence = _listed([_named(one) for one in (first, *more)], "and")
+    return f"{sentence[0].upper()}{sentence[1:]}{'' if more else _size(first)}"
+
+
+def main_laws(loop: Loop) -> tuple[Added, ...]:
+    """Return the main laws among the added effects; all of them where none is a main one."""
+    return tuple(one for one in loop.added if one.main) or loop.added
 
 
 def _named(added: Added) -> str:
@@ -196,8 +200,9 @@ def remaining_acceleration(loop: Loop) -> str:
 
 
 def accepted(loop: Loop) -> tuple[Added, ...]:
-    """Return the added effects, or none without a verdict."""
-    return () if loop.verdict == NOT_CONVERGED else loop.added
+    """Return the added effects, main laws first, or none without a verdict."""
+    main_first = tuple(sorted(loop.added, key=lambda one: not one.main))
+    return () if loop.verdict == NOT_CONVERGED else main_first
 
 
 def depends_on_records(loop: Loop) -> bool:
@@ -256,12 +261,12 @@ def rejected_in_words(loop: Loop) -> str:
         for one in loop.candidates
         if one.why and one.p_value < loop.criteria.try_p and (one.effect, one.body) not in present
     ]
-    return f"Not added: {'; '.join(reasons[:TRIED])}." if reasons else ""
+    return f"Not added: {'; '.join(reasons[:_LISTED])}." if reasons else ""
 
 
 def left_out_in_words(loop: Loop) -> str:
     """Return which bad frames were left out of the histories, the first few one by one."""
-    first, more = loop.bad_frames[:TRIED], len(loop.bad_frames) - TRIED
+    first, more = loop.bad_frames[:_LISTED], len(loop.bad_frames) - _LISTED
     rest = f"; and {more} more (report.json lists them)" if more > 0 else ""
     return f"{'; '.join(first)}{rest}." if first else ""
 
@@ -298,6 +303,7 @@ def _sizes(added: Added) -> str:
         for name, size in added.parameters.items()
     ]
     name = f"{plain(added.effect)} on the {plain(added.body)}"
+    name = name if added.main else f"small correction, {name}"
     text = f"  {name} ({added.sentence.rstrip('.')}): {', '.join(sizes)}"
     if added.not_separable_from:
         others = joined((plain(name) for name in added.not_separable_from), "or")
@@ -397,9 +403,9 @@ def quantity(value: float, unit: str, digits: int = 3) -> str:
     return f"{number(value, digits)} {unit.removesuffix('1')}".rstrip()
 
 
-def percent(share: float) -> str:
-    """Write a share in per cent, with two significant digits."""
-    return f"{number(100 * share, 2)} %"
+def percent(share: float | None) -> str:
+    """Write a share in per cent, with two significant digits; a dash where there is none."""
+    return "–" if share is None else f"{number(100 * share, 2)} %"
 
 
 def chance(p_value: float, smallest: float = 1e-16) -> str:

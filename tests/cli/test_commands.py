@@ -199,8 +199,19 @@ def test_three_commands_from_a_recording_to_criticism(
     assert simulated["laws"][0]["estimate"]["coefficient"] == pytest.approx(2.0, rel=0.05)
     assert simulated["before"]["vx"] > 2 * simulated["after"]["vx"]
     assert main(["criticise", "scene.toml", "train.csv", "--quiet", "--simulate"]) == 0
-    printed = capsys.readouterr().out
-    assert "linear_drag" in printed and "simulation error over 0.5 s" in printed
+    printed = " ".join(capsys.readouterr().out.split())
+    shortest = simulated["rungs"][0]
+    assert shortest["accepted"] == ["linear_drag on puck"] and simulated["rejected"] == {}
+    best = shortest["path"][0]
+    assert best["laws"] == ["linear_drag on puck"]
+    for said in (
+        f"s, intervals: {shortest['rows']} laws nats error relative to none",
+        f"linear_drag on puck {best['nats']:.1f} {best['error']:.3f}",
+        "accepted: linear_drag on puck dropped: none",
+        "linear_drag puck main",
+        "simulation error over 0.5 s",
+    ):
+        assert said in printed
 
 
 @pytest.mark.usefixtures("puck")
