@@ -118,8 +118,7 @@ class PBRLAgent(PhysicsAgent):
         if len(self._transitions) == self._fitted or self.model is None:
             return len(self._transitions) > self._fitted
         state, inputs, after = (array[self._fitted :] for array in self._data())
-        action, previous = inputs[..., :3], inputs[..., 3:6]
-        error = prediction_errors(self.model, state, action, after, previous)
+        error = prediction_errors(self.model, state, inputs[..., :3], after, inputs[..., 3:6])
         grown = len(self._transitions) >= (1.0 + self.growth) * self._fitted
         expected = 0.0 if grown else surprise * self._sigma
         return not (error <= np.maximum(expected, self._negligible)).all()

@@ -97,12 +97,11 @@ def revise(
 
     @cache
     def highest(*laws: Attached) -> Mode:
-        effects = (*problem.physics.effects, *laws)
-        return find_mode(problem.with_physics(effects=effects), seed=seed)
+        return find_mode(problem.with_physics(effects=(*problem.physics.effects, *laws)), seed=seed)
 
     # priors are in units that the data show, and change with them
     every = {(law.effect.name, law.body): law for law in missing(highest())}
-    laws = {every.get((one.effect, one.body), one.attached): one for one in added}
+    laws = {every[one.effect, one.body]: one for one in added}
     rivals: Mapping[Attached, tuple[Attached, ...]] = {}
     mode = highest(*laws)
     error = abs(mode.problem.residual(mode.phi))
@@ -112,15 +111,18 @@ def revise(
         for law, one in found.laws.items():
             since = laws[law].transitions if law in laws else problem.segments.n
             laws[law] = Revision(law, since, one.nats, one.share, one.confounded)
+    laws = {law: laws[law] for law in every.values() if law in laws}
     while laws:
         for law, kept in laws.items():
             without = highest(*(other for other in laws if other != law))
             worth = _evidence(without, highest(*laws), np.log(len(every)) - law.effect.log_odds)
             laws[law] = replace(kept, attached=law, nats=worth.nats, share=worth.share)
-        weakest = min(laws, key=lambda law: laws[law].nats)
-        if laws[weakest].nats >= least:
+        lowest = min(one.nats for one in laws.values())
+        if lowest >= least:
             break
-        del laws[weakest]
+        # of laws that the data do not separate the earlier in the catalogue stays
+        below = min(lowest + DEFAULT.search.least_nats, least)
+        del laws[[law for law, one in laws.items() if one.nats < below][-1]]
     for law in [one for one in rivals if one in laws]:
         names = []
         for rival, name in zip(rivals[law], laws[law].not_separable_from, strict=True):

@@ -37,6 +37,8 @@ class SearchCriteria:
         Share of the simulation error that laws take away, at least, on the pieces that show them.
     main_share : float
         The same of a main law on the longest pieces; a smaller one is a small correction.
+    small_share : float
+        The same of small corrections, which are searched on the longest pieces alone.
     alone : float
         The same of all laws together in a recording of one trajectory, which a lasting random force
         or error follows as well: more than what remains.
@@ -47,6 +49,7 @@ class SearchCriteria:
     least_nats: float = 3.0
     least_share: float = 0.1
     main_share: float = 0.2
+    small_share: float = 0.02
     alone: float = 0.5
     refits: int = 4
     singles: int = 2

@@ -298,6 +298,10 @@ class Search:
                 model = trial
             model, rung, _, regression = self._at_length(model.at(higher))
             rungs.append(rung)
+        # on the longest pieces, where they add up, small corrections as well
+        better = self._grown(model, regression, self.criteria.search.small_share)
+        if better is not model:
+            model, regression = better, self._regression(better.mode)
         found = self._judged(mode, model, regression, tuple(rungs), tried)
         if not found.laws:
             return found
