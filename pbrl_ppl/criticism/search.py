@@ -277,7 +277,7 @@ class Search:
         """
         if mode.problem.likelihood.independent:
             model, rung, before, regression = self._at_length(_Model(mode))
-            found = self._judged(mode, model, regression, (rung,), _alone(before))
+            found = self._judged(mode, mode, model, regression, (rung,), _alone(before))
             return replace(found, declared=mode)
         first, *longer = piece_lengths(mode)
         pieces = in_pieces(mode.problem, first, mode.problem.data.smoothed_states)
@@ -302,10 +302,10 @@ class Search:
         better = self._grown(model, regression, self.criteria.search.small_share)
         if better is not model:
             model, regression = better, self._regression(better.mode)
-        found = self._judged(mode, model, regression, tuple(rungs), tried)
+        declared = _without_all(model, begin)
+        found = self._judged(mode, declared, model, regression, tuple(rungs), tried)
         if not found.laws:
             return found
-        declared = _without_all(found, begin)
         share = Evidence.of(declared, found.after).share
         if mode.problem.data.history.n_trajectories > 1 or share >= self.criteria.search.alone:
             return replace(found, declared=declared)
@@ -325,7 +325,7 @@ class Search:
         """
         limits, error = self.criteria.search, _error(model.mode)
         before = tuple(model.earlier)
-        model = self._pruned(model.fitted())
+        model = self._pruned(model.fitted(), least=-limits.least_nats)
         regression = first = self._regression(model.mode)
         for _ in range(rounds):
             better = self._grown(model, regression, limits.least_share)
@@ -392,18 +392,22 @@ class Search:
         pruned = self._pruned(grown.fitted())
         return pruned if set(pruned.earlier) - set(model.earlier) else model
 
-    def _pruned(self, model: _Model) -> _Model:
-        """Drop laws whose evidence, summed over lengths, does not pay their price."""
+    def _pruned(self, model: _Model, least: float = 0.0) -> _Model:
+        """Drop laws whose evidence, summed over lengths, does not pay their price.
+
+        ``least``: those of less evidence than this (nats).
+        """
         while nats := model.nats:
             law = min(nats, key=lambda one: nats[one])
-            if nats[law] >= 0.0:
+            if nats[law] >= least:
                 break
             model = model.dropped(law)
         return model
 
     def _judged(
         self,
-        declared: Mode,
+        whole: Mode,
+        without: Mode,
         model: _Model,
         regression: Regression,
         rungs: tuple[Rung, ...],
@@ -411,41 +415,51 @@ class Search:
     ) -> SearchResult:
         """Return the laws that are worth it on the longest pieces, and what each is worth.
 
-        A main law takes a large share of the simulation error away there. A small correction may
-        stand for something else: innovations of ``declared``'s trajectories must not contradict it.
+        A main law takes a large share of the simulation error of the model ``without`` any away
+        there. A small correction may stand for something else: innovations of ``whole``
+        trajectories must not contradict it.
         """
         least, rejected = self.criteria.search.least_nats, dict[Attached, str]()
         while model.earlier:
-            nats, worth = model.nats, model.evidence
+            nats, worth, main = model.nats, model.evidence, self._main(without, model)
             weak = {
-                law: nats[law] if self._is_main(one) else min(nats[law], one.nats)
+                law: nats[law] if law in main else min(nats[law], one.nats)
                 for law, one in worth.items()
             }
             law: Attached | None = min(weak, key=lambda one: weak[one])
             if law is not None and weak[law] < least:
                 why = f"longer simulations do not need it ({weak[law]:.1f} nats)"
             else:
-                law, why = self._unconfirmed(declared, model)
+                law, why = self._unconfirmed(
+                    whole, model, [one for one in worth if one not in main]
+                )
             if law is None:
                 break
             model, rejected[law] = model.dropped(law), why
         absorbed = {one.attached for one in regression.signatures if not one.basis.shape[1]}
         model, confounded = self._confounded(model, absorbed)
-        worth, mode = model.evidence, model.mode
+        worth, main, mode = model.evidence, self._main(without, model), model.mode
         if mode.problem.likelihood.simulated:
             mode = with_robust_covariance(fit_pieces_closely(mode.problem, mode.phi))
         laws = {
-            law: law_of(mode, law, worth[law], self._is_main(worth[law]), confounded[law])
+            law: law_of(mode, law, worth[law], law in main, confounded[law])
             for law in sorted(worth, key=lambda law: -worth[law].nats)
         }
         return SearchResult(mode, mode, laws, model.without, confounded, rungs, tried, rejected)
 
-    def _is_main(self, evidence: Evidence) -> bool:
-        """Return whether a law is a main one."""
-        return evidence.share >= self.criteria.search.main_share
+    def _main(self, without: Mode, model: _Model) -> set[Attached]:
+        """Return the laws with a large share in what all take off the error of a model without.
+
+        Laws that replace each other in part are missed little alone: shares are in proportion.
+        """
+        gains = {law: -np.log1p(-one.share) for law, one in model.evidence.items()}
+        together = -np.log1p(-Evidence.of(without, model.mode).share)
+        scale = max(together / max(sum(gains.values()), 1e-300), 1.0)
+        least = -np.log1p(-self.criteria.search.main_share)
+        return {law for law, gain in gains.items() if scale * gain >= least}
 
     def _unconfirmed(
-        self, declared: Mode, model: _Model, *, contradicted: float = 0.1
+        self, whole: Mode, model: _Model, small: Sequence[Attached], *, contradicted: float = 0.1
     ) -> tuple[Attached | None, str]:
         """Return a small correction that innovations contradict, and why; None if they do not.
 
@@ -455,12 +469,12 @@ class Search:
         ``contradicted``: p-value of such a law's score above which they do not show it; one of 40
         that are there has a larger one.
         """
-        if not declared.problem.likelihood.filtered:
+        if not whole.problem.likelihood.filtered:
             return None, ""
         limits = self.criteria.residual
         power = (norm.isf(limits.detection_p) + norm.ppf(limits.detection_power)) ** 2
-        for law in (law for law, one in model.evidence.items() if not self._is_main(one)):
-            innovations = filtered_mode(declared, model.without[law])
+        for law in small:
+            innovations = filtered_mode(whole, model.without[law])
             (scored,) = rank_candidates(innovations, [law], self.criteria)
             if not scored.linear:
                 continue
@@ -536,10 +550,12 @@ def _proposals(
     return list({frozenset(one.laws): one for one in (*leading, *alone)}.values())
 
 
-def _without_all(found: SearchResult, begin: Floats) -> Mode:
+def _without_all(model: _Model, begin: Floats) -> Mode:
     """Return the mode without any law, from where it was on the shortest pieces or is with them."""
-    mode = found.after
-    kept = tuple(one for one in mode.problem.physics.effects if one not in found.laws)
+    mode = model.mode
+    if not model.earlier:
+        return mode
+    kept = tuple(one for one in mode.problem.physics.effects if one not in model.earlier)
     problem, near = with_effects(mode, kept)
     fits = in_parallel(partial(fit_pieces, problem), [begin, near])
     weight = weights(mode)

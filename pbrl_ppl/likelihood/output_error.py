@@ -54,12 +54,27 @@ class Starts:
     memory: Memory = field(init=False, default_factory=Memory)
 
     @cached_property
-    def counts(self) -> Floats:
+    def measured(self) -> Floats:
         """Numbers of measurements of each observed dimension, shape (state,)."""
         counts = self.seen.sum((0, 1, 2)).astype(float)
         begun = np.isfinite(self.begin).sum(axis=0)
         np.add.at(counts, self.column[self.column >= 0], begun[self.column >= 0])
         return np.asarray(counts)
+
+    @property
+    def unknown(self) -> int:
+        """Number of start coordinates that are inferred."""
+        return int((~self.given).sum())
+
+    @cached_property
+    def counts(self) -> Floats:
+        """Degrees of freedom of each observed dimension, shape (state,).
+
+        Its measurements, less its part of the start coordinates that are inferred (restricted
+        likelihood: H. D. Patterson and R. Thompson, Biometrika 58, 1971).
+        """
+        total = max(self.measured.sum(), 1.0)
+        return np.asarray(self.measured * max(total - self.unknown, 1.0) / total)
 
     def rows(self, residual: Floats, weight: Floats) -> Floats:
         """Return weighted residuals with those of the start, shape (..., piece, row).
@@ -150,7 +165,7 @@ class OutputErrorLikelihood(Likelihood):
     tau: tuple[float, ...]
 
     def counts(self, observations: Observations) -> Floats:
-        """Return the numbers of measurements over their autocorrelation times, shape (state,)."""
+        """Return the degrees of freedom over the autocorrelation times, shape (state,)."""
         return np.asarray(self.starts.counts / np.array(self.tau))
 
     def whiten(self, residual: Floats, sigma: Floats) -> Floats:
@@ -227,7 +242,7 @@ class OutputErrorLikelihood(Likelihood):
         )
 
     def profile(self, residual: Floats, least: Floats, *, rounds: int = 6) -> Floats:
-        """Return the maximum-likelihood sigma of each dimension, shape (state,).
+        """Return the restricted-likelihood sigma of each dimension, shape (state,).
 
         ``least`` are the least that they may be, shape (state,), SI units.
         ``rounds``: rounds of sigma and projection, which depend on each other.

@@ -88,7 +88,7 @@ def piece_lengths(mode: Mode) -> list[int]:
     starts = output_error(
         in_pieces(mode.problem, longest, mode.problem.data.smoothed_states)
     ).starts
-    measured, unknown = int(starts.counts.sum()), int((~starts.given).sum()) + len(mode.phi)
+    measured, unknown = int(starts.measured.sum()), starts.unknown + len(mode.phi)
     if measured <= unknown:
         raise HistoryError(
             f"history: it has {measured} measurements, and simulations of its trajectories have"

@@ -303,7 +303,7 @@ class Simulator:
         starts: Floats,
         inputs: Floats,
         out: Floats,
-        a_thread: int = 1000,
+        a_thread: int = 5000,
         kept: int = 64,
     ) -> None:
         """Run items in worlds of a choice, of which so many are kept.

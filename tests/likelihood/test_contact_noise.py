@@ -1,5 +1,7 @@
 """Noise of its own where bodies touch: how they part hangs on more than any engine knows."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from pbrl_ppl.likelihood import (
     smoothed,
     with_measurements,
 )
+from pbrl_ppl.likelihood.smoothing import linearised
 from pbrl_ppl.model import build_model
 from pbrl_ppl.modes import profile_sigma
 from pbrl_ppl.physics import Physics
@@ -69,6 +72,15 @@ def test_both_kinds_of_noise_are_told_apart(pucks) -> None:
     assert (np.abs(np.log(sigma / NOISE)[9:]) < 4 / np.sqrt(2 * looks)).all()
     assert (np.abs(np.log(sigma / NOISE)[:6]) < 0.4).all()
     assert (sigma[6:9] < 0.2 * NOISE[9:]).all()
+
+
+def test_a_measured_contact_counts_where_smoothing_takes_it_away(pucks) -> None:
+    """Blaming a start's measurement, smoothed states may pass by: the contact stays one."""
+    noise = pucks.trajectory_noise
+    apart = pucks.data.smoothed_states + np.array([[0.0] * 6, [5.0] + [0.0] * 5])
+    moved = replace(pucks, data=replace(pucks.data, states=apart))
+    again = linearised(moved, noise.coordinates, noise.slope, noise.sigma)
+    assert again.touching.mean() > 0.1
 
 
 def test_the_model_names_it_where_bodies_touch_and_there_alone(pucks) -> None:

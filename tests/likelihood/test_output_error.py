@@ -61,6 +61,19 @@ def test_a_velocity_recorded_at_the_start_alone_is_given(history) -> None:
     assert (z**2).sum() == pytest.approx((left**2).sum() / 0.01**2 / tau, rel=1e-6)
 
 
+def test_noise_is_not_underestimated_on_short_pieces() -> None:
+    """Pieces of 4 intervals give two of five rows to their start: sigma is unbiased all the same.
+
+    600 degrees of freedom: the interval of four standard errors is missed once in 16,000.
+    """
+    own = fall(3, trajectories=25, memory=0.0)
+    truth = 0.01
+    mode = fit_pieces(pieces(own, 4), np.zeros(0))
+    freedom = output_error(mode.problem).starts.counts.sum()
+    assert 0.5 < freedom / own.n_transitions < 0.8
+    assert np.log(mode.sigma[0] / truth) == pytest.approx(0.0, abs=4 / np.sqrt(2 * freedom))
+
+
 def test_the_result_does_not_depend_on_the_start_states(history) -> None:
     """Start states elsewhere, of a linear motion: the same whitened residual."""
     problem = fit_pieces(pieces(history, 44), np.zeros(0)).problem
