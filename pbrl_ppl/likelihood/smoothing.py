@@ -337,8 +337,9 @@ def _touching(problem: Problem, coordinates: Coordinates) -> Bools:
     trajectory, step = segments.trajectory, segments.step
     observed = problem.data.history.dataset["observed"].to_numpy()
     # smoothing may take a contact away and blame a measurement: what was measured counts as well
-    both = states, np.where(np.isfinite(observed), observed, states)
-    return np.any(
-        [touching(problem.scene, s[trajectory, step], s[trajectory, step + 1]) for s in both],
-        axis=0,
+    measured = np.where(np.isfinite(observed), observed, states)
+    smooth, met = (
+        touching(problem.scene, one[trajectory, step], one[trajectory, step + 1])
+        for one in (states, measured)
     )
+    return smooth | met
