@@ -14,7 +14,11 @@ from pbrl_ppl.criticism.dependence import find_dependence
 from pbrl_ppl.criticism.forecast import forecast
 from pbrl_ppl.criticism.results import Correlations, Growth, ResidualTest, Unexplained
 from pbrl_ppl.criticism.score import Signature
-from pbrl_ppl.criticism.unexplained import UnexplainedAcceleration, noise_alone
+from pbrl_ppl.criticism.unexplained import (
+    UnexplainedAcceleration,
+    innovations_over_steps,
+    noise_alone,
+)
 from pbrl_ppl.effects import Noise
 from pbrl_ppl.likelihood import bodies_acceleration
 from pbrl_ppl.modes import Mode
@@ -186,22 +190,23 @@ def held_out_forecasts(mode: Mode, sigma: Floats, horizon: int, criteria: Criter
 def score_test(mode: Mode, ranked: Sequence[Signature], criteria: Criteria) -> ResidualTest:
     """Return the test of the innovations for effects of the catalogue that the model lacks.
 
-    It fails where one is significant and would take more than a negligible share off them.
+    It fails where one is significant and changes a step by more than a negligible share.
     """
-    square = float((mode.whitened_residual**2).sum())
-    scored = [one.candidate for one in ranked if not isinstance(one.attached.effect.stage, Noise)]
-    if not scored or not square > 0.0:
+    scored = [one for one in ranked if not isinstance(one.attached.effect.stage, Noise)]
+    if not scored:
         return ResidualTest.untested(CANDIDATES, "no effect of the catalogue is left")
-    first = min(scored, key=lambda candidate: candidate.p_value)
-    share = 1.0 - float(np.sqrt(max(1.0 - first.statistic / square, 0.0)))
-    certain = first.p_value < criteria.false_alarm
-    name = f"{first.effect.replace('_', ' ')} on {first.body}"
+    first = min(scored, key=lambda one: one.candidate.p_value)
+    candidate, white = first.candidate, mode.whitened_residual
+    change = np.sqrt(candidate.statistic) * first.direction[: white.size].reshape(white.shape)
+    share = np.sqrt((change**2).mean(axis=0)) * innovations_over_steps(mode)
+    size, certain = float(share.max(initial=0.0)), candidate.p_value < criteria.false_alarm
+    name = f"{candidate.effect.replace('_', ' ')} on {candidate.body}"
     sentence = "no effect of the catalogue is significant in the innovations"
     if certain:
-        sentence = f"{name} would take {100 * share:.2g} % off the innovations"
-        sentence += ", which is negligible" if share < criteria.negligible else ""
-    passed = not certain or share < criteria.negligible
-    return ResidualTest(CANDIDATES, first.p_value, share, passed, sentence, body=first.body)
+        sentence = f"{name} would change a step by {100 * size:.2g} %"
+        sentence += ", which is negligible" if size < criteria.negligible else ""
+    passed = not certain or size < criteria.negligible
+    return ResidualTest(CANDIDATES, candidate.p_value, size, passed, sentence, body=candidate.body)
 
 
 def _forecasts(
