@@ -34,10 +34,7 @@ class Scratch(NamedTuple):
 
     state: NDArray[np.float64]  # (body, 6)
     axes: NDArray[np.float64]  # (wheel, 2): cos and sin of the wheel's angle on the body
-    signal: NDArray[np.float64]  # (8,): command, command before, begin and end of the substep
-    previous: NDArray[np.float64]  # (body, 3): commands of the interval before
-    command: NDArray[np.float64]  # (body, 3)
-    wrench: NDArray[np.float64]  # (body, 3)
+    acted: NDArray[np.float64]  # (body + 1, 9), see `act`
 
 
 @numba.njit(inline="always")
@@ -71,53 +68,48 @@ def _forget(fn, world, bodies, batch, touched):  # type: ignore[no-untyped-def]
     set_strengths(fn, world, bodies, True)
 
 
+#: Columns of what acts on a body: its command, the one of the interval before, and the wrench.
+COMMAND, PREVIOUS, WRENCHES = 0, 3, 6
+
+
 @compiled
-def act(  # type: ignore[no-untyped-def]  # arrays one by one: tuples of them cost 40 % here
-    state, interval, commands, command_parameters, forces, force_parameters, begin, end, signal,
-    previous, command, wrench,
+def act(  # type: ignore[no-untyped-def]
+    state, interval, commands, command_parameters, forces, force_parameters, begin, end, acted
 ):  # fmt: skip
     """Compute the wrench on each body in a substep: the command stage, then the force stage.
 
     ``state`` is (body, 6) and ``interval`` the inputs of the interval, (body, 3 or 9); ``begin``
-    and ``end`` of the substep are shares of the interval.
+    and ``end`` of the substep are shares of the interval. ``acted`` (body + 1, 9) becomes command,
+    command before and wrench of each body; the last row is what a command law sees. Laws are rows
+    of address, body, first parameter and memory.
     """
-    k = len(state)
-    addresses, owners, first, memory = commands
-    known = interval.shape[1] > 3
+    k, known, data = len(interval), interval.shape[1] > 3, acted.ctypes.data
+    signal_at = data + 72 * k
     for i in range(k):
         for w in range(3):
-            command[i, w] = interval[i, w]
-            previous[i, w] = interval[i, 3 + w] if known else 0.0
-    signal[6], signal[7] = begin, end
-    for e in range(len(addresses)):
-        i = owners[e]
+            acted[i, COMMAND + w] = interval[i, w]
+            acted[i, PREVIOUS + w] = interval[i, 3 + w] if known else 0.0
+    acted[k, 6], acted[k, 7] = begin, end
+    for e in range(len(commands)):
+        address, i, first, memory = (commands[e, 0], commands[e, 1], commands[e, 2], commands[e, 3])
         state_at = state.ctypes.data + 48 * i
-        parameters_at = command_parameters.ctypes.data + 8 * first[e]
-        for w in range(3):
-            signal[w], signal[3 + w] = command[i, w], previous[i, w]
-        call_law(
-            addresses[e], state_at, signal.ctypes.data, parameters_at, command.ctypes.data + 24 * i
-        )
-        if known and not memory[e]:
+        parameters_at = command_parameters.ctypes.data + 8 * first
+        for w in range(6):
+            acted[k, w] = acted[i, w]
+        call_law(address, state_at, signal_at, parameters_at, data + 72 * i)
+        if known and not memory:
             for w in range(3):
-                signal[w] = previous[i, w]
-            call_law(
-                addresses[e], state_at, signal.ctypes.data, parameters_at,
-                previous.ctypes.data + 24 * i,
-            )  # fmt: skip
-    addresses, owners, first = forces
+                acted[k, w] = acted[i, PREVIOUS + w]
+            call_law(address, state_at, signal_at, parameters_at, data + 72 * i + 8 * PREVIOUS)
     for i in range(k):
         for w in range(3):
-            wrench[i, w] = command[i, w]
-    for e in range(len(addresses)):
-        i = owners[e]
+            acted[i, WRENCHES + w] = acted[i, COMMAND + w]
+    for e in range(len(forces)):
+        address, i, first = forces[e, 0], forces[e, 1], forces[e, 2]
         call_law(
-            addresses[e],
-            state.ctypes.data + 48 * i,
-            command.ctypes.data + 24 * i,
-            force_parameters.ctypes.data + 8 * first[e],
-            wrench.ctypes.data + 24 * i,
-        )
+            address, state.ctypes.data + 48 * i, data + 72 * i,
+            force_parameters.ctypes.data + 8 * first, data + 72 * i + 8 * WRENCHES,
+        )  # fmt: skip
 
 
 @compiled
@@ -133,7 +125,7 @@ def _transition(fn, world, batch, p, t, substeps, scratch, out):  # type: ignore
     """Step one transition of horizon H into ``out`` (H, body, 6); return how it ended."""
     k = len(world.bodies)
     step = batch.time_step / substeps
-    state, axes, signal, previous, command, wrench = scratch
+    state, axes, acted = scratch
     commands, forces = batch.commands, batch.forces
     command_parameters, force_parameters = batch.given[3][p], batch.given[4][p]
     start, inputs = batch.start, batch.inputs[t]
@@ -145,7 +137,7 @@ def _transition(fn, world, batch, p, t, substeps, scratch, out):  # type: ignore
         axes[j, 0], axes[j, 1] = math.cos(turn), math.sin(turn)
     touched = _FREE
     driven = world.kinematic.any()
-    acting = len(batch.commands[0]) + len(batch.forces[0]) > 0
+    acting = len(batch.commands) + len(batch.forces) > 0
     sliding = len(world.patch_body) > 0
     watch = len(world.obstacles) > 0 or k > 1
     place_bodies(fn, world, bodies, state)
@@ -159,24 +151,24 @@ def _transition(fn, world, batch, p, t, substeps, scratch, out):  # type: ignore
             call_int(fn.cpSpaceSetIterations, world.space, enough)
         if driven:
             drive(fn, world, state, inputs[h])
-        copy(inputs[h], wrench)
+        for i in range(k):
+            for w in range(3):
+                acted[i, WRENCHES + w] = inputs[h, i, w]
         for s in range(substeps):
             if acting:
                 act(
                     state, inputs[h], commands, command_parameters, forces, force_parameters,
-                    s / substeps, (s + 1) / substeps, signal, previous, command, wrench,
+                    s / substeps, (s + 1) / substeps, acted,
                 )  # fmt: skip
             for i in range(k):
                 if driven and world.kinematic[i]:
                     continue
                 weight_x = bodies[i, COLUMN.mass] * bodies[i, COLUMN.extra_gravity_x]
                 weight_y = bodies[i, COLUMN.mass] * bodies[i, COLUMN.extra_gravity_y]
-                call2(
-                    fn.cpBodySetForce, world.bodies[i], wrench[i, 0] + weight_x,
-                    wrench[i, 1] + weight_y,
-                )  # fmt: skip
+                f_x, f_y = acted[i, WRENCHES], acted[i, WRENCHES + 1]
+                call2(fn.cpBodySetForce, world.bodies[i], f_x + weight_x, f_y + weight_y)
                 x, y = arm(bodies[i], state[i, 2])
-                torque = wrench[i, 2] - (x * wrench[i, 1] - y * wrench[i, 0])
+                torque = acted[i, WRENCHES + 2] - (x * f_y - y * f_x)
                 call1(fn.cpBodySetTorque, world.bodies[i], torque)
             place_wheels(fn, world, bodies, state, axes, step)
             if sliding:
@@ -218,9 +210,8 @@ def rollout(fn, world, batch, items, out):  # type: ignore[no-untyped-def]
     total = np.empty_like(states)
     timed = bodies.shape[1] > 1
     k = len(world.bodies)
-    previous, command, wrench = np.empty((3, k, 3))
     axes = np.empty((len(world.wheel_body), 2))
-    scratch = Scratch(np.empty((k, 6)), axes, np.empty(8), previous, command, wrench)
+    scratch = Scratch(np.empty((k, 6)), axes, np.empty((k + 1, 9)))
     proposal, finer = -1, 1
     outcome = _TOUCHED  # an earlier call may have left contacts
     for place in range(len(items)):

@@ -5,43 +5,53 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from queue import SimpleQueue
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import SimulationError
-from pbrl_ppl.physics import calls, compiled, lockstep
+from pbrl_ppl.physics import calls, compiled, flow, lockstep
 from pbrl_ppl.physics.calls import pointers
-from pbrl_ppl.physics.properties import COLUMN
-from pbrl_ppl.physics.world import World
-from pbrl_ppl.state import Floats
-
-Laws = tuple[NDArray[Any], ...]
+from pbrl_ppl.physics.motion import work_of
+from pbrl_ppl.physics.tree import tree_of
+from pbrl_ppl.physics.world import RING, World
+from pbrl_ppl.state import Floats, Ints
 
 
 class Batch(NamedTuple):
     """What the rollouts take: see `compiled.rollout`."""
 
     given: tuple[Floats, ...]
-    commands: Laws
-    forces: Laws
+    commands: Ints
+    forces: Ints
     start: Floats
     inputs: Floats
     time_step: float
     counts: NDArray[np.int64]
     weights: Floats
+    tolerance: float
 
-    def by_speed(self) -> tuple[Batch, NDArray[np.intp]]:
-        """The same with transitions in the order of their first body's speed, and that order.
 
-        They are solved side by side: those that slide alike need as many iterations.
-        """
-        order = np.argsort((self.start[0, :, 0, 3:5] ** 2).sum(axis=-1), kind="stable")
-        if self.given[0].shape[1] > 1:  # the bodies' numbers are those of each interval
-            return self, np.arange(len(order))
-        start, inputs = self.start[:, order], self.inputs[order]
-        return self._replace(start=np.ascontiguousarray(start), inputs=inputs), order
+class Still(NamedTuple):
+    """What of a world does not change, for the rollout of its tree."""
+
+    gravity: Floats  # (2,), m/s^2
+    normal_gravity: float  # m/s^2
+    length: float  # size of the smallest moving body (m)
+    fastest: float  # speed of divergence (m/s)
+    ring: Floats  # (point, 2)
+    radii: Floats  # (body,), m
+    can_touch: NDArray[np.bool_]  # (body, body)
+    obstacles: Floats  # (obstacle, 5), the discs last
+
+
+def still(world: World) -> Still:
+    """Return what of a world does not change."""
+    return Still(
+        np.array(world.space.gravity, dtype=float), world.scene.normal_gravity, world.size,
+        world.fastest, np.array(RING), world.radii, world.can_touch, world.obstacles.copy(),
+    )  # fmt: skip
 
 
 class Engine:
@@ -62,10 +72,13 @@ class Engine:
     def _renew(self) -> None:
         self.world = self._build()
         self.pointers = pointers(self.world)
-        self.free = lockstep.free_world(self.world) if self._name != "chipmunk" else None
-        self._joints = lockstep.joints_of(self.world)
-        #: Whether friction under bodies is solved for many transitions side by side.
-        self.slides = self.free is not None and len(self.free.patch_body) > 0
+        self._free = self._tree = None
+        if self._name == "chipmunk":
+            return
+        self._free, self._tree = lockstep.free_world(self.world), tree_of(self.world)
+        if self._free is None and self._tree is not None:
+            self._still = still(self.world)
+            self._work = work_of(self._tree, self.world.size)
 
     def rollout(self, batch: Batch, first: int, last: int, out: Floats) -> None:
         """Predict the items ``first`` to ``last`` into ``out``, NaN where the engine diverges.
@@ -80,8 +93,13 @@ class Engine:
             Shape (proposal * transition, H, body, 6).
         """
         items = np.arange(first, last)
-        if self.free is not None and len(items):
-            items = self._contact_free(self.free, batch, items, out)
+        left = np.zeros(len(items), dtype=bool)
+        if self._free is not None:
+            lockstep.rollout(self._free, batch, items, out, left)
+            items = items[left]
+        elif self._tree is not None:
+            flow.rollout(self._work, self._still, batch, items, out, left)
+            items = items[left]
         if len(items) and self._name == "contact-free":
             raise SimulationError(
                 f"engine 'contact-free': {len(items)} of {last - first} transitions have contacts,"
@@ -93,18 +111,6 @@ class Engine:
                 out[items[done]] = np.nan
                 self._renew()
             items = items[done + 1 :]
-
-    def _contact_free(
-        self, world: lockstep.FreeWorld, batch: Batch, items: NDArray[np.int64], out: Floats
-    ) -> NDArray[np.int64]:
-        """Predict where bodies come near nothing, and return which items are left."""
-        if world.chained.any():  # neighbours are to have about the same number of iterations
-            mass = batch.given[0][:, 0, world.chained, COLUMN.mass]
-            ratio = mass.max(axis=1) / mass.min(axis=1)
-            items = items[np.argsort(ratio[items // len(batch.inputs)], kind="stable")]
-        left = np.zeros(len(items), dtype=bool)
-        lockstep.rollout(world, self._joints, batch, items, out, left)
-        return np.sort(items[left])
 
 
 def share_out(

@@ -197,3 +197,57 @@ def watch(bodies, world, discs, touched):  # type: ignore[no-untyped-def]
                     x = body[BODY.origin_x + i] - other[BODY.origin_x + i]
                     y = body[BODY.origin_y + i] - other[BODY.origin_y + i]
                     touched[i] |= reaches(x, y, 0.0, 0.0, 0.0, radius + world.radii[j])
+
+
+@compiled
+def limited(impulse, most):  # type: ignore[no-untyped-def]
+    """Return an impulse clipped to ``most`` in both directions."""
+    impulse = most if impulse > most else impulse
+    return -most if impulse < -most else impulse
+
+
+@compiled
+def begin_wheel(body):  # type: ignore[no-untyped-def]
+    """Place a wheel's two rods and apply their impulses of the substep before."""
+    for i in range(BLOCK):
+        c, s = body[BODY.cos + i], body[BODY.sin + i]
+        x, y = body[BODY.wheel_x + i], body[BODY.wheel_y + i]
+        r_x, r_y = c * x - s * y, s * x + c * y
+        x, y = body[BODY.wheel_cos + i], body[BODY.wheel_sin + i]
+        n_x, n_y = c * x - s * y, s * x + c * y
+        along, across = r_x * n_y - r_y * n_x, r_x * n_x + r_y * n_y
+        mass, moment = body[BODY.inverse_mass + i], body[BODY.inverse_moment + i]
+        body[BODY.axis_x + i], body[BODY.axis_y + i] = n_x, n_y
+        body[BODY.lever_along + i], body[BODY.lever_across + i] = along, across
+        body[BODY.mass_along + i] = 1.0 / (mass + moment * along * along)
+        body[BODY.mass_across + i] = 1.0 / (mass + moment * across * across)
+        j_x, j_y = body[BODY.impulse_along + i], body[BODY.impulse_across + i]
+        body[BODY.vx + i] -= (n_x * j_x - n_y * j_y) * mass
+        body[BODY.vy + i] -= (n_y * j_x + n_x * j_y) * mass
+        body[BODY.omega + i] -= moment * (along * j_x + across * j_y)
+
+
+@compiled
+def solve_wheel(body):  # type: ignore[no-untyped-def]
+    """Do one iteration of a wheel's rods, whose impulses friction limits."""
+    for i in range(BLOCK):
+        n_x, n_y = body[BODY.axis_x + i], body[BODY.axis_y + i]
+        along, across = body[BODY.lever_along + i], body[BODY.lever_across + i]
+        mass, moment = body[BODY.inverse_mass + i], body[BODY.inverse_moment + i]
+        v_x, v_y, w = body[BODY.vx + i], body[BODY.vy + i], body[BODY.omega + i]
+        old = body[BODY.impulse_along + i]
+        new = old + (n_x * v_x + n_y * v_y + along * w) * body[BODY.mass_along + i]
+        new = limited(new, body[BODY.most_along + i])
+        body[BODY.impulse_along + i] = new
+        j = new - old
+        v_x -= n_x * j * mass
+        v_y -= n_y * j * mass
+        w -= moment * along * j
+        old = body[BODY.impulse_across + i]
+        new = old + (n_x * v_y - n_y * v_x + across * w) * body[BODY.mass_across + i]
+        new = limited(new, body[BODY.most_across + i])
+        body[BODY.impulse_across + i] = new
+        j = new - old
+        body[BODY.vx + i] = v_x + n_y * j * mass
+        body[BODY.vy + i] = v_y - n_x * j * mass
+        body[BODY.omega + i] = w - moment * across * j

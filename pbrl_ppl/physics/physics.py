@@ -36,11 +36,15 @@ class Physics:
     extrapolate : bool
         Whether runs with different numbers of substeps are combined to cancel the engine's leading
         errors.
+    tolerance : float
+        Largest error of a step of joined bodies, and of bodies on friction, which choose their own
+        steps: a share of an angle of 1 rad, or of the smallest body's size.
     engine : str
         ``auto``: the contact-free fast path, and Chipmunk for transitions in which bodies come near
         each other; ``chipmunk``: Chipmunk for all; ``contact-free``: the fast path alone, an error
         where it does not hold; ``python``: Chipmunk stepped by a plain Python loop. All agree to
-        rounding.
+        rounding, but for joined bodies and bodies on friction, where those of Chipmunk have its
+        error of the first order in the step.
     parts : tuple of tuple of str, optional
         Moving bodies grouped into parts that never interact; all in one part by default.
     together : tuple of str
@@ -73,6 +77,7 @@ class Physics:
     substeps: int = None  # type: ignore[assignment]  # filled in below
     threads: int = 1
     extrapolate: bool = True
+    tolerance: float = 1e-6
     engine: str = "auto"
     parts: Parts | None = None
     together: tuple[str, ...] = ()
@@ -91,6 +96,8 @@ class Physics:
                 f"substeps is {self.substeps} and threads is {self.threads}; both must be at least"
                 " 1"
             )
+        if not 1e-12 <= self.tolerance <= 1e-2:
+            raise SimulationError(f"tolerance is {self.tolerance:g}, expected 1e-12 to 1e-2")
         check_engine(self.engine)
 
     @classmethod

@@ -23,7 +23,7 @@ from pbrl_ppl.physics.joints import on_rod
 from pbrl_ppl.physics.properties import EngineInput, EngineProperties
 from pbrl_ppl.physics.world import FINER, World
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import INPUT, Floats
+from pbrl_ppl.state import INPUT, Floats, Ints
 
 if TYPE_CHECKING:
     from pbrl_ppl.physics.physics import Physics
@@ -237,30 +237,25 @@ class Simulator:
         return np.array(counts, dtype=np.int64), np.array(weights, dtype=float)
 
     @cached_property
-    def _commands(self) -> tuple[NDArray[Any], ...]:
-        """Address, body, first parameter and memory of each command law."""
-        memory = [
-            isinstance(attached.effect.stage, Command) and attached.effect.stage.memory
-            for attached in at_stage(self.physics.effects, Command)
-        ]
-        return (*self._laws(Command), np.array(memory, dtype=bool))
+    def _commands(self) -> Ints:
+        """Address, body, first parameter and memory of each command law, shape (law, 4)."""
+        return self._laws(Command)
 
     @cached_property
-    def _forces(self) -> tuple[NDArray[Any], ...]:
-        """Address, body and first parameter of each force law."""
+    def _forces(self) -> Ints:
+        """The same of each force law."""
         return self._laws(Force)
 
-    def _laws(self, kind: type) -> tuple[NDArray[Any], ...]:
-        acting = at_stage(self.physics.effects, kind)
-        names = [body.name for body in self.physics.scene.moving]
-        sizes = [len(attached.effect.parameters) for attached in acting]
-        stages = [attached.effect.stage for attached in acting]
-        addresses = [calls.law_address(s.law) for s in stages if isinstance(s, Command | Force)]
-        return (
-            np.array(addresses, dtype=np.int64),
-            np.array([names.index(attached.body) for attached in acting], dtype=np.int64),
-            np.cumsum([0, *sizes])[:-1].astype(np.int64),
-        )
+    def _laws(self, kind: type) -> Ints:
+        names, first, rows = [body.name for body in self.physics.scene.moving], 0, []
+        for attached in at_stage(self.physics.effects, kind):
+            stage = attached.effect.stage
+            if isinstance(stage, Command | Force):
+                memory = isinstance(stage, Command) and stage.memory
+                body = names.index(attached.body)
+                rows.append((calls.law_address(stage.law), body, first, int(memory)))
+            first += len(attached.effect.parameters)
+        return np.array(rows, dtype=np.int64).reshape(-1, 4)
 
     def _new_world(self, choice: Choice) -> World:
         joined, slides, there = choice
@@ -312,7 +307,7 @@ class Simulator:
         """
         batch = Batch(
             tuple(numbers[:-1]), self._commands, self._forces, starts, inputs,
-            self.physics.scene.time_step, *self.levels,
+            self.physics.scene.time_step, *self.levels, self.physics.tolerance,
         )  # fmt: skip
         steps = len(out) * inputs.shape[1] * int(self.levels[0].sum())
         workers = max(1, min(self.physics.threads, len(out), steps // a_thread))
@@ -322,17 +317,11 @@ class Simulator:
                 self._worlds.popitem(last=False)
             while len(engines) < workers:
                 engines.append(Engine(partial(self._new_world, choice), self.physics.engine))
-            states, slides = out, engines[0].slides and len(out) > 0
-            if slides:
-                states, (batch, order) = np.empty_like(out), batch.by_speed()
 
             def run(engine: Engine, first: int, last: int) -> None:
-                engine.rollout(batch, first, last, states)
+                engine.rollout(batch, first, last, out)
 
             share_out(run, engines[:workers], len(out))
-        if slides:
-            shape = (-1, len(order), *out.shape[1:])
-            out.reshape(shape)[:, order] = states.reshape(shape)
 
 
 def _each(states: Floats, proposals: int) -> Floats:

@@ -136,6 +136,9 @@ class PosteriorRecord:
         Share of those moves that were accepted; 1 without any.
     log_evidence : float, optional
         Of the model, about the modes that were found.
+    tolerance : float, optional
+        Largest error of a step of bodies that choose their own steps: a field of
+        :class:`pbrl_ppl.physics.Physics`.
     not_separable : tuple of tuple of str, optional
         Groups of effects, such as ``spring on cart``, that the recording cannot separate.
     """
@@ -171,6 +174,7 @@ class PosteriorRecord:
     rungs: int | None = None
     acceptance: float | None = None
     log_evidence: float | None = None
+    tolerance: float | None = None
     not_separable: tuple[tuple[str, ...], ...] | None = None
 
     @classmethod

