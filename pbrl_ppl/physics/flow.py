@@ -121,6 +121,14 @@ def _switch(work, laws, inputs, low):  # type: ignore[no-untyped-def]
 
 
 @compiled
+def _slowest(work, laws, r):  # type: ignore[no-untyped-def]
+    """Return the square of a ring's speed from which friction lets it slide by next to nothing."""
+    ring, points = r - work.n_rows, work.rings.shape[1] - POINTS
+    slowing = work.rings[ring, GRIP, 0] * points / work.links[work.kinds[r, 1], MASS]
+    return 2.0 * slowing * _COAST * laws.tolerance * laws.length
+
+
+@compiled
 def _decide(work, laws, inputs, share, low, high):  # type: ignore[no-untyped-def]
     """Set which rows and rings stick and which way the others slip; and the step's first slopes.
 
@@ -147,8 +155,7 @@ def _decide(work, laws, inputs, share, low, high):  # type: ignore[no-untyped-de
         else:
             i = kinds[r, 1]
             square = set_twist(work, r - count, i, U, TWIST)
-            slowing = greatest * (rings.shape[1] - POINTS) / work.links[i, MASS]
-            if square > 2.0 * slowing * _COAST * laws.tolerance * laws.length:
+            if square > _slowest(work, laws, r):
                 kinds[r, 2] = SLIDE
             moved = square > 0.0
         if kinds[r, 2] == STICK:
@@ -301,9 +308,13 @@ def _advance(work, laws, still, inputs, low, high, budget):  # type: ignore[no-u
         for j in range(n):
             motion[Q, j], motion[U, j] = motion[END_Q, j], motion[END_U, j]
             motion[SLOPES + 1, j] = motion[SLOPES + 13, j]
-        for ring in range(work.n_kinds - work.n_rows):
+        for r in range(work.n_rows, work.n_kinds):
+            ring, square = r - work.n_rows, 0.0
             for d in range(3):
                 work.rings[ring, TWIST, d] = work.rings[ring, TWIST_END, d]
+                square += work.rings[ring, TWIST, d] ** 2
+            if work.kinds[r, 2] == SLIDE and square <= _slowest(work, laws, r):
+                fresh = True
         share = high if last else share + width
         width = 1.0 if fresh else 2.0 * width
         for i in range(work.n_bodies):

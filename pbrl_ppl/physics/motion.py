@@ -26,6 +26,7 @@ from pbrl_ppl.physics.tree import (
     FREE,
     JOINT,
     KIND,
+    MOST,
     NEAR,
     OWNER,
     PARENT,
@@ -62,8 +63,6 @@ _SLOW = 2e-3
 _SOFT = 1e-11
 
 
-#: Links, coordinates, rows and rings that a tree may have; a larger one is left to the engine.
-MOST = 24
 #: Topology of a tree and numbers of one transition: one record, for a call of many arrays would
 #: cost more than what they hold.
 WORK = np.dtype(

@@ -157,14 +157,6 @@ class EngineProperties:
         changed = {e.body for e in effects if _changed_columns(e).intersection(names)}
         return tuple(i for i, name in enumerate(self._bodies) if name in changed)
 
-    def slides(self, bodies: Floats) -> NDArray[np.bool_]:
-        """Return which proposals have floor friction from effects, shape (proposal,)."""
-        sliding = np.zeros(len(bodies), dtype=bool)
-        for under, names in zip(self.under, (_PATCH, _WHEEL), strict=True):
-            columns = [COLUMNS.index(name) for name in names]
-            sliding |= (bodies[:, :, list(under)][..., columns] > 0).any(axis=(1, 2, 3))
-        return sliding
-
     def values(self, attached: Attached, phi: Floats, axes: int = 0) -> dict[str, Floats]:
         """Return an effect's parameters by name, shape (proposal, 1, ...) with ``axes`` ones.
 

@@ -140,20 +140,20 @@ class Simulator:
     def _choices(self, numbers: EngineInput) -> Iterator[tuple[Choice, Any]]:
         """The worlds that proposals need, and which of them each is for.
 
-        What bodies an inferred joint holds makes another world; and so does friction under bodies,
-        whose joints would cost ten times as much as all else where the coefficient is zero, as it
-        is when candidates are scored.
+        What bodies an inferred joint holds makes another world, and so does each rod that there is.
+        Friction under bodies is solved alike where its coefficient is zero: a derivative there is
+        not to see the difference of two solvers.
         """
-        sliding = self._properties.slides(numbers.bodies)
+        slides = any(self._properties.under)
         tied = numbers.joints[:, len(self.physics.scene.joints) :, -1] > 0
         proposals, joints, _ = numbers.indices.shape
         indices = numbers.indices.reshape(proposals, 2 * joints)
-        keys = np.column_stack([sliding, tied, indices])
+        keys = np.column_stack([np.zeros(proposals), tied, indices])
         choices, which = np.unique(keys, axis=0, return_inverse=True)
-        for i, (slides, *others) in enumerate(choices.astype(int).tolist()):
+        for i, (_, *others) in enumerate(choices.astype(int).tolist()):
             rods, pairs = others[: tied.shape[1]], others[tied.shape[1] :]
             joined = tuple(zip(pairs[::2], pairs[1::2], strict=True))
-            yield (joined, bool(slides), tuple(map(bool, rods))), which.ravel() == i
+            yield (joined, slides, tuple(map(bool, rods))), which.ravel() == i
 
     def _inputs(self, actions: Floats) -> tuple[Floats, Clock | None]:
         """Inputs of the rollout, and times of the intervals."""

@@ -28,6 +28,10 @@ PIVOT, UNDER, ALONG, ACROSS = range(4)
 KIND, PARENT, BODY, FIRST, TURN, JOINT, NEAR, FAR, OWNER = range(9)
 
 
+#: Links, coordinates, and rows and rings that a tree may have; a larger one is left to the engine.
+MOST = 24
+
+
 @dataclass(frozen=True)
 class Tree:
     """Links of a world, each after the one that it hangs on.
@@ -59,7 +63,8 @@ class Tree:
 def tree_of(world: World) -> Tree | None:
     """Return the tree of a world's bodies.
 
-    None where a body follows a path, or where joints close a loop or have no such coordinates.
+    None where a body follows a path, or where joints close a loop, have no such coordinates, or are
+    too many.
     """
     if world.kinematic.any() or not all(link.kind.contact_free for link in world.links):
         return None
@@ -107,6 +112,8 @@ def tree_of(world: World) -> Tree | None:
     alone = [links[i][KIND] == HINGE and links[i][PARENT] < 0 for i in under]
     rows += [(UNDER, i) for i, one in zip(under, alone, strict=True) if one]
     rings = [i for i, one in zip(under, alone, strict=True) if not one]
+    if max(len(links), size, len(rows) + len(rings)) > MOST:
+        return None
     return Tree(
         links=np.array(links, dtype=np.int64),
         poses=np.array(poses, dtype=float),

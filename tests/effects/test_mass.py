@@ -179,7 +179,7 @@ def test_paths_agree(timed) -> None:
     actions[..., 8] = 0.1 * np.arange(1, 4)[:, None]
     sims = [
         simulator(scene, tuple(BY_NAME[name] for name in effects), engine=path)
-        for path in ("auto", "python")
+        for path in ("chipmunk", "python")
     ]
     got, plain = (sim(phi_of(sim.physics.layout, effects), start, actions) for sim in sims)
     np.testing.assert_allclose(got, plain, atol=1e-11)

@@ -232,7 +232,8 @@ def test_pendulum_with_missing_columns(pendulum) -> None:
         "inertia_scale_scale": stats.lognorm(s=prior.sigma, scale=math.exp(prior.mu))
     }
     logp = float(model.compile_logp(jacobian=False, mode="FAST_COMPILE")(point))
-    assert logp == pytest.approx(expected_logp(model, values, priors), rel=1e-7)
+    # the arm moves to the tolerance of its steps, in the whole recording and in pieces
+    assert logp == pytest.approx(expected_logp(model, values, priors), rel=1e-6)
 
 
 def test_a_missing_cell_takes_no_part(cart) -> None:
