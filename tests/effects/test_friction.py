@@ -217,17 +217,24 @@ def test_friction_and_radius_are_recovered() -> None:
     assert (sd < 0.02 * truth).all()
 
 
-def test_nothing_is_solved_where_the_coefficient_is_zero() -> None:
-    """Candidates are scored there, on all bodies: joints that do nothing would cost ten times."""
-    sim = simulator(floor(), (BY_NAME["sliding_friction"],))
-    start, actions = state(vx=1.0)[None, None], np.zeros((1, 1, 1, 3))
-    sim(np.array([0.0, RADIUS]), start, actions)
-    worlds = [engine.world for engines in sim._worlds.values() for engine in engines]
-    assert [world.patches for world in worlds] == [[]]
-    both = sim(np.array([[MU, RADIUS], [0.0, RADIUS]]), start, actions)
-    np.testing.assert_array_equal(both[0], sim(np.array([MU, RADIUS]), start, actions))
-    np.testing.assert_allclose(both[1, 0, 0, 0], state(x=0.1, vx=1.0), atol=1e-15)
-    assert len(sim._worlds) == 2
+def test_friction_of_zero_is_solved_as_any_other() -> None:
+    """Candidates are scored there: a derivative does not see the difference of two solvers."""
+    sim = simulator(floor(), (BY_NAME["sliding_friction"], BY_NAME["linear_drag"]))
+    start, actions = state(vx=1.0, omega=2.0)[None, None], np.zeros((1, 1, 1, 3))
+    values = {"linear_drag_coefficient": 0.5, "sliding_friction_radius": RADIUS}
+    none, little = (
+        np.array(
+            [(values | {"sliding_friction_mu": mu})[label.split("[")[0]]
+             for label in sim.physics.layout.labels]
+        )
+        for mu in (0.0, 1e-7)
+    )  # fmt: skip
+    both = sim(np.stack([none, little]), start, actions)
+    np.testing.assert_array_equal(both[0], sim(none, start, actions))
+    assert 0.0 < np.abs(both[1] - both[0]).max() < 1e-6
+    decayed = np.exp(-0.5 / MASS * 0.1)  # free but for the drag
+    np.testing.assert_allclose(both[0, 0, 0, 0, 3], decayed, rtol=1e-8)
+    assert len(sim._worlds) == 1
 
 
 # -- a wheel that the scene does not declare -------------------------------------------------------
