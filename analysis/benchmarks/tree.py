@@ -21,7 +21,7 @@ from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Joint
 
 KNOWN = {"mass": 0.3, "r": 0.2, "mu_c": 0.2}
-LAWS = {"quadratic_drag": 0.01, "pivot_friction": 0.01, "pivot_damping": 0.002}
+LAWS = ("quadratic_drag", "pivot_friction", "pivot_damping")
 
 
 def arms(count: int, time_step: float) -> Scene:
@@ -31,7 +31,7 @@ def arms(count: int, time_step: float) -> Scene:
     return Scene(
         time_step=time_step,
         gravity=(0.0, -9.81),
-        bodies=tuple(Body(name, shape, known=KNOWN, effects=tuple(LAWS)) for name in names[1:]),
+        bodies=tuple(Body(name, shape, known=KNOWN, effects=LAWS) for name in names[1:]),
         joints=tuple(
             Joint("hinge", (names[i + 1], names[i]), (0.0, 0.2), (0.0, -0.2 if i else 0.0))
             for i in range(count)

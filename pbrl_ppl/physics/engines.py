@@ -34,7 +34,7 @@ class Batch(NamedTuple):
 
 
 class Still(NamedTuple):
-    """What of a world does not change, for the rollout of its tree."""
+    """What the rollout of a tree needs of its world; discs are moved for each proposal."""
 
     gravity: Floats  # (2,), m/s^2
     normal_gravity: float  # m/s^2
@@ -47,7 +47,7 @@ class Still(NamedTuple):
 
 
 def still(world: World) -> Still:
-    """Return what of a world does not change."""
+    """Return what the rollout of a tree needs of its world."""
     return Still(
         np.array(world.space.gravity, dtype=float), world.scene.normal_gravity, world.size,
         world.fastest, np.array(RING), world.radii, world.can_touch, world.obstacles.copy(),
@@ -75,8 +75,10 @@ class Engine:
         self._free = self._tree = None
         if self._name == "chipmunk":
             return
-        self._free, self._tree = lockstep.free_world(self.world), tree_of(self.world)
-        if self._free is None and self._tree is not None:
+        self._free = lockstep.free_world(self.world)
+        if self._free is None:
+            self._tree = tree_of(self.world)
+        if self._tree is not None:
             self._still = still(self.world)
             self._work = work_of(self._tree, self.world.size)
 

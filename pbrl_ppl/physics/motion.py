@@ -139,7 +139,7 @@ def set_numbers(work, gravity, normal_gravity, ring, bodies, joints):  # type: i
         link, row = work.links[i], bodies[work.tree[i, BODY]]
         load, radius = link[MASS] * normal_gravity, row[COLUMN.patch_radius]
         lever = 0.0
-        for j in range(len(ring)):
+        for j in range(len(ring) if kind < 0 or kind == UNDER else 0):
             x, y = ring[j, 0] * radius - link[OWN_X], ring[j, 1] * radius - link[OWN_Y]
             lever += math.sqrt(x * x + y * y) / len(ring)
             if kind < 0:

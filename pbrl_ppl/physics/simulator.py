@@ -32,10 +32,10 @@ if TYPE_CHECKING:
 ENGINES = ("auto", "chipmunk", "contact-free", "python")
 #: For each joint of unknown bodies, which of ``scene.joinable`` it holds.
 Joined = tuple[tuple[int, int], ...]
-#: And whether there is friction under bodies, and which rods there are: what worlds differ in.
-Choice = tuple[Joined, bool, tuple[bool, ...]]
+#: And which rods there are: what worlds differ in.
+Choice = tuple[Joined, tuple[bool, ...]]
 #: Where there is nothing to choose.
-_ONE_WORLD: Choice = ((), False, ())
+_ONE_WORLD: Choice = ((), ())
 
 
 def check_engine(name: str) -> None:
@@ -123,8 +123,7 @@ class Simulator:
         out = np.full((len(proposals), n, horizon, k, 6), np.nan)
         plain = self.physics.engine == "python" or not calls.AVAILABLE
         run = self._run_plain if plain else self._run_compiled
-        extra = (*self._properties.under, self._properties.tied)
-        if not (any(extra) or numbers.indices.shape[1]):
+        if not (self._properties.tied or numbers.indices.shape[1]):
             run(_ONE_WORLD, numbers, starts, inputs, out.reshape(-1, horizon, k, 6))
         else:
             for choice, rows in self._choices(numbers):
@@ -141,19 +140,18 @@ class Simulator:
         """The worlds that proposals need, and which of them each is for.
 
         What bodies an inferred joint holds makes another world, and so does each rod that there is.
-        Friction under bodies is solved alike where its coefficient is zero: a derivative there is
-        not to see the difference of two solvers.
+        Friction under bodies does not, where its coefficient is zero: a derivative there is not to
+        see the difference of two solvers.
         """
-        slides = any(self._properties.under)
         tied = numbers.joints[:, len(self.physics.scene.joints) :, -1] > 0
         proposals, joints, _ = numbers.indices.shape
         indices = numbers.indices.reshape(proposals, 2 * joints)
-        keys = np.column_stack([np.zeros(proposals), tied, indices])
+        keys = np.column_stack([tied, indices])
         choices, which = np.unique(keys, axis=0, return_inverse=True)
-        for i, (_, *others) in enumerate(choices.astype(int).tolist()):
-            rods, pairs = others[: tied.shape[1]], others[tied.shape[1] :]
+        for i, row in enumerate(choices.astype(int).tolist()):
+            rods, pairs = row[: tied.shape[1]], row[tied.shape[1] :]
             joined = tuple(zip(pairs[::2], pairs[1::2], strict=True))
-            yield (joined, slides, tuple(map(bool, rods))), which.ravel() == i
+            yield (joined, tuple(map(bool, rods))), which.ravel() == i
 
     def _inputs(self, actions: Floats) -> tuple[Floats, Clock | None]:
         """Inputs of the rollout, and times of the intervals."""
@@ -258,9 +256,9 @@ class Simulator:
         return np.array(rows, dtype=np.int64).reshape(-1, 4)
 
     def _new_world(self, choice: Choice) -> World:
-        joined, slides, there = choice
+        joined, there = choice
         properties = self._properties
-        patches, wheels = properties.under if slides else ((), ())
+        patches, wheels = properties.under
         rods = tuple(compress(properties.tied, there))
         scene, kinds = self.physics.scene, properties.joints.kinds
         return World(scene, kinds, joined, properties.n_discs, patches, wheels, rods)

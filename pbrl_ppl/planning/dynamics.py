@@ -175,8 +175,8 @@ class Dynamics:
         Effects beside those that the scene declares.
     noise : StepNoise, optional
         Noise of a step under each draw: then :meth:`noisy` works.
-    substeps, threads : int
-        Settings of the engine.
+    substeps, threads, tolerance
+        Settings of the engine: fields of :class:`pbrl_ppl.Physics`.
     declared : iterable of Effect
         Where the names of the effects that the scene declares are looked up.
     """
@@ -190,11 +190,12 @@ class Dynamics:
         noise: StepNoise | None = None,
         substeps: int | None = None,
         threads: int = 2,
+        tolerance: float = Physics.tolerance,
         declared: Iterable[Effect] = catalogue,
     ) -> None:
         attached = attach(scene, effects, declared)
         substeps = scene.substeps if substeps is None else substeps
-        self._physics = Physics(scene, attached, substeps, threads)
+        self._physics = Physics(scene, attached, substeps, threads, tolerance=tolerance)
         self.scene, self.layout, self._noise = scene, self._physics.layout, noise
         self.phi = np.atleast_2d(np.asarray(phi, dtype=float))
         self._whole = needs_inputs(attached)
@@ -242,8 +243,7 @@ class Dynamics:
         from pbrl_ppl.posterior import PosteriorRecord, vectors  # not for known dynamics
 
         record = PosteriorRecord.of(idata)
-        attached = record.attached(effects)
-        physics = Physics(record.scene, attached, record.substeps)
+        physics = record.physics(effects)
         layout = physics.layout
         if draws is None:
             phi, sigma = (vector[None] for vector in record.mode_vectors(layout))
@@ -269,9 +269,10 @@ class Dynamics:
             record.scene,
             phi,
             noise=noise,
-            substeps=record.substeps,
+            substeps=physics.substeps,
+            tolerance=physics.tolerance,
             threads=threads,
-            declared=[law.effect for law in attached],
+            declared=[law.effect for law in physics.effects],
         )
 
     @property

@@ -27,7 +27,6 @@ from pbrl_ppl.likelihood import (
     output_error,
     with_sensitivity,
 )
-from pbrl_ppl.physics import Physics
 from pbrl_ppl.posterior.record import PosteriorRecord, vectors
 from pbrl_ppl.posterior.store import Idata, best_draw, from_groups, group, groups
 from pbrl_ppl.scene import Scene
@@ -128,13 +127,7 @@ def problem_of(
         # of the first interval: there is no number after a trajectory's end
         history = history.numbered(float(actions[:, 0, :, INPUT.index("trajectory")].max()) + 1.0)
     problem = Problem.of(
-        Physics(
-            record.scene,
-            record.attached(effects),
-            substeps=record.substeps,
-            together=record.together,
-            tolerance=1e-6 if record.tolerance is None else record.tolerance,
-        ),
+        record.physics(effects),
         history,
         horizon=record.horizon,
         columns=columns,

@@ -13,7 +13,6 @@ from pbrl_ppl.effects import LEARNED_REMAINDER, Effect, catalogue
 from pbrl_ppl.likelihood import Observations, TransitionLikelihood
 from pbrl_ppl.modes import Mode, posterior_slopes
 from pbrl_ppl.parameters import JOINT_INDICES, Layout, Prior, inside, nearest, wheels
-from pbrl_ppl.physics import Physics
 from pbrl_ppl.posterior.record import PosteriorRecord, layout_of
 from pbrl_ppl.posterior.store import Idata, best_draw, group, labelled_draws
 from pbrl_ppl.state import STATE, Floats
@@ -330,7 +329,7 @@ def _sparse(rows: Floats) -> Floats:
 def _linearised(idata: Idata, effects: tuple[Effect, ...]) -> tuple[Layout, Floats, Floats]:
     """Return the layout, the best draw, and the whitened residual's derivative there."""
     record = PosteriorRecord.of(idata)
-    physics = Physics(record.scene, record.attached(effects), record.substeps, threads=2)
+    physics = record.physics(effects, threads=2)
     layout = physics.layout
     data, measured = group(idata, "constant_data"), group(idata, "observed_data")["next_state"]
     columns = tuple(STATE.index(name) for name in record.measured)

@@ -19,7 +19,7 @@ from pbrl_ppl.likelihood import (
     noise_labels,
 )
 from pbrl_ppl.parameters import Layout, ParameterLibrary
-from pbrl_ppl.physics import build_layout
+from pbrl_ppl.physics import Physics, build_layout
 from pbrl_ppl.posterior.store import SCHEMA, Idata, check_schema, draws
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats, Ints
@@ -224,6 +224,17 @@ class PosteriorRecord:
             If one is not among them.
         """
         return _attached(self.scene, self.learned_remainder, effects)
+
+    def physics(self, effects: Iterable[Effect], threads: int = 1) -> Physics:
+        """Return the physics that was fitted, its effects looked up among ``effects`` by name."""
+        return Physics(
+            self.scene,
+            self.attached(effects),
+            self.substeps,
+            threads,
+            tolerance=Physics.tolerance if self.tolerance is None else self.tolerance,
+            together=self.together,
+        )
 
     @property
     def noise_labels(self) -> tuple[str, ...]:

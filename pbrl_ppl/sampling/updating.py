@@ -24,7 +24,6 @@ from pbrl_ppl.likelihood import (
     single_transitions,
 )
 from pbrl_ppl.modes import systematic
-from pbrl_ppl.physics import Physics
 from pbrl_ppl.posterior import Idata, PosteriorRecord, from_groups, group, groups, parameter_draws
 from pbrl_ppl.sampling.fitting import sample
 from pbrl_ppl.sampling.update_checks import (
@@ -158,10 +157,8 @@ def _simulated(
     rows, new = earlier.to_dataframe(), history.to_dataframe()
     for part, first in ((rows, 0), (new, earlier.n_trajectories)):
         part["trajectory"] = first + pd.factorize(part["trajectory"])[0]
-    attached = record.attached(effects)
-    physics = Physics(record.scene, attached, substeps=record.substeps, together=record.together)
     both = History.from_dataframe(pd.concat([rows, new]), record.scene)
-    problem = declared_problem(physics, both, kind=OutputErrorLikelihood.name)
+    problem = declared_problem(record.physics(effects), both, kind=OutputErrorLikelihood.name)
     return problem.with_likelihood(prior=record.sigma_prior)
 
 

@@ -6,7 +6,7 @@ import sys
 #: Modules that a plan does not need.
 HEAVY = ("pymc", "pytensor", "arviz", "matplotlib")
 #: Modules of the package that planning may load.
-MOST = 97
+MOST = 96
 
 
 def test_planning_loads_no_sampler() -> None:
