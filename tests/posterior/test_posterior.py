@@ -10,9 +10,11 @@ import pytest
 import xarray as xr
 from scipy import stats
 
+from pbrl_ppl.effects import catalogue
 from pbrl_ppl.errors import OutputError, PosteriorError
 from pbrl_ppl.likelihood import Coordinates
 from pbrl_ppl.parameters import ParameterLibrary
+from pbrl_ppl.physics import Physics
 from pbrl_ppl.posterior import Linearisation, PosteriorRecord, StoredMode, scene_of
 from pbrl_ppl.posterior import store as posterior
 from pbrl_ppl.posterior.store import (
@@ -338,6 +340,15 @@ def test_a_missing_field_is_named() -> None:
     del attrs["substeps"]
     with pytest.raises(PosteriorError, match="does not say its substeps"):
         PosteriorRecord.of(from_groups(datasets(), attrs))
+
+
+def test_the_tolerance_of_the_physics_is_kept() -> None:
+    """Of a file that does not state it, the default."""
+    stored = PosteriorRecord.of(from_groups(datasets(), record(tolerance=1e-8).attributes()))
+    assert stored.physics(catalogue).tolerance == 1e-8
+    older = PosteriorRecord.of(from_groups(datasets(), record().attributes()))
+    assert older.physics(catalogue).tolerance == Physics(SCENE).tolerance
+    assert older.physics(catalogue).substeps == 10
 
 
 @pytest.mark.parametrize("prob", [0.5, 0.94])
