@@ -121,28 +121,35 @@ def intervals(bodies, p, t, horizon):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(inline="always")  # a call costs as much as a substep: the world is many arrays
-def _transition(fn, world, batch, p, t, substeps, scratch, out):  # type: ignore[no-untyped-def]
-    """Step one transition of horizon H into ``out`` (H, body, 6); return how it ended."""
+def _transition(  # type: ignore[no-untyped-def]
+    fn, world, batch, p, t, substeps, scratch, first, begin, whole, out
+):
+    """Step one transition into ``out`` (H, body, 6), from the states ``first`` on.
+
+    They are those before the interval ``begin``. One that is not ``whole`` ends where no body is
+    near another. Returns how it ended, and the interval after its last.
+    """
     k = len(world.bodies)
     step = batch.time_step / substeps
     state, axes, acted = scratch
     commands, forces = batch.commands, batch.forces
     command_parameters, force_parameters = batch.given[3][p], batch.given[4][p]
-    start, inputs = batch.start, batch.inputs[t]
+    inputs, end = batch.inputs[t], begin
     properties, joints = intervals(batch.given[0], p, t, len(inputs)), batch.given[1][p]
-    copy(start[p if len(start) > 1 else 0, t], state)
-    bodies = properties[0]
+    copy(first, state)
+    bodies = properties[begin if len(properties) > 1 else 0]
     for j in range(len(axes)):
         turn = bodies[world.wheel_body[j], COLUMN.w_theta]
         axes[j, 0], axes[j, 1] = math.cos(turn), math.sin(turn)
-    touched = _FREE
+    touched, near = _FREE, False
     driven = world.kinematic.any()
     acting = len(batch.commands) + len(batch.forces) > 0
     sliding = len(world.patch_body) > 0
     watch = len(world.obstacles) > 0 or k > 1
     place_bodies(fn, world, bodies, state)
-    for h in range(len(inputs)):
-        if h > 0 and len(properties) > 1:
+    while end < len(inputs) and (whole or near or end == begin):
+        h = end
+        if h > begin and len(properties) > 1:
             bodies = properties[h]
             set_properties(fn, world, bodies, joints)
             place_bodies(fn, world, bodies, state)
@@ -155,6 +162,7 @@ def _transition(fn, world, batch, p, t, substeps, scratch, out):  # type: ignore
             for w in range(3):
                 acted[i, WRENCHES + w] = inputs[h, i, w]
         for s in range(substeps):
+            near = False
             if acting:
                 act(
                     state, inputs[h], commands, command_parameters, forces, force_parameters,
@@ -184,22 +192,27 @@ def _transition(fn, world, batch, p, t, substeps, scratch, out):  # type: ignore
                 state[i, 3], state[i, 4], state[i, 5] = v_x + turn * y, v_y - turn * x, turn
                 speed = abs(state[i, 3]) + abs(state[i, 4]) + world.size * abs(turn)
                 if not speed < world.fastest:  # also true of NaN
-                    return _LOST
-                if watch and touched == _FREE:
-                    near = near_contact(i, state, world.radii, world.obstacles, world.can_touch)
-                    touched = _TOUCHED if near else _FREE
+                    return _LOST, end
+            if watch and (touched == _FREE or not whole):
+                near = near_contact(state, world.radii, world.obstacles, world.can_touch)
+                touched = _TOUCHED if near else touched
         copy(state, out[h])
-    return touched
+        end += 1
+    return touched, end
 
 
 @compiled
-def rollout(fn, world, batch, items, out):  # type: ignore[no-untyped-def]
+def rollout(fn, world, batch, items, begins, whole, out):  # type: ignore[no-untyped-def]
     """Predict ``items`` of ``out``, whose shape is (proposal * transition, H, body, 6).
 
-    Each transition is run with every number of substeps in ``batch.counts``, the finest first, and
-    the weighted sum cancels the leading errors. Where shapes came close the finest run stands
-    alone, since the time of a collision is no smooth function of the substep; with hidden discs it
-    is refined.
+    Those that are not ``whole`` are predicted from the interval in ``begins``, shape (item,), with
+    the most substeps, until an interval ends where no body is near another; ``begins`` becomes the
+    next one.
+
+    Each whole transition is run with every number of substeps in ``batch.counts``, the finest
+    first, and the weighted sum cancels the leading errors. Where shapes came close the finest run
+    stands alone, since the time of a collision is no smooth function of the substep; with hidden
+    discs it is refined.
 
     Returns the place among the items at which the engine diverged (its world must then be
     replaced), or the number of items.
@@ -213,16 +226,33 @@ def rollout(fn, world, batch, items, out):  # type: ignore[no-untyped-def]
     axes = np.empty((len(world.wheel_body), 2))
     scratch = Scratch(np.empty((k, 6)), axes, np.empty((k + 1, 9)))
     proposal, finer = -1, 1
-    outcome = _TOUCHED  # an earlier call may have left contacts
+    start, outcome = batch.start, _TOUCHED  # an earlier call may have left contacts
     for place in range(len(items)):
         item = items[place]
         p, t = item // n, item % n
-        first = intervals(bodies, p, t, horizon)[0]
+        begin = begins[place]
+        first = intervals(bodies, p, t, horizon)[begin if timed else 0]
+        states_before = start[p if len(start) > 1 else 0, t]
+        if begin > 0:
+            states_before = out[item, begin - 1]
         if p != proposal:
             proposal = p
             set_properties(fn, world, first, joints[p])
             set_discs(fn, world, discs[p])
             finer = FINER if (discs[p, :, 2] > 0.0).any() else 1
+        if not whole:
+            if timed:
+                set_properties(fn, world, first, joints[p])
+            _forget(fn, world, first, batch, _TOUCHED)
+            substeps = batch.counts[0] * finer
+            outcome, end = _transition(
+                fn, world, batch, p, t, substeps, scratch, states_before, begin, whole, out[item]
+            )
+            if outcome == _LOST:
+                return place
+            begins[place] = end
+            continue
+        begins[place] = horizon
         total[:] = 0.0
         for level in range(len(batch.counts)):
             before, substeps = outcome, batch.counts[level]
@@ -230,7 +260,9 @@ def rollout(fn, world, batch, items, out):  # type: ignore[no-untyped-def]
                 if timed:
                     set_properties(fn, world, first, joints[p])
                 _forget(fn, world, first, batch, before)
-                outcome = _transition(fn, world, batch, p, t, substeps, scratch, states)
+                outcome, _ = _transition(
+                    fn, world, batch, p, t, substeps, scratch, states_before, begin, whole, states
+                )
                 if substeps > batch.counts[level] and outcome == _FREE:
                     outcome = _TOUCHED  # the first run touched: a refined one is not extrapolated
                 fine = substeps == batch.counts[level] * finer

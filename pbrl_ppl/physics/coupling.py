@@ -39,7 +39,7 @@ def joined_parts(parts: Parts, together: Collection[str]) -> Parts:
     )
 
 
-def independent_parts(scene: Scene, history: History) -> Parts:
+def independent_parts(scene: Scene, history: History | None = None) -> Parts:
     """Return the moving bodies in parts that never come near and share no joint or parameters.
 
     A kinematic body counts as any other: all bodies that it meets are in its part.
@@ -52,8 +52,9 @@ def independent_parts(scene: Scene, history: History) -> Parts:
     ----------
     scene : Scene
         Shapes, joints and classes. A joint of unknown bodies may join any two.
-    history : History
-        Measured places; a body whose place is missing at some time may have been anywhere.
+    history : History, optional
+        Measured places, without which bodies come near no others; a body whose place is missing at
+        some time may have been anywhere.
 
     Returns
     -------
@@ -86,16 +87,17 @@ def independent_parts(scene: Scene, history: History) -> Parts:
     for sharing in scene.owners.values():
         for name in sharing[1:]:
             together[names.index(name), names.index(sharing[0])] = True
-    place = history.dataset["start"].to_numpy()[..., :2]
-    intervals = history.dataset["n_rows"].to_numpy() - 1
-    inside = np.arange(place.shape[1] - 1) < intervals[:, None]
-    begin, end = place[:, :-1][inside], place[:, 1:][inside]  # (interval, body, 2)
-    reach = [body.shape.bounding_radius for body in scene.moving]
-    for i in range(k):
-        for j in range(i):
-            least = (1.0 + SHARE) * (reach[i] + reach[j])
-            near = come_near(begin[:, i] - begin[:, j], end[:, i] - end[:, j], least)
-            together[i, j] |= near.any()
+    if history is not None:
+        place = history.dataset["start"].to_numpy()[..., :2]
+        intervals = history.dataset["n_rows"].to_numpy() - 1
+        inside = np.arange(place.shape[1] - 1) < intervals[:, None]
+        begin, end = place[:, :-1][inside], place[:, 1:][inside]  # (interval, body, 2)
+        reach = [body.shape.bounding_radius for body in scene.moving]
+        for i in range(k):
+            for j in range(i):
+                least = (1.0 + SHARE) * (reach[i] + reach[j])
+                near = come_near(begin[:, i] - begin[:, j], end[:, i] - end[:, j], least)
+                together[i, j] |= near.any()
     count, part = connected_components(together, directed=False)
     kinematic = np.array([body.kinematic for body in scene.moving])
     for label in range(count):  # a kinematic body that meets none joins the first dynamic one

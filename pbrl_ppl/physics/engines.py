@@ -18,6 +18,10 @@ from pbrl_ppl.physics.tree import tree_of
 from pbrl_ppl.physics.world import RING, World
 from pbrl_ppl.state import Floats, Ints
 
+#: Bodies are near each other within this multiple of their radii: a step of half a radius that
+#: passes through the edge of a bounding circle ends in it.
+_NEAR = 1.04
+
 
 class Batch(NamedTuple):
     """What the rollouts take: see `compiled.rollout`."""
@@ -44,13 +48,15 @@ class Still(NamedTuple):
     radii: Floats  # (body,), m
     can_touch: NDArray[np.bool_]  # (body, body)
     obstacles: Floats  # (obstacle, 5), the discs last
+    watched: bool  # whether there is anything to touch
 
 
 def still(world: World) -> Still:
     """Return what the rollout of a tree needs of its world."""
     return Still(
         np.array(world.space.gravity, dtype=float), world.scene.normal_gravity, world.size,
-        world.fastest, np.array(RING), world.radii, world.can_touch, world.obstacles.copy(),
+        world.fastest, np.array(RING), _NEAR * world.radii, world.can_touch,
+        world.obstacles.copy(), len(world.obstacles) > 0 or np.tril(world.can_touch, -1).any(),
     )  # fmt: skip
 
 
@@ -94,25 +100,32 @@ class Engine:
         out : ndarray
             Shape (proposal * transition, H, body, 6).
         """
-        items = np.arange(first, last)
-        left = np.zeros(len(items), dtype=bool)
-        if self._free is not None:
-            lockstep.rollout(self._free, batch, items, out, left)
-            items = items[left]
-        elif self._tree is not None:
-            flow.rollout(self._work, self._still, batch, items, out, left)
-            items = items[left]
-        if len(items) and self._name == "contact-free":
-            raise SimulationError(
-                f"engine 'contact-free': {len(items)} of {last - first} transitions have contacts,"
-                " or joints that the fast path lacks; use 'auto' or 'chipmunk'"
-            )
+        items, horizon = np.arange(first, last), batch.inputs.shape[1]
+        begins = np.zeros(len(items), dtype=np.int64)
+        whole = self._free is None and self._tree is None
         while len(items):
-            done = compiled.rollout(calls.FUNCTIONS, self.pointers, batch, items, out)
-            if done < len(items):  # diverged: that world is spoilt, and the item is lost
-                out[items[done]] = np.nan
-                self._renew()
-            items = items[done + 1 :]
+            if self._free is not None:
+                lockstep.rollout(self._free, batch, items, begins, out)
+            elif self._tree is not None:
+                flow.rollout(self._work, self._still, batch, items, begins, out)
+            left = begins < horizon
+            items, begins = items[left], begins[left]
+            if len(items) and self._name == "contact-free":
+                raise SimulationError(
+                    f"engine 'contact-free': {len(items)} of {last - first} transitions have"
+                    " contacts, or joints that the fast path lacks; use 'auto' or 'chipmunk'"
+                )
+            done = 0
+            while done < len(items):
+                done += compiled.rollout(
+                    calls.FUNCTIONS, self.pointers, batch, items[done:], begins[done:], whole, out
+                )
+                if done < len(items):  # diverged: that world is spoilt, and the item is lost
+                    out[items[done]], begins[done] = np.nan, horizon
+                    self._renew()
+                    done += 1
+            left = begins < horizon
+            items, begins = items[left], begins[left]
 
 
 def share_out(

@@ -32,6 +32,7 @@ from pbrl_ppl.physics.motion import (
     STICK,
     TWIST,
     TWIST_END,
+    G,
     Q,
     U,
     row_speed,
@@ -129,6 +130,15 @@ def _slowest(work, laws, r):  # type: ignore[no-untyped-def]
 
 
 @compiled
+def _set_wheel(work, r, mode):  # type: ignore[no-untyped-def]
+    """Set the mode of the rows of a wheel that is under the body of a ring, whose place is r."""
+    for row in range(work.n_rows):
+        under = work.kinds[row, 1] == work.kinds[r, 1] and work.kinds[row, 0] >= ALONG
+        if under and work.rows[row, BOUND] > 0.0:
+            work.kinds[row, 2], work.kinds[row, 3] = mode, 2
+
+
+@compiled
 def _decide(work, laws, inputs, share, low, high):  # type: ignore[no-untyped-def]
     """Set which rows and rings stick and which way the others slip; and the step's first slopes.
 
@@ -161,6 +171,9 @@ def _decide(work, laws, inputs, share, low, high):  # type: ignore[no-untyped-de
         if kinds[r, 2] == STICK:
             kinds[r, 3] = 0  # not settled
             moves |= moved
+    for r in range(count, work.n_kinds):
+        if kinds[r, 2] == STICK:
+            _set_wheel(work, r, SMOOTH)  # the ring holds for it
     stop = moves
     for _ in range(5 * work.n_kinds + 2):
         _slope(work, laws, U, SLOPES + 1, inputs, share, low, high)
@@ -183,8 +196,19 @@ def _decide(work, laws, inputs, share, low, high):  # type: ignore[no-untyped-de
         for r in range(count, work.n_kinds):
             if kinds[r, 2] == STICK and strain(work, r - count, kinds[r, 1]) > 0.0:
                 kinds[r, 2], slid = SLIDE, True
+                _set_wheel(work, r, STICK)
         if slid:
-            set_first_slide(work, END_U)
+            set_first_slide(work, U, END_U)
+            for r in range(count):
+                if kinds[r, 2] == STICK and kinds[r, 3] == 2:
+                    rate, most = row_speed(work, r, END_U), 0.0
+                    for j in range(n):
+                        most += abs(rows[r, G + j] * motion[END_U, j])
+                    kinds[r, 3] = 0
+                    if abs(rate) > 0.05 * most:
+                        kinds[r, 2], kinds[r, 3] = 1 if rate > 0.0 else -1, 1
+            for r in range(count, work.n_kinds):
+                kinds[r, 3] = 1 if kinds[r, 2] == SLIDE else 0
             for j in range(n):
                 motion[U, j] += 1e-6 * laws.time_step * motion[END_U, j]
             set_places(work, Q, U)
@@ -201,13 +225,27 @@ def _decide(work, laws, inputs, share, low, high):  # type: ignore[no-untyped-de
 
 
 @compiled
+def _margin(work, laws, u):  # type: ignore[no-untyped-def]
+    """Return by how much no row switches, by speeds in a row of the motion and forces as solved."""
+    least = 1.0
+    for r in range(work.n_rows):
+        mode = work.kinds[r, 2]
+        if mode == STICK:
+            least = min(least, 1.0 - abs(work.rows[r, FORCE]) / work.rows[r, BOUND])
+        elif mode != SMOOTH:
+            size = laws.length if work.kinds[r, 0] >= ALONG else 1.0
+            least = min(least, mode * row_speed(work, r, u) * laws.time_step / size)
+    return least
+
+
+@compiled
 def _step(work, laws, inputs, share, low, high, width):  # type: ignore[no-untyped-def]
     """Try a step of a width (share of the interval) from its first slopes.
 
     Returns its error over the tolerance, and by how much nothing switches: at its end, and on the
     way.
     """
-    motion, kinds, rows, rings = work.motion, work.kinds, work.rows, work.rings
+    motion, kinds, rings = work.motion, work.kinds, work.rings
     n, count, seconds, end, way = work.n, work.n_rows, width * laws.time_step, 1.0, 1.0
     for j in range(n):
         motion[SLOPES, j] = motion[U, j]
@@ -222,14 +260,7 @@ def _step(work, laws, inputs, share, low, high, width):  # type: ignore[no-untyp
         set_places(work, END_Q, END_U)
         at = share + _TIMES[stage] * width
         _slope(work, laws, END_U, SLOPES + 2 * stage + 1, inputs, at, low, high)
-        end = 1.0
-        for r in range(count):
-            mode = kinds[r, 2]
-            if mode == STICK:
-                end = min(end, 1.0 - abs(rows[r, FORCE]) / rows[r, BOUND])
-            elif mode != SMOOTH:
-                size = laws.length if kinds[r, 0] >= ALONG else 1.0
-                end = min(end, mode * row_speed(work, r, END_U) * laws.time_step / size)
+        end = _margin(work, laws, END_U)
         way = min(way, end)
     for r in range(count, work.n_kinds):
         if kinds[r, 2] == STICK:
@@ -255,28 +286,33 @@ def _step(work, laws, inputs, share, low, high, width):  # type: ignore[no-untyp
 
 
 @compiled
-def _advance(work, laws, still, inputs, low, high, budget):  # type: ignore[no-untyped-def]
-    """Move through a piece of an interval in which no command jumps; return the steps left.
+def _advance(work, laws, still, inputs, low, high, budget, wanted):  # type: ignore[no-untyped-def]
+    """Move through a piece of an interval in which no command jumps.
 
-    That is 0 where the motion has no prediction, and -1 where a body comes near an obstacle.
+    Begins with steps of a ``wanted`` width. Returns the steps left, and the width wanted next. Left
+    is 0 where the motion has no prediction, and -1 where a body comes near an obstacle.
     """
     motion, n = work.motion, work.n
-    share, width, last = low, 1.0, False
+    share, width, last = low, wanted, False
     fresh, locating = True, False  # whether modes are to be decided; whether a switch is located
     left = 0.0  # by how much nothing switches where the step begins
     begin, before, until, after, kept = 0.0, 0.0, 0.0, 0.0, 0
     while share < high:
         if fresh:
             _decide(work, laws, inputs, share, low, high)
-            fresh, left = False, 0.0
+            fresh, left = False, _margin(work, laws, U)
+            for r in range(work.n_rows, work.n_kinds):
+                if work.kinds[r, 2] == STICK:
+                    left = min(left, -strain(work, r - work.n_rows, work.kinds[r, 1]))
         if locating:
             width = begin + (until - begin) * before / (before - after)
         else:
+            width = min(wanted, _way(work, laws, still)) if still.watched else wanted
             last = width >= high - share
             width = min(width, high - share)
         budget -= 1
         if budget <= 0:
-            return 0
+            return 0, wanted
         error, end, way = _step(work, laws, inputs, share, low, high, width)
         if locating:  # regula falsi (Illinois)
             if abs(end) > _LOCATED and until - begin > 1e-12:
@@ -293,18 +329,23 @@ def _advance(work, laws, still, inputs, low, high, budget):  # type: ignore[no-u
         else:
             short = width <= _SHORTEST
             if short and not error < np.inf:
-                return 0
-            if not short and (not error <= 1.0 or (way < -_LOCATED and end >= -_LOCATED)):
-                width *= 0.5
+                return 0, wanted
+            if not short and not error <= 1.0:
+                wanted = width * (max(0.1, 0.9 * error**-0.2) if error < np.inf else 0.25)
+                continue
+            if not short and way < -_LOCATED and end >= -_LOCATED:
+                wanted = 0.5 * width
                 continue
             if end < -_LOCATED and not short:
                 if left > _LOCATED:
                     locating = True
                     begin, before, until, after, kept = 0.0, left, width, end, 0
                 else:  # it has just switched
-                    width *= 0.5
+                    wanted = 0.5 * width
                 continue
             fresh, left = end < -_LOCATED, end
+            wider = width * min(5.0, 0.9 * max(error, 1e-9) ** -0.2)
+            wanted = min(1.0, max(wanted, wider) if last or wanted > width else wider)
         for j in range(n):
             motion[Q, j], motion[U, j] = motion[END_Q, j], motion[END_U, j]
             motion[SLOPES + 1, j] = motion[SLOPES + 13, j]
@@ -315,12 +356,26 @@ def _advance(work, laws, still, inputs, low, high, budget):  # type: ignore[no-u
                 square += work.rings[ring, TWIST, d] ** 2
             if work.kinds[r, 2] == SLIDE and square <= _slowest(work, laws, r):
                 fresh = True
+        seconds = laws.time_step * width
         share = high if last else share + width
-        width = 1.0 if fresh else 2.0 * width
-        for i in range(work.n_bodies):
-            if near_contact(i, work.states, still.radii, still.obstacles, still.can_touch):
-                return -1
-    return budget
+        for k in range(work.n_bodies):
+            for d in range(3 if work.bodies[k] < 0 else 0):  # it follows a path
+                work.states[k, d] += seconds * work.states[k, 3 + d]
+        if still.watched and near_contact(
+            work.states, still.radii, still.obstacles, still.can_touch
+        ):
+            return -1, wanted
+    return budget, wanted
+
+
+@compiled
+def _way(work, laws, still):  # type: ignore[no-untyped-def]
+    """Return the share of an interval in which no body moves by more than half the smallest."""
+    fastest = 1e-300
+    for k in range(work.n_bodies):
+        square = work.states[k, 3] ** 2 + work.states[k, 4] ** 2
+        fastest = max(fastest, math.sqrt(square))
+    return max(_SHORTEST, 0.5 * still.length / (fastest * laws.time_step))
 
 
 class Laws(NamedTuple):
@@ -336,11 +391,12 @@ class Laws(NamedTuple):
 
 
 @compiled
-def rollout(works, still, batch, items, out, left):  # type: ignore[no-untyped-def]
+def rollout(works, still, batch, items, begins, out):  # type: ignore[no-untyped-def]
     """Predict ``items`` of ``out``, whose shape is (proposal * transition, H, body, 6).
 
-    ``left``, shape (item,), is set for those that come near an obstacle. Those that diverge, or
-    take more than ``MOST_STEPS`` steps of an interval, are NaN.
+    ``begins``, shape (item,), are their first intervals; they become those in which a body comes
+    near an obstacle, H where none does. Those that diverge, or take more than ``MOST_STEPS`` steps
+    of an interval, are NaN from there on.
     """
     rows, joints, discs, _, _ = batch.given
     work = works[0]
@@ -361,34 +417,46 @@ def rollout(works, still, batch, items, out, left):  # type: ignore[no-untyped-d
                 one, there = still.obstacles[fixed + j], discs[p, j, 2] > 0.0
                 one[0] = one[2] = discs[p, j, 0] if there else 1e9 * still.length
                 one[1], one[3], one[4] = discs[p, j, 1], discs[p, j, 1], discs[p, j, 2]
-        lost = False
-        for h in range(horizon):
-            if h == 0 or timed:
+        first, wanted = begins[place], 1.0
+        begins[place] = horizon
+        for h in range(first, horizon):
+            if h == first or timed:
                 set_numbers(
                     work, still.gravity, still.normal_gravity, still.ring,
                     rows[p, t * horizon + h if timed else 0], joints[p],
                 )  # fmt: skip
-            if h == 0:
+            if h == first:
                 for r in range(work.n_kinds):
                     work.kinds[r, 2] = SMOOTH
-                set_coordinates(work, batch.start[p if len(batch.start) > 1 else 0, t])
+                begin = batch.start[p if len(batch.start) > 1 else 0, t]
+                if h > 0:
+                    begin = out[item, h - 1]
+                set_coordinates(work, begin)
+                for k in range(bodies):
+                    for d in range(6):
+                        work.states[k, d] = begin[k, d]
             inputs, budget, low, high = batch.inputs[t, h], MOST_STEPS, 0.0, 0.0
             for k in range(bodies):
                 for w in range(3):
                     work.acted[k, WRENCHES + w] = inputs[k, w]
+                    if work.bodies[k] < 0:
+                        work.states[k, 3 + w] = inputs[k, w]
             while high < 1.0 and budget > 0:
                 low, high = high, 1.0
                 if remembers:
                     set_places(work, Q, U)
                     high = _switch(work, laws, inputs, low)
-                budget = _advance(work, laws, still, inputs, low, high, budget)
-            lost |= budget == 0
+                budget, wanted = _advance(work, laws, still, inputs, low, high, budget, wanted)
+            if budget < 0:
+                begins[place] = h
+                break
+            lost = budget == 0
             for k in range(bodies):
                 speed = abs(work.states[k, 3]) + abs(work.states[k, 4])
                 speed += still.length * abs(work.states[k, 5])
                 lost |= not speed < still.fastest  # also true of NaN
                 for d in range(6):
-                    out[item, h, k, d] = np.nan if lost else work.states[k, d]
-            if budget < 0:
-                left[place] = True
+                    out[item, h, k, d] = work.states[k, d]
+            if lost:
+                out[item, h:] = np.nan
                 break

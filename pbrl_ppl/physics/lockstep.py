@@ -80,10 +80,11 @@ def substep(bodies, world, step):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def rollout(world, batch, items, out, left):  # type: ignore[no-untyped-def]
-    """Predict ``items`` as `compiled.rollout` does, and mark those that the engine must predict.
+def rollout(world, batch, items, begins, out):  # type: ignore[no-untyped-def]
+    """Predict ``items`` as `compiled.rollout` does, but for intervals that the engine must predict.
 
-    ``left``, shape (item,), is set for items that come near an obstacle or diverge.
+    ``begins``, shape (item,), are their first intervals; they become those in which a body comes
+    near an obstacle or diverges, H where none does.
     """
     rows, _, discs, command_parameters, force_parameters = batch.given
     start, inputs = batch.start, batch.inputs
@@ -95,14 +96,16 @@ def rollout(world, batch, items, out, left):  # type: ignore[no-untyped-def]
     bodies = np.zeros((moving, BLOCK * len(BODY)))
     own_discs = np.zeros((BLOCK, discs.shape[1], 3))
     touched = np.zeros(BLOCK, dtype=np.bool_)
-    proposal, transition, interval = np.zeros((3, BLOCK), dtype=np.int64)
+    proposal, transition, first, until = np.zeros((4, BLOCK), dtype=np.int64)
     states, acted = np.empty((moving, 6)), np.empty((moving + 1, 9))
     for begin in range(0, len(items), BLOCK):
         width = min(BLOCK, len(items) - begin)
-        touched[:] = False
+        longest = 0
         for i in range(BLOCK):
-            item = items[begin + min(i, width - 1)]  # the rest of a block repeats the last
+            place = begin + min(i, width - 1)  # the rest of a block repeats the last
+            item, first[i], until[i] = items[place], begins[place], horizon
             proposal[i], transition[i] = item // n, item % n
+            longest = max(longest, horizon - first[i])
             for j in range(discs.shape[1]):
                 for d in range(3):
                     own_discs[i, j, d] = discs[proposal[i], j, d]
@@ -110,19 +113,20 @@ def rollout(world, batch, items, out, left):  # type: ignore[no-untyped-def]
             substeps, weight = batch.counts[level], batch.weights[level]
             step = batch.time_step / substeps
             bodies[:] = 0.0
+            touched[:] = False
             shifted = False
-            for h in range(horizon):
-                if timed:
-                    interval[:] = transition * horizon + h
+            for ahead in range(longest):
                 for k in range(moving):
                     body, wheel = bodies[k], world.wheel[k]
                     for i in range(BLOCK):
-                        p, t = proposal[i], transition[i]
-                        if timed or h == 0:
-                            row = rows[p, interval[i], k]
-                            if h == 0:
+                        p, t, h = proposal[i], transition[i], min(first[i] + ahead, horizon - 1)
+                        if timed or ahead == 0:
+                            row = rows[p, t * horizon + h if timed else 0, k]
+                            if ahead == 0:
                                 for d in range(6):
                                     states[k, d] = start[p if len(start) > 1 else 0, t, k, d]
+                                    if h > 0:
+                                        states[k, d] = out[p * n + t, h - 1, k, d]
                             else:
                                 get_state(body, i, states, k)
                             shifted |= set_body(body, i, row, wheel, world.normal_gravity, step)
@@ -134,7 +138,7 @@ def rollout(world, batch, items, out, left):  # type: ignore[no-untyped-def]
                 for s in range(substeps):
                     if acting:
                         for i in range(width):
-                            p, t = proposal[i], transition[i]
+                            p, t, h = proposal[i], transition[i], min(first[i] + ahead, horizon - 1)
                             for k in range(moving):
                                 get_state(bodies[k], i, states, k)
                             act(
@@ -151,13 +155,14 @@ def rollout(world, batch, items, out, left):  # type: ignore[no-untyped-def]
                         lose(bodies[k], world, touched)
                     if watched:
                         watch(bodies, world, own_discs, touched)
-                for k in range(moving):
-                    body = bodies[k]
-                    for i in range(width):
-                        item = items[begin + i]
-                        get_state(body, i, states, k)
+                for i in range(width):
+                    item, h = items[begin + i], first[i] + ahead
+                    if touched[i]:
+                        until[i] = min(until[i], h)
+                    for k in range(moving if h < until[i] else 0):
+                        get_state(bodies[k], i, states, k)
                         for d in range(6):
                             total = out[item, h, k, d] if level else 0.0
                             out[item, h, k, d] = total + weight * states[k, d]
         for i in range(width):
-            left[begin + i] = touched[i]
+            begins[begin + i] = until[i]

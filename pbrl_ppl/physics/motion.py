@@ -246,6 +246,8 @@ def set_forces(work, u):  # type: ignore[no-untyped-def]
             motion[M + j, k] = 0.0
     for body in range(work.n_bodies):
         i = work.bodies[body]
+        if i < 0:
+            continue
         turn, mass = tree[i, TURN], links[i, MASS]
         c, s, omega = links[i, COS], links[i, SIN], motion[u, turn]
         x = c * links[i, COM_X] - s * links[i, COM_Y]
@@ -414,23 +416,44 @@ def _sliding(work, ring, i, omega):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def set_first_slide(work, a, tries=60):  # type: ignore[no-untyped-def]
-    """Set accelerations from rest (row a) against the friction of rings that slide, and nothing.
+def set_first_slide(work, u, a, tries=30):  # type: ignore[no-untyped-def]
+    """Set the accelerations (row a) with which rings that hold begin to slide.
 
-    They are the least of ``a M a / 2 - Q a`` and the power of friction, which is along them: by
-    reweighted least squares.
+    They are the least of ``a M a / 2 - Q a`` and the power of friction where there is no speed yet,
+    by reweighted least squares; rows that slip, and rings that slide, have their friction.
     """
-    motion, system, rings, n = work.motion, work.system, work.rings, work.n
+    motion, system, rings, rows, n = work.motion, work.system, work.rings, work.rows, work.n
+    count = work.n_rows
     for attempt in range(tries):
         for j in range(n):
             system[j, n] = motion[LOAD, j]
             for k in range(n):
                 system[j, k] = motion[M + j, k]
-        for r in range(work.n_rows, work.n_kinds):
-            i, ring = work.kinds[r, 1], r - work.n_rows
-            if work.kinds[r, 2] != SLIDE or attempt == 0:
-                continue
+        for r in range(count):
+            mode = work.kinds[r, 2]
+            if mode in (-1, 1):
+                for j in range(n):
+                    system[j, n] -= mode * rows[r, BOUND] * rows[r, G + j]
+            elif attempt > 0:
+                speed, slow = 0.0, 1e-24
+                for j in range(n):
+                    speed += rows[r, G + j] * motion[a, j]
+                    slow += (_SLOW * rows[r, G + j] * motion[a, j]) ** 2
+                weight = rows[r, BOUND] / math.sqrt(speed * speed + slow)
+                for j in range(n):
+                    for k in range(n):
+                        system[j, k] += weight * rows[r, G + j] * rows[r, G + k]
+        for r in range(count, work.n_kinds):
+            i, ring = work.kinds[r, 1], r - count
             c, s, turn = work.links[i, COS], work.links[i, SIN], work.tree[i, TURN]
+            if work.kinds[r, 3] == 1 and work.kinds[r, 2] == SLIDE:
+                f_x, f_y, torque = _sliding(work, ring, i, motion[u, turn])
+                for j in range(n):
+                    system[j, n] += work.slope[i, j, 0] * f_x + work.slope[i, j, 1] * f_y
+                system[turn, n] += torque
+                continue
+            if attempt == 0:
+                continue
             slow = 1e-24
             for j in range(n):
                 way = abs(work.slope[i, j, 0]) + abs(work.slope[i, j, 1])
@@ -455,8 +478,13 @@ def set_first_slide(work, a, tries=60):  # type: ignore[no-untyped-def]
                 work.slope[i, turn, 0] += y
                 work.slope[i, turn, 1] -= x
         _eliminate(system, n)
+        off, size = 0.0, 1e-300
         for j in range(n):
+            off = max(off, abs(motion[a, j] - system[j, n]) / motion[SIZE, j])
+            size = max(size, abs(system[j, n]) / motion[SIZE, j])
             motion[a, j] = system[j, n]
+        if off < 1e-4 * size:
+            break
 
 
 @compiled
@@ -483,10 +511,12 @@ def set_twist(work, ring, i, u, field):  # type: ignore[no-untyped-def]
 def strain(work, ring, i, tries=40):  # type: ignore[no-untyped-def]
     """Return by how much the reaction on a ring that holds exceeds what it can hold, as a share.
 
+    With a wheel under the same body, which holds with it.
+
     The greatest power of the reaction over that of friction, less one (S. Goyal, A. Ruina and
     J. Papadopoulos, Wear 143, 1991), by reweighted least squares.
     """
-    rings, c, s = work.rings, work.links[i, COS], work.links[i, SIN]
+    rings, system, c, s = work.rings, work.system, work.links[i, COS], work.links[i, SIN]
     grip, f_x, f_y = rings[ring, GRIP, 0], -rings[ring, GRIP, 1], -rings[ring, GRIP, 2]
     torque, square = -rings[ring, GRIP, 3], 0.0
     for j in range(POINTS, rings.shape[1]):
@@ -498,7 +528,10 @@ def strain(work, ring, i, tries=40):  # type: ignore[no-untyped-def]
         if not size > 0.0:
             return -1.0  # nothing pulls
         t_x, t_y, rate = t_x / size, t_y / size, rate / size
-        a_00, a_02, a_12, a_22, lost = 0.0, 0.0, 0.0, 0.0, 0.0
+        for j in range(3):
+            for k in range(3):
+                system[j, k] = 0.0
+        lost = 0.0
         for j in range(POINTS, rings.shape[1]):
             x = c * rings[ring, j, 0] - s * rings[ring, j, 1]
             y = s * rings[ring, j, 0] + c * rings[ring, j, 1]
@@ -506,14 +539,35 @@ def strain(work, ring, i, tries=40):  # type: ignore[no-untyped-def]
             speed = math.sqrt(v_x * v_x + v_y * v_y + _SLOW * _SLOW)
             lost += grip * speed
             weight = grip / speed
-            a_00 += weight
-            a_02 -= weight * y
-            a_12 += weight * x
-            a_22 += weight * (x * x + y * y)
+            system[0, 0] += weight
+            system[1, 1] += weight
+            system[0, 2] -= weight * y
+            system[1, 2] += weight * x
+            system[2, 2] += weight * (x * x + y * y)
+        for r in range(work.n_rows):  # of a wheel on the same body
+            if work.kinds[r, 1] == i and work.kinds[r, 0] >= ALONG:
+                row = work.rows[r]
+                n_x = c * row[W_COS] - s * row[W_SIN]
+                n_y = s * row[W_COS] + c * row[W_SIN]
+                x, y = c * row[W_X] - s * row[W_Y], s * row[W_X] + c * row[W_Y]
+                lever = n_y * x - n_x * y
+                along = n_x * t_x + n_y * t_y + lever * rate
+                speed = math.sqrt(along * along + _SLOW * _SLOW)
+                lost += row[BOUND] * speed
+                weight = row[BOUND] / speed
+                system[0, 0] += weight * n_x * n_x
+                system[0, 1] += weight * n_x * n_y
+                system[1, 1] += weight * n_y * n_y
+                system[0, 2] += weight * n_x * lever
+                system[1, 2] += weight * n_y * lever
+                system[2, 2] += weight * lever * lever
         share, before = (f_x * t_x + f_y * t_y + torque * rate) / lost - 1.0, share
         if abs(share - before) < 1e-12:
             break
-        left = a_22 - (a_02 * a_02 + a_12 * a_12) / a_00
-        rate = (torque - (a_02 * f_x + a_12 * f_y) / a_00) / left if left > 1e-12 * a_22 else 0.0
-        t_x, t_y = (f_x - a_02 * rate) / a_00, (f_y - a_12 * rate) / a_00
+        system[1, 0], system[2, 0], system[2, 1] = system[0, 1], system[0, 2], system[1, 2]
+        system[0, 3], system[1, 3], system[2, 3] = f_x, f_y, torque
+        if not square > 0.0:  # a point, which holds no torque
+            system[2, 0], system[2, 1], system[2, 2], system[2, 3] = 0.0, 0.0, 1.0, 0.0
+        _eliminate(system, 3)
+        t_x, t_y, rate = system[0, 3], system[1, 3], system[2, 3]
     return share

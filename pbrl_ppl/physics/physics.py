@@ -40,11 +40,11 @@ class Physics:
         Largest error of a step of joined bodies, and of bodies on friction, which choose their own
         steps: a share of an angle of 1 rad, or of the smallest body's size.
     engine : str
-        ``auto``: the contact-free fast path, and Chipmunk for transitions in which bodies come near
+        ``auto``: the contact-free fast path, and Chipmunk for intervals in which bodies come near
         each other; ``chipmunk``: Chipmunk for all; ``contact-free``: the fast path alone, an error
         where it does not hold; ``python``: Chipmunk stepped by a plain Python loop. All agree to
-        rounding, but for joined bodies and bodies on friction, where those of Chipmunk have its
-        error of the first order in the step.
+        rounding for free bodies. For joined bodies, bodies on friction, and before and after a
+        contact, those of Chipmunk have its error of the first order in the step.
     parts : tuple of tuple of str, optional
         Moving bodies grouped into parts that never interact; all in one part by default.
     together : tuple of str
@@ -175,8 +175,11 @@ class Physics:
         copy = replace(self, **changes)  # type: ignore[arg-type]
         return self if copy == self else copy
 
-    def in_parts(self, history: History) -> Physics:
-        """Return the same with the parts that a history shows to be independent."""
+    def in_parts(self, history: History | None = None) -> Physics:
+        """Return the same with the parts that a history shows to be independent.
+
+        Without one, bodies that are not joined go through each other.
+        """
         parts = joined_parts(independent_parts(self.scene, history), self.together)
         return self.changed(parts=parts)
 

@@ -100,8 +100,7 @@ def rollout(
             _place_constraints(world, bodies, now, step)
             world.space.step(step)
             now = _states(world)
-            near = (near_contact(i, now, *nearness) for i in range(len(names)))
-            touched = touched or any(near)
+            touched = touched or bool(near_contact(now, *nearness))
             speeds = np.abs(now[:, 3:])
             if not (speeds @ (1.0, 1.0, world.size) < world.fastest).all():  # also true of NaN
                 states[:] = np.nan

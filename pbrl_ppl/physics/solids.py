@@ -243,20 +243,21 @@ def reaches(x, y, d_x, d_y, scale, reach):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def near_contact(i, state, radii, obstacles, can_touch):  # type: ignore[no-untyped-def]
-    """Return whether body ``i`` may touch an obstacle or a body before it.
+def near_contact(state, radii, obstacles, can_touch):  # type: ignore[no-untyped-def]
+    """Return whether a body may touch an obstacle, or another body.
 
     ``state`` has x and y of each body first; obstacles are segments with a radius, shape
-    (obstacle, 5).
+    (obstacle, 5). Which bodies can touch each other, and obstacles (the diagonal), is (body, body).
     """
-    x, y = state[i, 0], state[i, 1]
-    for j in range(len(obstacles)):
-        a_x, a_y, d_x, d_y, scale, radius = segment(obstacles[j])
-        if reaches(x - a_x, y - a_y, d_x, d_y, scale, radii[i] + radius):
-            return True
-    for j in range(i):
-        if can_touch[i, j]:
-            reach = radii[i] + radii[j]
-            if reaches(x - state[j, 0], y - state[j, 1], 0.0, 0.0, 0.0, reach):
+    for i in range(len(radii)):
+        x, y = state[i, 0], state[i, 1]
+        for j in range(len(obstacles) if can_touch[i, i] else 0):
+            a_x, a_y, d_x, d_y, scale, radius = segment(obstacles[j])
+            if reaches(x - a_x, y - a_y, d_x, d_y, scale, radii[i] + radius):
                 return True
+        for j in range(i):
+            if can_touch[i, j]:
+                reach = radii[i] + radii[j]
+                if reaches(x - state[j, 0], y - state[j, 1], 0.0, 0.0, 0.0, reach):
+                    return True
     return False

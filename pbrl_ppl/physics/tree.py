@@ -47,7 +47,7 @@ class Tree:
     rings : ndarray of int
         Links of bodies on a ring of friction with more coordinates than one, shape (ring,).
     bodies : ndarray of int
-        Link of each body, shape (body,).
+        Link of each body, shape (body,); -1 for one that follows a path.
     size : int
         Number of coordinates.
     """
@@ -63,16 +63,18 @@ class Tree:
 def tree_of(world: World) -> Tree | None:
     """Return the tree of a world's bodies.
 
-    None where a body follows a path, or where joints close a loop, have no such coordinates, or are
-    too many.
+    A body that follows a path is none of its links. None where joints hold one, close a loop, have
+    no such coordinates, or are too many.
     """
-    if world.kinematic.any() or not all(link.kind.contact_free for link in world.links):
+    if not all(link.kind.contact_free for link in world.links):
         return None
     links: list[list[int]] = []
     poses: list[tuple[float, ...]] = []
     place: dict[int, int] = {}
     left = [(_ends(world, link), link) for link in world.links]
     size, nowhere = 0, (0.0, 0.0, 1.0, 0.0)
+    if any(end >= 0 and world.kinematic[end] for ends, _ in left for end in ends):
+        return None
 
     def add(kind: int, parent: int, body: int, pose: tuple[float, ...], *joint: int) -> int:
         nonlocal size
@@ -81,10 +83,11 @@ def tree_of(world: World) -> Tree | None:
         size += 3 if kind == FREE else 1
         return len(links) - 1
 
-    while len(place) < len(world.bodies):
+    moves = (~world.kinematic).tolist()
+    while len(place) < sum(moves):
         ready = [one for one in left if any(end < 0 or end in place for end in one[0])]
         if not ready:
-            body = next(i for i in range(len(world.bodies)) if i not in place)
+            body = next(i for i in range(len(world.bodies)) if i not in place and moves[i])
             place[body] = add(FREE, -1, body, nowhere, -1, -1, -1, -1)
             continue
         chosen = min(ready, key=lambda one: min(one[0]) >= 0)  # the world's first
@@ -119,7 +122,7 @@ def tree_of(world: World) -> Tree | None:
         poses=np.array(poses, dtype=float),
         rows=np.array(rows, dtype=np.int64).reshape(-1, 2),
         rings=np.array(rings, dtype=np.int64),
-        bodies=np.array([place[i] for i in range(len(world.bodies))], dtype=np.int64),
+        bodies=np.array([place.get(i, -1) for i in range(len(world.bodies))], dtype=np.int64),
         size=size,
     )
 

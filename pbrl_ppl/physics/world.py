@@ -189,7 +189,8 @@ class World:
             if body.wheel or i in wheels:
                 self.wheels.append(self._constrain("wheel", i, rigid, self.space.static_body))
         self._add_shapes()
-        self.can_touch = np.ones((len(self.bodies), len(self.bodies)), dtype=bool)
+        #: Which bodies can touch each other, and what does not move (the diagonal).
+        self.can_touch = ~np.logical_and.outer(self.kinematic, self.kinematic)
         self._add_joints(kinds, joined)
         for i, position in rods:
             self._add_link(position, self.bodies[i], self.space.static_body, ROD)

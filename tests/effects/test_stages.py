@@ -276,7 +276,7 @@ def test_both_paths_agree_with_effects_of_every_stage() -> None:
     )[:, :, None]
     compiled, plain = (
         Simulator(Physics(scene, attached, substeps=8, engine=path))(phi, start, given)
-        for path in ("auto", "python")
+        for path in ("chipmunk", "python")
     )
     assert compiled == pytest.approx(plain, rel=1e-9, abs=1e-9, nan_ok=True)
     diverged = np.isnan(plain).any(axis=(-3, -2, -1))  # drag of 33 kg/m at 4 substeps

@@ -144,3 +144,22 @@ def test_the_transition_takes_its_velocity_as_the_push() -> None:
     after = f([*state(x=-0.3), *state(), 0, 1.0, 0.5, 2.0])
     np.testing.assert_allclose(after[:6], [-0.2, 0.05, 0.2, 1.0, 0.5, 2.0], atol=1e-12)
     np.testing.assert_array_equal(after[6:], 0.0)
+
+
+@pytest.mark.skipif(not calls.AVAILABLE, reason="the fast path is compiled for this platform alone")
+def test_a_body_coasts_before_a_push_and_after_it() -> None:
+    """A block on friction: v^2 = v_0^2 - 2 mu g s, to the tolerance, however long the steps."""
+    mu, block = 0.1, body("block", Shape.circle(0.1), mass=2.0)
+    scene = beside(block, normal_gravity=9.81, substeps=1)
+    sim = simulator(scene, (BY_NAME["sliding_friction"],))
+    start = np.stack([state(x=-1.0), state(x=0.0, vx=0.3)])[None]
+    actions = np.zeros((1, 12, 2, 3))
+    actions[0, :8, 0, 0] = 1.5  # it comes from behind, and stops
+    states = sim(np.array([mu, 0.05]), start, actions)[0]
+    at_rest = 0.3**2 / (2.0 * mu * 9.81)
+    np.testing.assert_allclose(states[3, 1, :4], [at_rest, 0.0, 0.0, 0.0], atol=1e-6)
+    assert states[-1, 1, 0] > 0.2
+    np.testing.assert_allclose(states[:8, 0, 0], -1.0 + 0.15 * np.arange(1, 9), atol=1e-12)
+    left = np.flatnonzero(states[:, 1, 3] > 0.0)[-2:]  # of the last interval of its way
+    v, x = states[left, 1, 3], states[left, 1, 0]
+    assert v[0] ** 2 - v[1] ** 2 == pytest.approx(2 * mu * 9.81 * (x[1] - x[0]), rel=1e-4)

@@ -48,7 +48,7 @@ class Rig(NamedTuple):
     def physics(self, scene: Scene, engine: str) -> tuple[Physics, np.ndarray]:
         """Return the physics of a scene with these effects, and phi."""
         attached = attach(scene, [BY_NAME[name] for name in self.effects])
-        physics = Physics(scene, attached, engine=engine)
+        physics = Physics(scene, attached, engine=engine, tolerance=1e-10)
         return physics, phi_of(physics.layout, self.effects)
 
     def predict(self, engine: str) -> np.ndarray:

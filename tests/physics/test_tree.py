@@ -24,6 +24,13 @@ pytestmark = [
 ]
 
 PIVOT = ("pivot_friction", "pivot_damping")
+
+
+def _on_a_wheel(**options) -> Scene:
+    bodies = (Body("cart", BOX, wheel=True),)
+    return Scene(time_step=0.1, normal_gravity=G, bodies=bodies, **options)
+
+
 CASES = {
     "double pendulum": (chain("hh"), ("com_offset", "inertia_scale", *PIVOT)),
     "four links": (chain("hhhh", turned=(0, 2)), ("com_offset", *PIVOT, "linear_drag")),
@@ -33,6 +40,7 @@ CASES = {
     "free, with a payload": (chain("-hr", turned=(1,)), ("com_offset", "mass_change")),
     "sliding": (chain("-h", normal_gravity=G), ("com_offset", "sliding_friction")),
     "trailers": (cart_with_trailers(), ("com_offset", "angular_drag")),
+    "a wheel on friction": (_on_a_wheel(), ("sliding_friction", "linear_drag")),
 }
 
 
@@ -41,14 +49,16 @@ def like(sim: Simulator, **options) -> Simulator:
 
 
 @pytest.fixture
-def engine_items(monkeypatch) -> list[int]:
-    """Items that go to the engine."""
-    items: list[int] = []
+def engine_items(monkeypatch) -> list[tuple[int, int]]:
+    """What goes to the engine: item, and the first of its intervals that do."""
+    items: list[tuple[int, int]] = []
     rollout = compiled.rollout
 
     def counted(*arguments):
-        items.extend(arguments[-2])
-        return rollout(*arguments)
+        chosen, begins = arguments[3].tolist(), arguments[4].tolist()
+        done = rollout(*arguments)
+        items.extend(zip(chosen, begins, strict=True))
+        return done
 
     monkeypatch.setattr(compiled, "rollout", counted)
     return items
@@ -299,11 +309,15 @@ def test_contacts_are_left_to_the_engine(engine_items) -> None:
     walls = (Wall((0.4, -9.0), (0.4, 9.0)),)
     sim, phi, start, inputs = case(chain("hhh", walls=walls), ("com_offset",), seed=6, n=30)
     got = sim(phi, start, inputs)
-    assert 0.1 < len(engine_items) / got[:, :, 0, 0, 0].size < 0.9
-    touched = np.zeros(got.shape[0] * got.shape[1], dtype=bool)
-    touched[engine_items] = True
-    expected = like(sim, engine="python")(phi, start, inputs)
-    touched = touched.reshape(got.shape[:2])
+    touched = np.zeros((got.shape[0] * got.shape[1], got.shape[2]), dtype=bool)
+    touched[tuple(np.transpose(engine_items))] = True
+    assert 0.1 < touched.mean() < 0.9
+    touched = touched.reshape(got.shape[:3])
+    first = np.broadcast_to(start, (len(phi), *start.shape))
+    begins = np.concatenate([first[:, :, None], got[:, :, :-1]], axis=2)
+    begins = begins.reshape(len(phi), -1, *start.shape[1:])
+    alone = like(sim, engine="python", extrapolate=False)
+    expected = alone(phi, begins, inputs.reshape(-1, 1, *inputs.shape[2:])).reshape(got.shape)
     np.testing.assert_allclose(got[touched], expected[touched], rtol=1e-9, atol=1e-9)
 
 
@@ -315,3 +329,49 @@ def test_an_item_that_diverges_is_lost_alone() -> None:
     kept = np.arange(len(start)) != 2
     assert np.isnan(got[:, 2]).any()
     np.testing.assert_array_equal(got[:, kept], expected[:, kept])
+
+
+def test_a_wheel_and_a_ring_hold_a_body_together() -> None:
+    """It stays under less than both hold, and moves under more, whatever each holds alone."""
+    scene = _on_a_wheel()
+    sim, phi, start, inputs = case(scene, ("sliding_friction",), seed=0, n=2, horizon=6)
+    layout = sim.physics.layout
+    given = {"mass": 2.0, "mu_x": 0.3, "mu_y": 0.3, "sliding_friction_mu": 0.2}
+    for label, value in zip(layout.labels, phi[0], strict=True):
+        phi[:, layout.labels.index(label)] = given.get(label.split("[")[0], 0.0 * value)
+    start[:], inputs[..., :6] = 0.0, 0.0
+    most = (0.3 + 0.2) * 2.0 * G
+    inputs[..., :3] = 0.0
+    inputs[0, ..., 0], inputs[1, ..., 0] = 0.98 * most, 1.02 * most
+    held, moved = sim(phi[0], start, inputs)[:, -1, 0]
+    np.testing.assert_allclose(held, 0.0, atol=1e-9)
+    assert moved[3] == pytest.approx(0.02 * most / 2.0 * 0.6, rel=1e-3)
+
+
+def test_the_engine_steps_near_contacts_alone(engine_items) -> None:
+    """A puck on friction between two walls: intervals away from both are the tree's."""
+    walls = (Wall((-1.0, -9.0), (-1.0, 9.0)), Wall((1.0, -9.0), (1.0, 9.0)))
+    puck = Body("puck", Shape.circle(0.1), known={"mass": 1.0, "r": 0.9, "mu_c": 0.0})
+    scene = Scene(time_step=0.1, normal_gravity=G, bodies=(puck,), walls=walls)
+    sim, phi, start, inputs = case(scene, ("sliding_friction",), seed=0, n=1, horizon=30)
+    phi[:] = (0.01, 0.05)
+    start[:], inputs[:] = 0.0, 0.0
+    start[0, 0, 3] = 3.0
+    got = sim(phi[0], start, inputs)[0, :, 0]
+    assert 2 <= len(engine_items) <= 12
+    assert got[:, 3].max() > 0.0 > got[:, 3].min()
+    free = sim(phi[0], start, inputs[:, :2])[0, :, 0]
+    np.testing.assert_array_equal(got[:2], free)
+
+
+@pytest.mark.parametrize("speed", [3.0, 30.0, 300.0])
+def test_no_step_jumps_over_a_wall(speed) -> None:
+    """However far a body would move in an interval."""
+    wall = (Wall((1.0, -90.0), (1.0, 90.0)),)
+    puck = Body("puck", Shape.circle(0.1), known={"mass": 1.0, "r": 0.5, "mu_c": 0.0})
+    scene = Scene(time_step=0.1, substeps=400, normal_gravity=G, bodies=(puck,), walls=wall)
+    sim, phi, start, inputs = case(scene, ("sliding_friction",), seed=0, n=1, horizon=4)
+    start[:], inputs[:] = 0.0, 0.0
+    start[0, 0, 3] = speed
+    got = sim(phi[0], start, inputs)[0, :, 0]
+    assert (got[:, 0] < 1.0).all()
