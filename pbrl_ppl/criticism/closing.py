@@ -40,7 +40,7 @@ from pbrl_ppl.criticism.results import (
 )
 from pbrl_ppl.criticism.rivals import keep_groups
 from pbrl_ppl.criticism.score import Signature, rank_candidates
-from pbrl_ppl.criticism.search import Search, SearchResult, elpd_gain
+from pbrl_ppl.criticism.search import Search, SearchResult
 from pbrl_ppl.criticism.unexplained import (
     UnexplainedAcceleration,
     measurement_noise,
@@ -629,7 +629,7 @@ def _added(judged: _Judged, revised: Fit) -> tuple[Added, ...]:
             estimates[parameter.name] = Estimate(
                 float(values.mean()), float(values.std()), interval(values), parameter.unit
             )
-        gained, error = elpd_gain(found.without[law], found.after)
+        gained, error = found.gains[law]
         added.append(
             Added(
                 effect=words.effect,

@@ -37,7 +37,7 @@ from pbrl_ppl.modes import (
 )
 from pbrl_ppl.parameters import inside, prior_residual, prior_slopes
 from pbrl_ppl.scene import state_sizes
-from pbrl_ppl.state import Floats
+from pbrl_ppl.state import Bools, Floats
 from pbrl_ppl.threads import in_parallel
 
 #: Share of the joint sizes from which refits begin a second time.
@@ -87,14 +87,16 @@ def weights(mode: Mode, *, still: float = 1e-4) -> Floats:
     return np.where(moves, mode.problem.likelihood.counts(observations), 0.0)
 
 
-def _more_informed(before: Mode, after: Mode, informed: float = 0.7) -> int:
-    """Return how many of a model's further parameters the data inform; all that are scanned.
+def _informed(mode: Mode, *, share: float = 0.7) -> Bools:
+    """Return which parameters have a posterior of less than a share of the prior's width, (p,)."""
+    width = np.sqrt(np.maximum(np.diag(mode.covariance), 0.0))
+    slopes = prior_slopes(mode.problem.layout.priors, mode.phi)
+    return np.asarray(width * np.abs(slopes) < share)
 
-    ``informed``: share of the prior's width below which a posterior is informed.
-    """
-    layout = after.problem.layout
-    width = np.sqrt(np.maximum(np.diag(after.covariance), 0.0))
-    narrow = width * np.abs(prior_slopes(layout.priors, after.phi)) < informed
+
+def _more_informed(before: Mode, after: Mode) -> int:
+    """Return how many of a model's further parameters the data inform; all that are scanned."""
+    layout, narrow = after.problem.layout, _informed(after)
     return sum(
         attached.effect.scan is not None or bool(narrow[place])
         for attached in after.problem.physics.effects
@@ -160,8 +162,8 @@ class SearchResult:
         The declared model and the one with the laws, on the longest pieces.
     laws : dict of Attached to Law
         The laws with what each is worth there, those of most evidence first.
-    without : dict of Attached to Mode
-        The model without each law, refitted.
+    gains : dict of Attached to tuple of float
+        Gain in expected log predictive density by each law, and its standard error (nats).
     confounded : dict of Attached to tuple of Attached
         Effects that explain the data as well as a law.
     rungs : tuple of Rung
@@ -175,7 +177,7 @@ class SearchResult:
     declared: Mode
     after: Mode
     laws: Mapping[Attached, Law] = field(default_factory=dict)
-    without: Mapping[Attached, Mode] = field(default_factory=dict)
+    gains: Mapping[Attached, tuple[float, float]] = field(default_factory=dict)
     confounded: Mapping[Attached, tuple[Attached, ...]] = field(default_factory=dict)
     rungs: tuple[Rung, ...] = ()
     tried: Mapping[Attached, Evidence] = field(default_factory=dict)
@@ -191,10 +193,9 @@ class SearchResult:
             pieces = in_pieces(problem, problem.data.horizon, problem.data.smoothed_states)
             return with_robust_covariance(fit_pieces_closely(pieces, mode.phi))
 
-        without = {law: refitted(mode) for law, mode in self.without.items()}
         after = refitted(self.after)
         declared = after if self.declared is self.after else refitted(self.declared)
-        return replace(self, declared=declared, after=after, without=without)
+        return replace(self, declared=declared, after=after)
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,7 +281,7 @@ class Search:
             found = self._judged(mode, mode, model, regression, (rung,), _alone(before))
             return replace(found, declared=mode)
         first, *longer = piece_lengths(mode)
-        pieces = in_pieces(mode.problem, first, mode.problem.data.smoothed_states)
+        pieces = in_pieces(_apart(mode), first, mode.problem.data.smoothed_states)
         model = _Model(fit_pieces(pieces, mode.phi))
         begin = model.mode.phi
         model, rung, before, regression = self._at_length(model)
@@ -305,14 +306,15 @@ class Search:
         declared = _without_all(model, begin)
         found = self._judged(mode, declared, model, regression, tuple(rungs), tried)
         if not found.laws:
-            return found
+            return _with_contacts(found, mode, first)
         share = Evidence.of(declared, found.after).share
         if mode.problem.data.history.n_trajectories > 1 or share >= self.criteria.search.alone:
-            return replace(found, declared=declared)
+            return _with_contacts(replace(found, declared=declared), mode, first)
         # a lasting error of the sensor or a random force follows a single trajectory as well
         why = f"takes {100 * share:.2g} % off the error of a single trajectory, which is too little"
         rejected = {**found.rejected, **dict.fromkeys(found.laws, why)}
-        return SearchResult(declared, declared, rungs=tuple(rungs), tried=tried, rejected=rejected)
+        found = SearchResult(declared, declared, rungs=tuple(rungs), tried=tried, rejected=rejected)
+        return _with_contacts(found, mode, first)
 
     def _at_length(
         self, model: _Model, rounds: int = 3
@@ -445,7 +447,8 @@ class Search:
             law: law_of(mode, law, worth[law], law in main, confounded[law])
             for law in sorted(worth, key=lambda law: -worth[law].nats)
         }
-        return SearchResult(mode, mode, laws, model.without, confounded, rungs, tried, rejected)
+        gains = {law: elpd_gain(model.without[law], mode) for law in laws}
+        return SearchResult(mode, mode, laws, gains, confounded, rungs, tried, rejected)
 
     def _main(self, without: Mode, model: _Model) -> set[Attached]:
         """Return the laws with a large share in what all take off the error of a model without.
@@ -526,6 +529,71 @@ class Search:
                 law = better
             groups[law] = (*same, *close)
         return model, groups
+
+
+def _apart(mode: Mode, *, most: float = 0.5) -> Problem:
+    """Return a mode's problem with breaks between pieces where bodies touch.
+
+    The instant of a collision is no smooth function of anything, and what it does to a body says
+    nothing of the laws between: no piece goes through one. A body that touches in more than a share
+    of ``most`` of them is always simulated.
+    """
+    problem = mode.problem
+    if not problem.likelihood.filtered:
+        return problem
+    touched, segments = problem.trajectory_noise.touching, problem.segments
+    if not touched.any() or touched.mean() > most:
+        return problem
+    breaks = np.zeros(problem.data.smoothed_states.shape[:2], dtype=bool)
+    breaks[segments.trajectory, segments.step] = touched
+    physics = problem.physics
+    enough = min(max(physics.scene.substeps, physics.fine_enough), physics.substeps)
+    problem = problem.with_physics(substeps=enough)
+    if not any(body.kinematic for body in problem.scene.moving):
+        problem = replace(problem, physics=problem.physics.in_parts())
+    return problem.on(replace(problem.data, breaks=breaks))
+
+
+def _with_contacts(
+    found: SearchResult, whole: Mode, shortest: int, *, far_out: float = 5.0
+) -> SearchResult:
+    """Return the result with its models fitted to contacts as well, which have parameters, too.
+
+    These begin where the ``whole`` trajectories have them.
+
+    ``far_out``: errors of collisions above this many noise sizes are those of the engine.
+    """
+    contacts = found.after.problem.data.breaks
+    if contacts is None:
+        return found
+
+    def refitted(mode: Mode) -> Mode:
+        data = mode.problem.data
+        problem = mode.problem.with_physics(substeps=whole.problem.physics.substeps)
+        problem = problem.on(replace(data, breaks=None, horizon=1))
+        problem = replace(problem, physics=problem.physics.in_parts(data.history))
+        known = problem.layout.from_layout(whole.problem.layout, whole.phi)
+        phi = np.where(_informed(mode), mode.phi, known)
+        pieces = in_pieces(problem, shortest, simulated_states(mode))
+        fitted = fit_pieces(pieces, phi)
+        # a collision that the engine does not have stays left out
+        off = np.abs(fitted.problem.residual(fitted.phi)).max(axis=(1, 2)) > far_out * mode.sigma
+        segments, breaks = pieces.segments, np.zeros_like(contacts)
+        for i in np.flatnonzero(off.any(axis=1)):
+            rows = segments.trajectory[i], slice(segments.step[i], segments.step[i] + shortest)
+            breaks[rows] = contacts[rows]
+        problem = problem.on(replace(problem.data, breaks=breaks))
+        pieces = in_pieces(problem, data.horizon, simulated_states(mode))
+        longer = fit_pieces_closely(pieces, fitted.phi)
+        fitted = fitted if growth(longer.problem) > MOST_GROWTH else longer
+        fitted = with_robust_covariance(fitted)
+        return replace(fitted, phi=np.where(_informed(fitted), fitted.phi, known))
+
+    if found.declared is found.after:
+        declared = after = refitted(found.after)
+    else:
+        declared, after = in_parallel(refitted, [found.declared, found.after])
+    return replace(found, declared=declared, after=after)
 
 
 def _carried(mode: Mode, length: int) -> Mode:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Unpack
 
@@ -293,7 +294,7 @@ class History:
             )
         return self._segments(start, trajectory, step, int(horizon))
 
-    def pieces(self, states: Floats, horizon: int) -> Segments:
+    def pieces(self, states: Floats, horizon: int, breaks: Bools | None = None) -> Segments:
         """Cut every trajectory into pieces of ``horizon`` intervals between given states.
 
         A rest of at least a third of a piece is a piece, too: nothing is measured after its end.
@@ -304,13 +305,20 @@ class History:
             Shape (trajectory, time, body, 6), SI units, complete where pieces start.
         horizon : int
             Intervals in each piece, at least 1.
+        breaks : ndarray of bool, optional
+            Intervals that no piece goes through, shape (trajectory, interval).
         """
-        intervals = self.dataset["n_rows"].to_numpy() - 1
         begins = [
-            [b for b in range(0, n, horizon) if b == 0 or 3 * (n - b) >= horizon] for n in intervals
+            (trajectory, step, end)
+            for trajectory, n in enumerate(self.dataset["n_rows"].to_numpy() - 1)
+            for first, end in _runs(n, None if breaks is None else breaks[trajectory])
+            for step in range(first, end, horizon)
+            if step == 0 or 3 * (end - step) >= horizon
         ]
-        trajectory = np.repeat(np.arange(len(begins)), [len(rows) for rows in begins])
-        return self._segments(states, trajectory, np.concatenate(begins).astype(int), horizon)
+        trajectory, step, end = np.array(begins, dtype=int).reshape(-1, 3).T
+        segments = self._segments(states, trajectory, step, horizon)
+        segments.observed[step[:, None] + np.arange(horizon) >= end[:, None]] = np.nan
+        return segments
 
     def _segments(self, start: Floats, trajectory: Ints, step: Ints, horizon: int) -> Segments:
         """Return the segments of ``horizon`` intervals that start at these rows of ``start``."""
@@ -583,3 +591,11 @@ def from_segments(scene: Scene, start: Floats, actions: Floats, observed: Floats
             clock=data["clock"].copy(data=np.concatenate([begin, end[:, -1:]], axis=1)),
         )
     )
+
+
+def _runs(n: int, breaks: Bools | None) -> list[tuple[int, int]]:
+    """Return the runs of ``n`` intervals between breaks: the first, and that after the last."""
+    if breaks is None:
+        return [(0, n)]
+    edges = [-1, *np.flatnonzero(breaks[:n]).tolist(), n]
+    return [(a + 1, b) for a, b in pairwise(edges) if b - a > 2]

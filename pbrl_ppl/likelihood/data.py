@@ -148,6 +148,8 @@ class Data:
         Smoothed states, shape (trajectory, time, body, 6), SI units, which take the measured ones'
         place; see :func:`pbrl_ppl.model.along_trajectories`. With a longer horizon, pieces are
         simulated from them; see :func:`pbrl_ppl.likelihood.in_pieces`.
+    breaks : ndarray of bool, optional
+        Intervals that no piece goes through, shape (trajectory, interval).
     """
 
     scene: Scene
@@ -155,6 +157,7 @@ class Data:
     horizon: int = 1
     columns: tuple[int, ...] | None = None
     states: Floats | None = None
+    breaks: Bools | None = None
 
     def __getstate__(self) -> dict[str, object]:
         """Return the fields to pickle, without computed values."""
@@ -172,7 +175,7 @@ class Data:
             If bodies start deep inside each other or a wall, or a hinge's bodies apart.
         """
         if self.states is not None and self.horizon > 1:
-            return self.history.pieces(self.states, self.horizon)
+            return self.history.pieces(self.states, self.horizon, self.breaks)
         if self.states is not None:
             return self.history.transitions(self.states)
         segments = self.history.segments(self.horizon)

@@ -451,9 +451,11 @@ def simulated_states(mode: Mode) -> Floats:
     problem, segments = mode.problem, mode.problem.segments
     ends = problem.rough.simulator(mode.phi, segments.start, problem.inputs)
     states = problem.data.smoothed_states.copy()
-    rows = problem.data.history.dataset["n_rows"].to_numpy()[segments.trajectory]
+    last = problem.data.history.dataset["n_rows"].to_numpy()[segments.trajectory] - 1
+    follows = np.flatnonzero(np.diff(segments.trajectory) == 0)
+    last[follows] = segments.step[follows + 1]
     for i in range(segments.horizon):
-        reached = (segments.step + 1 + i < rows) & np.isfinite(ends[:, i]).all(axis=(1, 2))
+        reached = (segments.step + 1 + i <= last) & np.isfinite(ends[:, i]).all(axis=(1, 2))
         states[segments.trajectory[reached], segments.step[reached] + 1 + i] = ends[reached, i]
     states[segments.trajectory, segments.step] = segments.start
     return states

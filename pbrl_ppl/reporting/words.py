@@ -120,6 +120,8 @@ def _where(loop: Loop, dimension: str, body: str = "") -> str:
     where = f"in {dimension}"
     if loop.acceleration.certain_after.get(dimension):
         where = acceleration_in_words(dimension, loop.acceleration.after[dimension])
+    if not dimension:
+        return f"on the {plain(body)}"
     return f"{where} of the {plain(body)}" if body else where
 
 

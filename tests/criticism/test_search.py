@@ -125,3 +125,46 @@ def test_laws_that_only_help_together() -> None:
     assert laws["sliding_friction"].estimate["mu"] * 95 * 9.81 == pytest.approx(20.0, rel=0.1)
     assert laws["constant_force"].estimate["force_x"] == pytest.approx(-8.0, rel=0.1)
     assert found.before["x"] > 20 * found.after["x"]
+
+
+def _colliding(seed: int, drag: float, e: float = 0.5, sd: float = 1e-3) -> tuple[Scene, History]:
+    """Two pucks of 1 kg on a line that meet half-way, in closed form, with errors of 1 mm."""
+    rng, dt, radius, rows = np.random.default_rng(seed), 0.05, 0.1, 40
+    known = {"mass": 1.0, "mu_c": 0.0}
+    pucks = tuple(Body(name, Shape.circle(radius), known=known) for name in ("a", "b"))
+    scene = Scene(time_step=dt, bodies=pucks, noise={"x": sd, "y": sd})
+    states = np.zeros((6, rows, 2, 6))
+    states[..., 3:] = np.nan
+
+    def way(v: np.ndarray, t: np.ndarray) -> np.ndarray:
+        gone = -np.expm1(-drag * t) / drag if drag else t
+        return np.multiply.outer(gone, v)
+
+    for one in states:
+        x, v = np.array([0.0, rng.uniform(0.8, 1.2)]), rng.uniform((0.6, -0.6), (1.2, -0.2))
+        gap = (x[1] - x[0] - 2 * radius) / (v[0] - v[1])
+        met = -np.log1p(-drag * gap) / drag if drag else gap
+        left = v * np.exp(-drag * met)
+        after = np.array([
+            0.5 * (1 - e) * left[0] + 0.5 * (1 + e) * left[1],
+            0.5 * (1 + e) * left[0] + 0.5 * (1 - e) * left[1],
+        ])  # fmt: skip
+        t = dt * np.arange(rows)
+        at_met = x + way(v, np.array([met]))[0]
+        places = np.where((t < met)[:, None], x + way(v, t), at_met + way(after, t - met))
+        one[..., 0] = places
+        one[..., :2] += sd * rng.standard_normal((rows, 2, 2))
+    return scene, History.of_arrays(states, scene, np.zeros((6, rows - 1, 2, 3)))
+
+
+def test_laws_are_found_between_collisions() -> None:
+    """A drag on both with its size within 4 sd, and none in clean recordings of the same."""
+    laws = some("linear_drag", "constant_force", "spring", "point_attractor")
+    scene, history = _colliding(0, drag=0.4)
+    found = attribute(scene, history, catalogue=laws)
+    assert sorted((law.effect, law.body) for law in found.laws) == [
+        ("linear_drag", "a"), ("linear_drag", "b"),
+    ]  # fmt: skip
+    for law in found.laws:
+        assert abs(law.estimate["coefficient"] - 0.4) < 4 * law.sd["coefficient"]
+    assert not attribute(*_colliding(1, drag=0.0), catalogue=laws).laws

@@ -227,6 +227,24 @@ def test_segments_start_at_the_first_complete_state() -> None:
     assert History.from_dataframe(frame, CART).segments(2).step.tolist() == [1, 4]
 
 
+def test_no_piece_goes_through_a_break() -> None:
+    history = History.from_dataframe(table(steps=(7, 4)), CART)
+    data = history.dataset
+    states = np.nan_to_num(data["start"].to_numpy())
+    whole = history.pieces(states, 2)
+    n = int(data["n_rows"].max()) - 1
+    breaks = np.zeros((history.n_trajectories, n), dtype=bool)
+    none = history.pieces(states, 2, breaks)
+    np.testing.assert_array_equal(none.observed, whole.observed)
+    breaks[0, 2] = True
+    cut = history.pieces(states, 2, breaks)
+    first = cut.trajectory == 0
+    rows = cut.step[first][:, None] + np.arange(2)
+    seen = np.isfinite(cut.observed[first]).any(axis=(2, 3))
+    assert 2 not in rows[seen]
+    assert {0, 1, 3, 4} <= set(rows[seen].tolist())
+
+
 def test_split_and_select() -> None:
     history = History.from_dataframe(table(steps=(3, 4, 2, 5, 3)), CART)
     train, test = history.split(0.4, seed=3)
