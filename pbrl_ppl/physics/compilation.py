@@ -10,6 +10,7 @@ from typing import Any
 
 import numba
 from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.types import unliteral
 
 from pbrl_ppl.parameters import BODY_PARAMETERS, JOINT_ANCHORS
 
@@ -56,6 +57,9 @@ def compiled(function: Callable[..., Any]) -> Any:
     Where no folder can be written to, each process compiles it again.
     """
     dispatcher = numba.njit(nogil=True, error_model="numpy")(function)
+    template = dispatcher.get_call_template
+    # not anew for each constant that is passed
+    dispatcher.get_call_template = lambda args, kws: template(tuple(map(unliteral, args)), kws)
     with suppress(RuntimeError):
         dispatcher._cache = disk_cache(function, SOURCES)
     return dispatcher

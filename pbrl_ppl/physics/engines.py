@@ -38,7 +38,7 @@ class Batch(NamedTuple):
 
 
 class Still(NamedTuple):
-    """What the rollout of a tree needs of its world; discs are moved for each proposal."""
+    """What contact-free rollouts need of a world; discs are moved for each proposal."""
 
     gravity: Floats  # (2,), m/s^2
     normal_gravity: float  # m/s^2
@@ -52,7 +52,7 @@ class Still(NamedTuple):
 
 
 def still(world: World) -> Still:
-    """Return what the rollout of a tree needs of its world."""
+    """Return what contact-free rollouts need of a world."""
     return Still(
         np.array(world.space.gravity, dtype=float), world.scene.normal_gravity, world.size,
         world.fastest, np.array(RING), _NEAR * world.radii, world.can_touch,
@@ -78,14 +78,14 @@ class Engine:
     def _renew(self) -> None:
         self.world = self._build()
         self.pointers = pointers(self.world)
-        self._free = self._tree = None
+        self._wheels = self._tree = None
         if self._name == "chipmunk":
             return
-        self._free = lockstep.free_world(self.world)
-        if self._free is None:
+        self._still = still(self.world)
+        self._wheels = lockstep.free_wheels(self.world)
+        if self._wheels is None:
             self._tree = tree_of(self.world)
         if self._tree is not None:
-            self._still = still(self.world)
             self._work = work_of(self._tree, self.world.size)
 
     def rollout(self, batch: Batch, first: int, last: int, out: Floats) -> None:
@@ -102,10 +102,10 @@ class Engine:
         """
         items, horizon = np.arange(first, last), batch.inputs.shape[1]
         begins = np.zeros(len(items), dtype=np.int64)
-        whole = self._free is None and self._tree is None
+        whole = self._wheels is None and self._tree is None
         while len(items):
-            if self._free is not None:
-                lockstep.rollout(self._free, batch, items, begins, out)
+            if self._wheels is not None:
+                lockstep.rollout(self._wheels, self._still, batch, items, begins, out)
             elif self._tree is not None:
                 flow.rollout(self._work, self._still, batch, items, begins, out)
             left = begins < horizon

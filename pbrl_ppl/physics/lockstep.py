@@ -35,52 +35,35 @@ from pbrl_ppl.physics.lockstep_bodies import (
 from pbrl_ppl.physics.world import World
 
 
-class FreeWorld(NamedTuple):
-    """A world whose bodies touch nothing, for the contact-free fast path."""
+class Wheels(NamedTuple):
+    """Which bodies have a wheel, and the solver's iterations."""
 
+    under: NDArray[np.bool_]  # (body,)
     iterations: int
-    gravity: NDArray[np.float64]  # (2,)
-    normal_gravity: float
-    size: float  # of the smallest moving body (m)
-    fastest: float  # speed of divergence (m/s)
-    wheel: NDArray[np.bool_]  # (body,)
-    radii: NDArray[np.float64]  # (body,)
-    can_touch: NDArray[np.bool_]  # (body, body)
-    obstacles: NDArray[np.float64]  # (obstacle, 5), without the discs
 
 
-def free_world(world: World) -> FreeWorld | None:
-    """Describe a world; None where a body follows a path, is joined, or rests on friction."""
+def free_wheels(world: World) -> Wheels | None:
+    """Return a world's wheels; None where a body follows a path, is joined, or is on friction."""
     if world.kinematic.any() or world.links or world.patches:
         return None
     wheels = [wheel.body for wheel in world.wheels]
-    return FreeWorld(
-        iterations=world.iterations,
-        gravity=np.array(world.space.gravity, dtype=float),
-        normal_gravity=world.scene.normal_gravity,
-        size=world.size,
-        fastest=world.fastest,
-        wheel=np.isin(np.arange(len(world.bodies)), wheels),
-        radii=world.radii,
-        can_touch=world.can_touch,
-        obstacles=world.obstacles[: len(world.obstacles) - len(world.discs)].copy(),
-    )
+    return Wheels(np.isin(np.arange(len(world.bodies)), wheels), world.iterations)
 
 
 @compiled
-def substep(bodies, world, step):  # type: ignore[no-untyped-def]
+def substep(bodies, wheels, gravity, step):  # type: ignore[no-untyped-def]
     """Do one step of the engine."""
-    for k in range(len(world.wheel)):
+    for k in range(len(wheels.under)):
         turn(bodies[k], step)
-        accelerate(bodies[k], world.gravity, step)
-        if world.wheel[k]:
+        accelerate(bodies[k], gravity, step)
+        if wheels.under[k]:
             begin_wheel(bodies[k])
-            for _ in range(world.iterations):
+            for _ in range(wheels.iterations):
                 solve_wheel(bodies[k])
 
 
 @compiled
-def rollout(world, batch, items, begins, out):  # type: ignore[no-untyped-def]
+def rollout(wheels, still, batch, items, begins, out):  # type: ignore[no-untyped-def]
     """Predict ``items`` as `compiled.rollout` does, but for intervals that the engine must predict.
 
     ``begins``, shape (item,), are their first intervals; they become those in which a body comes
@@ -88,11 +71,10 @@ def rollout(world, batch, items, begins, out):  # type: ignore[no-untyped-def]
     """
     rows, _, discs, command_parameters, force_parameters = batch.given
     start, inputs = batch.start, batch.inputs
-    n, horizon, moving = len(inputs), inputs.shape[1], len(world.radii)
+    n, horizon, moving = len(inputs), inputs.shape[1], len(still.radii)
     timed = rows.shape[1] > 1
     commands, forces = batch.commands, batch.forces
     acting = len(commands) + len(forces) > 0
-    watched = len(world.obstacles) + discs.shape[1] > 0 or world.can_touch.sum() > moving
     bodies = np.zeros((moving, BLOCK * len(BODY)))
     own_discs = np.zeros((BLOCK, discs.shape[1], 3))
     touched = np.zeros(BLOCK, dtype=np.bool_)
@@ -117,7 +99,7 @@ def rollout(world, batch, items, begins, out):  # type: ignore[no-untyped-def]
             shifted = False
             for ahead in range(longest):
                 for k in range(moving):
-                    body, wheel = bodies[k], world.wheel[k]
+                    body, wheel = bodies[k], wheels.under[k]
                     for i in range(BLOCK):
                         p, t, h = proposal[i], transition[i], min(first[i] + ahead, horizon - 1)
                         if timed or ahead == 0:
@@ -129,7 +111,7 @@ def rollout(world, batch, items, begins, out):  # type: ignore[no-untyped-def]
                                         states[k, d] = out[p * n + t, h - 1, k, d]
                             else:
                                 get_state(body, i, states, k)
-                            shifted |= set_body(body, i, row, wheel, world.normal_gravity, step)
+                            shifted |= set_body(body, i, row, wheel, still.normal_gravity, step)
                             set_state(body, i, states, k)
                         else:
                             align(body, i)
@@ -150,11 +132,11 @@ def rollout(world, batch, items, begins, out):  # type: ignore[no-untyped-def]
                     if shifted:
                         for k in range(moving):
                             lever(bodies[k])
-                    substep(bodies, world, step)
+                    substep(bodies, wheels, still.gravity, step)
                     for k in range(moving):
-                        lose(bodies[k], world, touched)
-                    if watched:
-                        watch(bodies, world, own_discs, touched)
+                        lose(bodies[k], still, touched)
+                    if still.watched:
+                        watch(bodies, still, own_discs, touched)
                 for i in range(width):
                     item, h = items[begin + i], first[i] + ahead
                     if touched[i]:

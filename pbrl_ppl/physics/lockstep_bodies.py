@@ -161,26 +161,26 @@ def accelerate(body, gravity, step):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def lose(body, world, touched):  # type: ignore[no-untyped-def]
+def lose(body, still, touched):  # type: ignore[no-untyped-def]
     """Mark the transitions that have diverged."""
     for i in range(BLOCK):
         speed = abs(body[BODY.vx + i]) + abs(body[BODY.vy + i])
-        speed += world.size * abs(body[BODY.omega + i])
-        touched[i] |= not speed < world.fastest  # also true of NaN
+        speed += still.length * abs(body[BODY.omega + i])
+        touched[i] |= not speed < still.fastest  # also true of NaN
 
 
 @compiled
-def watch(bodies, world, discs, touched):  # type: ignore[no-untyped-def]
+def watch(bodies, still, discs, touched):  # type: ignore[no-untyped-def]
     """Mark the transitions in which a body is near an obstacle or another that it may touch."""
-    for k in range(len(world.radii)):
-        body, radius = bodies[k], world.radii[k]
+    for k in range(len(still.radii)):
+        body, radius = bodies[k], still.radii[k]
         for i in range(BLOCK):
             c, s = body[BODY.cos + i], body[BODY.sin + i]
             com_x, com_y = body[BODY.com_x + i], body[BODY.com_y + i]
             body[BODY.origin_x + i] = body[BODY.x + i] - (c * com_x - s * com_y)
             body[BODY.origin_y + i] = body[BODY.y + i] - (s * com_x + c * com_y)
-        for j in range(len(world.obstacles)):
-            a_x, a_y, d_x, d_y, scale, size = segment(world.obstacles[j])
+        for j in range(len(still.obstacles) - discs.shape[1]):
+            a_x, a_y, d_x, d_y, scale, size = segment(still.obstacles[j])
             for i in range(BLOCK):
                 x, y = body[BODY.origin_x + i] - a_x, body[BODY.origin_y + i] - a_y
                 touched[i] |= reaches(x, y, d_x, d_y, scale, radius + size)
@@ -191,12 +191,12 @@ def watch(bodies, world, discs, touched):  # type: ignore[no-untyped-def]
                 near = reaches(x, y, 0.0, 0.0, 0.0, radius + discs[i, j, 2])
                 touched[i] |= near & (discs[i, j, 2] > 0.0)
         for j in range(k):
-            if world.can_touch[k, j]:
+            if still.can_touch[k, j]:
                 other = bodies[j]
                 for i in range(BLOCK):
                     x = body[BODY.origin_x + i] - other[BODY.origin_x + i]
                     y = body[BODY.origin_y + i] - other[BODY.origin_y + i]
-                    touched[i] |= reaches(x, y, 0.0, 0.0, 0.0, radius + world.radii[j])
+                    touched[i] |= reaches(x, y, 0.0, 0.0, 0.0, radius + still.radii[j])
 
 
 @compiled

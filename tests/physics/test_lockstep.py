@@ -145,16 +145,16 @@ def test_one_of_several_bodies_at_a_wall_is_enough(at_the_wall) -> None:
 
 def test_worlds_of_the_fast_path() -> None:
     """All of bodies that nothing joins, holds or moves."""
-    assert lockstep.free_world(World(SCENES["wheel"])) is not None
+    assert lockstep.free_wheels(World(SCENES["wheel"])) is not None
     bodies = (Body("a", BOX), Body("b", BOX, wheel=True))
     two = SCENES["wheel"].replace(bodies=bodies)
-    assert lockstep.free_world(World(two)).wheel.tolist() == [False, True]
+    assert lockstep.free_wheels(World(two)).under.tolist() == [False, True]
     joint = Joint("hinge", ("a", "b"), (0.5, 0.0), (-0.5, 0.0))
     joined = World(two.replace(joints=(joint,)), (HINGE,))
-    assert lockstep.free_world(joined) is None
+    assert lockstep.free_wheels(joined) is None
     assert tree_of(joined) is not None
     pushed = World(two.replace(bodies=(bodies[0], Body("finger", BOX, kinematic=True))))
-    assert lockstep.free_world(pushed) is None
+    assert lockstep.free_wheels(pushed) is None
     assert tree_of(pushed).bodies.tolist() == [0, -1]
     held = pushed.scene.replace(joints=(Joint("hinge", ("a", "finger"), (0.5, 0.0), (-0.5, 0.0)),))
     assert tree_of(World(held, (HINGE,))) is None
