@@ -281,7 +281,7 @@ class Search:
             found = self._judged(mode, mode, model, regression, (rung,), _alone(before))
             return replace(found, declared=mode)
         first, *longer = piece_lengths(mode)
-        pieces = in_pieces(_apart(mode), first, mode.problem.data.smoothed_states)
+        pieces = in_pieces(_apart(mode, first), first, mode.problem.data.smoothed_states)
         model = _Model(fit_pieces(pieces, mode.phi))
         begin = model.mode.phi
         model, rung, before, regression = self._at_length(model)
@@ -531,21 +531,25 @@ class Search:
         return model, groups
 
 
-def _apart(mode: Mode, *, most: float = 0.5) -> Problem:
+def _apart(mode: Mode, length: int, *, most: float = 0.5) -> Problem:
     """Return a mode's problem with breaks between pieces where bodies touch.
 
     The instant of a collision is no smooth function of anything, and what it does to a body says
-    nothing of the laws between: no piece goes through one. A body that touches in more than a share
-    of ``most`` of them is always simulated.
+    nothing of the laws between: no piece goes through one. Where pieces of a ``length`` would leave
+    more than a share of ``most`` of the measurements out, contacts are simulated.
     """
     problem = mode.problem
     if not problem.likelihood.filtered:
         return problem
     touched, segments = problem.trajectory_noise.touching, problem.segments
-    if not touched.any() or touched.mean() > most:
-        return problem
-    breaks = np.zeros(problem.data.smoothed_states.shape[:2], dtype=bool)
+    states, history = problem.data.smoothed_states, problem.data.history
+    breaks = np.zeros(states.shape[:2], dtype=bool)
     breaks[segments.trajectory, segments.step] = touched
+    kept, every = (
+        np.isfinite(history.pieces(states, length, one).observed).sum() for one in (breaks, None)
+    )
+    if not touched.any() or kept < (1.0 - most) * every:
+        return problem
     physics = problem.physics
     enough = min(max(physics.scene.substeps, physics.fine_enough), physics.substeps)
     problem = problem.with_physics(substeps=enough)

@@ -51,11 +51,11 @@ class Still(NamedTuple):
     watched: bool  # whether there is anything to touch
 
 
-def still(world: World) -> Still:
-    """Return what contact-free rollouts need of a world."""
+def still(world: World, near: float = 1.0) -> Still:
+    """Return what contact-free rollouts need of a world, with ``near`` times its radii."""
     return Still(
         np.array(world.space.gravity, dtype=float), world.scene.normal_gravity, world.size,
-        world.fastest, np.array(RING), _NEAR * world.radii, world.can_touch,
+        world.fastest, np.array(RING), near * world.radii, world.can_touch,
         world.obstacles.copy(), len(world.obstacles) > 0 or np.tril(world.can_touch, -1).any(),
     )  # fmt: skip
 
@@ -81,8 +81,8 @@ class Engine:
         self._wheels = self._tree = None
         if self._name == "chipmunk":
             return
-        self._still = still(self.world)
         self._wheels = lockstep.free_wheels(self.world)
+        self._still = still(self.world, _NEAR if self._wheels is None else 1.0)
         if self._wheels is None:
             self._tree = tree_of(self.world)
         if self._tree is not None:

@@ -9,7 +9,8 @@ from pbrl_ppl.criticism import attribute
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History
-from pbrl_ppl.scene import Body, Scene, Shape
+from pbrl_ppl.physics import Physics
+from pbrl_ppl.scene import Body, Scene, Shape, Wall
 from tests.helpers.falls import BALL, GRAVITY, MASS, fall
 
 pytestmark = [pytest.mark.one_stack, pytest.mark.slow]
@@ -168,3 +169,20 @@ def test_laws_are_found_between_collisions() -> None:
     for law in found.laws:
         assert abs(law.estimate["coefficient"] - 0.4) < 4 * law.sd["coefficient"]
     assert not attribute(*_colliding(1, drag=0.0), catalogue=laws).laws
+
+
+def test_a_puck_that_touches_all_the_time_is_simulated_through_its_contacts() -> None:
+    """It rattles between two walls, with one or two intervals of free motion between."""
+    walls = tuple(Wall((x, -1.0), (x, 1.0)) for x in (-0.25, 0.25))
+    known = {"mass": 1.0, "mu_c": 0.0, "r": 1.0}
+    puck = Body("puck", Shape.circle(0.1), known=known)
+    scene = Scene(time_step=0.1, bodies=(puck,), walls=walls, substeps=80)
+    speed = np.array([1.5, 1.7, 1.9])
+    start, push = np.zeros((3, 1, 6)), np.zeros((3, 30, 1, 3))
+    start[:, 0, 3] = speed
+    after = Physics(scene).predict(np.zeros(0), start, push)
+    states = np.concatenate([start[:, None], after], axis=1)
+    states += np.random.default_rng(0).normal(0.0, 1e-3, states.shape)
+    history = History.of_arrays(states, scene, push)
+    found = attribute(scene, history, catalogue=some("linear_drag"))
+    assert not found.laws
