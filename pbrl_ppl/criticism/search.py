@@ -305,16 +305,22 @@ class Search:
             model, regression = better, self._regression(better.mode)
         declared = _without_all(model, begin)
         found = self._judged(mode, declared, model, regression, tuple(rungs), tried)
-        if not found.laws:
-            return _with_contacts(found, mode, first)
+        if found.laws:
+            found = self._beside(declared, found)
+        return _with_contacts(found, mode, first)
+
+    def _beside(self, declared: Mode, found: SearchResult) -> SearchResult:
+        """Return the laws beside the declared model; none if one trajectory shows too little."""
         share = Evidence.of(declared, found.after).share
-        if mode.problem.data.history.n_trajectories > 1 or share >= self.criteria.search.alone:
-            return _with_contacts(replace(found, declared=declared), mode, first)
+        history = declared.problem.data.history
+        if history.n_trajectories > 1 or share >= self.criteria.search.alone:
+            return replace(found, declared=declared)
         # a lasting error of the sensor or a random force follows a single trajectory as well
         why = f"takes {100 * share:.2g} % off the error of a single trajectory, which is too little"
         rejected = {**found.rejected, **dict.fromkeys(found.laws, why)}
-        found = SearchResult(declared, declared, rungs=tuple(rungs), tried=tried, rejected=rejected)
-        return _with_contacts(found, mode, first)
+        return SearchResult(
+            declared, declared, rungs=found.rungs, tried=found.tried, rejected=rejected
+        )
 
     def _at_length(
         self, model: _Model, rounds: int = 3
@@ -542,20 +548,22 @@ def _apart(mode: Mode, length: int, *, most: float = 0.5) -> Problem:
     if not problem.likelihood.filtered:
         return problem
     touched, segments = problem.trajectory_noise.touching, problem.segments
+    if not touched.any():
+        return problem
     states, history = problem.data.smoothed_states, problem.data.history
     breaks = np.zeros(states.shape[:2], dtype=bool)
     breaks[segments.trajectory, segments.step] = touched
     kept, every = (
         np.isfinite(history.pieces(states, length, one).observed).sum() for one in (breaks, None)
     )
-    if not touched.any() or kept < (1.0 - most) * every:
+    if kept < (1.0 - most) * every:
         return problem
     physics = problem.physics
     enough = min(max(physics.scene.substeps, physics.fine_enough), physics.substeps)
     problem = problem.with_physics(substeps=enough)
     if not any(body.kinematic for body in problem.scene.moving):
         problem = replace(problem, physics=problem.physics.in_parts())
-    return problem.on(replace(problem.data, breaks=breaks))
+    return problem.with_data(breaks=breaks)
 
 
 def _with_contacts(
@@ -572,13 +580,13 @@ def _with_contacts(
         return found
 
     def refitted(mode: Mode) -> Mode:
-        data = mode.problem.data
-        problem = mode.problem.with_physics(substeps=whole.problem.physics.substeps)
-        problem = problem.on(replace(data, breaks=None, horizon=1))
-        problem = replace(problem, physics=problem.physics.in_parts(data.history))
+        data, states = mode.problem.data, simulated_states(mode)
+        problem = mode.problem.with_data(breaks=None)
+        physics = problem.physics.changed(substeps=whole.problem.physics.substeps)
+        problem = replace(problem, physics=physics.in_parts(data.history))
         known = problem.layout.from_layout(whole.problem.layout, whole.phi)
         phi = np.where(_informed(mode), mode.phi, known)
-        pieces = in_pieces(problem, shortest, simulated_states(mode))
+        pieces = in_pieces(problem, shortest, states)
         fitted = fit_pieces(pieces, phi)
         # a collision that the engine does not have stays left out
         off = np.abs(fitted.problem.residual(fitted.phi)).max(axis=(1, 2)) > far_out * mode.sigma
@@ -586,8 +594,7 @@ def _with_contacts(
         for i in np.flatnonzero(off.any(axis=1)):
             rows = segments.trajectory[i], slice(segments.step[i], segments.step[i] + shortest)
             breaks[rows] = contacts[rows]
-        problem = problem.on(replace(problem.data, breaks=breaks))
-        pieces = in_pieces(problem, data.horizon, simulated_states(mode))
+        pieces = in_pieces(problem.with_data(breaks=breaks), data.horizon, states)
         longer = fit_pieces_closely(pieces, fitted.phi)
         fitted = fitted if growth(longer.problem) > MOST_GROWTH else longer
         fitted = with_robust_covariance(fitted)

@@ -117,11 +117,11 @@ def _remains(loop: Loop) -> str:
 
 def _where(loop: Loop, dimension: str, body: str = "") -> str:
     """Write where something remains, with its acceleration if that is significant."""
+    if not dimension:
+        return f"on the {plain(body)}"
     where = f"in {dimension}"
     if loop.acceleration.certain_after.get(dimension):
         where = acceleration_in_words(dimension, loop.acceleration.after[dimension])
-    if not dimension:
-        return f"on the {plain(body)}"
     return f"{where} of the {plain(body)}" if body else where
 
 

@@ -67,20 +67,16 @@ def case(name: str, **options) -> tuple[Simulator, np.ndarray, np.ndarray, np.nd
 
 @pytest.mark.parametrize("name", SCENES)
 def test_it_agrees_with_the_engine(name) -> None:
-    """Extrapolated where nothing touches; where something does, an interval at a time."""
-    touches = {"walls": 0.9, "disc": 0.2}.get(name, 0.0)
-    for extrapolate in (False,) if touches else (True, False):
-        simulator, phi, start, inputs = case(name, extrapolate=extrapolate)
-        got = simulator(phi, start, inputs)
-        reference = Simulator(simulator.physics.changed(engine="python"))
-        expected = reference(phi, start, inputs)
-        assert np.isfinite(expected).all()
-        off = (np.abs(got - expected) / (1.0 + np.abs(expected))).max(axis=(2, 3, 4))
-        if name == "disc":  # it is refined near the disc alone, the reference all the way
-            assert (off < 1e-9).mean() > 1.0 - touches
-            continue
-        assert np.quantile(off, 0.95) < 1e-10
-        assert off.max() < 1e-9
+    simulator, phi, start, inputs = case(name)
+    if name in ("walls", "disc"):  # of several intervals those that touch alone are the engine's
+        inputs = inputs[:, :1]
+    got = simulator(phi, start, inputs)
+    reference = Simulator(simulator.physics.changed(engine="python"))
+    expected = reference(phi, start, inputs)
+    assert np.isfinite(expected).all()
+    off = np.abs(got - expected) / (1.0 + np.abs(expected))
+    assert np.quantile(off, 0.99) < 1e-11
+    assert off.max() < 1e-9
 
 
 @pytest.mark.parametrize("name", ["wheel", "walls"])

@@ -24,13 +24,7 @@ pytestmark = [
 ]
 
 PIVOT = ("pivot_friction", "pivot_damping")
-
-
-def _on_a_wheel(**options) -> Scene:
-    bodies = (Body("cart", BOX, wheel=True),)
-    return Scene(time_step=0.1, normal_gravity=G, bodies=bodies, **options)
-
-
+ON_A_WHEEL = Scene(time_step=0.1, normal_gravity=G, bodies=(Body("cart", BOX, wheel=True),))
 CASES = {
     "double pendulum": (chain("hh"), ("com_offset", "inertia_scale", *PIVOT)),
     "four links": (chain("hhhh", turned=(0, 2)), ("com_offset", *PIVOT, "linear_drag")),
@@ -40,7 +34,7 @@ CASES = {
     "free, with a payload": (chain("-hr", turned=(1,)), ("com_offset", "mass_change")),
     "sliding": (chain("-h", normal_gravity=G), ("com_offset", "sliding_friction")),
     "trailers": (cart_with_trailers(), ("com_offset", "angular_drag")),
-    "a wheel on friction": (_on_a_wheel(), ("sliding_friction", "linear_drag")),
+    "a wheel on friction": (ON_A_WHEEL, ("sliding_friction", "linear_drag")),
 }
 
 
@@ -77,6 +71,18 @@ def convergence(sim: Simulator, phi, start, inputs, coarse: int = 80) -> tuple[f
         for n in (coarse, 4 * coarse)
     ]  # fmt: skip
     return float(np.log(off[0] / off[1]) / np.log(4)), float(off[1])
+
+
+def by_interval(sim: Simulator, phi, start, inputs, states) -> np.ndarray:
+    """Each interval alone by the plain Python loop, from where ``states`` had it.
+
+    ``states`` are (proposal, transition, H, body, 6).
+    """
+    first = np.broadcast_to(start, (len(phi), *start.shape))
+    begins = np.concatenate([first[:, :, None], states[:, :, :-1]], axis=2)
+    begins = begins.reshape(len(phi), -1, *start.shape[1:])
+    alone = Simulator(sim.physics.changed(engine="python", extrapolate=False))
+    return alone(phi, begins, inputs.reshape(-1, 1, *inputs.shape[2:])).reshape(states.shape)
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -313,11 +319,7 @@ def test_contacts_are_left_to_the_engine(engine_items) -> None:
     touched[tuple(np.transpose(engine_items))] = True
     assert 0.1 < touched.mean() < 0.9
     touched = touched.reshape(got.shape[:3])
-    first = np.broadcast_to(start, (len(phi), *start.shape))
-    begins = np.concatenate([first[:, :, None], got[:, :, :-1]], axis=2)
-    begins = begins.reshape(len(phi), -1, *start.shape[1:])
-    alone = like(sim, engine="python", extrapolate=False)
-    expected = alone(phi, begins, inputs.reshape(-1, 1, *inputs.shape[2:])).reshape(got.shape)
+    expected = by_interval(sim, phi, start, inputs, got)
     np.testing.assert_allclose(got[touched], expected[touched], rtol=1e-9, atol=1e-9)
 
 
@@ -333,17 +335,13 @@ def test_an_item_that_diverges_is_lost_alone() -> None:
 
 def test_a_wheel_and_a_ring_hold_a_body_together() -> None:
     """It stays under less than both hold, and moves under more, whatever each holds alone."""
-    scene = _on_a_wheel()
-    sim, phi, start, inputs = case(scene, ("sliding_friction",), seed=0, n=2, horizon=6)
-    layout = sim.physics.layout
+    sim, _, start, inputs = case(ON_A_WHEEL, ("sliding_friction",), seed=0, n=2, horizon=6)
     given = {"mass": 2.0, "mu_x": 0.3, "mu_y": 0.3, "sliding_friction_mu": 0.2}
-    for label, value in zip(layout.labels, phi[0], strict=True):
-        phi[:, layout.labels.index(label)] = given.get(label.split("[")[0], 0.0 * value)
+    phi = np.array([given.get(label.split("[")[0], 0.0) for label in sim.physics.layout.labels])
     start[:], inputs[..., :6] = 0.0, 0.0
     most = (0.3 + 0.2) * 2.0 * G
-    inputs[..., :3] = 0.0
     inputs[0, ..., 0], inputs[1, ..., 0] = 0.98 * most, 1.02 * most
-    held, moved = sim(phi[0], start, inputs)[:, -1, 0]
+    held, moved = sim(phi, start, inputs)[:, -1, 0]
     np.testing.assert_allclose(held, 0.0, atol=1e-9)
     assert moved[3] == pytest.approx(0.02 * most / 2.0 * 0.6, rel=1e-3)
 
