@@ -347,16 +347,8 @@ def solve(work, u, a, impulse):  # type: ignore[no-untyped-def]
                 elif not impulse and d < 2:
                     system[at, size] = -work.links[i, B_X + d]
                 at += 1
-        elif impulse or mode == SMOOTH:
-            continue
-        elif r < count:
-            for j in range(n):
-                system[j, size] -= mode * rows[r, BOUND] * rows[r, G + j]
-        else:
-            f_x, f_y, torque = _sliding(work, r - count, i, motion[u, turn])
-            for j in range(n):
-                system[j, size] += work.slope[i, j, 0] * f_x + work.slope[i, j, 1] * f_y
-            system[turn, size] += torque
+        elif not impulse and mode != SMOOTH:
+            _resist(work, r, u, size)
     _eliminate(system, size)
     for j in range(n):
         motion[a, j] = system[j, size]
@@ -416,6 +408,22 @@ def _sliding(work, ring, i, omega):  # type: ignore[no-untyped-def]
 
 
 @compiled
+def _resist(work, r, u, column):  # type: ignore[no-untyped-def]
+    """Add the friction of a row that slips, or of a ring that slides, to a column of the system."""
+    system, slope = work.system, work.slope
+    if r < work.n_rows:
+        for j in range(work.n):
+            system[j, column] -= work.kinds[r, 2] * work.rows[r, BOUND] * work.rows[r, G + j]
+        return
+    i = work.kinds[r, 1]
+    turn = work.tree[i, TURN]
+    f_x, f_y, torque = _sliding(work, r - work.n_rows, i, work.motion[u, turn])
+    for j in range(work.n):
+        system[j, column] += slope[i, j, 0] * f_x + slope[i, j, 1] * f_y
+    system[turn, column] += torque
+
+
+@compiled
 def set_first_slide(work, u, a, tries=30):  # type: ignore[no-untyped-def]
     """Set the accelerations (row a) with which rings that hold begin to slide.
 
@@ -430,10 +438,8 @@ def set_first_slide(work, u, a, tries=30):  # type: ignore[no-untyped-def]
             for k in range(n):
                 system[j, k] = motion[M + j, k]
         for r in range(count):
-            mode = work.kinds[r, 2]
-            if mode in (-1, 1):
-                for j in range(n):
-                    system[j, n] -= mode * rows[r, BOUND] * rows[r, G + j]
+            if work.kinds[r, 2] in (-1, 1):
+                _resist(work, r, u, n)
             elif attempt > 0:
                 speed, slow = 0.0, 1e-24
                 for j in range(n):
@@ -447,10 +453,7 @@ def set_first_slide(work, u, a, tries=30):  # type: ignore[no-untyped-def]
             i, ring = work.kinds[r, 1], r - count
             c, s, turn = work.links[i, COS], work.links[i, SIN], work.tree[i, TURN]
             if work.kinds[r, 3] == 1 and work.kinds[r, 2] == SLIDE:
-                f_x, f_y, torque = _sliding(work, ring, i, motion[u, turn])
-                for j in range(n):
-                    system[j, n] += work.slope[i, j, 0] * f_x + work.slope[i, j, 1] * f_y
-                system[turn, n] += torque
+                _resist(work, r, u, n)
                 continue
             if attempt == 0:
                 continue
