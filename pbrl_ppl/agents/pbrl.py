@@ -102,7 +102,7 @@ class PBRLAgent(PhysicsAgent):
         self.draws, self.growth = draws, growth
         self._likelihood, self.revise = TransitionLikelihood.declare(sigma), revise
         self._catalogue = tuple(catalogue)
-        declared = sum(len(body.effects) for body in task.scene.dynamic)
+        declared = len(attach(task.scene, (), self._catalogue))
         self._given = attach(task.scene, effects, self._catalogue)[declared:]
         self._transitions: list[tuple[Floats, Floats, Floats]] = []
         self._sigma = np.empty(0)

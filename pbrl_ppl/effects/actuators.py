@@ -35,6 +35,23 @@ actuator_rotation = Effect(
 )
 
 
+def _turn_with_body(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
+    c, s = math.cos(state[2]), math.sin(state[2])
+    x = wrench[0]
+    wrench[0] = c * x - s * wrench[1]
+    wrench[1] = s * x + c * wrench[1]
+
+
+#: Of scenes whose recording gives forces along the bodies' own axes; no law to be found.
+body_frame = Effect(
+    "body_frame",
+    (),
+    "pushes are given along the body's own axes and turn with it",
+    "rotation of a vector in the plane",
+    Command(_turn_with_body),
+)
+
+
 def _scale_force(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
     wrench[0] *= parameters[0]
     wrench[1] *= parameters[0]

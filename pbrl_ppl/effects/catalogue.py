@@ -56,6 +56,8 @@ def attach(
 ) -> tuple[Attached, ...]:
     """Return all effects of a model: those that the scene declares, then the extra ones.
 
+    Forces that its recording gives along the bodies' axes are turned by an effect, too.
+
     Their priors are in SI units; see :func:`pbrl_ppl.scene.units_of`.
 
     Parameters
@@ -86,8 +88,14 @@ def attach(
     listed = [item.effect if isinstance(item, Attached) else item for item in extra]
     check_names((*effects, *listed))
     by_name = {effect.name: effect for effect in (*effects, *listed)}
+    turning = actuators.body_frame
+    by_name[turning.name] = turning
     result: list[Attached] = []
+    along_bodies = scene.recording is not None and scene.recording.forces == "body"
+    given = {(item.effect, item.body) for item in extra if isinstance(item, Attached)}
     for body in scene.dynamic:
+        if along_bodies and turning.name not in body.effects and (turning, body.name) not in given:
+            result.append(turning.on(body.name))
         for name in body.effects:
             if name not in by_name:
                 near = difflib.get_close_matches(name, by_name, n=1)

@@ -129,8 +129,8 @@ class Effect:
     Raises
     ------
     EffectError
-        If it has no name, no parameters or no stage, positive log odds, or a null value outside its
-        prior's support.
+        If it has no name or no stage, no parameters (which an effect of the command may lack),
+        positive log odds, or a null value outside its prior's support.
 
     Examples
     --------
@@ -162,7 +162,7 @@ class Effect:
         """Check the fields."""
         if not self.name.isidentifier():
             raise EffectError(f"effect name {self.name!r} is not an identifier; use letters and _")
-        if not self.parameters:
+        if not self.parameters and not isinstance(self.stage, Command):
             raise EffectError(f"effect {self.name} has no parameters; give it at least one")
         if force is not None and self.stage is None:
             object.__setattr__(self, "stage", Force(force))
