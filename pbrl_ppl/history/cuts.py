@@ -36,7 +36,7 @@ def cut(frame: pd.DataFrame, cuts: Mapping[str, float], source: str) -> pd.DataF
         raise HistoryError(
             f"{source}: nothing is left between its cuts; make [recording] cut less strict"
         )
-    joined: pd.DataFrame = pd.concat(parts).reset_index(drop=True)
+    joined: pd.DataFrame = pd.concat(parts)
     return joined
 
 
@@ -152,9 +152,10 @@ def propose(
     layout: Recording,
     time_step: float,
     *,
+    jumps: bool = True,
     trajectories: int = 4,
     shortest: int = 30,
-    longest: int = 200,
+    most: int = 12,
 ) -> tuple[Recording, list[str]]:
     """Return a layout with what a recording's rows show, and a sentence on each.
 
@@ -165,66 +166,70 @@ def propose(
     layout : Recording
         What is known; its entries are kept.
     time_step : float
-        Median time between rows (s).
+        Time between rows of the scene (s).
+    jumps : bool
+        Whether velocities may jump where nothing is declared.
     trajectories : int
         Fewer long ones are cut: criticism needs so many.
-    shortest, longest : int
-        Rows of the pieces.
+    shortest : int
+        Rows of a piece, at least; it is also as long as the slowest motion where so many such
+        pieces are there.
+    most : int
+        Pieces that one trajectory is cut to.
     """
     said = []
     times = pd.to_numeric(frame["time"], errors="coerce").to_numpy(float)
     indices = frame.groupby(["trajectory", "body"], sort=False).indices.values()
     groups = [np.asarray(rows, dtype=np.int64) for rows in indices]
-    places = [name for name in ("x", "y") if name in frame]
-    states = frame[places].apply(pd.to_numeric, errors="coerce").to_numpy(float, copy=True)
-    unseen = _unseen(states, groups)
-    if unseen.any() and not layout.not_seen:
-        layout = replace(layout, not_seen=tuple((name, 0.0) for name in places))
-        said.append(f"{' = '.join(places)} = 0 in {unseen.sum()} rows: read as not seen")
-        states[unseen] = np.nan
+    names = [name for name in STATE[:3] if name in frame]
+    poses = frame[names].apply(pd.to_numeric, errors="coerce").to_numpy(float)
+    places = poses[:, [i for i, name in enumerate(names) if name != "theta"]]
     spacing = np.concatenate([np.diff(times[rows]) for rows in groups])
     if not layout.resample and (np.abs(spacing - time_step) > TIME_TOLERANCE * time_step).any():
         layout = replace(layout, resample=True)
-        said.append(f"samples are uneven: interpolated every {time_step:g} s")
+        said.append(f"rows are not {time_step:g} s apart: interpolated every {time_step:g} s")
     if layout.cut:
         return layout, said
     cuts: dict[str, float] = {}
-    gap = max(_longest_gap(times[rows], states[rows]) for rows in groups)
+    gap = max(_longest_gap(times[rows], poses[rows]) for rows in groups)
     if gap > LONGEST * time_step:
         cuts["gaps"] = float(f"{LONGEST * time_step:.6g}")
         said.append(f"nothing was seen for up to {gap:.3g} s: cut at gaps")
     pushed = frame[[name for name in WRENCH if name in frame]].apply(pd.to_numeric, errors="coerce")
-    if places and not pushed.fillna(0.0).to_numpy().any():
-        least = _jump([(times[rows], states[rows]) for rows in groups])
+    if jumps and places.shape[1] and not pushed.fillna(0.0).to_numpy().any():
+        least = _jump([(times[rows], places[rows]) for rows in groups])
         if least:
             cuts["jumps"] = least
             said.append(
                 "the velocity jumps, as at a wall, and none is declared: cut there"
                 f" (by more than {least:g} m/s)"
             )
-    whole = frame.groupby("trajectory", sort=False)["time"].count().to_numpy()
-    rows = float(np.median(whole)) / frame["body"].nunique()
-    if len(whole) < trajectories and not cuts and rows >= 2 * shortest:
-        wanted = np.clip(rows * len(whole) / 12, shortest, longest)
-        cuts["every"] = float(f"{wanted * time_step:.2g}")
+    long = [float(np.ptp(times[rows])) for rows in groups]
+    length = float(np.median(long))
+    if (
+        frame["trajectory"].nunique() < trajectories
+        and not cuts
+        and length >= 2 * shortest * time_step
+    ):
+        slow = max(_slowest(times[rows], poses[rows]) for rows in groups)
+        parts = np.clip(length / max(slow, shortest * time_step), min(trajectories, most), most)
+        cuts["every"] = float(f"{length / int(parts):.2g}")
         said.append(
-            f"{len(whole)} long trajectory: cut every {cuts['every']:g} s, so that there are"
-            " several"
+            f"{frame['trajectory'].nunique()} long trajectory: cut every {cuts['every']:g} s, so"
+            " that there are several"
         )
     return replace(layout, cut=tuple(cuts.items())), said
 
 
-def _unseen(states: Floats, groups: list[Ints], far: float = 5.0) -> Bools:
-    """Return the rows where all places are zero, ``far`` typical changes from those seen before."""
-    zero = np.all(states == 0.0, axis=1) if states.shape[1] > 1 else np.zeros(len(states), bool)
-    for rows in groups:
-        here, seen = zero[rows], np.flatnonzero(~zero[rows])
-        before = np.searchsorted(seen, np.flatnonzero(here)) - 1
-        steps = np.linalg.norm(np.diff(states[rows][seen], axis=0), axis=1)
-        away = np.linalg.norm(states[rows][seen[before[before >= 0]]], axis=1)
-        jumps = len(steps) and len(away) and np.median(away) > far * np.median(steps)
-        zero[rows] &= bool(jumps)
-    return zero
+def _slowest(times: Floats, poses: Floats) -> float:
+    """Return the longest period of a coordinate (s): twice the time between means crossed."""
+    periods = [0.0]
+    for column in poses.T:
+        seen = column[np.isfinite(column)]
+        if len(seen) > 2 and np.ptp(seen) > 0:
+            crossed = int((np.diff(np.sign(seen - seen.mean())) != 0).sum())
+            periods.append(2.0 * float(np.ptp(times)) / max(crossed, 1))
+    return max(periods)
 
 
 def _longest_gap(times: Floats, states: Floats) -> float:

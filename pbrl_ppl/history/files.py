@@ -1,6 +1,5 @@
-"""Files of histories: CSV, Parquet and NetCDF to a table, and back, written atomically."""
+"""Files of histories to a table: by suffix; and back, written atomically."""
 
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,20 +12,17 @@ import xarray as xr
 from pbrl_ppl.errors import HistoryError, OutputError
 from pbrl_ppl.files import write_atomically
 from pbrl_ppl.history import bags
-from pbrl_ppl.scene import SEPARATORS, Recording
+from pbrl_ppl.history.foreign import read_mat, read_sysid
+from pbrl_ppl.history.text import read_text
+from pbrl_ppl.scene import Recording
 from pbrl_ppl.state import STATE, WRENCH, Floats
 
 COLUMNS = ("trajectory", "step", "time", "body", *STATE, *WRENCH)
 SUFFIXES = (".csv", ".parquet", ".nc")
 #: Suffixes of text tables that are read, and never written.
 _TEXTS = (".csv", ".txt", ".tsv", ".dat")
-
-# pandas reads numbers exactly from 3.1 on, and warns there of the option that older ones need.
-_PANDAS = tuple(int(part) for part in pd.__version__.split(".")[:2])
-_EXACT: dict[str, Any] = {} if _PANDAS >= (3, 1) else {"float_precision": "round_trip"}
-#: Separator of columns by blanks.
-_BLANKS = SEPARATORS["blank"].encode()
-_MISSING = ["", "nan", "NaN", "NAN", "NA", "N/A", "null", "NULL", "None"]
+#: Suffixes of other programs' tables that are read, and never written.
+_FOREIGN = {".json": read_sysid, ".mat": read_mat}
 
 
 def read_table(
@@ -41,8 +37,8 @@ def read_table(
     names : mapping of str to object, optional
         Its values are names of columns of numbers, as of `Reading`.
     layout : Recording, optional
-        Separator and header of a text table; otherwise found from its first line. The columns of
-        one without header are called 0, 1, 2, ...
+        Separator and header of a text table; otherwise found from its lines. The columns of one
+        without header are called 0, 1, 2, ...
 
     Raises
     ------
@@ -52,7 +48,7 @@ def read_table(
     suffix, layout = path.suffix.lower(), layout or Recording()
     if suffix in bags.SUFFIXES or path.is_dir():
         return _read_bag(path, dict(layout.topics))
-    known = tuple(dict.fromkeys((*_TEXTS, *SUFFIXES)))
+    known = tuple(dict.fromkeys((*_TEXTS, *SUFFIXES, *_FOREIGN)))
     if suffix not in known:
         raise HistoryError(
             f"history {path}: the suffix is {path.suffix!r}, expected one of "
@@ -61,14 +57,23 @@ def read_table(
     try:
         if suffix in _TEXTS:
             columns = {**dict(layout.columns), **(names or {})}
-            return _read_text(
-                path, [column for column in columns.values() if isinstance(column, str)], layout
-            )
+            named = [column for column in columns.values() if isinstance(column, str)]
+            return read_text(path, layout, ["step", "time", *STATE, *WRENCH, *named])
+        if suffix in _FOREIGN:
+            return _FOREIGN[suffix](path)
         return _read_parquet(path) if suffix == ".parquet" else _read_netcdf(path)
     except FileNotFoundError:
         raise HistoryError(f"history {path}: there is no such file; check the path") from None
     except OSError as error:
         raise HistoryError(f"history {path}: cannot be read: {error}") from None
+
+
+def read_commands(path: Path, layout: Recording | None) -> pd.DataFrame | None:
+    """Return the table of a layout's ``commands``, beside a recording; None without any."""
+    if layout is None or not layout.commands:
+        return None
+    beside = path.parent / layout.commands.replace("{stem}", path.stem)
+    return read_table(beside, layout=Recording(columns=layout.columns))
 
 
 def _read_bag(path: Path, topics: dict[str, Any]) -> pd.DataFrame:
@@ -79,67 +84,6 @@ def _read_bag(path: Path, topics: dict[str, Any]) -> pd.DataFrame:
             f" [recording]); it has {there}"
         )
     return bags.read_bag(path, topics)
-
-
-def _read_text(path: Path, others: list[str], layout: Recording) -> pd.DataFrame:
-    content = path.read_bytes()
-    lines = content.removeprefix(b"\xef\xbb\xbf").splitlines()
-    if not any(line.strip() for line in lines):
-        raise HistoryError(f"history {path}: the file is empty; expected a header and rows")
-    declared = SEPARATORS.get(layout.separator, layout.separator).encode()
-    # a spreadsheet may write "1,5;2,0"
-    guessed = next((mark for mark in (b",", b";", b"\t") if mark in lines[0]), b"")
-    separator = declared or guessed or (b"," if len(lines[0].split()) < 2 else _BLANKS)
-    decimal = "," if separator in (b";", b"\t") and b"," in content else "."
-    first = _cells(lines[0], separator)
-    header = layout.header if layout.header is not None else not all(map(_is_number, first))
-    # pandas fills short rows with blanks without a word: a file that was cut off would pass.
-    if b'"' not in content:
-        for number, line in enumerate(lines, start=1):
-            cells = len(_cells(line, separator))
-            if cells != len(first) and line.strip():
-                raise HistoryError(
-                    f"history row {number}: {cells} cells, expected {len(first)} as in the first"
-                    f" line; repair or drop the row (file {path})"
-                )
-    unnamed = [] if header else [str(i) for i in range(len(first))]
-    number_columns = dict.fromkeys(("step", "time", *STATE, *WRENCH, *others, *unnamed), _MISSING)
-    try:
-        frame: pd.DataFrame = pd.read_csv(
-            io.BytesIO(content),
-            sep=separator.decode(),
-            header=0 if header else None,
-            names=None if header else unnamed,
-            decimal=decimal,
-            dtype={"trajectory": "str", "body": "str"},
-            keep_default_na=False,
-            na_values=number_columns,
-            skipinitialspace=True,
-            skip_blank_lines=False,
-            low_memory=False,
-            encoding="utf-8",
-            **_EXACT,
-        )
-    except (ValueError, pd.errors.ParserError) as error:
-        raise HistoryError(f"history {path}: not a CSV table: {error}") from None
-    if not isinstance(frame.index, pd.RangeIndex):
-        raise HistoryError(f"history {path}: rows have more cells than the header; repair them")
-    frame.attrs["headerless"] = not header
-    return frame
-
-
-def _cells(line: bytes, separator: bytes) -> list[bytes]:
-    """Return the cells of a line."""
-    return line.split() if separator == _BLANKS else line.split(separator)
-
-
-def _is_number(cell: bytes) -> bool:
-    """Return whether a cell is a number, with a point or a comma."""
-    try:
-        float(cell.replace(b",", b"."))
-    except ValueError:
-        return False
-    return True
 
 
 def _read_parquet(path: Path) -> pd.DataFrame:

@@ -15,11 +15,11 @@ import pandas as pd
 import xarray as xr
 
 from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.history.conversion import Reading, as_history, layout_of
-from pbrl_ppl.history.files import read_table, to_table, write_dataset
+from pbrl_ppl.history.conversion import Reading, as_history
+from pbrl_ppl.history.files import read_commands, read_table, to_table, write_dataset
 from pbrl_ppl.history.kinematics import complete_start, kinematic_bodies, path_velocities
 from pbrl_ppl.history.resampling import resampled
-from pbrl_ppl.history.rows import Rows, padded, rows_of_arrays, rows_of_table
+from pbrl_ppl.history.rows import Rows, padded, rows_of_arrays, rows_of_table, with_lines
 from pbrl_ppl.scene import Recording, Scene
 from pbrl_ppl.state import STATE, STATE_UNITS, WRENCH, WRENCH_UNITS, Bools, Floats, Ints
 
@@ -135,6 +135,7 @@ class History:
             scene,
             estimate_velocities=estimate_velocities,
             layout=scene.recording,
+            commands=read_commands(path, scene.recording),
             source=f"history {path}",
             **reading,
         )
@@ -147,17 +148,20 @@ class History:
         *,
         estimate_velocities: bool = False,
         layout: Recording | None = None,
+        commands: pd.DataFrame | None = None,
         source: str = "history",
         **reading: Unpack[Reading],
     ) -> History:
         """Build a history from a table; arguments, errors and row numbers as `load` of a file.
 
         A table is a history's unless ``layout`` says otherwise, such as the scene's ``recording``.
+        ``commands`` is the table of commands with times of their own.
         """
         if not isinstance(frame, pd.DataFrame):
             raise HistoryError(f"{source}: got {type(frame).__name__}, expected a pandas.DataFrame")
-        layout = layout_of(frame, layout)
-        rows = rows_of_table(as_history(frame, scene, source, layout, **reading), scene, source)
+        frame = with_lines(frame, source)
+        table = as_history(frame, scene, source, layout, commands=commands, **reading)
+        rows = rows_of_table(table, scene, source, cut=layout is not None and bool(layout.cut))
         if reading.get("resample") or (layout is not None and layout.resample):
             rows = resampled(rows, scene, source)
         estimated = layout is not None and layout.velocities == "estimate"

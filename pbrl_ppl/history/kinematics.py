@@ -175,9 +175,12 @@ def _filled(values: Floats, others: Floats) -> Floats:
 
 
 def fill_hinges(start: Floats, scene: Scene) -> None:
-    """Fill missing x, y, vx, vy of hinged bodies in place, breadth first from the world."""
+    """Fill missing coordinates of hinged bodies in place, breadth first from the world.
+
+    Positions and their velocities follow from angles, and angles from positions.
+    """
     position = {body.name: i for i, body in enumerate(scene.moving)}
-    for parent, child, at_parent, at_child in _hinge_order(scene):
+    for parent, child, at_parent, at_child in hinge_order(scene):
         if child not in position:
             continue
         if parent in position:
@@ -187,6 +190,10 @@ def fill_hinges(start: Floats, scene: Scene) -> None:
             origin = np.broadcast_to(np.array([*pose, 0.0, 0.0, 0.0]), (*start.shape[:2], 6))
         body = start[:, :, position[child]]
         arm, arm_rate = lever(origin, at_parent)
+        if np.any(at_child):  # from the hinge to the body's origin
+            to = body[..., :2] - origin[..., :2] - arm
+            turned = np.arctan2(to[..., 1], to[..., 0]) - np.arctan2(-at_child[1], -at_child[0])
+            body[..., 2] = _filled(body[..., 2], wrapped(turned))
         child_arm, child_rate = lever(body, at_child)
         body[..., :2] = _filled(body[..., :2], origin[..., :2] + arm - child_arm)
         body[..., 3:5] = _filled(body[..., 3:5], origin[..., 3:5] + arm_rate - child_rate)
@@ -197,7 +204,7 @@ def hung_bodies(scene: Scene) -> list[str]:
     moving = [body.name for body in scene.dynamic]
     reached = {WORLD, *(body.name for body in scene.bodies if body.static)}
     hung = []
-    for parent, child, *_ in _hinge_order(scene):
+    for parent, child, *_ in hinge_order(scene):
         if parent in reached and child in moving and child not in reached:
             reached.add(child)
             hung.append(child)
@@ -212,7 +219,7 @@ def lever(state: Floats, anchor: Point) -> tuple[Floats, Floats]:
     return np.stack([x, y], -1), np.stack([-y, x], -1) * state[..., 5:6]
 
 
-def _hinge_order(scene: Scene) -> list[tuple[str, str, Point, Point]]:
+def hinge_order(scene: Scene) -> list[tuple[str, str, Point, Point]]:
     """Return known hinges as (parent, child, anchors), breadth first from static bodies."""
     edges = []
     for joint in scene.joints:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Unpack
 
 from pbrl_ppl.errors import warn
+from pbrl_ppl.history.conventions import angle_doubts
 from pbrl_ppl.history.conversion import Reading
 from pbrl_ppl.history.ends import strange_ends, trimmed
 from pbrl_ppl.history.history import History
@@ -46,7 +47,7 @@ def read_recording(
     these are left out. A warning names ``most_ends`` of them.
     """
     history = History.load(path, scene, estimate_velocities=estimate_velocities, **reading)
-    for sentence in unit_mismatches(history):
+    for sentence in (*unit_mismatches(history), *angle_doubts(history, scene)):
         warn(f"history {path}: {sentence}", UserWarning)
     ends = strange_ends(history, scene)
     if not ends:

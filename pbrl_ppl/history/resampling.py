@@ -3,10 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline, CubicSpline
+from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 
 from pbrl_ppl.errors import HistoryError, ResamplingWarning, warn
-from pbrl_ppl.history.kinematics import unwrapped
+from pbrl_ppl.history.clocks import LayoutError
+from pbrl_ppl.history.kinematics import column_noise, unwrapped
 from pbrl_ppl.history.rows import TIME_TOLERANCE, Rows, rows_of_arrays
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE, THETA, VELOCITY, WRENCH, Bools, Floats, Ints
@@ -15,6 +16,8 @@ from pbrl_ppl.state import STATE, THETA, VELOCITY, WRENCH, Bools, Floats, Ints
 LONGEST = 5.0
 #: A sample this near to a row's time (in time steps) is taken as it is.
 _SAME = 1e-6
+#: Samples this near to the one before (in time steps) are the same: their difference is noise.
+_NEAR = 0.05
 
 
 @dataclass(frozen=True)
@@ -30,9 +33,11 @@ class _Track:
 def resampled(rows: Rows, scene: Scene, source: str, *, reach: float = 1.9) -> Rows:
     """Return rows every ``time_step`` of the scene; the same if they are that already.
 
-    Positions are interpolated by cubics (Hermite's, where velocities were measured), velocities
-    linearly, both exact for a constant acceleration between samples. A wrench, held until the next
-    sample, is averaged over each step, which keeps its impulse.
+    Positions with measured velocities are interpolated by Hermite's cubics, and velocities
+    linearly, both exact for a constant acceleration between samples; positions alone by monotone
+    cubics, which never leave the range of the samples beside. A wrench, held until the next sample,
+    is averaged over each step, which keeps its impulse. Of samples within 5 % of a time step the
+    first is taken.
 
     Parameters
     ----------
@@ -59,21 +64,26 @@ def resampled(rows: Rows, scene: Scene, source: str, *, reach: float = 1.9) -> R
     dt = scene.time_step
     tracks = [_tracks(rows, label, scene) for label in range(len(rows.labels))]
     spacing = np.concatenate([np.diff(track.time) for bodies in tracks for track in bodies])
-    if not spacing.size or (np.abs(spacing - dt) <= TIME_TOLERANCE * dt).all():
+    merged = sum(len(track.time) for bodies in tracks for track in bodies) < len(rows.time)
+    if not merged and (np.abs(spacing - dt) <= TIME_TOLERANCE * dt).all():
         return rows
     _check_spacing(rows, tracks, dt)
     quotients = np.array([_quotients(samples) for samples in zip(*tracks, strict=True)])
     grids = []
-    for label, bodies in zip(rows.labels, tracks, strict=True):
+    for bodies in tracks:
         begin = max(track.time[0] for track in bodies)
         end = min(track.time[-1] for track in bodies)
         n = int((end - begin) / dt + _SAME) + 1
-        if n < 2:
-            raise HistoryError(
-                f"{source}: trajectory {label} is {end - begin:.3g} s long, less than a time step"
-                f" of {dt:g} s; drop it"
-            )
-        grids.append(begin + dt * np.arange(n))
+        grids.append(begin + dt * np.arange(max(n, 0)))
+    long = [i for i, grid in enumerate(grids) if len(grid) > 1]
+    short = len(grids) - len(long)
+    if not long:
+        raise HistoryError(
+            f"{source}: no trajectory is as long as a time step of {dt:g} s; give a shorter one"
+        )
+    labels, grids, tracks = (
+        [list(parts)[i] for i in long] for parts in (rows.labels, grids, tracks)
+    )
     shape = (len(grids), max(map(len, grids)), len(scene.moving))
     state, action = (np.full((*shape, len(names)), np.nan) for names in (STATE, WRENCH))
     clock = np.full(shape[:2], np.nan)
@@ -87,12 +97,14 @@ def resampled(rows: Rows, scene: Scene, source: str, *, reach: float = 1.9) -> R
             measured = ~np.isnan(track.state).all(axis=0)
             empty += int((np.isnan(state[i, : len(grid), body]) & measured).any(axis=1).sum())
     state[:, :, quotients] = np.nan
-    result = rows_of_arrays(state, scene, action, clock, rows.labels)
+    result = rows_of_arrays(state, scene, action, clock, labels)
     message = (
         f"{source}: samples are {spacing.min():.4g} to {spacing.max():.4g} s apart (median"
         f" {np.median(spacing):.4g} s), not {dt:g} s: {len(rows.time)} rows were resampled to"
         f" {len(result.time)}{_noise_in_words(weights)}"
     )
+    if short:
+        message += f"; {short} trajectories shorter than a time step are left out"
     if empty:
         message += f"; {empty} rows have empty cells, in gaps of more than {reach * dt:.4g} s"
     if quotients.any():
@@ -117,7 +129,7 @@ def _tracks(rows: Rows, label: int, scene: Scene) -> list[_Track]:
                 f'history: body "{body.name}" has no rows in trajectory {rows.labels[label]}; add'
                 " them, or drop the trajectory"
             )
-        time, action = rows.time[row], rows.action[row]
+        time = rows.time[row]
         for back in np.flatnonzero(np.diff(time) <= 0):
             at = int(row[back + 1])
             raise rows.error(
@@ -125,6 +137,8 @@ def _tracks(rows: Rows, label: int, scene: Scene) -> list[_Track]:
                 f"time does not rise in {rows.trajectory_of(at)}: {rows.time[at]:.6g} s after"
                 f" {time[back]:.6g} s; sort the rows, drop duplicates",
             )
+        row = row[np.append(True, np.diff(time) >= _NEAR * scene.time_step)]
+        time, action = rows.time[row], rows.action[row]
         missing = np.isnan(action[:-1]).any(axis=1)
         if missing.any() and not body.kinematic:
             at = int(row[missing.argmax()])
@@ -156,12 +170,13 @@ def _check_spacing(
                 f" least {median:.4g} s",
             )
         if spacing[worst] > LONGEST * dt:
-            raise rows.error(
-                row,
+            gaps = float(f"{LONGEST * dt:.6g}")
+            message = (
                 f"{spacing[worst]:.4g} s since the sample before in {rows.trajectory_of(row)}, more"
                 f" than {LONGEST:g} time steps of {dt:g} s; give the rows after the gap a"
-                " trajectory of their own",
+                f" trajectory of their own, or cut = {{ gaps = {gaps:g} }} in [recording]"
             )
+            raise LayoutError(str(rows.error(row, message)), cut={"gaps": gaps})
 
 
 def _quotients(tracks: tuple[_Track, ...], near: float = 1e-3) -> Bools:
@@ -216,11 +231,14 @@ def _interpolated(time: Floats, values: Floats, rate: Floats | None, grid: Float
     grid = np.clip(grid, time[0], time[-1])
     if rate is None or len(time) < 2:
         return np.interp(grid, time, values)
-    if np.isfinite(rate).all():
-        return np.asarray(CubicHermiteSpline(time, values, rate)(grid))
-    if len(time) < 4:
-        return np.interp(grid, time, values)
-    return np.asarray(CubicSpline(time, values)(grid))
+    if not np.isfinite(rate).all():
+        return np.asarray(PchipInterpolator(time, values)(grid))
+    # a position turns by an eighth of the change of its velocity, and by its noise
+    part = np.clip(np.searchsorted(time, grid, side="right") - 1, 0, len(time) - 2)
+    beyond = np.diff(time) * np.abs(np.diff(rate)) / 8 + column_noise([values], 2, robust=True)
+    low, high = (pick(values[:-1], values[1:])[part] for pick in (np.minimum, np.maximum))
+    cubic = CubicHermiteSpline(time, values, rate)(grid)
+    return np.asarray(np.clip(cubic, low - beyond[part], high + beyond[part]))
 
 
 def _mean_wrenches(track: _Track, grid: Floats) -> Floats:

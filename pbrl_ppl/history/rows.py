@@ -38,7 +38,11 @@ class Rows:
     time, state, action : ndarray
         Shape (row,), (row, 6) and (row, 3), SI units; NaN where a state or wrench is missing.
     line : ndarray of int or None
-        Number of the row in its table; None of arrays.
+        Number of the row in its file; None of arrays.
+    source : str
+        Name of the recording in messages.
+    cut : bool
+        Whether trajectories are pieces of those that the file has.
     """
 
     labels: Labels
@@ -49,14 +53,19 @@ class Rows:
     state: Floats
     action: Floats
     line: Ints | None = None
+    source: str = "history"
+    cut: bool = False
 
     def error(self, row: int, message: str) -> HistoryError:
-        """Return an error that names the row of the table, or its time."""
+        """Return an error that names the row of the file, or its time."""
         at = f"at {self.time[row]:.6g} s" if self.line is None else f"row {self.line[row]}"
-        return HistoryError(f"history {at}: {message}")
+        return HistoryError(f"{self.source} {at}: {message}")
 
     def trajectory_of(self, row: int) -> str:
-        """Return the name of a row's trajectory, for messages."""
+        """Return the name of a row's trajectory, for messages; of a cut one, where it begins."""
+        if self.cut and self.line is not None:
+            first = int(self.line[self.trajectory == self.trajectory[row]].min())
+            return f"the piece from row {first} on"
         return f"trajectory {self.labels[self.trajectory[row]]}"
 
 
@@ -142,20 +151,32 @@ def with_clean_names(frame: pd.DataFrame, source: str) -> pd.DataFrame:
     return frame
 
 
-def rows_of_table(frame: pd.DataFrame, scene: Scene, source: str) -> Rows:
+def with_lines(frame: pd.DataFrame, source: str) -> pd.DataFrame:
+    """Return a table with clean names, and the rows' lines in its file as its index.
+
+    Tables that were not read from text count lines as a CSV file of them would: from 2.
+    """
+    lines = frame.attrs.get("lines", False)
+    frame = with_clean_names(frame, source)
+    return frame if lines else frame.set_axis(pd.RangeIndex(2, len(frame) + 2))
+
+
+def rows_of_table(frame: pd.DataFrame, scene: Scene, source: str, *, cut: bool = False) -> Rows:
     """Return a table's rows after a check of the columns' names and of each cell.
+
+    The index of the table is the number of each row in its file.
 
     Raises
     ------
     HistoryError
         If a column is unknown or missing, or a cell is not what its column needs.
     """
-    frame = with_clean_names(frame, source)
     for name in frame:
         if name not in COLUMNS:
             raise HistoryError(
                 f'{source}: unknown column "{name}"{nearest(name, COLUMNS)} '
-                f"Rename or drop it; the columns are {', '.join(COLUMNS)}"
+                f"Rename or drop it; the columns are {', '.join(COLUMNS)}. Of another program's"
+                " table say which is which: columns = { time = ... } in [recording], or --columns"
             )
     required = ("trajectory", "time", "body", *WRENCH)
     if missing := [name for name in required if name not in frame]:
@@ -164,43 +185,41 @@ def rows_of_table(frame: pd.DataFrame, scene: Scene, source: str) -> Rows:
             "(step is optional)"
         )
     blank = (frame.isna() | (frame.astype(object) == "")).to_numpy(dtype=bool).all(axis=1)
-    filled = np.flatnonzero(~blank)
-    line, frame = filled + 2, frame.iloc[filled].reset_index(drop=True)
+    frame = frame.iloc[np.flatnonzero(~blank)]
+    line, frame = frame.index.to_numpy(), frame.reset_index(drop=True)
     if not len(frame):
         raise HistoryError(f"{source}: it has no rows; expected one for each body at each step")
 
-    labels, trajectory = _trajectories(frame["trajectory"], line)
-    body = _bodies(frame["body"], line, scene)
-    where = [f"in trajectory {labels[i]}" for i in trajectory]
+    at = [f"{source} row {number}" for number in line]
+    labels, trajectory = _trajectories(frame["trajectory"], at)
+    body = _bodies(frame["body"], at, scene)
+    where = ["" if cut else f"in trajectory {labels[i]}" for i in trajectory]
     number = {name: np.full(len(frame), np.nan) for name in ("time", *STATE, *WRENCH)} | {
-        name: _numbers(frame[name], line, where)
+        name: _numbers(frame[name], at, where)
         for name in frame.columns.difference(["trajectory", "body"], sort=False)
     }
     for name in ("time", "step"):
         if np.isnan(number.get(name, 0.0)).any():
             row = int(np.isnan(number[name]).argmax())
             raise HistoryError(
-                f"history row {line[row]}: {name} is empty {where[row]}; expected a number; fill it"
+                f"{at[row]}: {name} is empty {where[row]}; expected a number; fill it"
                 " in or drop the row"
             )
     step = number.get("step")
     if step is not None and (broken := (step != np.round(step)) | (np.abs(step) > 2**53)).any():
         row = int(broken.argmax())
-        raise HistoryError(
-            f"history row {line[row]}: step is {step[row]} {where[row]}; expected a whole number"
-        )
+        raise HistoryError(f"{at[row]}: step is {step[row]} {where[row]}; expected a whole number")
     whole = None if step is None else step.astype(np.int64)
     state, action = (np.stack([number[name] for name in names], 1) for names in (STATE, WRENCH))
-    return Rows(labels, trajectory, body, whole, number["time"], state, action, line)
+    return Rows(labels, trajectory, body, whole, number["time"], state, action, line, source, cut)
 
 
-def _trajectories(column: pd.Series, line: Ints) -> tuple[Labels, Ints]:
+def _trajectories(column: pd.Series, at: list[str]) -> tuple[Labels, Ints]:
     """Return the labels in order of appearance (integers where all are) and each row's code."""
     text = [str(cell).strip() for cell in column.astype(object).where(column.notna(), "")]
     if "" in text:
         raise HistoryError(
-            f"history row {line[text.index('')]}: trajectory is empty; expected a number or a name;"
-            " fill it in"
+            f"{at[text.index('')]}: trajectory is empty; expected a number or a name; fill it in"
         )
     whole = [re.fullmatch(r"(-?(?:0|[1-9]\d{0,17}))(?:\.0*)?", label) for label in text]
     labels: Labels = [*text]
@@ -210,7 +229,7 @@ def _trajectories(column: pd.Series, line: Ints) -> tuple[Labels, Ints]:
     return unique.tolist(), codes.astype(np.int64)
 
 
-def _bodies(column: pd.Series, line: Ints, scene: Scene) -> Ints:
+def _bodies(column: pd.Series, at: list[str], scene: Scene) -> Ints:
     """Return each row's position among the scene's moving bodies."""
     known = [body.name for body in scene.moving]
     names = [str(name).strip() for name in column.astype(object).where(column.notna(), "")]
@@ -220,9 +239,7 @@ def _bodies(column: pd.Series, line: Ints, scene: Scene) -> Ints:
                 cure = "it is static there; drop its rows or set static = false"
             else:
                 cure = f"the scene has {', '.join(known)}{nearest(name, known)}"
-            raise HistoryError(
-                f'history row {line[row]}: body "{name}" does not move in the scene; {cure}'
-            )
+            raise HistoryError(f'{at[row]}: body "{name}" does not move in the scene; {cure}')
     for name in known:
         if name not in names:
             raise HistoryError(
@@ -232,7 +249,7 @@ def _bodies(column: pd.Series, line: Ints, scene: Scene) -> Ints:
     return np.array([known.index(name) for name in names], dtype=np.int64)
 
 
-def _numbers(column: pd.Series, line: Ints, where: list[str]) -> Floats:
+def _numbers(column: pd.Series, at: list[str], where: list[str]) -> Floats:
     """Return a column as floats, NaN where empty."""
     if column.dtype.kind in "bmMc":
         values = np.full(len(column), np.nan)
@@ -243,13 +260,13 @@ def _numbers(column: pd.Series, line: Ints, where: list[str]) -> Floats:
     for row in np.flatnonzero(suspect):
         if str(column[row]).strip().lower() not in ("", "nan"):
             raise HistoryError(
-                f"history row {line[row]}: {column.name} is {str(column[row])!r} {where[row]};"
+                f"{at[row]}: {column.name} is {str(column[row])!r} {where[row]};"
                 " expected a number or an empty cell; correct it"
             )
     limit = np.inf if column.name in ("time", "step") else _LARGEST
     for row in np.flatnonzero(np.isinf(values) | (np.abs(values) > limit)):
         raise HistoryError(
-            f"history row {line[row]}: {column.name} is {values[row]} {where[row]}; expected a"
+            f"{at[row]}: {column.name} is {values[row]} {where[row]}; expected a"
             f" finite number of at most {_LARGEST:g}; empty the cell if it was not measured"
         )
     return values

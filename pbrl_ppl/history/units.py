@@ -132,7 +132,7 @@ def shown_mass(
     # between the middles of two intervals each command acts for half of the time
     push = (0.5 * (wrench[:, :-2, columns] + wrench[:, 1:-1, columns])).ravel() / moment
     seen = np.isfinite(response) & np.isfinite(push)
-    if seen.sum() < few or not np.any(push[seen]):
+    if seen.sum() < few or not np.ptp(push[seen]) > 0:
         return None
     fitted = linregress(push[seen], response[seen])
     shows = fitted.slope > certainty * fitted.stderr

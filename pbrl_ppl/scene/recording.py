@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from pbrl_ppl.errors import SceneError
@@ -26,12 +26,27 @@ class Recording:
 
     Attributes
     ----------
-    columns : tuple of (str, str or float)
+    columns : tuple of (str, str, float or table)
         Column of the file for each of a history, ``{ x = "pos_x" }``, or a number that holds on all
-        rows; of a file without header the number of the column, from 0. ``duration`` in place of
-        ``time`` is the time since the row before. A dict will do here and below.
+        rows; of a file without header the number of the column, from 0. A minus turns the sign,
+        ``"-heading"``. ``duration`` in place of ``time`` is the time since the row before. An angle
+        may be a table, ``{ column = "knee", zero = "hanging" }``: its ``zero`` is where the body on
+        its hinge is when the column is 0 (``"hanging"``, ``"upright"`` or ``"horizontal"``), or the
+        number in the column when the body has theta 0. A dict will do here and below.
     units : tuple of (str, str)
-        Unit of each column that is not in SI units, ``{ x = "mm" }``.
+        Unit of each column that is not in SI units, ``{ x = "mm" }``; goes before units that the
+        file states.
+    time : tuple of (str, str or float)
+        Clocks: ``rate`` in Hz of rows that are even, whatever their stamps, with ``counter``, the
+        column that counts them; ``{ theta = "angle_time" }`` where a column has stamps of its own;
+        ``commands``, the column of times in the file of commands.
+    commands : str
+        File of the commands, beside the recording, with times of its own on the same clock.
+    hold : bool, optional
+        Whether a command with stamps of its own holds until the next, or runs straight to it; by
+        default samples of a smooth signal do not hold.
+    forces : str
+        ``"world"``, or ``"body"`` for forces along the body's own axes, which turn with it.
     separator : str
         ``"blank"``, ``"tab"``, ``"comma"``, ``"semicolon"`` or a character; found from the first
         line by default.
@@ -68,6 +83,10 @@ class Recording:
 
     columns: Pairs = ()
     units: Pairs = ()
+    time: Pairs = ()
+    commands: str = ""
+    hold: bool | None = None
+    forces: str = "world"
     separator: str = ""
     header: bool | None = None
     not_seen: Pairs = ()
@@ -83,10 +102,20 @@ class Recording:
                 pairs = _pairs(getattr(self, field.name), f"[recording]: {field.name}")
                 object.__setattr__(self, field.name, pairs)
         for name, column in self.columns:
-            if isinstance(column, bool) or not isinstance(column, str | int | float):
+            if isinstance(column, bool) or not isinstance(column, str | int | float | tuple):
                 raise SceneError(
                     f"[recording]: column {name} is {column!r}, expected a name or a number"
                 )
+            if isinstance(column, tuple) and {"column", "zero"} != {*dict(column)}:
+                raise SceneError(
+                    f"[recording]: column {name} is {dict(column)}, expected a table such as"
+                    f' {{ column = "knee", zero = "hanging" }}'
+                )
+        if not isinstance(self.commands, str) or self.forces not in ("world", "body"):
+            raise SceneError(
+                f"[recording]: commands is {self.commands!r} and forces {self.forces!r}, expected"
+                ' the name of a file, and "world" or "body"'
+            )
         topics = tuple((n, tuple(t) if isinstance(t, list) else t) for n, t in self.topics)
         object.__setattr__(self, "topics", topics)
         for key in ("units", "topics"):
@@ -102,8 +131,12 @@ class Recording:
             )
         if self.header is not None:
             flag(self.header, "[recording]: header")
+        if self.hold is not None:
+            flag(self.hold, "[recording]: hold")
         flag(self.resample, "[recording]: resample")
         flag(self.trim, "[recording]: trim")
+        if "rate" in dict(self.time):
+            positive(dict(self.time)["rate"], "[recording]: time, rate")
         if self.velocities not in VELOCITIES:
             raise SceneError(
                 f"[recording]: velocities is {self.velocities!r}, expected one of"
@@ -125,14 +158,30 @@ class Recording:
         for field in fields(self):
             value = getattr(self, field.name)
             if value != field.default:
-                table[field.name] = dict(value) if field.type == "Pairs" else value
+                table[field.name] = value
+                if field.type == "Pairs":
+                    table[field.name] = {name: _thawed(item) for name, item in value}
         return table
+
+    def with_entries(self, **entries: Mapping[str, Any]) -> Recording:
+        """Return the layout with more entries in tables, which go before those that it has."""
+        tables: dict[str, Any] = {
+            key: dict(getattr(self, key)) | dict(value) for key, value in entries.items()
+        }
+        return replace(self, **tables)
 
 
 def _pairs(value: object, where: str) -> Pairs:
     """Return names with their values."""
     if isinstance(value, Mapping):
-        return tuple(value.items())
+        items = ((k, tuple(v.items()) if isinstance(v, Mapping) else v) for k, v in value.items())
+        return tuple(items)
     if isinstance(value, tuple) and all(isinstance(e, tuple) and len(e) == 2 for e in value):
         return value
     raise SceneError(f"{where} is {value!r}, expected a table such as {{ x = ... }}")
+
+
+def _thawed(value: object) -> object:
+    """Return a table of pairs as a dict, and other values as they are."""
+    is_table = isinstance(value, tuple) and value and isinstance(value[0], tuple)
+    return dict(value) if is_table else value  # type: ignore[call-overload]

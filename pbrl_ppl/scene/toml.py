@@ -4,10 +4,12 @@ import json
 import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields
 from typing import Any
 
 from pbrl_ppl.errors import SceneError
 from pbrl_ppl.scene.checks import nearest
+from pbrl_ppl.scene.recording import Recording
 from pbrl_ppl.state import STATE
 
 Table = dict[str, Any]
@@ -17,10 +19,7 @@ KEYS: dict[str, tuple[str, str]] = {
     "the file": ("world", "noise recording body wall joint"),
     "[world]": ("time_step", "gravity normal_gravity substeps test_is_later joints"),
     "[noise]": ("", " ".join(STATE)),
-    "[recording]": (
-        "",
-        "columns units separator header not_seen velocities resample trim cut topics",
-    ),
+    "[recording]": ("", " ".join(field.name for field in fields(Recording))),
     "body": (
         "name shape",
         "wheel static kinematic known prior effects pose class attributes typical",

@@ -79,7 +79,6 @@ def test_bodies_side_by_side() -> None:
         ({"columns": NAMES, "units": {"theta": "mm"}}, '"mm" is none of theta'),
         ({"columns": NAMES, "units": {"body": "mm"}}, '"body" has none'),
         ({"columns": NAMES, "units": {"vx": "mm/s"}}, "the table has no such column"),
-        ({"columns": NAMES}, "missing column(s) force_y, torque"),
     ],
 )
 def test_bad_names_and_units(tmp_path, options, message) -> None:

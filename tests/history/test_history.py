@@ -496,7 +496,7 @@ def test_the_first_broken_rule_is_reported_in_the_row_of_the_file(tmp_path: Path
     text[5] = text[5].replace("cart,", "cart,abc")
     text.insert(3, "")  # a blank line counts
     path.write_text("\n".join(text), encoding="utf-8")
-    with pytest.raises(HistoryError, match="history row 7: x is 'abc"):
+    with pytest.raises(HistoryError, match=r"history.csv row 7: x is 'abc"):
         History.load(path, CART)
 
 
@@ -506,7 +506,7 @@ def test_the_first_broken_rule_is_reported_in_the_row_of_the_file(tmp_path: Path
         ("a.xlsx", b"", "suffix is '.xlsx', expected one of .csv, .txt, .tsv, .dat, .parquet, .nc"),
         ("a.csv", b"", "the file is empty"),
         ("a.csv", b"\n \n", "the file is empty"),
-        ("a.csv", b"\xff\xfe,\n1,2\n", "not a CSV table"),
+        ("a.csv", b"\xff\xfe,\n1,2\n", "not a CSV table|unknown column"),
         ("a.csv", b"x\0y,z\n1,2\n", "unknown column"),
         ("a.csv", b'x,"y\n1,2\n', "not a CSV table|unknown column|no rows|missing"),
         ("a.csv", b'x,"y"\n1,2,3\n', "not a CSV table|more cells|missing"),

@@ -1,0 +1,423 @@
+"""Times of a recording's rows: units, bursts, clocks that start again, streams on other clocks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from pbrl_ppl.errors import HistoryError
+from pbrl_ppl.history.text import unit_in_name
+from pbrl_ppl.scene import Recording
+from pbrl_ppl.state import STATE, WRENCH, Bools, Floats, Ints
+
+#: Units of time in s.
+TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
+#: Names of columns of times, in lower case.
+TIMES = ("time", "t", "stamp", "timestamp", "header.stamp", "secs", "seconds", "sec")
+#: Seconds since 1970 of the years 2001 to 2036.
+_EPOCH = (1e9, 2.1e9)
+#: Rows further apart (s) are believed where the unit is declared only.
+_SLOWEST = 2.0
+
+Say = Callable[[str], None]
+
+
+class LayoutError(HistoryError):
+    """A recording that needs an entry of ``[recording]`` first: the message proposes it.
+
+    Parameters
+    ----------
+    message : str
+        What is wrong, and the entry as the cure.
+    **entries
+        The entries, such as ``units={"time": "ms"}``.
+    """
+
+    def __init__(self, message: str, **entries: Any) -> None:
+        super().__init__(message)
+        self.entries = entries
+
+
+def likely_unit(stamps: Floats) -> str:
+    """Return the unit that stamps are likely in: by the year, or by the time between rows.
+
+    Examples
+    --------
+    >>> likely_unit(1.7e18 + 1e7 * np.arange(9.0)), likely_unit(20.0 * np.arange(9.0))
+    ('ns', 'ms')
+    >>> likely_unit(0.02 * np.arange(9.0))
+    's'
+    """
+    stamps = stamps[np.isfinite(stamps)]
+    if len(stamps) < 2:
+        return "s"
+    for unit in ("s", "ms", "us", "ns"):
+        if _EPOCH[0] < float(np.median(stamps)) * TIME[unit] < _EPOCH[1]:
+            return unit
+    lag = max(1, min(50, len(stamps) // 4))  # longer than a burst
+    step = float(np.median(np.abs(stamps[lag:] - stamps[:-lag]))) / lag
+    if step < _SLOWEST:
+        return "s"
+    return next((unit for unit in ("ms", "us") if step * TIME[unit] <= 0.5), "ns")
+
+
+def on_one_clock(
+    frame: pd.DataFrame, layout: Recording, commands: pd.DataFrame | None, source: str, say: Say
+) -> pd.DataFrame:
+    """Return a table with ``time`` (s), and with columns of other clocks at its rows' times.
+
+    Parameters
+    ----------
+    frame : pandas.DataFrame
+        The file's columns.
+    layout : Recording
+        Its ``columns``, ``units``, ``time`` and ``hold`` are used.
+    commands : pandas.DataFrame, optional
+        Table of the commands, with stamps of its own.
+    source : str
+        Name of the recording in messages.
+    say : callable
+        Takes a sentence on what was done.
+
+    Raises
+    ------
+    LayoutError
+        If the unit of the times is not what the numbers say, or they come in bursts.
+    HistoryError
+        If a column of times is missing or two clocks have no time in common.
+    """
+    columns, clocks, whole = dict(layout.columns), dict(layout.time), frame
+    own = {name: clocks[name] for name in clocks if name.rpartition(".")[2] in (*STATE, *WRENCH)}
+    bare = {unit_in_name(str(column))[0]: column for column in frame.columns}
+    own = {name: bare.get(column, column) for name, column in own.items()}
+    columns = {name: bare.get(column, column) for name, column in columns.items()}
+    for name, column in own.items():
+        if column not in frame or columns.get(name, name) not in frame:
+            raise HistoryError(
+                f'{source}: [recording] time has {name} = "{column}", and the file has no such'
+                f" column, or none of {name}; it has {', '.join(map(str, frame.columns))}"
+            )
+    name = columns.get("time", "time")
+    states = [name for name in own if name.rpartition(".")[2] in STATE]
+    if name not in frame and states:
+        name = own[states[0]]
+    if isinstance(name, str) and name in frame:
+        if own:  # of a longer column with a clock of its own the rows below are no rows
+            frame = frame[frame[name].notna()]
+        time = _seconds(frame, name, layout, source)
+    elif "rate" in clocks:
+        time = np.zeros(len(frame))
+    else:
+        return frame
+    if "rate" in clocks:
+        time = _at_rate(frame, layout, time, source, say)
+    elif counted := _bursts(frame, layout, time):
+        message, entry = counted
+        raise LayoutError(f"{source}: {message}", time=entry)
+    frame = frame.assign(time=time)
+    for key, column in own.items():
+        if column == name:
+            continue
+        value = columns.get(key, key)
+        stamps = _seconds(whole, column, layout, source)
+        values = pd.to_numeric(whole[value], errors="coerce").to_numpy(float)
+        hold = key.rpartition(".")[2] in WRENCH and _holds(layout, stamps, values)
+        frame = frame.assign(**{value: _at_times(time, stamps, values, hold=hold)})
+        say(_offset(str(value), stamps, time, held=hold))
+    if commands is not None:
+        frame = _with_commands(frame, layout, commands, source, say)
+    first = float(np.nanmin(frame["time"]))
+    return frame.assign(time=frame["time"] - first) if abs(first) > _EPOCH[0] else frame
+
+
+def _seconds(frame: pd.DataFrame, name: str, layout: Recording, source: str) -> Floats:
+    """Return a column of stamps in s: in its unit, or of dates."""
+    column, units = frame[name], dict(layout.units)
+    numeric = pd.to_numeric(column, errors="coerce")
+    if numeric.isna().all() and column.notna().any():
+        try:
+            dates = pd.to_datetime(column, utc=True, format="ISO8601")
+        except (ValueError, TypeError):
+            raise HistoryError(
+                f"{source}: {name} is {column.dropna().iloc[0]!r}, expected a number or a date such"
+                " as 2024-05-28T10:00:00.25"
+            ) from None
+        since = (dates - pd.Timestamp(0, tz="UTC")) / pd.Timedelta(seconds=1)
+        return np.array(since, dtype=float)
+    stated = frame.attrs.get("units", {}).get(name) or unit_in_name(name)[1]
+    unit = units.get("time", stated if stated in TIME else "")
+    stamps = np.array(numeric, dtype=np.float64)
+    if not unit:
+        unit = likely_unit(stamps)
+        if unit != "s":
+            raise LayoutError(
+                f'{source}: the times of column "{name}" rise by'
+                f" {np.nanmedian(np.abs(np.diff(stamps))):.4g} a row, which is no time in s: looks"
+                f' like {unit}: units = {{ time = "{unit}" }} in [recording] (--units time={unit});'
+                ' or units = { time = "s" }',
+                units={"time": unit},
+            )
+    if unit not in TIME:
+        raise HistoryError(f'units: "{unit}" is none of time; expected one of {", ".join(TIME)}')
+    return np.array(stamps * TIME[unit])
+
+
+def _at_rate(
+    frame: pd.DataFrame, layout: Recording, stamps: Floats, source: str, say: Say
+) -> Floats:
+    """Return the times of rows at an even rate: by their counter, or by their order."""
+    clocks = dict(layout.time)
+    named = [dict(layout.columns).get(name, name) for name in ("trajectory", "body")]
+    keys = [name for name in named if name in frame]
+    if "counter" in clocks:
+        if clocks["counter"] not in frame:
+            raise HistoryError(
+                f'{source}: [recording] time has counter = "{clocks["counter"]}", which is no'
+                f" column; it has {', '.join(map(str, frame.columns))}"
+            )
+        count = pd.to_numeric(frame[clocks["counter"]], errors="coerce").to_numpy(float)
+    else:
+        count = (frame.groupby(keys).cumcount() if keys else np.arange(len(frame))) * np.ones(1)
+        count = np.asarray(count, dtype=float)
+    time = count / float(clocks["rate"])
+    off = (time - stamps) - np.nanmedian(time - stamps)
+    if np.isfinite(off).any() and np.ptp(stamps) > 0 and not keys:
+        far = float(np.nanmax(np.abs(off)))
+        if far > max(0.5, 50.0 / float(clocks["rate"])):
+            say(
+                f"times of rows at {clocks['rate']:g} Hz are up to {far:.3g} s from their stamps:"
+                " rows are missing, or this is not their rate"
+            )
+    return np.asarray(time)
+
+
+def _bursts(
+    frame: pd.DataFrame, layout: Recording, time: Floats
+) -> tuple[str, dict[str, Any]] | None:
+    """Return a message on stamps that come in bursts, with the entry that cures them."""
+    whole = np.isfinite(time) & ~frame.duplicated().to_numpy()
+    rows, seen = np.flatnonzero(whole), time[whole]
+    steps = np.diff(seen)
+    if len(steps) < 20:
+        return None
+    starts = np.flatnonzero(np.append(True, steps < -50 * np.median(np.abs(steps))))
+    first, last = max(pairwise((*starts, len(seen))), key=lambda run: run[1] - run[0])
+    rows, seen = rows[first:last], seen[first:last]
+    counters = [name for name in frame.columns if _is_counter(frame[name].iloc[rows])]
+    count = frame[counters[0]].iloc[rows].to_numpy(float) if counters else np.arange(len(rows))
+    rate = float(np.polyfit(seen, count, 1)[0]) if np.ptp(seen) > 0 else 0.0
+    steps = np.diff(seen)
+    hair = np.abs(steps) * rate < 0.25
+    if not rate > 0 or hair.mean() < 0.4 or not _moves_within(frame, layout, rows, hair):
+        return None
+    entry: dict[str, Any] = {"rate": _round_rate(rate)}
+    if counters:
+        entry["counter"] = str(counters[0])
+    written = ", ".join(
+        f'{key} = "{value}"' if isinstance(value, str) else f"{key} = {value:g}"
+        for key, value in entry.items()
+    )
+    message = (
+        f"the stamps come in bursts, {hair.mean():.0%} of them within"
+        f" {np.abs(steps[hair]).max():.2g} s of the row before ({int((steps < 0).sum())} go back):"
+        f" they say when rows arrived, not when they were measured; if rows are even,"
+        f" [recording] time = {{ {written} }}"
+    )
+    return message, entry
+
+
+def _moves_within(frame: pd.DataFrame, layout: Recording, rows: Ints, hair: Bools) -> bool:
+    """Return whether a state changes as much between rows of nearly one stamp as between others.
+
+    If not, the stamps are true, and rows are twice.
+    """
+    for key, column in (*layout.columns, *((name, name) for name in STATE)):
+        name = str(column).removeprefix("-")
+        if key.rpartition(".")[2] in STATE and name in frame:
+            values = pd.to_numeric(frame[name].iloc[rows], errors="coerce").to_numpy(float)
+            change = np.abs(np.diff(values))
+            if np.nanmedian(change[hair]) > 0.5 * np.nanmedian(change[~hair]):
+                return True
+    return False
+
+
+def _is_counter(column: pd.Series) -> bool:
+    """Return whether a column counts the rows."""
+    values = pd.to_numeric(column, errors="coerce").to_numpy(float)
+    steps = np.diff(values)
+    whole = np.isfinite(values).all() and (values == np.round(values)).all()
+    return bool(whole and (steps >= 0).all() and (steps == 1).mean() > 0.8)
+
+
+def _round_rate(rate: float) -> float:
+    """Return a rate (Hz) to two digits where that is within 1 % of it, else to four."""
+    near = float(f"{rate:.2g}")
+    return near if abs(near / rate - 1) < 0.01 else float(f"{rate:.4g}")
+
+
+def _at_times(times: Floats, stamps: Floats, values: Floats, *, hold: bool) -> Floats:
+    """Return values at times: the mean until the next row of what is held, or straight lines.
+
+    Values before the first stamp are the first's where it is held, else NaN.
+
+    Parameters
+    ----------
+    times : ndarray
+        Of the rows, in any order, shape (n,), s.
+    stamps, values : ndarray
+        Shape (m,), s; those that are not both finite are left out.
+
+    Examples
+    --------
+    >>> _at_times(np.arange(3.0), np.array([0.0, 1.5]), np.array([1.0, 3.0]), hold=True)
+    array([1., 2., 3.])
+    """
+    seen = np.isfinite(stamps) & np.isfinite(values)
+    stamps, at = np.unique(stamps[seen], return_index=True)
+    values = values[seen][at]
+    if not len(stamps):
+        return np.full(len(times), np.nan)
+    if not hold:
+        return np.asarray(np.interp(times, stamps, values, left=np.nan, right=np.nan))
+    rows, back = np.unique(times, return_inverse=True)
+    impulse = np.concatenate([[0.0], np.cumsum(values[:-1] * np.diff(stamps))])
+
+    def until(when: Floats) -> Floats:
+        """Return the impulse of the held values from the first stamp until then."""
+        which = np.clip(np.searchsorted(stamps, when, side="right") - 1, 0, None)
+        return np.asarray(impulse[which] + values[which] * (when - stamps[which]))
+
+    ends = np.append(rows[1:], rows[-1])
+    last = values[np.clip(np.searchsorted(stamps, rows, side="right") - 1, 0, None)]
+    with np.errstate(invalid="ignore"):
+        mean = np.where(ends > rows, (until(ends) - until(rows)) / (ends - rows), last)
+    return np.asarray(mean[back])
+
+
+def _holds(layout: Recording, stamps: Floats, values: Floats) -> bool:
+    """Return whether a command holds until the next, as declared, or as its values look.
+
+    Samples of a smooth signal, most of which change by nearly as much as the one before, do not.
+    """
+    if layout.hold is not None:
+        return layout.hold
+    seen = np.isfinite(stamps) & np.isfinite(values)
+    steps = np.diff(values[seen][np.argsort(stamps[seen])])
+    if len(steps) < 8 or (steps == 0).mean() > 0.3:
+        return True
+    return bool(np.median(np.abs(np.diff(steps))) > 0.5 * np.median(np.abs(steps)))
+
+
+def _offset(name: str, stamps: Floats, times: Floats, *, held: bool) -> str:
+    first = np.nanmin(stamps) - np.nanmin(times)
+    how = "held onto" if held else "interpolated onto"
+    return f"{name}, which begins {first:.4g} s after the rows, is {how} their times"
+
+
+def command_stamps(commands: pd.DataFrame, layout: Recording, source: str = "history") -> Floats:
+    """Return the times of the rows of a table of commands (s).
+
+    Raises
+    ------
+    HistoryError
+        If it has no column of times.
+    """
+    columns, clocks = dict(layout.columns), dict(layout.time)
+    plain = {str(name): unit_in_name(str(name))[0].lower() for name in commands.columns}
+    named = (n for n, text in plain.items() if n == columns.get("time") or text in TIMES)
+    time = clocks.get("commands") or next(named, None)
+    if time not in commands:
+        raise HistoryError(
+            f"{source}: {layout.commands} has no column of times; say which it is: [recording]"
+            f' time = {{ commands = "..." }}; it has {", ".join(plain)}'
+        )
+    numeric = np.asarray(pd.to_numeric(commands[time], errors="coerce"), dtype=float)
+    unit = commands.attrs.get("units", {}).get(time) or unit_in_name(str(time))[1]
+    unit = unit if unit in TIME else likely_unit(numeric)
+    return np.asarray(numeric * TIME[unit] + float(clocks.get("offset", 0.0)))
+
+
+def command_step(commands: pd.DataFrame, layout: Recording) -> float:
+    """Return the median time between commands (s), to two digits where that is within 1 %."""
+    return 1.0 / _round_rate(1.0 / float(np.median(np.diff(command_stamps(commands, layout)))))
+
+
+def _with_commands(
+    frame: pd.DataFrame, layout: Recording, commands: pd.DataFrame, source: str, say: Say
+) -> pd.DataFrame:
+    """Return a table with the commands of another file at its rows."""
+    columns, rows = dict(layout.columns), frame["time"].to_numpy(float)
+    stamps = command_stamps(commands, layout, source)
+    wanted = {
+        key: columns.get(key, key)
+        for key in dict.fromkeys((*columns, *WRENCH))
+        if key.rpartition(".")[2] in WRENCH and columns.get(key, key) in commands
+    }
+    if not wanted:
+        raise HistoryError(
+            f"{source}: {layout.commands} has no column of a wrench; say which it is: columns ="
+            f' {{ torque = "..." }}; it has {", ".join(map(str, commands.columns))}'
+        )
+    if np.nanmin(stamps) > np.nanmax(rows) or np.nanmax(stamps) < np.nanmin(rows):
+        raise HistoryError(
+            f"{source}: commands run from {np.nanmin(stamps):.6g} to {np.nanmax(stamps):.6g} s and"
+            f" the rows from {np.nanmin(rows):.6g} to {np.nanmax(rows):.6g} s, so that they have no"
+            " time in common; [recording] time = { offset = ... } adds seconds to the commands'"
+        )
+    if (np.diff(rows[np.isfinite(rows)]) < -1.0).any():
+        raise HistoryError(
+            f"{source}: its clock starts again, and commands in a file of their own need one clock"
+            " throughout; write a file for each start"
+        )
+    for name in dict.fromkeys(wanted.values()):
+        values = np.asarray(pd.to_numeric(commands[name], errors="coerce"), dtype=float)
+        hold = _holds(layout, stamps, values)
+        frame = frame.assign(**{name: _at_times(rows, stamps, values, hold=hold)})
+        say(_offset(str(name), stamps, rows, held=hold))
+    return frame
+
+
+def in_order(frame: pd.DataFrame, say: Say, *, far: float = 5.0) -> pd.DataFrame:
+    """Return rows in the order of their times; a clock that falls back begins a new trajectory.
+
+    Parameters
+    ----------
+    frame : pandas.DataFrame
+        With ``trajectory``, ``body`` and ``time`` (s).
+    say : callable
+        Takes a sentence on each repair.
+    far : float
+        A clock that falls back by more than so many rows' time starts again; rows that are out of
+        order by less are sorted.
+    """
+    time = pd.to_numeric(frame["time"], errors="coerce").to_numpy(float)
+    run = np.zeros(len(frame), dtype=int)
+    groups = frame.groupby(["trajectory", "body"], sort=False, dropna=False).indices
+    swapped, resets = 0, 0
+    for rows in groups.values():
+        steps = np.diff(time[rows])
+        usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+        starts = steps < -far * usual
+        run[rows] = np.concatenate([[0], np.cumsum(starts)])
+        swapped += int(((steps < 0) & ~starts).sum())
+        resets += int(starts.sum())
+    if resets:
+        say(f"the clock falls back {resets} times: a new trajectory begins there each time")
+        text = frame["trajectory"].astype(str) + "."
+        prefix = "" if frame["trajectory"].nunique() == 1 else text
+        frame = frame.assign(trajectory=prefix + pd.Series(run, frame.index).astype(str))
+    if swapped:
+        say(f"{swapped} rows are out of order by less than {far:g} rows: sorted by time")
+    if swapped:
+        frame = frame.iloc[np.lexsort((time, run, pd.factorize(frame["trajectory"])[0]))]
+    keys = ["trajectory", "body", "time"]
+    again = frame.duplicated(keys) & frame["time"].notna()
+    if again.any():
+        other = int((again & ~frame.duplicated()).sum())
+        words = f", {other} of them with other values" if other else ""
+        say(f"{int(again.sum())} rows repeat a time and are left out{words}")
+    return frame[~again]

@@ -1,0 +1,95 @@
+"""Tables from WPILib's SysId (JSON) and from MATLAB (.mat)."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from pbrl_ppl.errors import HistoryError
+
+#: Columns of SysId's rows by their number: one mechanism, and a drivetrain.
+_SYSID = {
+    4: ("time", "voltage", "position", "velocity"),
+    9: ("time", "left voltage", "right voltage", "left position", "right position",
+        "left velocity", "right velocity", "angle", "angular rate"),
+}  # fmt: skip
+_SYSID_UNITS = {"meters": "m", "feet": "ft", "inches": "in", "radians": "rad", "degrees": "deg",
+                "rotations": "rev"}  # fmt: skip
+
+
+def read_sysid(path: Path) -> pd.DataFrame:
+    """Return the rows of a WPILib SysId log, with the name of each test as ``trajectory``.
+
+    Columns are ``time``, ``voltage``, ``position`` and ``velocity``, or those of a drivetrain's two
+    sides with ``angle`` and ``angular rate``. The log's units are kept.
+
+    Raises
+    ------
+    HistoryError
+        If the file is no such log.
+    """
+    try:
+        log: dict[str, Any] = json.loads(path.read_bytes())
+        tests = {k: np.array(v, float) for k, v in log.items() if isinstance(v, list) and v}
+        (width,) = {rows.shape[1] for rows in tests.values()}
+        names = _SYSID[width]
+    except (ValueError, KeyError, AttributeError, IndexError, TypeError, RecursionError):
+        raise HistoryError(
+            f"history {path}: not a log of WPILib's SysId; expected an object with rows of 4 or 9"
+            ' numbers for each test, such as "fast-forward"; save other JSON as CSV'
+        ) from None
+    parts = [pd.DataFrame(rows, columns=names).assign(trajectory=k) for k, rows in tests.items()]
+    frame: pd.DataFrame = pd.concat(parts, ignore_index=True)
+    unit = _SYSID_UNITS.get(str(log.get("units", "")).lower(), "")
+    of_rates = {"voltage": "V", "rate": "rad/s", "angle": "rad"}
+    units = {name: of_rates.get(name.split()[-1], unit) for name in names[1:]}
+    units |= {name: f"{unit}/s" for name in names if name.endswith("velocity") and unit}
+    frame.attrs["units"] = {name: text for name, text in units.items() if text}
+    return frame
+
+
+def read_mat(path: Path) -> pd.DataFrame:
+    """Return the vectors of a MATLAB file that are as long as most, a column each.
+
+    Fields of structures have their path as names, ``log.theta``; columns of matrices their number,
+    ``pos[0]``.
+
+    Raises
+    ------
+    HistoryError
+        If the file cannot be read, or has no vectors.
+    """
+    from scipy.io import loadmat
+
+    with path.open("rb") as file:
+        try:
+            content = loadmat(file, squeeze_me=True, simplify_cells=True)
+        except Exception as error:  # damaged files raise errors of many kinds
+            cure = 'save it from MATLAB with "-v7", or as CSV'
+            raise HistoryError(f"history {path}: not a MATLAB file ({error}); {cure}") from None
+    columns: dict[str, np.ndarray[Any, Any]] = {}
+    for name, value in content.items():
+        if not name.startswith("__"):
+            _add_vectors(columns, name, value)
+    lengths = [len(column) for column in columns.values()]
+    if not lengths:
+        raise HistoryError(f"history {path}: it has no vectors of numbers; save each as a column")
+    longest = max(set(lengths), key=lambda length: (lengths.count(length), length))
+    return pd.DataFrame({k: column for k, column in columns.items() if len(column) == longest})
+
+
+def _add_vectors(columns: dict[str, np.ndarray[Any, Any]], name: str, value: object) -> None:
+    """Add the vectors of a MATLAB value under their names."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            _add_vectors(columns, f"{name}.{key}", item)
+    elif isinstance(value, np.ndarray) and value.dtype.kind in "iufb" and value.size > 1:
+        if value.ndim == 1:
+            columns[name] = value.astype(float)
+        elif value.ndim == 2:
+            tall = value if value.shape[0] >= value.shape[1] else value.T
+            columns |= {f"{name}[{i}]": column.astype(float) for i, column in enumerate(tall.T)}

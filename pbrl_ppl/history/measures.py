@@ -1,0 +1,129 @@
+"""Units of columns: those that a file states, those that are declared, and SI."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from pbrl_ppl.errors import HistoryError
+from pbrl_ppl.history.clocks import TIME
+from pbrl_ppl.history.text import unit_in_name
+from pbrl_ppl.scene import nearest
+
+_LENGTH = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "km": 1e3, "in": 0.0254, "ft": 0.3048,
+           "yd": 0.9144}  # fmt: skip
+_ANGLE = {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180, "rev": 2 * np.pi, "turn": 2 * np.pi}
+#: A thrust stand's g is the weight of a gram.
+_FORCE = {"N": 1.0, "mN": 1e-3, "kN": 1e3, "lbf": 4.4482216152605, "kgf": 9.80665, "kg": 9.80665,
+          "gf": 9.80665e-3, "g": 9.80665e-3, "ozf": 0.27801385, "oz": 0.27801385}  # fmt: skip
+#: How files write units that are listed above.
+_SAME = {"\u00b0": "deg", "degree": "deg", "degrees": "deg", "radian": "rad", "radians": "rad",
+         "meter": "m", "meters": "m", "metre": "m", "metres": "m", "sec": "s", "seconds": "s",
+         "second": "s", "\u00b5s": "us", "millimeters": "mm", "feet": "ft", "inches": "in",
+         "rotations": "rev", "newton": "N", "\u00b0/s": "deg/s", "dps": "deg/s", "kmh": "km/h",
+         "kph": "km/h", "1/min": "rpm", "RPM": "rpm"}  # fmt: skip
+
+
+def _rates(units: Mapping[str, float]) -> dict[str, float]:
+    return {f"{a}/{b}": size / time for a, size in units.items() for b, time in TIME.items()}
+
+
+#: What each column may be measured in, in SI units.
+_UNITS: Mapping[str, Mapping[str, float]] = {
+    **dict.fromkeys(("time", "duration"), TIME),
+    **dict.fromkeys(("x", "y"), _LENGTH),
+    "theta": _ANGLE,
+    **dict.fromkeys(("vx", "vy"), _rates(_LENGTH) | {"mph": 0.44704, "kn": 1852 / 3600}),
+    "omega": _rates(_ANGLE) | {"rpm": 2 * np.pi / 60, "rps": 2 * np.pi},
+    **dict.fromkeys(("force_x", "force_y"), _FORCE),
+    "torque": {
+        f"{a}{mark}{b}": force * length
+        for a, force in _FORCE.items()
+        for b, length in _LENGTH.items()
+        for mark in (" ", "", "*", ".", "\u00b7")
+    },
+}
+
+
+def stated_units(frame: pd.DataFrame, columns: Mapping[str, Any]) -> dict[str, str]:
+    """Return the unit of each history's column that the file states and that is not SI.
+
+    Parameters
+    ----------
+    frame : pandas.DataFrame
+        The file's columns; its attribute ``units`` has those of a row of units. Names such as
+        ``angle [deg]`` state theirs.
+    columns : mapping of str to str, float or table
+        From a history's column to the file's, as of `Recording.columns`.
+
+    Raises
+    ------
+    HistoryError
+        If a row of units has one that is not known.
+    """
+    row, units = frame.attrs.get("units", {}), {}
+    for key in dict.fromkeys((*columns, *(name for name in _UNITS if name in frame))):
+        column, name = columns.get(key, key), key.rpartition(".")[2]
+        if isinstance(column, tuple):
+            column = dict(column)["column"]
+        if not isinstance(column, str) or name not in _UNITS or name == "time":
+            continue
+        column = column.removeprefix("-")
+        whole = next((c for c in frame.columns if column in (c, unit_in_name(str(c))[0])), column)
+        text = row.get(whole) or unit_in_name(str(whole))[1]
+        unit = _SAME.get(text, text)
+        if unit in _UNITS[name]:
+            units[key] = unit
+        elif row.get(whole) and unit not in ("-", "1"):
+            raise HistoryError(_no_unit(key, name, text) + "; the file's row of units says so")
+    return units
+
+
+def _no_unit(key: str, name: str, unit: str) -> str:
+    known = [known for known in _UNITS[name] if not {"*", ".", "\u00b7"} & {*known}]
+    return (
+        f'units: "{unit}" is none of {key}; expected one of'
+        f' {", ".join(known[:12])}: units = {{ {key} = "{known[0]}" }}'
+    )
+
+
+def in_si(frame: pd.DataFrame, units: Mapping[str, str]) -> pd.DataFrame:
+    """Return a history's table in SI units.
+
+    Parameters
+    ----------
+    frame : pandas.DataFrame
+        With a history's column names.
+    units : mapping of str to str
+        What columns are measured in, such as ``{"x": "mm", "cart.theta": "deg"}``; the others are
+        in SI units.
+
+    Raises
+    ------
+    HistoryError
+        If a column or a unit is unknown.
+
+    Examples
+    --------
+    >>> in_si(pd.DataFrame({"x": [1500.0], "omega": [180.0]}), {"x": "mm", "omega": "deg/s"})
+         x     omega
+    0  1.5  3.141593
+    """
+    frame = frame.copy()
+    for key, text in units.items():
+        body, _, name = key.rpartition(".")
+        unit = _SAME.get(text, text)
+        if name not in _UNITS:
+            raise HistoryError(f'units: "{key}" has none{nearest(name, _UNITS)}')
+        if unit not in _UNITS[name]:
+            raise HistoryError(_no_unit(key, name, text))
+        if name not in frame:
+            raise HistoryError(f'units: "{name}" is in {unit}, and the table has no such column')
+        values = pd.to_numeric(frame[name], errors="coerce")
+        scaled = values.notna() & (frame["body"] == body if body else True)
+        # non-numbers are kept, for the message that names them
+        frame[name] = (values * _UNITS[name][unit]).where(scaled, frame[name])
+    return frame
