@@ -22,6 +22,7 @@ from pbrl_ppl.errors import HistoryError, OutputError, RecordingWarning, SceneEr
 from pbrl_ppl.files import write_text
 from pbrl_ppl.scene import WORLD, Body, Joint, Recording, Scene, Shape, nearest
 from pbrl_ppl.scene import toml as scene_toml
+from pbrl_ppl.state import Floats
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -48,6 +49,8 @@ class Recorded:
         What was seen in it.
     angles : tuple of str
         Bodies of which angles alone were measured, which must be hinged.
+    circles : dict of str to (float, float, float)
+        Centre and radius (m) of bodies that swing on a circle, and whose angle was not measured.
     """
 
     names: tuple[str, ...]
@@ -55,6 +58,7 @@ class Recorded:
     layout: Recording | None
     said: list[str]
     angles: tuple[str, ...]
+    circles: dict[str, tuple[float, float, float]]
 
 
 def recorded(
@@ -84,10 +88,24 @@ def recorded(
     """
     import pandas as pd
 
-    from pbrl_ppl.history import as_history, is_history, propose, read_table
+    from pbrl_ppl.history import (
+        LayoutError,
+        as_history,
+        is_history,
+        propose,
+        read_commands,
+        read_table,
+        unused_columns,
+        with_guesses,
+    )
 
-    frame, columns = read_table(path, layout=layout), dict(layout.columns)
+    said: list[str] = []
+    frame = read_table(path, layout=layout)
     plain = is_history(frame) and layout == Recording()
+    commands = read_commands(path, layout)
+    if not plain:
+        layout = with_guesses(frame, commands, layout, said.append)
+    columns = dict(layout.columns)
     names = _names(frame, columns) or list(given)
     if not names:
         raise HistoryError(
@@ -98,14 +116,24 @@ def recorded(
     stand_in = Scene(
         time_step=time_step or 1.0, bodies=tuple(Body(n, Shape.circle(1.0)) for n in names)
     )  # fmt: skip
-    if not plain and time_step is None and not {"time", "duration"} & {*columns, *frame.columns}:
+    timed = {"time", "duration"} & {*columns, *frame.columns} or layout.time
+    if not plain and time_step is None and not timed:
         raise HistoryError(
             f"history {path}: it has no column time; say which it is (--columns time=COLUMN, or"
             " duration=COLUMN for times since the row before), or give --time-step"
         )
-    with warnings.catch_warnings():  # what is left out is said when the recording is used
-        warnings.simplefilter("ignore", RecordingWarning)
-        table = as_history(frame, stand_in, f"history {path}", None if plain else layout)
+    table = None
+    while table is None:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", RecordingWarning)
+            try:
+                table = as_history(
+                    frame, stand_in, f"history {path}", None if plain else layout, commands=commands
+                )
+            except LayoutError as proposal:
+                said.append(str(proposal).removeprefix(f"history {path}: "))
+                layout = layout.with_entries(**proposal.entries)
+    said += [str(warning.message).removeprefix(f"history {path}: ") for warning in caught]
     for name in ("trajectory", "body"):
         if name not in table:
             raise HistoryError(
@@ -120,17 +148,74 @@ def recorded(
             f"history {path}: its times do not rise from row to row of a body and trajectory;"
             " correct them, or give --time-step; times since the row before are a column duration"
         )
-    step = float(f"{step:.6g}")
-    proposed, said = propose(table, layout, step)
+    step = time_step or _longer_step(float(f"{step:.4g}"), commands, layout, said)
     measured = table.reindex(columns=["x", "y", "theta"]).notna().groupby(table["body"]).any()
+    tracks = table.reindex(columns=["x", "y"]).groupby(table["body"])
+    circles = {
+        name: circle
+        for name, track in tracks
+        if not measured["theta"][name] and (circle := _circle(track.to_numpy(float)))
+    }
+    proposed, shown = propose(table, layout, step, jumps=not circles)
     angles = measured["theta"] & ~measured["x"] & ~measured["y"]
     hung = tuple(name for name in names if angles.get(name, False))
     if hung:
-        said.append(
+        shown.append(
             f"only the angle of {' and '.join(hung)} was measured: hung by the upper end; correct"
             " the places of [[joint]]"
         )
-    return Recorded(tuple(names), step, None if plain and not said else proposed, said, hung)
+    for name, (x, y, radius) in circles.items():
+        shown.append(
+            f"{name} swings on a circle of {radius:g} m about ({x:g}, {y:g}): hung on a hinge there"
+        )
+    if not plain and (unused := unused_columns(frame, proposed)):
+        shown.append(f"columns that are not used: {', '.join(unused)}")
+    as_is = plain and not shown
+    return Recorded(tuple(names), step, None if as_is else proposed, [*said, *shown], hung, circles)
+
+
+def _longer_step(
+    step: float, commands: pd.DataFrame | None, layout: Recording, said: list[str]
+) -> float:
+    """Return the time step: that of commands in a file of their own, where they are slower.
+
+    A command that is late by less than its own interval is late by a part of one time step.
+    """
+    from pbrl_ppl.history import command_step
+
+    slower = 0.0 if commands is None else command_step(commands, layout)
+    if slower < 2 * step:
+        return step
+    said.append(
+        f"rows are {step:g} s apart and commands {slower:g} s: time_step is the commands', so that"
+        " a delay of theirs is a part of it"
+    )
+    return slower
+
+
+def _circle(track: Floats, round_: float = 0.02) -> tuple[float, float, float] | None:
+    """Return the centre and radius (m) of a circle that a track swings on, or None.
+
+    It goes back and forth over at least half a radian, off the circle by ``round_`` of its radius
+    at most (root mean square).
+    """
+    track = track[np.isfinite(track).all(axis=1)]
+    if len(track) < 20:
+        return None
+    matrix = np.column_stack([track, np.ones(len(track))])
+    (a, b, c), *_ = np.linalg.lstsq(matrix, (track**2).sum(axis=1), rcond=None)
+    centre, square = np.array([a, b]) / 2, c + (a**2 + b**2) / 4
+    if square <= 0:
+        return None
+    radius = float(np.sqrt(square))
+    arm = track - centre
+    off = float(np.sqrt(np.mean((np.linalg.norm(arm, axis=1) - radius) ** 2)))
+    angle = np.unwrap(np.arctan2(arm[:, 1], arm[:, 0]))
+    crossings = int((np.diff(np.sign(angle - np.median(angle))) != 0).sum())
+    if off > round_ * radius or np.ptp(angle) < 0.5 or (crossings < 4 and np.ptp(angle) < 12.0):
+        return None
+    digits = int(np.ceil(-np.log10(max(off, 1e-6)))) + 1
+    return round(float(centre[0]), digits), round(float(centre[1]), digits), round(radius, digits)
 
 
 def _names(frame: pd.DataFrame, columns: Mapping[str, str | float]) -> list[str]:
@@ -173,6 +258,10 @@ def new(
     ] = None,
     columns: options.Columns = None,
     units: options.Units = None,
+    commands: Annotated[
+        str,
+        typer.Option(metavar="FILE", help="Commands with times of their own, beside the history."),
+    ] = "",
     topics: Annotated[
         list[str] | None,
         typer.Option(
@@ -198,13 +287,16 @@ def new(
         layout = Recording(
             columns=tuple(options.columns_of(columns).items()),
             units=tuple(options.units_of(units).items()),
+            commands=commands,
             topics=tuple(_topics(topics).items()),
         )
         described = (bodies, time_step, history, columns, units)
         if model is not None and (side is not None or any(described)):
             raise SceneError("--from copies a model as it is: leave the other options, or --from")
-        if history is None and (columns or units):
-            raise SceneError("--columns and --units say how a recording is read: add --history")
+        if history is None and (columns or units or commands):
+            raise SceneError(
+                "--columns, --units and --commands say how a recording is read: add --history"
+            )
         recording: Recorded | None = None
         try:
             if model is not None:
@@ -341,6 +433,8 @@ def scene_text(answers: Answers, found: Recorded | None = None) -> str:
         *_, low, high = answers.shapes[name].bounds
         joints.append(Joint("hinge", (name, above), (0.0, high), end))
         above, end = name, (0.0, low)
+    for name, (x, y, radius) in (found.circles if found else {}).items():
+        joints.append(Joint("hinge", (name, WORLD), (0.0, radius), (x, y)))
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("pbrl_ppl", "cli"), undefined=jinja2.StrictUndefined,
         trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,

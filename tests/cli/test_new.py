@@ -107,7 +107,7 @@ def test_a_double_pendulum_side_by_side_in_a_row(capsys: pytest.CaptureFixture[s
     assert [joint.anchor_b for joint in scene.joints] == [(0.0, 0.0), (0.0, -0.1)]
     # its samples are uneven: later commands interpolate them
     said = capsys.readouterr().out
-    assert "samples are uneven: interpolated every 0.0101 s" in said
+    assert "rows are not 0.0101 s apart: interpolated every 0.0101 s" in said
     assert scene.recording is not None and scene.recording.resample
 
 
@@ -162,7 +162,7 @@ def test_what_a_new_scene_has_as_comments_is_valid() -> None:
         ("--columns x=px", "add --history"),
         ("--history swing.csv", "it has no column time; say which it is"),
         ("--history swing.csv --columns time=sec", 'no column "sec" for time'),
-        (f"--history swing.csv {COLUMNS} --units time=h", '"h" is none of time'),
+        (f"--history swing.csv {COLUMNS} --units time=day", '"day" is none of time'),
         ("--history swing.csv --columns time=volts", "its times do not rise"),
     ],
 )

@@ -52,7 +52,7 @@ def test_angles_between_blanks_in_one_take() -> None:
     assert run(f"new --history pole.txt --columns time=0,theta=1 {raw_logs.POLE}") == 0
     raw_logs.weighed(Path("scene.toml"), 0.2)
     scene = Scene.load("scene.toml")
-    assert scene.time_step == 0.05 and dict(scene.recording.cut) == {"every": 1.7}
+    assert scene.time_step == 0.05 and dict(scene.recording.cut) == {"every": 2.5}
     assert run("check scene.toml pole.txt -q") == 0
     assert run("close-loop scene.toml pole.txt --method laplace -q -o out") == 0
     verdict, effects = named("out")
