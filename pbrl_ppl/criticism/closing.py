@@ -20,6 +20,7 @@ from pbrl_ppl.criticism.misfit import (
     find_misfit,
     held_out_forecasts,
     score_test,
+    simulation_test,
     with_negligible_acceleration,
 )
 from pbrl_ppl.criticism.prior_check import prior_predictive_check, telling_horizon
@@ -273,6 +274,7 @@ class _Judged:
     misfit: Misfit
     small: tuple[Candidate, ...]
     rollout: int
+    simulated: Mapping[str, float]
 
 
 def _cleaned(task: _Task, train: History, test: History) -> _Cleaned:
@@ -353,12 +355,27 @@ def _tested(task: _Task, cleaned: _Cleaned, searched: _Searched) -> _Judged:
     noise = noise_alone(innovations, revised.excess)
     at_test = replace(innovations, problem=revised.held_out.problem)
     misfit = misfit.with_test(held_out_forecasts(at_test, noise, rollout, criteria))
+    collides = revised.mode.problem.data.breaks is not None
+    simulated = {} if collides else revised.held_out.simulated()
+    if not searched.laws:
+        problem = revised.held_out.problem
+        steps = int(problem.data.history.dataset["n_rows"].max()) - 1
+        measured = revised.held_out.measurement_errors(noise)
+        misfit = misfit.with_test(
+            simulation_test(
+                simulated,
+                measured,
+                revised.held_out.motion(),
+                steps * task.scene.time_step,
+                criteria,
+            )
+        )
     ranked = searched.ranked
     if searched.laws:
         ranked = rank_candidates(innovations, task.missing(innovations), criteria)
     misfit = misfit.with_test(score_test(innovations, ranked, criteria))
     small = tuple(one.candidate for one in ranked[:1] if one.candidate.p_value < criteria.try_p)
-    return _Judged(cleaned, searched, declared, revised, misfit, small, rollout)
+    return _Judged(cleaned, searched, declared, revised, misfit, small, rollout, simulated)
 
 
 def _innovations(searched: _Searched) -> Mode:
@@ -484,13 +501,19 @@ def _put_together(task: _Task, judged: _Judged, before: Fit, after: Fit, recorde
         model.held_out.errors(held_out, fit, rollout, task.seed, unit)
         for model, fit in ((declared, before), (revised, after))[revised is declared :]
     ]
+    first = declared.held_out.simulated() if laws and judged.simulated else judged.simulated
+    both = (first, judged.simulated)
+    errors = [
+        replace(error, simulated_rmse=simulated)
+        for error, simulated in zip(errors, both[revised is declared :], strict=True)
+    ]
     verdict, unexplained = _verdict(
         misfit, len(laws), errors[0], errors[-1],
         all(_converged(fit, task.criteria) for fit in (before, after)), task.criteria,
     )  # fmt: skip
     added = _added(judged, after)
     keep_groups(after.posterior, added)
-    first, last = declared.excess, revised.excess
+    excess, last = declared.excess, revised.excess
     return Loop(
         scene=scene,
         verdict=verdict,
@@ -525,9 +548,9 @@ def _put_together(task: _Task, judged: _Judged, before: Fit, after: Fit, recorde
         },
         tests=misfit.tests,
         acceleration=Acceleration(
-            first.by_name(first.size),
+            excess.by_name(excess.size),
             last.by_name(last.size),
-            first.by_name(first.relative),
+            excess.by_name(excess.relative),
             last.by_name(last.relative),
             last.by_name(last.certain),
         ),

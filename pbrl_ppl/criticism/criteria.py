@@ -112,6 +112,10 @@ class Criteria:
         Prior scales from the prior's centre beyond which an effect's size is not accepted.
     worse_forecast : float
         Forecasts may have this many times the error that noise and a negligible acceleration make.
+    worst_simulation : float
+        A model that lacks nothing simulates whole held-out trajectories, from start states that are
+        fitted to them, to this many times the measurement noise: errors of a sensor may be
+        correlated.
     outlier_deviations : float
         A single measurement is left out if its residual exceeds this many robust standard
         deviations: 1 of 10^14 of Gaussian noise.
@@ -137,6 +141,7 @@ class Criteria:
     try_p: float = 0.01
     far_out: float = 6.0
     worse_forecast: float = 1.5
+    worst_simulation: float = 4.0
     outlier_deviations: float = 8.0
     min_remainder: float = 6.0
     worst_rhat: float = 1.05

@@ -12,11 +12,11 @@ from pbrl_ppl.criticism.forecast import forecast, whole_rollouts
 from pbrl_ppl.criticism.results import Errors, Rollout
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History, longest_gap
-from pbrl_ppl.likelihood import Problem, along_trajectories, observed_coordinates
-from pbrl_ppl.modes import Mode
+from pbrl_ppl.likelihood import Problem, along_trajectories, in_pieces, observed_coordinates
+from pbrl_ppl.modes import MOST_GROWTH, Mode, fit_pieces, growth
 from pbrl_ppl.posterior import Fit
 from pbrl_ppl.scene import Scene, motion_time, state_sizes
-from pbrl_ppl.state import STATE, STATE_UNITS, Floats
+from pbrl_ppl.state import STATE, STATE_UNITS, THETA, Floats
 
 
 def rollout_horizon(history: History, scene: Scene, motion_times: float = 4.0) -> int:
@@ -130,6 +130,23 @@ class HeldOut:
             elpd=float((logsumexp(density, axis=0) - np.log(len(phi))).sum()),
         )
 
+    def simulated(self) -> dict[str, float]:
+        """Return the errors of whole trajectories, simulated from start states fitted to them.
+
+        They are root mean squares by measured state dimension, in its unit, less the degrees of
+        freedom of the start states; empty where simulations magnify their start, or trajectories
+        are too short.
+        """
+        longest = int(self.problem.data.history.dataset["n_rows"].max()) - 1
+        if longest < 3:
+            return {}
+        pieces = in_pieces(self.problem, longest, self.problem.data.smoothed_states)
+        fitted = fit_pieces(pieces, self.mode.phi, starts_alone=True)
+        if growth(fitted.problem) > MOST_GROWTH:
+            return {}
+        names = fitted.problem.observations.names
+        return dict(zip(names, fitted.sigma.tolist(), strict=True))
+
     def noise_floor(self, sigma: Floats, rollout: int) -> Errors:
         """Return the errors that measurement noise alone makes, at both ends of a forecast.
 
@@ -142,7 +159,23 @@ class HeldOut:
             rollout_rmse=forecast(self.problem, phi, sigma, rollout).floor(),
             normalised_rmse=1.0,
             elpd=float(at_best - 0.5 * cells * (1.0 + np.log(2 * np.pi))),
+            simulated_rmse=self.measurement_errors(sigma),
         )
+
+    def motion(self) -> dict[str, float]:
+        """Return the standard deviation of each state dimension's motion, in its unit."""
+        states = self.problem.data.smoothed_states.copy()
+        states[..., THETA] = np.unwrap(states[..., THETA], axis=1)
+        rows = (
+            np.arange(states.shape[1]) < self.problem.data.history.dataset["n_rows"].values[:, None]
+        )
+        sizes = np.nanmax(np.std(states[rows], axis=0), axis=0)
+        return dict(zip(STATE, sizes.tolist(), strict=True))
+
+    def measurement_errors(self, sigma: Floats) -> dict[str, float]:
+        """Return the standard deviation of each measured state dimension's errors, in its unit."""
+        sensors = self.problem.trajectory_noise.coordinates.sensors
+        return {STATE[d]: float(sd) for d, sd in zip(sensors, sigma, strict=False)}
 
 
 def example_rollout(declared: HeldOut, revised: HeldOut) -> Rollout:

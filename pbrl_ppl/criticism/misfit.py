@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,7 +26,7 @@ from pbrl_ppl.state import STATE, Floats
 
 #: Names of the tests that a model must pass to predict well.
 ACCELERATION, FORECASTS, PRIOR = "unexplained acceleration", "forecasts", "prior"
-HELD_OUT = "held-out forecasts"
+HELD_OUT, SIMULATION = "held-out forecasts", "held-out simulation"
 #: Name of the test for effects of the catalogue.
 CANDIDATES = "effects of the catalogue"
 #: What an unexplained residual depends on where no quantity predicts it.
@@ -185,6 +185,47 @@ def held_out_forecasts(mode: Mode, sigma: Floats, horizon: int, criteria: Criter
     """
     test, _ = _forecasts(mode, sigma, horizon, criteria)
     return replace(test, name=HELD_OUT, sentence=f"held out: {test.sentence}")
+
+
+def simulation_test(
+    simulated: Mapping[str, float],
+    noise: Mapping[str, float],
+    motion: Mapping[str, float],
+    seconds: float,
+    criteria: Criteria,
+) -> ResidualTest:
+    """Return the test of held-out trajectories that are simulated from fitted start states.
+
+    Parameters
+    ----------
+    simulated, noise, motion : mapping of str to float
+        Error of the simulation, standard deviation of the measurement, and standard deviation of
+        what was measured, by state dimension, SI units.
+    seconds : float
+        Length of the longest trajectory.
+    criteria : Criteria
+        The error may be ``worst_simulation`` times the noise, which may be correlated, or a
+        ``negligible`` share of the motion.
+    """
+    if not simulated:
+        return ResidualTest.untested(
+            SIMULATION, "no simulation is as long as a held-out trajectory"
+        )
+    name = max(simulated, key=lambda one: simulated[one] / noise[one])
+    error, times = simulated[name], simulated[name] / noise[name]
+    far = {one: size for one, size in simulated.items() if size > criteria.negligible * motion[one]}
+    passed = all(size < criteria.worst_simulation * noise[one] for one, size in far.items())
+    if not passed:
+        name = max(far, key=lambda one: far[one] / noise[one])
+        error, times = simulated[name], simulated[name] / noise[name]
+    sentence = (
+        f"held-out trajectories, simulated over {seconds:.3g} s, are {error:.3g}"
+        f" {'rad' if name in ('theta', 'omega') else 'm'}{'/s' * (name in STATE[3:])} off in"
+        f" {name}, {times:.3g} times the measurement noise"
+    )
+    return ResidualTest(
+        SIMULATION, float("nan"), times, passed, sentence, body="", dimension="" if passed else name
+    )
 
 
 def score_test(mode: Mode, ranked: Sequence[Signature], criteria: Criteria) -> ResidualTest:

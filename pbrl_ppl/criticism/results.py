@@ -329,12 +329,16 @@ class Errors:
         Root mean square innovation in units of what measurement noise alone makes.
     elpd : float
         Log predictive density, summed over held-out transitions.
+    simulated_rmse : dict of str to float
+        Root mean square error of whole trajectories, simulated from start states that are fitted to
+        them, per measured state dimension; empty where simulations magnify their start.
     """
 
     one_step_rmse: Mapping[str, float]
     rollout_rmse: Mapping[str, float]
     normalised_rmse: float
     elpd: float
+    simulated_rmse: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

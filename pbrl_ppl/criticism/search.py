@@ -307,6 +307,11 @@ class Search:
         found = self._judged(mode, declared, model, regression, tuple(rungs), tried)
         if found.laws:
             found = self._beside(declared, found)
+        named = {law: "" for rung in rungs for law in rung.accepted}
+        named |= {_name(law): f": {why}" for law, why in found.rejected.items()}
+        for law, why in named.items():
+            if law not in map(_name, found.laws):
+                self.say(f"dropped {law}{why or ': longer simulations do not need it'}")
         return _with_contacts(found, mode, first)
 
     def _beside(self, declared: Mode, found: SearchResult) -> SearchResult:

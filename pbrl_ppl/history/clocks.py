@@ -58,8 +58,9 @@ def likely_unit(stamps: Floats) -> str:
     for unit in ("s", "ms", "us", "ns"):
         if _EPOCH[0] < float(np.median(stamps)) * TIME[unit] < _EPOCH[1]:
             return unit
-    lag = max(1, min(50, len(stamps) // 4))  # longer than a burst
-    step = float(np.median(np.abs(stamps[lag:] - stamps[:-lag]))) / lag
+    # of bursts most steps are tiny, and one of a few is not; between runs there are pauses
+    steps = np.sort(np.abs(np.diff(stamps)))
+    step = float(steps[: max(1, int(0.9 * len(steps)))].mean())
     if step < _SLOWEST:
         return "s"
     return next((unit for unit in ("ms", "us") if step * TIME[unit] <= 0.5), "ns")

@@ -147,7 +147,8 @@ class Coordinates:
             flat[i, :, place] += steps[i]
             flat[d + i, :, place] -= steps[i]
         after = self.of(predict(self.completed(scene, moved)))
-        slopes = (after[:d] - after[d:]) / (2 * steps[:, None, None])
+        with np.errstate(invalid="ignore"):  # a coordinate that never moves has no step
+            slopes = (after[:d] - after[d:]) / (2 * steps[:, None, None])
         return np.nan_to_num(slopes).transpose(1, 2, 0)
 
     def wrapped(self, difference: Floats) -> Floats:

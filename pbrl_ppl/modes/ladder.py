@@ -184,6 +184,7 @@ def fit_pieces(
     rounds: int = 20,
     tolerance: float = 0.1,
     *,
+    starts_alone: bool = False,
     n_steps: int = 2,
     much: float = 0.2,
     dampings: tuple[float, ...] = (0.2, 10.0, 1e4),
@@ -203,6 +204,8 @@ def fit_pieces(
         Linearisations, at most.
     tolerance : float
         Gain in log-posterior (nats) below which it ends.
+    starts_alone : bool
+        Whether phi stays, and the start states alone are fitted.
     n_steps : int
         Steps from one linearisation.
     much : float
@@ -229,7 +232,7 @@ def fit_pieces(
             steps = step.differences(scale, sizes)
         gained = 0.0
         for _ in range(n_steps):
-            tried = [step.moved(damping * factor) for factor in dampings]
+            tried = [step.moved(damping * factor, starts_alone) for factor in dampings]
             points, starts = (np.array(values) for values in zip(*tried, strict=True))
             residuals = _residual(problem, points, starts)
             costs = [step.cost(*trial) for trial in zip(points, starts, residuals, strict=True)]
@@ -430,10 +433,10 @@ class _Step:
         begin = of_start_sd / np.sqrt(np.maximum(np.median(of_start, axis=0), 1e-300))
         return width, np.clip(begin, _LEAST * sizes, _MOST * sizes)
 
-    def moved(self, damping: float) -> tuple[Floats, Floats]:
+    def moved(self, damping: float, starts_alone: bool) -> tuple[Floats, Floats]:
         """Return phi and start states a damped step on, shapes (p,) and (piece, body, 6)."""
         phi, coordinates = self.phi, self.starts.coordinates
-        if len(phi):
+        if len(phi) and not starts_alone:
             sd = 1.0 / np.sqrt(np.maximum(np.diag(self.precision), 1e-300))
             scaled = self.precision * np.outer(sd, sd) + damping * np.eye(len(sd))
             step = sd * np.linalg.solve(scaled, sd * self.gradient)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from pbrl_ppl.effects import Structure
 from pbrl_ppl.errors import (
     BoundWarning,
     ConvergenceWarning,
@@ -448,7 +449,13 @@ def _of_parameters(
                 " shape and the frame of the body; an effect that the model lacks may press too"
             )
             warned.append((BoundWarning, text))
-    silent = uninformed(idata, effects={attached.effect for attached in problem.physics.effects})
+    effects = {attached.effect for attached in problem.physics.effects}
+    silent = list(uninformed(idata, effects=effects))
+    scene = problem.scene
+    alone = len(scene.bodies) == 1 and not scene.walls
+    if alone and not any(isinstance(effect.stage, Structure) for effect in effects):
+        # no motion of a body that can touch nothing depends on its contacts
+        silent = [label for label in silent if label.partition("[")[0] not in ("r", "mu_c")]
     if silent:
         text = (
             f"the data say nothing about {', '.join(silent)}: the posterior is the prior; record"

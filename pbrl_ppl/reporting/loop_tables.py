@@ -82,6 +82,7 @@ def error_tables(loop: Loop) -> list[Table]:
     kinds = [
         ("one_step_rmse", f"One interval ahead, {loop.scene.time_step:g} s"),
         ("rollout_rmse", f"{loop.rollout_horizon} intervals ahead, {number(seconds)} s"),
+        ("simulated_rmse", "Whole trajectories, simulated from start states fitted to them"),
     ]
     for kind, title in kinds:
         sizes = [getattr(each, kind) for each in errors]

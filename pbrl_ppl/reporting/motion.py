@@ -13,7 +13,7 @@ from pbrl_ppl.likelihood import along_trajectories
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.reporting.words import number
 from pbrl_ppl.scene import Scene, Shape
-from pbrl_ppl.state import Floats, wrapped
+from pbrl_ppl.state import Bools, Floats, wrapped
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +30,8 @@ class Motion:
         x, y, theta (m, m, rad), shape (time, body, 3); NaN where not measured, or from where a
         prediction diverges. Predictions begin at the first state, which is as measured, or fitted
         to the first rows where velocities were not measured.
+    unmeasured : ndarray of bool
+        Coordinates that were not measured and follow from none that was, shape (body, 3).
     """
 
     name: str
@@ -37,6 +39,7 @@ class Motion:
     measured: Floats
     before: Floats
     after: Floats
+    unmeasured: Bools
 
 
 def held_out_motions(loop: Loop, most: int = 6, most_rows: int = 3000) -> list[Motion]:
@@ -54,6 +57,11 @@ def held_out_motions(loop: Loop, most: int = 6, most_rows: int = 3000) -> list[M
     after = before if last_mode is first_mode else _predicted(last_mode, loop.held_out)
     dataset = loop.held_out.dataset
     known = dataset["start"].to_numpy()[..., :3]
+    unmeasured = dataset["assumed"].to_numpy()[:, :3]
+    paths = [states for predicted in (before, after) for states in predicted.values()]
+    moves = np.nanmax([np.ptp(states, axis=0) for states in paths], axis=0)[:, :2]
+    if (moves[unmeasured[:, :2]] > 1e-6).any():
+        return []  # a place that moves, and that nobody measured
     labels = [str(label) for label in dataset["trajectory"].to_numpy()]
     motions = [
         Motion(
@@ -62,6 +70,7 @@ def held_out_motions(loop: Loop, most: int = 6, most_rows: int = 3000) -> list[M
             known[trajectory, : len(first)],
             first,
             after[trajectory],
+            unmeasured,
         )
         for trajectory, first in before.items()
     ]
@@ -86,7 +95,7 @@ def distance(scene: Scene, motion: Motion, predicted: Floats) -> float:
     if diverged_after(motion.time, predicted) is not None:
         return float("inf")
     reach = np.array([body.shape.bounding_radius for body in scene.moving])
-    off = predicted - motion.measured
+    off = np.where(motion.unmeasured, 0.0, predicted - motion.measured)
     square = off[..., 0] ** 2 + off[..., 1] ** 2 + (reach * wrapped(off[..., 2])) ** 2
     return float(np.sqrt(np.nanmean(square))) if np.isfinite(square).any() else float("nan")
 

@@ -23,6 +23,8 @@ from pbrl_ppl.reporting.style import UNITS
 
 #: Candidates and bad frames that are listed one by one.
 _LISTED = 4
+#: A share of the bodies' acceleration below which a remainder that forecasts do not show is small.
+_SMALL = 0.05
 #: A held-out error above this many times the noise needs an explanation.
 _TOO_LARGE = 1.5
 
@@ -109,7 +111,10 @@ def _remains(loop: Loop) -> str:
         if loop.acceleration.relative_after[name] >= loop.criteria.negligible:
             return f"what remains, {where}, is no more than the engine's error"
     if where or left is not None:
-        return f"what remains{where and f', {where},'} is negligible"
+        at = left.dimension if left is not None and left.dimension else name
+        share = loop.acceleration.relative_after.get(at, 0.0)
+        small = "is negligible" if share < _SMALL else "does not show in forecasts"
+        return f"what remains{where and f', {where},'} {small}"
     if loop.after.normalised_rmse > _TOO_LARGE:
         return "the recordings that were fitted leave only noise"
     return "only noise remains"
@@ -138,7 +143,8 @@ def _unexplained(loop: Loop, where: str) -> str:
         text = f"the model{still} fails the test of {failed[0]}"
     else:
         text = "held-out forecasts became worse"
-    if forecasts_at_noise(loop):
+    share = max(loop.acceleration.relative_after.values(), default=0.0)
+    if forecasts_at_noise(loop) and share < LARGEST_SHARE:
         text += ", but forecasts are as good as the noise allows"
     return text
 
@@ -315,9 +321,14 @@ def _sizes(added: Added) -> str:
 
 def _worst_error(loop: Loop) -> list[str]:
     """Write the held-out error far ahead that is worst, before and after if something was added."""
-    before, after, floor = (
-        errors.rollout_rmse for errors in (loop.before, loop.after, loop.noise_floor)
-    )
+    every = (loop.before, loop.after, loop.noise_floor)
+    seconds, ahead = loop.rollout_horizon * loop.scene.time_step, "ahead"
+    before, after, floor = (errors.rollout_rmse for errors in every)
+    if loop.after.simulated_rmse and loop.held_out is not None:
+        before, after, floor = (errors.simulated_rmse for errors in every)
+        before = {name: error for name, error in before.items() if name in floor}
+        steps = int(loop.held_out.dataset["n_rows"].max()) - 1
+        seconds, ahead = steps * loop.scene.time_step, "from fitted starts"
 
     def times_floor(name: str) -> float:
         if np.isposinf(after.get(name, 0.0)):
@@ -327,15 +338,23 @@ def _worst_error(loop: Loop) -> list[str]:
     lines = []
     if before:
         name = max(before, key=times_floor)
-        seconds = loop.rollout_horizon * loop.scene.time_step
         errors = (before[name], after.get(name, np.nan)) if loop.added else (before[name],)
         unit = f" {UNITS[name]}" * bool(np.isfinite(errors[-1]))
         lines.append(
-            f"Held-out error of {name} {number(seconds)} s ahead:"
-            f" {' -> '.join(map(error, errors))}{unit} (noise floor {number(floor.get(name))}"
-            f" {UNITS[name]})."
+            f"Held-out error of {name}, {number(seconds)} s {ahead}:"
+            f" {' -> '.join(map(error, errors))}{unit}{_floor(loop, floor, name)}."
         )
     return [*lines, *([f"  {note}"] if (note := error_in_words(loop)) else [])]
+
+
+def _floor(loop: Loop, floor: Mapping[str, float], name: str) -> str:
+    """Return the noise floor of an error in brackets, unless it is larger than the motion."""
+    size = floor.get(name, np.inf)
+    if loop.held_out is not None:
+        measured = loop.held_out.dataset["observed"].sel(state=name)
+        if not size < float(measured.max() - measured.min()):
+            return ""
+    return f" (noise floor {number(size)} {UNITS[name]})"
 
 
 def _next_step(loop: Loop, folder: Path, tried: bool) -> str:
