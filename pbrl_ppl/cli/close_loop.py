@@ -199,8 +199,8 @@ def demo(
     cart = models_folder() / "shopping_cart"
     if not (as_json or quiet):
         typer.echo(
-            "A shopping cart is pushed; the scene does not declare that its castor resists turning.\n"
-            "This takes some 30 s on an idle machine, the first time a minute more to compile."
+            "A shopping cart is pushed; the scene does not declare that its castor resists turning."
+            "\nThis takes some 30 s on an idle machine, the first time a minute more to compile."
         )
     close_loop(
         context,

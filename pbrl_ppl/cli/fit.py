@@ -22,7 +22,7 @@ from pbrl_ppl.cli.terminal import (
     print_table,
     stages,
 )
-from pbrl_ppl.errors import ConvergenceWarning, FitError, PosteriorError
+from pbrl_ppl.errors import ConvergenceWarning, FitError, LinearisationWarning, PosteriorError
 from pbrl_ppl.files import write_text
 
 if TYPE_CHECKING:
@@ -146,6 +146,8 @@ def fit(
         )
     else:
         print_table(None, ["parameter", *table.columns], _rows(table))
+        if any(issubclass(one.category, LinearisationWarning) for one in caught):
+            typer.echo("intervals: not to be trusted, the likelihood does not hold (warning above)")
         typer.echo(f"posterior: {output}")
     if cut:
         kept = group(idata, "posterior").sizes

@@ -207,6 +207,7 @@ def simulation_test(
         The error may be ``worst_simulation`` times the noise, which may be correlated, or a
         ``negligible`` share of the motion.
     """
+    simulated = {name: error for name, error in simulated.items() if name in noise}
     if not simulated:
         return ResidualTest.untested(
             SIMULATION, "no simulation is as long as a held-out trajectory"

@@ -190,10 +190,11 @@ def fill_hinges(start: Floats, scene: Scene) -> None:
             origin = np.broadcast_to(np.array([*pose, 0.0, 0.0, 0.0]), (*start.shape[:2], 6))
         body = start[:, :, position[child]]
         arm, arm_rate = lever(origin, at_parent)
-        if np.any(at_child):  # from the hinge to the body's origin
+        if np.any(at_child) and np.isnan(body[..., 2]).all():  # angles from places, then exact ones
             to = body[..., :2] - origin[..., :2] - arm
             turned = np.arctan2(to[..., 1], to[..., 0]) - np.arctan2(-at_child[1], -at_child[0])
-            body[..., 2] = _filled(body[..., 2], wrapped(turned))
+            body[..., 2] = wrapped(turned)
+            body[..., :2] = np.where(np.isfinite(turned)[..., None], np.nan, body[..., :2])
         child_arm, child_rate = lever(body, at_child)
         body[..., :2] = _filled(body[..., :2], origin[..., :2] + arm - child_arm)
         body[..., 3:5] = _filled(body[..., 3:5], origin[..., 3:5] + arm_rate - child_rate)

@@ -322,13 +322,13 @@ def _sizes(added: Added) -> str:
 def _worst_error(loop: Loop) -> list[str]:
     """Write the held-out error far ahead that is worst, before and after if something was added."""
     every = (loop.before, loop.after, loop.noise_floor)
-    seconds, ahead = loop.rollout_horizon * loop.scene.time_step, "ahead"
+    ahead = f" {number(loop.rollout_horizon * loop.scene.time_step)} s ahead"
     before, after, floor = (errors.rollout_rmse for errors in every)
     if loop.after.simulated_rmse and loop.held_out is not None:
         before, after, floor = (errors.simulated_rmse for errors in every)
         before = {name: error for name, error in before.items() if name in floor}
         steps = int(loop.held_out.dataset["n_rows"].max()) - 1
-        seconds, ahead = steps * loop.scene.time_step, "from fitted starts"
+        ahead = f", {number(steps * loop.scene.time_step)} s from fitted starts"
 
     def times_floor(name: str) -> float:
         if np.isposinf(after.get(name, 0.0)):
@@ -341,7 +341,7 @@ def _worst_error(loop: Loop) -> list[str]:
         errors = (before[name], after.get(name, np.nan)) if loop.added else (before[name],)
         unit = f" {UNITS[name]}" * bool(np.isfinite(errors[-1]))
         lines.append(
-            f"Held-out error of {name}, {number(seconds)} s {ahead}:"
+            f"Held-out error of {name}{ahead}:"
             f" {' -> '.join(map(error, errors))}{unit}{_floor(loop, floor, name)}."
         )
     return [*lines, *([f"  {note}"] if (note := error_in_words(loop)) else [])]

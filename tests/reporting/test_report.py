@@ -350,7 +350,7 @@ def test_added_effects_with_a_rest() -> None:
     )
     assert "What remains. Its omega is off in a way" in Page(render(some)).text
     noted = replace(some, verdict="effects-added", after=findings.after)
-    assert "what remains, 0.15 rad/s² in omega of the cart, is negligible." in (
+    assert "what remains, 0.15 rad/s² in omega of the cart, does not show in forecasts." in (
         verdict_in_words(noted)
     )
 
