@@ -3,194 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 
 from pbrl_ppl.errors import HistoryError
+from pbrl_ppl.history.bad_frames import outliers
 from pbrl_ppl.history.history import History, hashed
 from pbrl_ppl.history.kinematics import RATE_REACH, column_noise, finest_step
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import THETA, Floats
 
+#: Positions of a dimension without gaps, by trajectory.
+Series = dict[int, Floats]
 #: Least rows at rest, and of a trajectory without its ends.
 LEAST = 3
 #: Least rows of motion beside those at rest.
 BESIDE = 6
-
-
-@dataclass(frozen=True, eq=False)
-class Column:
-    """Positions of a dimension in all trajectories.
-
-    Attributes
-    ----------
-    series : list of ndarray
-        Shape (time,) each.
-    noise : float
-        Standard deviation of the measurement noise.
-    change : float
-        90th percentile of the changes of velocity, per row.
-    still : float
-        Measurement noises within which a body is at rest.
-    longest : int
-        Rows at rest, and rows of motion, that are looked at, at most.
-    places : int
-        Places of a bend that are tried, at most.
-    gain, share : float
-        A bend takes this much off the sum of squares of a cubic, in variances of the noise, and
-        this share of it.
-    outside : float
-        A cubic fits the end this many times worse than it fits the median window of all rows.
-    certainty, large : float
-        An abrupt change of velocity in standard errors, and over ``change``.
-    limit : float
-        A moment of release may fit worse than the best by so much, in variances.
-    """
-
-    series: list[Floats]
-    noise: float
-    change: float
-    still: float = 4.0
-    longest: int = 200
-    places: int = 60
-    gain: float = 100.0
-    share: float = 0.9
-    outside: float = 2.5
-    certainty: float = 8.0
-    large: float = 4.0
-    limit: float = 4.0
-
-    @classmethod
-    def of(cls, series: list[Floats]) -> Column | None:
-        """Return the column of series; None where nothing moves or rows are too few.
-
-        Noise comes from fourth differences, changes of velocity from second ones.
-        """
-        if not any(len(values) > 4 for values in series) or not any(map(np.ptp, series)):
-            return None
-        finest = finest_step(np.concatenate(series))
-        noise = max(column_noise(series, 4, robust=True), finest / np.sqrt(12))
-        second = np.concatenate([np.diff(values, 2) for values in series])
-        # of independent errors the second differences have six times the variance
-        change = float(np.quantile(np.abs(second), 0.9)) ** 2 - 6 * (1.8 * noise) ** 2
-        return cls(series, noise, float(np.sqrt(max(change, 0.0))))
-
-    def held(self, values: Floats, push: Floats) -> int:
-        """Return the rows at rest at the beginning, before it moves off without a command."""
-        still = self._still(values)
-        if not LEAST <= still < len(values) - BESIDE:
-            return 0
-        skip = max(0, still - self.longest)  # of a long rest its last rows are enough
-        still -= skip
-        for window in self._windows(values[skip:], still):
-            if push[: skip + len(window)].any():
-                break
-            places = np.linspace(2, still, min(2 * still - 3, self.places))
-            bend = self._bend(window, places, 3, rest=True, abrupt=False)
-            if bend is not None and bend.place >= LEAST - 1:
-                return skip + int(np.ceil(bend.latest))
-        return 0
-
-    def stopped(self, values: Floats, push: Floats) -> int:
-        """Return the rows at the end after an abrupt change of velocity with constant commands."""
-        back = values[::-1]
-        still = self._still(back)
-        n = len(values)
-        tries = [(min(max(LEAST, n // 4), self.longest), 0, False)]
-        if LEAST <= still < n - BESIDE:
-            skip = max(0, still - self.longest)
-            tries.append((still - skip, skip, True))
-        best, rows = None, 0
-        for longest, skip, rest in tries:
-            places = np.linspace(1.5, longest, min(2 * longest - 2, self.places))
-            for window in self._windows(back[skip:], longest):
-                if np.ptp(push[n - skip - len(window) : -1], axis=0).any():
-                    continue
-                bend = self._bend(window, places, 2, rest=rest, abrupt=True)
-                if bend is None or abs(bend.jump) < self.large * self.change:
-                    continue
-                if bend.certainty < self.certainty:
-                    continue
-                if best is None or bend.certainty > best.certainty:
-                    # rows after the moment of the stop: in reversed time those before it
-                    best, rows = bend, skip + int(np.floor(bend.latest)) + 1
-        return rows
-
-    def _still(self, values: Floats) -> int:
-        """Return the number of rows at the beginning that stay within the noise of their mean."""
-        mean = np.cumsum(values) / np.arange(1, len(values) + 1)
-        off = np.abs(values - mean) > self.still * self.noise
-        return int(np.argmax(off)) if off.any() else len(values)
-
-    def _windows(self, values: Floats, still: int) -> list[Floats]:
-        """Return beginnings of a series: the rows at rest, and more and more beside them."""
-        beside = (int(np.clip(times * still, BESIDE, self.longest)) for times in (1, 2, 4))
-        return [values[: still + rows] for rows in beside if still + rows <= len(values)]
-
-    def _bend(
-        self, window: Floats, places: Floats, degree: int, *, rest: bool, abrupt: bool
-    ) -> Bend | None:
-        """Return the best bend, if no smoother motion fits as well and it is unlike other rows.
-
-        Smoother is a cubic; than an abrupt change of velocity also one of the acceleration, as
-        where dry friction ends a motion.
-        """
-        n = len(window)
-        time = np.arange(n, dtype=float)
-        cubic = np.vander(time / n, 4)
-        smooth = np.eye(n) - cubic @ np.linalg.pinv(cubic)
-        without = float(((smooth @ window) ** 2).sum())
-        for place in np.linspace(1, n - 2, min(2 * n, self.places)) if abrupt else ():
-            parts = [time, time**2, np.maximum(time - place, 0.0) ** 2]
-            without = min(without, _fitted(window, parts)[2])
-        bends, powers = [], range(2 if rest else 1, degree + 1)
-        for place in places:
-            after = np.maximum(time - place, 0.0)
-            more = [(after if rest else time) ** k for k in powers]
-            jump, error, left = _fitted(window, [after, *more])
-            free = max(n - len(more) - 3, 1)
-            error *= max(self.noise, float(np.sqrt(left / free)))
-            bends.append(Bend(float(place), float(place), jump, error, left))
-        best = min(bends, key=lambda bend: bend.left)
-        variance = max(self.noise**2, best.left / max(n - 5, 1))
-        if without - best.left < self.gain * variance or best.left > (1 - self.share) * without:
-            return None
-        elsewhere = [
-            ((np.lib.stride_tricks.sliding_window_view(values, n) @ smooth) ** 2).sum(axis=1)
-            for values in self.series
-            if len(values) >= n
-        ]
-        if without < self.outside**2 * float(np.median(np.concatenate(elsewhere))):
-            return None
-        near = [bend.place for bend in bends if bend.left < best.left + self.limit * variance]
-        return replace(best, latest=max(near))
-
-
-@dataclass(frozen=True)
-class Bend:
-    """A bend at a row (a fraction): its latest place, its jump of velocity with standard error."""
-
-    place: float
-    latest: float
-    jump: float
-    error: float
-    left: float
-
-    @property
-    def certainty(self) -> float:
-        """Jump over its standard error."""
-        return abs(self.jump) / self.error
-
-
-def _fitted(window: Floats, parts: list[Floats]) -> tuple[float, float, float]:
-    """Return the first part's size, its error at a noise of one, and the sum of squares left."""
-    design = np.stack([*parts, np.ones(len(window))], axis=1)
-    inverse = np.linalg.pinv(design)
-    size = inverse @ window
-    left = float(((window - design @ size) ** 2).sum())
-    return float(size[0]), float(np.linalg.norm(inverse[0])), left
+#: Rows at rest, and rows of motion, that are looked at, at most.
+LONGEST = 200
+#: Robust standard deviations, and standard errors, of a bend.
+LIMIT = 8.0
 
 
 @dataclass(frozen=True)
@@ -263,33 +97,104 @@ def strange_ends(history: History, scene: Scene) -> list[End]:
     """
     dataset = history.dataset
     observed, clock = dataset["observed"].to_numpy(), dataset["clock"].to_numpy()
-    action = np.nan_to_num(dataset["action"].to_numpy())
-    follows = dataset["kinematic"].to_numpy()
-    labels, n_rows = dataset["trajectory"].to_numpy().tolist(), dataset["n_rows"].to_numpy()
+    follows, labels = dataset["kinematic"].to_numpy(), dataset["trajectory"].to_numpy().tolist()
+    lengths = dataset["n_rows"].to_numpy()
+    push = np.nan_to_num(dataset["action"].to_numpy())[:, :, ~follows]
     ends: dict[tuple[int, bool], End] = {}
     for body, d in product(np.flatnonzero(~follows), range(3)):
-        series = [_filled(observed[t, :n, body, d], d == THETA) for t, n in enumerate(n_rows)]
-        column = Column.of([complete for complete in series if complete is not None])
-        for t, values in enumerate(series):
-            if values is None or column is None:
-                continue
-            n = len(values)
-            push = action[t, :n][:, ~follows].reshape(n, -1)
+        found = [_filled(observed[t, :n, body, d], d == THETA) for t, n in enumerate(lengths)]
+        series = {t: values for t, values in enumerate(found) if values is not None}
+        if not any(len(values) > 4 and np.ptp(values) > 0 for values in series.values()):
+            continue
+        noise = column_noise(series.values(), 4, robust=True)
+        noise = max(noise, finest_step(np.concatenate([*series.values()])) / np.sqrt(12))
+        kinks = _kinks(series, noise)
+        for t, values in series.items():
+            n, name = len(values), history.bodies[body]
             others = np.delete(observed[t, :n], body, axis=1)[..., :3]
-            for first in (True, False):
-                rows = column.held(values, push) if first else column.stopped(values, push)
-                if rows <= (ends[t, first].rows if (t, first) in ends else 0):
-                    continue
-                if first:
-                    explained = _moves(others[: 2 * rows + BESIDE])
-                else:
-                    explained = _near(scene, int(body), observed[t, :n], n - rows)
-                if not explained:
-                    times = clock[t, :rows] if first else clock[t, n - rows : n]
-                    begin, end = float(times[0]), float(times[-1])
-                    why, name = "held" if first else "stopped", history.bodies[body]
-                    ends[t, first] = End(labels[t], first, rows, begin, end, name, why)
-    return [ends[key] for key in sorted(ends, key=lambda key: (key[0], not key[1]))]
+            rows = _held(values, push[t], series, noise)
+            if rows and not _moves(others[: 2 * rows + BESIDE]):
+                end = End(labels[t], True, rows, clock[t, 0], clock[t, rows - 1], name, "held")
+                ends[t, False] = max(ends.get((t, False), end), end, key=lambda end: end.rows)
+            rows = _stopped(values, push[t], kinks[t], noise)
+            if rows and not _near(scene, int(body), observed[t, :n], n - rows):
+                times = clock[t, n - rows], clock[t, n - 1]
+                end = End(labels[t], False, rows, *times, name, "stopped")
+                ends[t, True] = max(ends.get((t, True), end), end, key=lambda end: end.rows)
+    return [ends[key] for key in sorted(ends)]
+
+
+def _still(values: Floats, noise: float) -> int:
+    """Return the number of rows at the beginning that stay within the noise of their mean."""
+    mean = np.cumsum(values) / np.arange(1, len(values) + 1)
+    near = np.convolve(values, np.full(3, 1 / 3), "same")[1:-1]  # of three rows
+    off = np.abs(near - mean[1:-1]) > 4 * noise / np.sqrt(3)
+    return int(np.argmax(off)) + 1 if off.any() else len(values)
+
+
+def _windows(series: Series, n: int) -> tuple[Floats, list[tuple[int, int]]]:
+    """Return windows of all series, shape (window, n), and the key and first row of each."""
+    at = [(t, i) for t, values in series.items() for i in range(len(values) - n + 1)]
+    return np.array([series[t][i : i + n] for t, i in at]).reshape(-1, n), at
+
+
+def _held(values: Floats, push: Floats, series: Series, noise: float) -> int:
+    """Return the rows at rest at the beginning, before it moves off without a command.
+
+    Motion that sets off at rest differs from a cubic by a quadratic and a cubic after that moment.
+    """
+    still = _still(values, noise)
+    if not LEAST <= still < len(values) - BESIDE:
+        return 0
+    skip = max(0, still - LONGEST)
+    for times in (1, 2, 4):
+        end = still + int(np.clip(times * (still - skip), BESIDE, LONGEST))
+        if end > len(values) or push[:end].any():
+            break
+        rows, at = _windows(series, end - skip)
+        rest = np.eye(end - skip)[:, : still - skip]
+        _, far, sure, _ = outliers(rows, rest, 3, noise)
+        mine = next(i for i, (t, first) in enumerate(at) if series[t] is values and first == skip)
+        if ((far[mine] > 3) & (sure[mine] > LIMIT)).any():
+            return still
+    return 0
+
+
+def _kinks(series: Series, noise: float) -> dict[int, list[tuple[float, int, int]]]:
+    """Return abrupt changes of velocity: certainty, first row of a window, first row after it."""
+    found: dict[int, list[tuple[float, int, int]]] = {t: [] for t in series}
+    for after in (3, 6, 12, 24):
+        rows, at = _windows(series, 3 * after)
+        if not len(rows):
+            continue
+
+        def bent(place: float, power: int, rows: Floats = rows) -> tuple[Floats, ...]:
+            part = np.maximum(np.arange(rows.shape[1]) - place, 0.0)[:, None] ** power
+            return outliers(rows, part, 2, noise)
+
+        places = np.linspace(1, 3 * after - 2, min(6 * after, 60))
+        smooth = np.min([bent(place, 2)[3] for place in places], axis=0)
+        for place in 2 * after - 1 + np.arange(10) / 10:
+            _, far, sure, misfit = bent(place, 1)
+            abrupt = np.minimum(far, sure)[:, 0] > LIMIT
+            for i in np.flatnonzero(abrupt & (misfit < 0.3 * smooth)):
+                t, first = at[i]
+                found[t].append((float(sure[i, 0]), first, first + 2 * after))
+    return found
+
+
+def _stopped(
+    values: Floats, push: Floats, kinks: list[tuple[float, int, int]], noise: float
+) -> int:
+    """Return the rows at the end after an abrupt change of velocity with constant commands."""
+    n = len(values)
+    most = max(n // 4, min(_still(values[::-1], noise), n - BESIDE))
+    ends = [
+        (certainty, n - row)
+        for certainty, first, row in kinks
+        if n - row <= most and not np.ptp(push[first : n - 1], axis=0).any()
+    ]
+    return max(ends)[1] if ends else 0
 
 
 def trimmed(history: History, ends: Iterable[End]) -> History:
