@@ -98,42 +98,44 @@ def strange_ends(history: History, scene: Scene) -> list[End]:
     dataset = history.dataset
     observed, clock = dataset["observed"].to_numpy(), dataset["clock"].to_numpy()
     follows, labels = dataset["kinematic"].to_numpy(), dataset["trajectory"].to_numpy().tolist()
-    lengths = dataset["n_rows"].to_numpy()
     push = np.nan_to_num(dataset["action"].to_numpy())[:, :, ~follows]
-    ends: dict[tuple[int, bool], End] = {}
+    found: dict[tuple[int, bool], End] = {}
     for body, d in product(np.flatnonzero(~follows), range(3)):
-        found = [_filled(observed[t, :n, body, d], d == THETA) for t, n in enumerate(lengths)]
-        series = {t: values for t, values in enumerate(found) if values is not None}
+        filled = [
+            _filled(observed[t, :n, body, d], d == THETA)
+            for t, n in enumerate(dataset["n_rows"].to_numpy())
+        ]
+        series = {t: values for t, values in enumerate(filled) if values is not None}
         if not any(len(values) > 4 and np.ptp(values) > 0 for values in series.values()):
             continue
         noise = column_noise(series.values(), 4, robust=True)
         noise = max(noise, finest_step(np.concatenate([*series.values()])) / np.sqrt(12))
-        kinks = _kinks(series, noise)
+        stops = _stops(series, push, noise)
         for t, values in series.items():
-            n, name = len(values), history.bodies[body]
-            others = np.delete(observed[t, :n], body, axis=1)[..., :3]
-            rows = _held(values, push[t], series, noise)
-            if rows and not _moves(others[: 2 * rows + BESIDE]):
-                end = End(labels[t], True, rows, clock[t, 0], clock[t, rows - 1], name, "held")
-                ends[t, False] = max(ends.get((t, False), end), end, key=lambda end: end.rows)
-            rows = _stopped(values, push[t], kinks[t], noise)
-            if rows and not _near(scene, int(body), observed[t, :n], n - rows):
-                times = clock[t, n - rows], clock[t, n - 1]
-                end = End(labels[t], False, rows, *times, name, "stopped")
-                ends[t, True] = max(ends.get((t, True), end), end, key=lambda end: end.rows)
-    return [ends[key] for key in sorted(ends)]
+            states, n = observed[t, : len(values)], len(values)
+            held, stopped = _held(values, push[t], series, noise), stops.get(t, 0)
+            if held and _moves(np.delete(states, body, axis=1)[: 2 * held + BESIDE, :, :3]):
+                held = 0
+            if stopped and _near(scene, int(body), states, n - stopped):
+                stopped = 0
+            for last, rows, what in ((False, held, "held"), (True, stopped, "stopped")):
+                if rows > (found[t, last].rows if (t, last) in found else 0):
+                    times = clock[t, n - rows : n] if last else clock[t, :rows]
+                    where = (rows, float(times[0]), float(times[-1]), history.bodies[body])
+                    found[t, last] = End(labels[t], not last, *where, what)
+    return [found[key] for key in sorted(found)]
 
 
 def _still(values: Floats, noise: float) -> int:
     """Return the number of rows at the beginning that stay within the noise of their mean."""
     mean = np.cumsum(values) / np.arange(1, len(values) + 1)
-    near = np.convolve(values, np.full(3, 1 / 3), "same")[1:-1]  # of three rows
-    off = np.abs(near - mean[1:-1]) > 4 * noise / np.sqrt(3)
+    three = np.convolve(values, np.full(3, 1 / 3), "valid")
+    off = np.abs(three - mean[1:-1]) > 4 * noise / np.sqrt(3)
     return int(np.argmax(off)) + 1 if off.any() else len(values)
 
 
 def _windows(series: Series, n: int) -> tuple[Floats, list[tuple[int, int]]]:
-    """Return windows of all series, shape (window, n), and the key and first row of each."""
+    """Return windows of all series, shape (window, n), and the trajectory and first row of each."""
     at = [(t, i) for t, values in series.items() for i in range(len(values) - n + 1)]
     return np.array([series[t][i : i + n] for t, i in at]).reshape(-1, n), at
 
@@ -141,60 +143,45 @@ def _windows(series: Series, n: int) -> tuple[Floats, list[tuple[int, int]]]:
 def _held(values: Floats, push: Floats, series: Series, noise: float) -> int:
     """Return the rows at rest at the beginning, before it moves off without a command.
 
-    Motion that sets off at rest differs from a cubic by a quadratic and a cubic after that moment.
+    They are off the cubic through the rows after them, which a smooth motion from rest is not.
     """
     still = _still(values, noise)
-    if not LEAST <= still < len(values) - BESIDE:
-        return 0
-    skip = max(0, still - LONGEST)
-    for times in (1, 2, 4):
-        end = still + int(np.clip(times * (still - skip), BESIDE, LONGEST))
+    first = max(0, still - LONGEST)  # of a long rest its last rows are enough
+    for times in (1, 2, 4) if LEAST <= still < len(values) - BESIDE else ():
+        end = still + int(np.clip(times * (still - first), BESIDE, LONGEST))
         if end > len(values) or push[:end].any():
             break
-        rows, at = _windows(series, end - skip)
-        rest = np.eye(end - skip)[:, : still - skip]
-        _, far, sure, _ = outliers(rows, rest, 3, noise)
-        mine = next(i for i, (t, first) in enumerate(at) if series[t] is values and first == skip)
-        if ((far[mine] > 3) & (sure[mine] > LIMIT)).any():
+        rows = np.vstack([values[first:end], _windows(series, end - first)[0]])
+        _, far, sure, _ = outliers(rows, np.eye(end - first)[:, : still - first], 3, noise)
+        if ((far[0] > 3) & (sure[0] > LIMIT)).any():
             return still
     return 0
 
 
-def _kinks(series: Series, noise: float) -> dict[int, list[tuple[float, int, int]]]:
-    """Return abrupt changes of velocity: certainty, first row of a window, first row after it."""
-    found: dict[int, list[tuple[float, int, int]]] = {t: [] for t in series}
+def _stops(series: Series, push: Floats, noise: float) -> dict[int, int]:
+    """Return the rows at the end after an abrupt change of velocity with constant commands.
+
+    A change of the acceleration, as where dry friction ends a motion, must fit far worse.
+    """
+    best: dict[int, tuple[float, int]] = {}
+    still = {t: _still(values[::-1], noise) for t, values in series.items()}
     for after in (3, 6, 12, 24):
         rows, at = _windows(series, 3 * after)
-        if not len(rows):
-            continue
-
-        def bent(place: float, power: int, rows: Floats = rows) -> tuple[Floats, ...]:
-            part = np.maximum(np.arange(rows.shape[1]) - place, 0.0)[:, None] ** power
-            return outliers(rows, part, 2, noise)
-
-        places = np.linspace(1, 3 * after - 2, min(6 * after, 60))
-        smooth = np.min([bent(place, 2)[3] for place in places], axis=0)
-        for place in 2 * after - 1 + np.arange(10) / 10:
-            _, far, sure, misfit = bent(place, 1)
-            abrupt = np.minimum(far, sure)[:, 0] > LIMIT
-            for i in np.flatnonzero(abrupt & (misfit < 0.3 * smooth)):
-                t, first = at[i]
-                found[t].append((float(sure[i, 0]), first, first + 2 * after))
-    return found
-
-
-def _stopped(
-    values: Floats, push: Floats, kinks: list[tuple[float, int, int]], noise: float
-) -> int:
-    """Return the rows at the end after an abrupt change of velocity with constant commands."""
-    n = len(values)
-    most = max(n // 4, min(_still(values[::-1], noise), n - BESIDE))
-    ends = [
-        (certainty, n - row)
-        for certainty, first, row in kinks
-        if n - row <= most and not np.ptp(push[first : n - 1], axis=0).any()
-    ]
-    return max(ends)[1] if ends else 0
+        time, places = np.arange(3 * after)[:, None], np.linspace(1, 3 * after - 2, 6 * after)
+        for place in 2 * after - 1 + np.arange(10) / 10 if len(rows) else ():
+            _, far, sure, misfit = outliers(rows, np.maximum(time - place, 0.0), 2, noise)
+            abrupt = np.flatnonzero(np.minimum(far, sure)[:, 0] > LIMIT)
+            if not len(abrupt):
+                continue
+            bent = [np.maximum(time - other, 0.0) ** 2 for other in places]
+            smooth = np.min([outliers(rows[abrupt], part, 2, noise)[3] for part in bent], axis=0)
+            for i in abrupt[misfit[abrupt] < 0.3 * smooth]:
+                (t, first), n = at[i], len(series[at[i][0]])
+                left = n - first - 2 * after
+                constant = not np.ptp(push[t, first : n - 1], axis=0).any()
+                if constant and left <= max(n // 4, min(still[t], n - BESIDE)):
+                    best[t] = max(best.get(t, (0.0, 0)), (float(sure[i, 0]), left))
+    return {t: left for t, (_, left) in best.items()}
 
 
 def trimmed(history: History, ends: Iterable[End]) -> History:
@@ -221,49 +208,35 @@ def trimmed(history: History, ends: Iterable[End]) -> History:
     """
     dataset = history.dataset
     labels, n_rows = dataset["trajectory"].to_numpy().tolist(), dataset["n_rows"].to_numpy()
-    begin, end = np.zeros(len(labels), dtype=np.int64), n_rows.astype(np.int64)
+    begin, end = np.zeros_like(n_rows), n_rows.copy()
     for bad in ends:
         t = labels.index(bad.trajectory)
-        if bad.first:
-            begin[t] = max(begin[t], bad.rows)
-        else:
-            end[t] = min(end[t], n_rows[t] - bad.rows)
-    for t in np.flatnonzero(end - begin < LEAST):
+        begin[t] = max(begin[t], bad.rows if bad.first else 0)
+        end[t] = min(end[t], n_rows[t] - (0 if bad.first else bad.rows))
+    kept = end - begin
+    for t in np.flatnonzero(kept < LEAST):
         raise HistoryError(
-            f"history: trajectory {labels[t]} has {max(end[t] - begin[t], 0)} rows without its"
-            f" first {begin[t]} and last {n_rows[t] - end[t]}; expected at least {LEAST}; drop the"
+            f"history: trajectory {labels[t]} has {max(kept[t], 0)} rows without its first"
+            f" {begin[t]} and last {n_rows[t] - end[t]}; expected at least {LEAST}; drop the"
             " trajectory"
         )
-    if (begin == 0).all() and (end == n_rows).all():
+    if (kept == n_rows).all():
         return history
-    length = int((end - begin).max())
-    rows = begin[:, None] + np.arange(length)
-    outside = rows >= end[:, None]
-    rows = np.where(outside, 0, rows)
-    result = dataset.isel(time=slice(length)).copy()
+    each, rows = np.arange(len(labels)), begin[:, None] + np.arange(kept.max())
+    result = dataset.isel(time=slice(kept.max())).assign(n_rows=dataset["n_rows"].copy(data=kept))
     for name in ("observed", "action", "start", "clock"):
-        values = dataset[name].to_numpy()
-        kept = values[np.arange(len(labels))[:, None], rows]
-        kept[outside] = np.nan
-        result[name] = result[name].copy(data=kept)
+        values = dataset[name].to_numpy()[each[:, None], np.minimum(rows, end[:, None] - 1)]
+        values[rows >= end[:, None]] = np.nan
+        result[name] = result[name].copy(data=values)
+    result["action"].to_numpy()[each, kept - 1] = np.nan
     # velocities estimated from positions across a stop
     never = ~np.isfinite(dataset["observed"].to_numpy()[..., 3:]).any(axis=(0, 1))
-    start = result["start"].to_numpy().copy()
     for t in np.flatnonzero(end < n_rows):
-        kept = end[t] - begin[t]
-        start[t, max(kept - RATE_REACH, 1) : kept, :, 3:][:, never] = np.nan
-    action, before = dataset["action"].to_numpy(), dataset["before"].to_numpy().copy()
-    late = np.flatnonzero(begin)
-    before[late] = np.nan_to_num(action[late, begin[late] - 1])
-    last = result["action"].to_numpy()
-    last[np.arange(len(labels)), end - begin - 1] = np.nan
-    result = result.assign(
-        action=result["action"].copy(data=last),
-        start=result["start"].copy(data=start),
-        before=dataset["before"].copy(data=before),
-        n_rows=dataset["n_rows"].copy(data=end - begin),
-    )
-    return History(hashed(result))
+        last = slice(max(kept[t] - RATE_REACH, 1), kept[t])
+        result["start"].to_numpy()[t, last, :, 3:][:, never] = np.nan
+    before, late = dataset["before"].to_numpy().copy(), np.flatnonzero(begin)
+    before[late] = np.nan_to_num(dataset["action"].to_numpy()[late, begin[late] - 1])
+    return History(hashed(result.assign(before=dataset["before"].copy(data=before))))
 
 
 def _filled(values: Floats, angle: bool) -> Floats | None:
@@ -294,24 +267,19 @@ def _near(scene: Scene, body: int, states: Floats, row: int, slack: float = 0.25
     values = places[:, body]
     if not np.isfinite(values).all():
         return False  # a hinged body with a measured angle alone
-    speed = np.abs(np.diff(values, axis=0)).max() if len(values) > 1 else 0.0
-    reach = (1 + slack) * moving[body].shape.bounding_radius + 2 * float(speed)
+    reach = (1 + slack) * moving[body].shape.bounding_radius
+    reach += 2 * float(np.abs(np.diff(values, axis=0)).max(initial=0.0))
+    far = []
     for wall in scene.walls:
         start, way = np.array(wall.start), np.array(wall.end) - np.array(wall.start)
-        along = np.clip(
-            (values - start) @ way / max(float(way @ way), np.finfo(float).tiny), 0.0, 1.0
-        )
-        if (np.linalg.norm(values - start - along[:, None] * way, axis=1) < reach).any():
-            return True
-    others = [(neighbour, places[:, i]) for i, neighbour in enumerate(moving) if i != body]
-    others += [
-        (neighbour, np.array(neighbour.pose)[:2]) for neighbour in scene.bodies if neighbour.static
-    ]
+        along = np.clip((values - start) @ way / max(way @ way, np.finfo(float).tiny), 0.0, 1.0)
+        far.append(np.linalg.norm(values - start - along[:, None] * way, axis=1))
+    others = [(other, places[:, i]) for i, other in enumerate(moving) if i != body]
+    others += [(other, np.array(other.pose)[:2]) for other in scene.bodies if other.static]
     for other, place in others:
-        far = np.linalg.norm(values - place, axis=1)
-        if not (far > reach + (1 + slack) * other.shape.bounding_radius).all():
-            return True
-    return any(
+        radius = (1 + slack) * other.shape.bounding_radius
+        far.append(np.linalg.norm(values - place, axis=1) - radius)
+    return not all((distance > reach).all() for distance in far) or any(
         joint.traits.stops_bodies and moving[body].name in (joint.bodies or ())
         for joint in scene.joints
     )
