@@ -34,7 +34,7 @@ from .units import mass_contradictions as mass_contradictions
 from .units import unit_mismatches as unit_mismatches
 from .units import with_units as with_units
 from .velocities import UnusedVelocity as UnusedVelocity
-from .velocities import computed_by as computed_by
+from .velocities import computed_lag as computed_lag
 from .velocities import measured_alone as measured_alone
 from .velocities import measurement_noise as measurement_noise
 from .velocities import unused_velocities as unused_velocities

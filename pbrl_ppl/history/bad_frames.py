@@ -230,44 +230,67 @@ def _off(
         Shape (trajectory, time).
     """
     result, rough = np.full((*column.shape, gap), np.nan), np.zeros(column.shape, dtype=bool)
-    span = 2 * width + gap
+    span, end = 2 * width + gap, width + gap
     if column.shape[1] < span:
         return result, rough
     windows = np.lib.stride_tricks.sliding_window_view(column, span, axis=1)
     trajectory, first = np.nonzero(np.isfinite(windows).all(axis=-1))
-    rows = windows[trajectory, first]
-    if not len(rows):
+    if not len(first):
         return result, rough
-    middle = slice(width, width + gap)
-    place = np.arange(span) - width - (gap - 1) / 2
-    there, other = place[middle], np.delete(place, middle)
-    sides = np.delete(rows, middle, axis=1)
-    sides = np.unwrap(sides, axis=1) if angle else sides
-    least = finest_step(column)
-
-    def off_curve(side: slice, degree: int) -> tuple[Floats, Floats, Floats]:
-        """Return the rows less a curve, that over its standard error, and that over the scale."""
-        predict = np.vander(there, degree + 1) @ np.linalg.pinv(np.vander(other[side], degree + 1))
-        off = rows[:, middle] - sides[:, side] @ predict.T
-        off = wrapped(off) if angle else off
-        size = np.abs(off) / np.sqrt(1.0 + (predict**2).sum(axis=1))
-        scale = max(GAUSSIAN * float(np.median(size)), least)
-        return off, size, size / scale
-
-    off, size, far = off_curve(slice(None), 3)
-    powers = np.vander(other, 4)
-    remainder = sides - sides @ (powers @ np.linalg.pinv(powers)).T
-    misfit = np.sqrt((remainder**2).sum(axis=1) / (len(other) - 4))
-    good = ((far > limit) & (size > limit * misfit[:, None])).all(axis=1)
-    for side in (slice(width), slice(width, None)):
-        off_side, _, far = off_curve(side, 2)
+    rows, middle = windows[trajectory, first], np.arange(width, end)
+    if angle:
+        sides = np.delete(np.arange(span), middle)
+        rows[:, sides] = np.unwrap(rows[:, sides], axis=1)
+    least, each = finest_step(column), np.eye(span)[:, middle]
+    off, far, sure, misfit = outliers(rows, each, 3, least, angle=angle)
+    good = ((far > limit) & (sure > limit)).all(axis=1)
+    for side in (slice(end), slice(width, None)):
+        off_side, far, _, _ = outliers(rows[:, side], each[side], 2, least, angle=angle)
         apart = wrapped(off_side - off) if angle else off_side - off
-        agree = np.abs(apart) <= agreement * np.abs(off)
-        good &= ((far > limit_of_side) & agree).all(axis=1)
+        good &= ((far > limit_of_side) & (np.abs(apart) <= agreement * np.abs(off))).all(axis=1)
     ragged = misfit > limit * max(float(np.median(misfit)), least)
     result[trajectory[good], first[good] + width] = off[good]
     rough[trajectory[ragged], first[ragged] + width] = True
     return result, rough
+
+
+def outliers(
+    rows: Floats, parts: Floats, degree: int, least: float, *, angle: bool = False
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return the sizes of deviations from a polynomial, fitted alongside, and how large they are.
+
+    Parameters
+    ----------
+    rows : ndarray
+        Windows of a column, shape (window, time).
+    parts : ndarray
+        Shapes of deviations, shape (time, part); of a row that is off one there, zero elsewhere.
+    degree : int
+        Of the polynomial.
+    least : float
+        Least noise.
+    angle : bool
+        Whether the sizes wrap (rad).
+
+    Returns
+    -------
+    size, far, sure : ndarray
+        Sizes, those over their robust scale in all windows, and over their standard errors, shape
+        (window, part).
+    misfit : ndarray
+        Standard deviation of the rows about the fit, shape (window,).
+    """
+    time = np.linspace(-1.0, 1.0, rows.shape[1])
+    design = np.hstack([parts, np.vander(time, degree + 1)])
+    inverse, n = np.linalg.pinv(design), parts.shape[1]
+    size = rows @ inverse[:n].T
+    residual = rows - rows @ inverse.T @ design.T
+    misfit = np.sqrt((residual**2).sum(axis=1) / max(len(time) - design.shape[1], 1))
+    size = wrapped(size) if angle else size
+    standard = np.abs(size) / np.linalg.norm(inverse[:n], axis=1)
+    scale = max(GAUSSIAN * float(np.median(standard)), least)
+    sure = standard / np.maximum(misfit, least)[:, None]
+    return size, standard / scale, sure, misfit
 
 
 def _happened(state: Floats, off: Floats, dt: float) -> Bools:

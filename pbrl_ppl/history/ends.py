@@ -3,194 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 
 from pbrl_ppl.errors import HistoryError
+from pbrl_ppl.history.bad_frames import outliers
 from pbrl_ppl.history.history import History, hashed
 from pbrl_ppl.history.kinematics import RATE_REACH, column_noise, finest_step
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import THETA, Floats
 
+#: Positions of a dimension without gaps, by trajectory.
+Series = dict[int, Floats]
 #: Least rows at rest, and of a trajectory without its ends.
 LEAST = 3
 #: Least rows of motion beside those at rest.
 BESIDE = 6
-
-
-@dataclass(frozen=True, eq=False)
-class Column:
-    """Positions of a dimension in all trajectories.
-
-    Attributes
-    ----------
-    series : list of ndarray
-        Shape (time,) each.
-    noise : float
-        Standard deviation of the measurement noise.
-    change : float
-        90th percentile of the changes of velocity, per row.
-    still : float
-        Measurement noises within which a body is at rest.
-    longest : int
-        Rows at rest, and rows of motion, that are looked at, at most.
-    places : int
-        Places of a bend that are tried, at most.
-    gain, share : float
-        A bend takes this much off the sum of squares of a cubic, in variances of the noise, and
-        this share of it.
-    outside : float
-        A cubic fits the end this many times worse than it fits the median window of all rows.
-    certainty, large : float
-        An abrupt change of velocity in standard errors, and over ``change``.
-    limit : float
-        A moment of release may fit worse than the best by so much, in variances.
-    """
-
-    series: list[Floats]
-    noise: float
-    change: float
-    still: float = 4.0
-    longest: int = 200
-    places: int = 60
-    gain: float = 100.0
-    share: float = 0.9
-    outside: float = 2.5
-    certainty: float = 8.0
-    large: float = 4.0
-    limit: float = 4.0
-
-    @classmethod
-    def of(cls, series: list[Floats]) -> Column | None:
-        """Return the column of series; None where nothing moves or rows are too few.
-
-        Noise comes from fourth differences, changes of velocity from second ones.
-        """
-        if not any(len(values) > 4 for values in series) or not any(map(np.ptp, series)):
-            return None
-        finest = finest_step(np.concatenate(series))
-        noise = max(column_noise(series, 4, robust=True), finest / np.sqrt(12))
-        second = np.concatenate([np.diff(values, 2) for values in series])
-        # of independent errors the second differences have six times the variance
-        change = float(np.quantile(np.abs(second), 0.9)) ** 2 - 6 * (1.8 * noise) ** 2
-        return cls(series, noise, float(np.sqrt(max(change, 0.0))))
-
-    def held(self, values: Floats, push: Floats) -> int:
-        """Return the rows at rest at the beginning, before it moves off without a command."""
-        still = self._still(values)
-        if not LEAST <= still < len(values) - BESIDE:
-            return 0
-        skip = max(0, still - self.longest)  # of a long rest its last rows are enough
-        still -= skip
-        for window in self._windows(values[skip:], still):
-            if push[: skip + len(window)].any():
-                break
-            places = np.linspace(2, still, min(2 * still - 3, self.places))
-            bend = self._bend(window, places, 3, rest=True, abrupt=False)
-            if bend is not None and bend.place >= LEAST - 1:
-                return skip + int(np.ceil(bend.latest))
-        return 0
-
-    def stopped(self, values: Floats, push: Floats) -> int:
-        """Return the rows at the end after an abrupt change of velocity with constant commands."""
-        back = values[::-1]
-        still = self._still(back)
-        n = len(values)
-        tries = [(min(max(LEAST, n // 4), self.longest), 0, False)]
-        if LEAST <= still < n - BESIDE:
-            skip = max(0, still - self.longest)
-            tries.append((still - skip, skip, True))
-        best, rows = None, 0
-        for longest, skip, rest in tries:
-            places = np.linspace(1.5, longest, min(2 * longest - 2, self.places))
-            for window in self._windows(back[skip:], longest):
-                if np.ptp(push[n - skip - len(window) : -1], axis=0).any():
-                    continue
-                bend = self._bend(window, places, 2, rest=rest, abrupt=True)
-                if bend is None or abs(bend.jump) < self.large * self.change:
-                    continue
-                if bend.certainty < self.certainty:
-                    continue
-                if best is None or bend.certainty > best.certainty:
-                    # rows after the moment of the stop: in reversed time those before it
-                    best, rows = bend, skip + int(np.floor(bend.latest)) + 1
-        return rows
-
-    def _still(self, values: Floats) -> int:
-        """Return the number of rows at the beginning that stay within the noise of their mean."""
-        mean = np.cumsum(values) / np.arange(1, len(values) + 1)
-        off = np.abs(values - mean) > self.still * self.noise
-        return int(np.argmax(off)) if off.any() else len(values)
-
-    def _windows(self, values: Floats, still: int) -> list[Floats]:
-        """Return beginnings of a series: the rows at rest, and more and more beside them."""
-        beside = (int(np.clip(times * still, BESIDE, self.longest)) for times in (1, 2, 4))
-        return [values[: still + rows] for rows in beside if still + rows <= len(values)]
-
-    def _bend(
-        self, window: Floats, places: Floats, degree: int, *, rest: bool, abrupt: bool
-    ) -> Bend | None:
-        """Return the best bend, if no smoother motion fits as well and it is unlike other rows.
-
-        Smoother is a cubic; than an abrupt change of velocity also one of the acceleration, as
-        where dry friction ends a motion.
-        """
-        n = len(window)
-        time = np.arange(n, dtype=float)
-        cubic = np.vander(time / n, 4)
-        smooth = np.eye(n) - cubic @ np.linalg.pinv(cubic)
-        without = float(((smooth @ window) ** 2).sum())
-        for place in np.linspace(1, n - 2, min(2 * n, self.places)) if abrupt else ():
-            parts = [time, time**2, np.maximum(time - place, 0.0) ** 2]
-            without = min(without, _fitted(window, parts)[2])
-        bends, powers = [], range(2 if rest else 1, degree + 1)
-        for place in places:
-            after = np.maximum(time - place, 0.0)
-            more = [(after if rest else time) ** k for k in powers]
-            jump, error, left = _fitted(window, [after, *more])
-            free = max(n - len(more) - 3, 1)
-            error *= max(self.noise, float(np.sqrt(left / free)))
-            bends.append(Bend(float(place), float(place), jump, error, left))
-        best = min(bends, key=lambda bend: bend.left)
-        variance = max(self.noise**2, best.left / max(n - 5, 1))
-        if without - best.left < self.gain * variance or best.left > (1 - self.share) * without:
-            return None
-        elsewhere = [
-            ((np.lib.stride_tricks.sliding_window_view(values, n) @ smooth) ** 2).sum(axis=1)
-            for values in self.series
-            if len(values) >= n
-        ]
-        if without < self.outside**2 * float(np.median(np.concatenate(elsewhere))):
-            return None
-        near = [bend.place for bend in bends if bend.left < best.left + self.limit * variance]
-        return replace(best, latest=max(near))
-
-
-@dataclass(frozen=True)
-class Bend:
-    """A bend at a row (a fraction): its latest place, its jump of velocity with standard error."""
-
-    place: float
-    latest: float
-    jump: float
-    error: float
-    left: float
-
-    @property
-    def certainty(self) -> float:
-        """Jump over its standard error."""
-        return abs(self.jump) / self.error
-
-
-def _fitted(window: Floats, parts: list[Floats]) -> tuple[float, float, float]:
-    """Return the first part's size, its error at a noise of one, and the sum of squares left."""
-    design = np.stack([*parts, np.ones(len(window))], axis=1)
-    inverse = np.linalg.pinv(design)
-    size = inverse @ window
-    left = float(((window - design @ size) ** 2).sum())
-    return float(size[0]), float(np.linalg.norm(inverse[0])), left
+#: Rows at rest, and rows of motion, that are looked at, at most.
+LONGEST = 200
+#: Robust standard deviations, and standard errors, of a bend.
+LIMIT = 8.0
 
 
 @dataclass(frozen=True)
@@ -263,33 +97,91 @@ def strange_ends(history: History, scene: Scene) -> list[End]:
     """
     dataset = history.dataset
     observed, clock = dataset["observed"].to_numpy(), dataset["clock"].to_numpy()
-    action = np.nan_to_num(dataset["action"].to_numpy())
-    follows = dataset["kinematic"].to_numpy()
-    labels, n_rows = dataset["trajectory"].to_numpy().tolist(), dataset["n_rows"].to_numpy()
-    ends: dict[tuple[int, bool], End] = {}
+    follows, labels = dataset["kinematic"].to_numpy(), dataset["trajectory"].to_numpy().tolist()
+    push = np.nan_to_num(dataset["action"].to_numpy())[:, :, ~follows]
+    found: dict[tuple[int, bool], End] = {}
     for body, d in product(np.flatnonzero(~follows), range(3)):
-        series = [_filled(observed[t, :n, body, d], d == THETA) for t, n in enumerate(n_rows)]
-        column = Column.of([complete for complete in series if complete is not None])
-        for t, values in enumerate(series):
-            if values is None or column is None:
+        filled = [
+            _filled(observed[t, :n, body, d], d == THETA)
+            for t, n in enumerate(dataset["n_rows"].to_numpy())
+        ]
+        series = {t: values for t, values in enumerate(filled) if values is not None}
+        if not any(len(values) > 4 and np.ptp(values) > 0 for values in series.values()):
+            continue
+        noise = column_noise(series.values(), 4, robust=True)
+        noise = max(noise, finest_step(np.concatenate([*series.values()])) / np.sqrt(12))
+        stops = _stops(series, push, noise)
+        for t, values in series.items():
+            states, n = observed[t, : len(values)], len(values)
+            held, stopped = _held(values, push[t], series, noise), stops.get(t, 0)
+            if held and _moves(np.delete(states, body, axis=1)[: 2 * held + BESIDE, :, :3]):
+                held = 0
+            if stopped and _near(scene, int(body), states, n - stopped):
+                stopped = 0
+            for last, rows, what in ((False, held, "held"), (True, stopped, "stopped")):
+                if rows > (found[t, last].rows if (t, last) in found else 0):
+                    times = clock[t, n - rows : n] if last else clock[t, :rows]
+                    where = (rows, float(times[0]), float(times[-1]), history.bodies[body])
+                    found[t, last] = End(labels[t], not last, *where, what)
+    return [found[key] for key in sorted(found)]
+
+
+def _still(values: Floats, noise: float) -> int:
+    """Return the number of rows at the beginning that stay within the noise of their mean."""
+    mean = np.cumsum(values) / np.arange(1, len(values) + 1)
+    three = np.convolve(values, np.full(3, 1 / 3), "valid")
+    off = np.abs(three - mean[1:-1]) > 4 * noise / np.sqrt(3)
+    return int(np.argmax(off)) + 1 if off.any() else len(values)
+
+
+def _windows(series: Series, n: int) -> tuple[Floats, list[tuple[int, int]]]:
+    """Return windows of all series, shape (window, n), and the trajectory and first row of each."""
+    at = [(t, i) for t, values in series.items() for i in range(len(values) - n + 1)]
+    return np.array([series[t][i : i + n] for t, i in at]).reshape(-1, n), at
+
+
+def _held(values: Floats, push: Floats, series: Series, noise: float) -> int:
+    """Return the rows at rest at the beginning, before it moves off without a command.
+
+    They are off the cubic through the rows after them, which a smooth motion from rest is not.
+    """
+    still = _still(values, noise)
+    first = max(0, still - LONGEST)  # of a long rest its last rows are enough
+    for times in (1, 2, 4) if LEAST <= still < len(values) - BESIDE else ():
+        end = still + int(np.clip(times * (still - first), BESIDE, LONGEST))
+        if end > len(values) or push[:end].any():
+            break
+        rows = np.vstack([values[first:end], _windows(series, end - first)[0]])
+        _, far, sure, _ = outliers(rows, np.eye(end - first)[:, : still - first], 3, noise)
+        if ((far[0] > 3) & (sure[0] > LIMIT)).any():
+            return still
+    return 0
+
+
+def _stops(series: Series, push: Floats, noise: float) -> dict[int, int]:
+    """Return the rows at the end after an abrupt change of velocity with constant commands.
+
+    A change of the acceleration, as where dry friction ends a motion, must fit far worse.
+    """
+    best: dict[int, tuple[float, int]] = {}
+    still = {t: _still(values[::-1], noise) for t, values in series.items()}
+    for after in (3, 6, 12, 24):
+        rows, at = _windows(series, 3 * after)
+        time, places = np.arange(3 * after)[:, None], np.linspace(1, 3 * after - 2, 6 * after)
+        for place in 2 * after - 1 + np.arange(10) / 10 if len(rows) else ():
+            _, far, sure, misfit = outliers(rows, np.maximum(time - place, 0.0), 2, noise)
+            abrupt = np.flatnonzero(np.minimum(far, sure)[:, 0] > LIMIT)
+            if not len(abrupt):
                 continue
-            n = len(values)
-            push = action[t, :n][:, ~follows].reshape(n, -1)
-            others = np.delete(observed[t, :n], body, axis=1)[..., :3]
-            for first in (True, False):
-                rows = column.held(values, push) if first else column.stopped(values, push)
-                if rows <= (ends[t, first].rows if (t, first) in ends else 0):
-                    continue
-                if first:
-                    explained = _moves(others[: 2 * rows + BESIDE])
-                else:
-                    explained = _near(scene, int(body), observed[t, :n], n - rows)
-                if not explained:
-                    times = clock[t, :rows] if first else clock[t, n - rows : n]
-                    begin, end = float(times[0]), float(times[-1])
-                    why, name = "held" if first else "stopped", history.bodies[body]
-                    ends[t, first] = End(labels[t], first, rows, begin, end, name, why)
-    return [ends[key] for key in sorted(ends, key=lambda key: (key[0], not key[1]))]
+            bent = [np.maximum(time - other, 0.0) ** 2 for other in places]
+            smooth = np.min([outliers(rows[abrupt], part, 2, noise)[3] for part in bent], axis=0)
+            for i in abrupt[misfit[abrupt] < 0.3 * smooth]:
+                (t, first), n = at[i], len(series[at[i][0]])
+                left = n - first - 2 * after
+                constant = not np.ptp(push[t, first : n - 1], axis=0).any()
+                if constant and left <= max(n // 4, min(still[t], n - BESIDE)):
+                    best[t] = max(best.get(t, (0.0, 0)), (float(sure[i, 0]), left))
+    return {t: left for t, (_, left) in best.items()}
 
 
 def trimmed(history: History, ends: Iterable[End]) -> History:
@@ -316,49 +208,35 @@ def trimmed(history: History, ends: Iterable[End]) -> History:
     """
     dataset = history.dataset
     labels, n_rows = dataset["trajectory"].to_numpy().tolist(), dataset["n_rows"].to_numpy()
-    begin, end = np.zeros(len(labels), dtype=np.int64), n_rows.astype(np.int64)
+    begin, end = np.zeros_like(n_rows), n_rows.copy()
     for bad in ends:
         t = labels.index(bad.trajectory)
-        if bad.first:
-            begin[t] = max(begin[t], bad.rows)
-        else:
-            end[t] = min(end[t], n_rows[t] - bad.rows)
-    for t in np.flatnonzero(end - begin < LEAST):
+        begin[t] = max(begin[t], bad.rows if bad.first else 0)
+        end[t] = min(end[t], n_rows[t] - (0 if bad.first else bad.rows))
+    kept = end - begin
+    for t in np.flatnonzero(kept < LEAST):
         raise HistoryError(
-            f"history: trajectory {labels[t]} has {max(end[t] - begin[t], 0)} rows without its"
-            f" first {begin[t]} and last {n_rows[t] - end[t]}; expected at least {LEAST}; drop the"
+            f"history: trajectory {labels[t]} has {max(kept[t], 0)} rows without its first"
+            f" {begin[t]} and last {n_rows[t] - end[t]}; expected at least {LEAST}; drop the"
             " trajectory"
         )
-    if (begin == 0).all() and (end == n_rows).all():
+    if (kept == n_rows).all():
         return history
-    length = int((end - begin).max())
-    rows = begin[:, None] + np.arange(length)
-    outside = rows >= end[:, None]
-    rows = np.where(outside, 0, rows)
-    result = dataset.isel(time=slice(length)).copy()
+    each, rows = np.arange(len(labels)), begin[:, None] + np.arange(kept.max())
+    result = dataset.isel(time=slice(kept.max())).assign(n_rows=dataset["n_rows"].copy(data=kept))
     for name in ("observed", "action", "start", "clock"):
-        values = dataset[name].to_numpy()
-        kept = values[np.arange(len(labels))[:, None], rows]
-        kept[outside] = np.nan
-        result[name] = result[name].copy(data=kept)
+        values = dataset[name].to_numpy()[each[:, None], np.minimum(rows, end[:, None] - 1)]
+        values[rows >= end[:, None]] = np.nan
+        result[name] = result[name].copy(data=values)
+    result["action"].to_numpy()[each, kept - 1] = np.nan
     # velocities estimated from positions across a stop
     never = ~np.isfinite(dataset["observed"].to_numpy()[..., 3:]).any(axis=(0, 1))
-    start = result["start"].to_numpy().copy()
     for t in np.flatnonzero(end < n_rows):
-        kept = end[t] - begin[t]
-        start[t, max(kept - RATE_REACH, 1) : kept, :, 3:][:, never] = np.nan
-    action, before = dataset["action"].to_numpy(), dataset["before"].to_numpy().copy()
-    late = np.flatnonzero(begin)
-    before[late] = np.nan_to_num(action[late, begin[late] - 1])
-    last = result["action"].to_numpy()
-    last[np.arange(len(labels)), end - begin - 1] = np.nan
-    result = result.assign(
-        action=result["action"].copy(data=last),
-        start=result["start"].copy(data=start),
-        before=dataset["before"].copy(data=before),
-        n_rows=dataset["n_rows"].copy(data=end - begin),
-    )
-    return History(hashed(result))
+        last = slice(max(kept[t] - RATE_REACH, 1), kept[t])
+        result["start"].to_numpy()[t, last, :, 3:][:, never] = np.nan
+    before, late = dataset["before"].to_numpy().copy(), np.flatnonzero(begin)
+    before[late] = np.nan_to_num(dataset["action"].to_numpy()[late, begin[late] - 1])
+    return History(hashed(result.assign(before=dataset["before"].copy(data=before))))
 
 
 def _filled(values: Floats, angle: bool) -> Floats | None:
@@ -389,24 +267,19 @@ def _near(scene: Scene, body: int, states: Floats, row: int, slack: float = 0.25
     values = places[:, body]
     if not np.isfinite(values).all():
         return False  # a hinged body with a measured angle alone
-    speed = np.abs(np.diff(values, axis=0)).max() if len(values) > 1 else 0.0
-    reach = (1 + slack) * moving[body].shape.bounding_radius + 2 * float(speed)
+    reach = (1 + slack) * moving[body].shape.bounding_radius
+    reach += 2 * float(np.abs(np.diff(values, axis=0)).max(initial=0.0))
+    far = []
     for wall in scene.walls:
         start, way = np.array(wall.start), np.array(wall.end) - np.array(wall.start)
-        along = np.clip(
-            (values - start) @ way / max(float(way @ way), np.finfo(float).tiny), 0.0, 1.0
-        )
-        if (np.linalg.norm(values - start - along[:, None] * way, axis=1) < reach).any():
-            return True
-    others = [(neighbour, places[:, i]) for i, neighbour in enumerate(moving) if i != body]
-    others += [
-        (neighbour, np.array(neighbour.pose)[:2]) for neighbour in scene.bodies if neighbour.static
-    ]
+        along = np.clip((values - start) @ way / max(way @ way, np.finfo(float).tiny), 0.0, 1.0)
+        far.append(np.linalg.norm(values - start - along[:, None] * way, axis=1))
+    others = [(other, places[:, i]) for i, other in enumerate(moving) if i != body]
+    others += [(other, np.array(other.pose)[:2]) for other in scene.bodies if other.static]
     for other, place in others:
-        far = np.linalg.norm(values - place, axis=1)
-        if not (far > reach + (1 + slack) * other.shape.bounding_radius).all():
-            return True
-    return any(
+        radius = (1 + slack) * other.shape.bounding_radius
+        far.append(np.linalg.norm(values - place, axis=1) - radius)
+    return not all((distance > reach).all() for distance in far) or any(
         joint.traits.stops_bodies and moving[body].name in (joint.bodies or ())
         for joint in scene.joints
     )

@@ -1,13 +1,10 @@
 """Velocity columns that were computed from positions of the log, or lag them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from functools import lru_cache
-from itertools import chain
+from dataclasses import dataclass
 from math import comb
 
 import numpy as np
-from scipy.signal import savgol_coeffs
 from scipy.stats import f as f_distribution
 from scipy.stats import t as t_distribution
 
@@ -31,23 +28,23 @@ class UnusedVelocity:
         Name of the velocity: "vx", "vy" or "omega".
     position : str
         Name of its position: "x", "y" or "theta".
-    computed_by : str or None
-        The filter that gives it from the position; None if it lags the position only.
+    computed : bool
+        Whether positions of the log give it; else it only lags them.
     lag : float
         By how much it is late (s); negative if early.
 
     Examples
     --------
-    >>> UnusedVelocity("ball", "vy", "y", "central differences", 0.0).sentence
-    'vy of ball was computed from y (central differences) and is not used'
-    >>> UnusedVelocity("arm", "omega", "theta", None, 0.012).sentence
+    >>> UnusedVelocity("ball", "vy", "y", True, 0.02).sentence
+    'vy of ball was computed from y, 20 ms late, and is not used'
+    >>> UnusedVelocity("arm", "omega", "theta", False, 0.012).sentence
     'omega of arm lags theta by 12 ms and is not used'
     """
 
     body: str
     state: str
     position: str
-    computed_by: str | None
+    computed: bool
     lag: float
 
     @property
@@ -56,11 +53,11 @@ class UnusedVelocity:
         name, late = f"{self.state} of {self.body}", f"{abs(self.lag):.3g} s"
         if 1e-3 <= abs(self.lag) < 1.0:
             late = f"{1e3 * abs(self.lag):.3g} ms"
-        if self.computed_by is None:
+        if not self.computed:
             verb = "lags" if self.lag > 0 else "leads"
             return f"{name} {verb} {self.position} by {late} and is not used"
-        lag = f", {late} {'late' if self.lag > 0 else 'early'}" if self.lag else ""
-        return f"{name} was computed from {self.position} ({self.computed_by}{lag}) and is not used"
+        lag = f", {late} {'late' if self.lag > 0 else 'early'}," if self.lag else ""
+        return f"{name} was computed from {self.position}{lag} and is not used"
 
 
 def unused_velocities(history: History) -> tuple[UnusedVelocity, ...]:
@@ -91,7 +88,7 @@ def unused_velocities(history: History) -> tuple[UnusedVelocity, ...]:
     >>> table["x"] = np.cumsum(np.random.default_rng(1).normal(0.0, 0.02, 50))
     >>> table["vx"] = np.gradient(table["x"], 0.05)
     >>> print(unused_velocities(History.from_dataframe(table, scene))[0].sentence)
-    vx of puck was computed from x (central differences) and is not used
+    vx of puck was computed from x and is not used
     """
     dt = float(history.dataset.attrs["time_step"])
     unused: list[UnusedVelocity] = []
@@ -99,11 +96,10 @@ def unused_velocities(history: History) -> tuple[UnusedVelocity, ...]:
         for d in range(3):
             runs = _runs(history, int(body), d)
             names = (history.bodies[body], STATE[d + VELOCITY], STATE[d])
-            if match := computed_by(runs, dt):
-                late = match.lag if abs(match.lag) > 0.05 * dt else 0.0
-                unused.append(UnusedVelocity(*names, match.name, late))
+            if (late := computed_lag(runs, dt)) is not None:
+                unused.append(UnusedVelocity(*names, True, late if abs(late) > 0.05 * dt else 0.0))
             elif lag := velocity_lag(runs, dt):
-                unused.append(UnusedVelocity(*names, None, lag))
+                unused.append(UnusedVelocity(*names, False, lag))
     return tuple(unused)
 
 
@@ -248,86 +244,6 @@ def _runs(history: History, body: int, d: int, shortest: int = 5) -> Runs:
     return runs
 
 
-@dataclass(frozen=True)
-class Filter:
-    """A linear relation between a velocity, its neighbours and positions.
-
-    Attributes
-    ----------
-    name : str
-        As the report says it.
-    places : tuple of int
-        Rows of the positions, relative to the velocity's.
-    weights : tuple of float, optional
-        Of the positions, in units of 1 / time step; fitted if empty.
-    rates : tuple of tuple of int
-        Rows of earlier (later) velocities, relative; those of a group share a fitted weight.
-    rows : float
-        Rows per fitted coefficient, at least.
-    exact : float
-        Without noise it leaves no more than this share of the velocity's variance.
-    """
-
-    name: str
-    places: tuple[int, ...]
-    weights: tuple[float, ...] = ()
-    rates: tuple[tuple[int, ...], ...] = ()
-    rows: float = 2.5
-    exact: float = 0.0
-
-
-@dataclass(frozen=True)
-class Match:
-    """A filter that gives a velocity, its delay (s), and its misfit over the bound of noise."""
-
-    name: str
-    lag: float
-    misfit: float = field(repr=False)
-
-
-@lru_cache(maxsize=1)
-def known_filters() -> tuple[Filter, ...]:
-    """Return the filters without unknown coefficients.
-
-    Examples
-    --------
-    >>> [each.name for each in known_filters()][:3]
-    ['forward differences', 'backward differences', 'central differences']
-    """
-    quotients = (
-        ("forward differences", 0, 1),
-        ("backward differences", 1, 0),
-        ("central differences", 1, 1),
-        *((f"backward differences over {m} rows", m, 0) for m in range(2, 11)),
-        *((f"central differences over {2 * m} rows", m, m) for m in range(2, 6)),
-    )
-    filters = [
-        Filter(name, (-m, n), (-1 / (m + n), 1 / (m + n)), exact=1e-12) for name, m, n in quotients
-    ]
-    for half in range(2, 11):
-        for order, orders in ((2, "2"), (4, "3 or 4")):  # of odd windows, 3 and 4 are the same
-            weights = tuple(savgol_coeffs(2 * half + 1, order, deriv=1, use="dot").tolist())
-            name = f"a Savitzky-Golay filter of {2 * half + 1} rows, order {orders}"
-            filters.append(Filter(name, tuple(range(-half, half + 1)), weights, exact=1e-12))
-    return tuple(filters)
-
-
-def _fitted(name: str, before: int, after: int, *rates: tuple[int, ...]) -> Filter:
-    return Filter(name, tuple(range(-before, after + 1)), rates=rates)
-
-
-#: Filters with fitted coefficients, the fewest first: exponential smoothing and Butterworth
-#: low-passes of a difference, causal and forward-backward, and any finite filter.
-FITTED = (
-    _fitted("a finite filter of 5 rows", 2, 2),
-    _fitted("a causal first-order low-pass of differences", 2, 1, (-1,)),
-    _fitted("a zero-phase first-order low-pass of differences", 2, 2, (-1, 1)),
-    _fitted("a causal second-order low-pass of differences", 3, 1, (-1,), (-2,)),
-    _fitted("a zero-phase second-order low-pass of differences", 3, 3, (-1, 1), (-2, 2)),
-    replace(_fitted("a finite filter of 17 rows", 8, 8), rows=4.0, exact=1e-8),
-)
-
-
 def position_noise(runs: Runs, dt: float) -> tuple[float, float]:
     """Return the noise variances of positions and of velocities, from their kinematic residuals.
 
@@ -360,13 +276,34 @@ def position_noise(runs: Runs, dt: float) -> tuple[float, float]:
     return place * dt**2, max(0.0, square / max(n, 1) - 20 * place)
 
 
-def computed_by(runs: Runs, dt: float) -> Match | None:
-    """Return the filter that computed velocities from positions, or None.
+#: Regressions of a velocity: rows before and after of its positions, whether the weights of rows
+#: at equal distances are opposite, and rows of other velocities, those of a tuple with one weight.
+REGRESSIONS: tuple[tuple[int, int, bool, tuple[tuple[int, ...], ...]], ...] = (
+    (1, 1, False, ()),
+    (2, 2, False, ()),
+    (5, 5, True, ()),
+    (10, 10, True, ()),
+    (4, 0, False, ()),
+    (10, 0, False, ()),
+    (2, 1, False, ((-1,),)),
+    (2, 2, False, ((-1, 1),)),
+    (3, 1, False, ((-1,), (-2,))),
+    (3, 3, False, ((-1, 1), (-2, 2))),
+    (8, 8, False, ()),
+)
 
-    A velocity with independent noise differs from a filter of noisy positions with weights ``w``
-    by a variance of at least ``|w|^2 s^2``, ``s`` being the positions' noise. A computed velocity
-    does not. The ratio of what a filter leaves to that bound is compared with the lower tail of the
-    F distribution (1e-5 for each filter), degrees of freedom corrected for serial correlation.
+
+def computed_lag(
+    runs: Runs, dt: float, *, alarm: float = 1e-5, most: float = 0.25, pole: float = 0.1
+) -> float | None:
+    """Return by how much (s) velocities computed from positions are late; None for measured ones.
+
+    Velocities are regressed on positions of neighbouring rows, and on neighbouring velocities as in
+    a low-pass. A velocity with independent noise differs from any sum of noisy positions with
+    weights ``w`` by a variance of at least ``|w|^2 s^2``, ``s`` being the positions' noise. A
+    computed velocity does not. The ratio of the residual variance to that bound is compared with
+    the lower tail of the F distribution, degrees of freedom corrected for serial correlation. The
+    lag is the group delay of the weights at low frequency.
 
     Parameters
     ----------
@@ -374,31 +311,65 @@ def computed_by(runs: Runs, dt: float) -> Match | None:
         Positions and velocities of rows without gaps, shape (n,) each.
     dt : float
         Time step (s).
+    alarm : float
+        Size of the test of each regression.
+    most : float
+        Largest ratio of the variances, however many rows there are.
+    pole : float
+        Least denominator of a low-pass at half the sampling rate: it is zero in a relation that
+        holds of noiseless measurements too, that the mean of two velocities is the difference
+        quotient.
 
     Examples
     --------
     >>> x = np.random.default_rng(1).normal(size=40)
-    >>> computed_by([(x[1:], np.diff(x) / 0.1)], 0.1)
-    Match(name='backward differences', lag=0.05)
+    >>> computed_lag([(x[1:], np.diff(x) / 0.1)], 0.1)
+    0.05
     """
-    rates = np.concatenate([rate for _, rate in runs]) if runs else np.zeros(0)
-    total = float(rates.var()) if len(rates) else 0.0
+    total = float(np.concatenate([np.zeros(0), *(rate for _, rate in runs)]).var()) if runs else 0.0
     if not total > 0:
         return None
-    least, most = _noise_bounds(runs)
-    noise = min(max(position_noise(runs, dt)[0], least), most)
+    noise, found = _noise(runs, dt), []
     shown = sum(max(len(position) - 3, 0) for position, _ in runs) / _correlation([-1, 3, -3, 1])
-    tested = [_tested(candidate, runs, dt, noise, shown, total) for candidate in known_filters()]
-    if matches := [match for match in tested if match is not None]:
-        return min(matches, key=lambda match: match.misfit)
-    for candidate in FITTED:
-        if match := _tested(candidate, runs, dt, noise, shown, total):
-            return match
-    return None
+    for before, after, odd, groups in REGRESSIONS:
+        place = np.arange(-before, after + 1)
+        windows = [
+            np.lib.stride_tricks.sliding_window_view(np.stack(run), len(place), axis=1)
+            for run in runs
+            if len(run[0]) >= len(place)
+        ]
+        if not windows:
+            continue
+        x, rates = np.concatenate(windows, axis=1)
+        one, y = np.eye(len(place)), rates[:, before]
+        sums = one - one[::-1] if odd else one - one[before]
+        sums = sums[before + 1 :] if odd else np.delete(sums, before, axis=0)
+        v = [rates[:, np.add(group, before)].sum(axis=1) for group in groups]
+        design = np.column_stack([*v, (x - x[:, [before]]) @ sums.T])
+        dof = len(y) - design.shape[1]
+        if dof < 3:
+            continue
+        inverse = np.linalg.pinv(design, rcond=1e-9)
+        errors = sums.T @ inverse[len(v) :]
+        a, b = inverse[: len(v)] @ y, errors @ y
+        count = np.array([len(group) for group in groups], dtype=np.float64)
+        gain = 1 - float(a @ count)
+        if 1 - float(a @ (count * [(-1.0) ** group[0] for group in groups])) < pole:
+            continue
+        variance = float(((y - design @ (inverse @ y)) ** 2).sum()) / dof
+        square = float(b @ b) - variance * float((errors**2).sum())  # less the weights' errors
+        share = min(most, float(f_distribution.ppf(alarm, dof / _correlation(b), max(shown, 1.0))))
+        slope, curve = float(b @ place), float(b @ place**2)
+        exact = len(y) > 4 * design.shape[1] and abs(slope * dt - gain) < 1e-6 * abs(gain)
+        if variance < max(share * square * noise, 1e-12 * total * exact) and slope * gain > 0:
+            lag = -curve / (2 * slope) - float(a @ [sum(group) for group in groups]) / gain
+            found.append((variance / square, round(lag, 6) * dt + 0.0))
+    late = min(found, default=(0.0, np.inf))[1]
+    return late if abs(late) < 100 * dt else None
 
 
-def _noise_bounds(runs: Runs, floor: float = 1e-3) -> tuple[float, float]:
-    """Return bounds of the variance of positions' noise, from positions alone.
+def _noise(runs: Runs, dt: float, floor: float = 1e-3) -> float:
+    """Return the variance of positions' noise from kinematics, within bounds of positions alone.
 
     Kinematics do not tell it where a velocity is late, which leaves more than noise does, and tell
     too much where bodies collide: high differences of smooth positions leave noise, their median
@@ -408,75 +379,13 @@ def _noise_bounds(runs: Runs, floor: float = 1e-3) -> tuple[float, float]:
     positions = [position for position, _ in runs]
     eighth, ninth = (column_noise(positions, order) ** 2 for order in (8, 9))
     white = ninth * comb(18, 9) > 2.0 * eighth * comb(16, 8)
-    return (floor * eighth if white else 0.0), column_noise(positions, 8, robust=True) ** 2
-
-
-def _tested(
-    candidate: Filter,
-    runs: Runs,
-    dt: float,
-    noise: float,
-    shown: float,
-    total: float,
-    *,
-    alarm: float = 1e-5,
-    most: float = 0.25,
-    pole: float = 0.1,
-) -> Match | None:
-    """Return the match of a filter; None if its misfit is above the bound.
-
-    ``alarm`` is the test's size: some forty are made of a column. However many rows there are, a
-    filter leaves at most the share ``most`` of the variance that the positions' noise would leave
-    of an independent measurement (half of its amplitude). ``pole`` is the least denominator of a
-    low-pass at half the sampling rate: it is zero in a relation that holds of noiseless
-    measurements too, that the mean of two velocities is the difference quotient.
-    """
-    near = (0, *candidate.places, *chain(*candidate.rates))
-    places, rates, middle = [], [], []
-    for position, rate in runs:
-        k = np.arange(-min(near), len(position) - max(near))
-        if len(k):
-            places.append(position[k[:, None] + candidate.places] - position[k, None])
-            groups = [rate[k[:, None] + group].sum(axis=1) for group in candidate.rates]
-            rates.append(np.array(groups).T.reshape(len(k), len(groups)))
-            middle.append(rate[k])
-    if not middle:
-        return None
-    x, v, y = np.concatenate(places), np.concatenate(rates), np.concatenate(middle)
-    fitted = 0 if candidate.weights else x.shape[1] - 1 + v.shape[1]
-    if len(y) < candidate.rows * fitted:
-        return None
-    a, b, errors = np.zeros(0), np.array(candidate.weights) / dt, np.zeros((0, len(y)))
-    if fitted:
-        zero = candidate.places.index(0)
-        inverse = np.linalg.pinv(np.hstack([v, np.delete(x, zero, axis=1) / dt]))
-        errors = inverse[v.shape[1] :] / dt
-        errors = np.insert(errors, zero, -errors.sum(axis=0), axis=0)
-        a, b = inverse[: v.shape[1]] @ y, errors @ y
-        ends = (sum((-1.0) ** row for row in group) for group in candidate.rates)
-        if 1 - sum(weight * end for weight, end in zip(a, ends, strict=True)) < pole:
-            return None
-    dof = len(y) - fitted
-    variance = float(((y - v @ a - x @ b) ** 2).sum()) / dof
-    square = float(b @ b) - variance * float((errors**2).sum())  # without the errors of the weights
-    if not square > 0:
-        return None
-    share = min(most, float(f_distribution.ppf(alarm, dof / _correlation(b), max(shown, 1.0))))
-    if not variance < max(share * square * noise, candidate.exact * total):
-        return None
-    return Match(candidate.name, _lag(candidate, a, b) * dt, variance / square)
+    least = floor * eighth * white
+    return float(
+        np.clip(position_noise(runs, dt)[0], least, column_noise(positions, 8, robust=True) ** 2)
+    )
 
 
 def _correlation(weights: Floats | list[int]) -> float:
     """Return how many squares of filtered white noise count as one independent square."""
     product = np.correlate(weights, weights, "full")
     return float(product @ product / product.max() ** 2)
-
-
-def _lag(candidate: Filter, a: Floats, b: Floats) -> float:
-    """Return the group delay of a differentiator at low frequency, in rows."""
-    row = np.array(candidate.places, dtype=float)
-    lag = -float(b @ row**2) / (2 * float(b @ row))
-    for weight, group in zip(a, candidate.rates, strict=True):
-        lag -= float(weight) * sum(group) / (1 - sum(a * [len(rates) for rates in candidate.rates]))
-    return round(float(lag), 6) + 0.0

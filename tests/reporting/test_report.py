@@ -564,8 +564,8 @@ def test_report_alone(tmp_path: Path) -> None:
 
 
 def test_velocities_that_are_not_used_are_named() -> None:
-    unused = (UnusedVelocity("cart", "vy", "y", "backward differences", 0.05),)
+    unused = (UnusedVelocity("cart", "vy", "y", True, 0.05),)
     findings = replace(made_up(), velocities_not_used=unused)
-    said = "vy of cart was computed from y (backward differences, 50 ms late) and is not used."
+    said = "vy of cart was computed from y, 50 ms late, and is not used."
     assert said in " ".join(Page(render(findings)).text.split())
     assert findings.to_dict()["velocities_not_used"][0]["lag"] == 0.05
