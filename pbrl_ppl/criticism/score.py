@@ -21,7 +21,7 @@ from pbrl_ppl.criticism.scan import (
 from pbrl_ppl.effects import Attached, Noise
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import Mode, posterior_slopes
-from pbrl_ppl.parameters import prior_residual, prior_slopes
+from pbrl_ppl.parameters import box, prior_residual, prior_slopes
 from pbrl_ppl.state import Floats, Ints
 from pbrl_ppl.threads import in_parallel
 
@@ -194,7 +194,7 @@ def _slopes(mode: Mode, attached: Attached | None = None) -> Floats:
     new = layout.places(labels)
     if not new:
         return np.zeros((mode.whitened_residual.size, 0))
-    lower, upper = (bound[new] for bound in layout.bounds)
+    lower, upper = (bound[new] for bound in box(layout.priors))  # a mass of 0 is at the end
     begin = 1e-3 * np.array([layout.priors[place].scale for place in new])
 
     def predict(points: Floats, problem: Problem = wide) -> Floats:

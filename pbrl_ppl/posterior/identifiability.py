@@ -12,7 +12,7 @@ import pandas as pd
 from pbrl_ppl.effects import LEARNED_REMAINDER, Effect, catalogue
 from pbrl_ppl.likelihood import Observations, TransitionLikelihood
 from pbrl_ppl.modes import Mode, posterior_slopes
-from pbrl_ppl.parameters import JOINT_INDICES, Layout, Prior, inside, nearest, wheels
+from pbrl_ppl.parameters import JOINT_INDICES, Layout, Prior, box, inside, nearest, wheels
 from pbrl_ppl.posterior.record import PosteriorRecord, layout_of
 from pbrl_ppl.posterior.store import Idata, best_draw, group, labelled_draws
 from pbrl_ppl.state import STATE, Floats
@@ -346,7 +346,7 @@ def _linearised(idata: Idata, effects: tuple[Effect, ...]) -> tuple[Layout, Floa
         z = TransitionLikelihood().whiten(observations.residual(states), sigma)
         return np.nan_to_num(z.reshape(len(points), -1))
 
-    jacobian = posterior_slopes(residual, phi, *layout.bounds, 1e-3 * layout.scale(phi))
+    jacobian = posterior_slopes(residual, phi, *box(layout.priors), 1e-3 * layout.scale(phi))
     return layout, phi, jacobian
 
 
