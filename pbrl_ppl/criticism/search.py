@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from scipy.stats import norm
@@ -609,7 +610,24 @@ def _with_contacts(
         declared = after = refitted(found.after)
     else:
         declared, after = in_parallel(refitted, [found.declared, found.after])
-    return replace(found, declared=declared, after=after)
+    # collisions inform the rest: a small law that was of their errors is within its own here
+    gone = [law for law, one in found.laws.items() if not one.main and _is_null(after, law)]
+    for law in gone:
+        after = drop(after, law) if len(gone) < len(found.laws) else declared
+    why = "small, and not significant with collisions"
+    left: dict[str, Any] = {
+        name: {law: one for law, one in getattr(found, name).items() if law not in gone}
+        for name in ("laws", "gains", "confounded")
+    }
+    rejected = {**found.rejected, **dict.fromkeys(gone, why)}
+    return replace(found, declared=declared, after=after, rejected=rejected, **left)
+
+
+def _is_null(mode: Mode, law: Attached, *, significant: float = 3.0) -> bool:
+    """Return whether a law's parameters are within so many standard deviations of its null."""
+    places = mode.problem.layout.places(law.labels)
+    sd = np.sqrt(np.diag(mode.covariance)[places])
+    return bool((np.abs(mode.phi[places] - law.effect.null) < significant * sd).all())
 
 
 def _carried(mode: Mode, length: int) -> Mode:
