@@ -22,41 +22,41 @@ if TYPE_CHECKING:
 
 @command("calibrate", 12, "pbrl-ppl calibrate scene.toml train.csv -o ranks/ --jobs 4")
 def calibrate(
-    scene: options.SceneFile,
-    history: Annotated[
-        Path, typer.Argument(metavar="HISTORY", help="History whose design is kept (.csv, ...).")
-    ],
-    output: Annotated[
-        Path,
-        typer.Option("-o", "--output", metavar="DIR", help="Folder for results; goes on there."),
-    ],
+    scene: Path,
+    history: Path,
+    output: options.OutputFolder,
     reading: options.SceneReading,
-    likelihood: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME",
-            help="transitions (single ones from exact states, the paper's Eq. 11), trajectories"
-            " (whole ones with process noise, as of close-loop; it takes several times as long) or"
-            " simulation (trajectories without process noise, as of criticise --simulate).",
-        ),
-    ] = "transitions",
-    trajectories: Annotated[
-        bool | None, typer.Option("--trajectories/--transitions", hidden=True)
-    ] = None,
-    colour: Annotated[
-        float,
-        typer.Option(
-            min=0.0, help="Correlation of neighbouring rows' errors, with --likelihood simulation."
-        ),
-    ] = 0.0,
-    replications: Annotated[int, typer.Option(min=2, help="Simulated histories.")] = 200,
+    likelihood: str = "transitions",
+    trajectories: options.OldLikelihood = None,
+    colour: Annotated[float, typer.Option(min=0.0)] = 0.0,
+    replications: Annotated[int, typer.Option(min=2)] = 200,
     seed: options.Seed = 1,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
-    draws: Annotated[int, typer.Option(min=100, help="Posterior draws of each chain.")] = 1500,
+    jobs: options.Count = 1,
+    draws: Annotated[int, typer.Option(min=100)] = 1500,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Simulate from the prior, fit, and test whether the true values' ranks are uniform."""
+    """Simulate from the prior, fit, and test whether the true values' ranks are uniform.
+
+    Parameters
+    ----------
+    history : HISTORY
+        History whose design is kept (.csv, ...).
+    output
+        Folder for results; goes on there.
+    likelihood : NAME
+        transitions (single ones from exact states, the paper's Eq. 11), trajectories (whole ones
+        with process noise, as of close-loop; it takes several times as long) or simulation
+        (trajectories without process noise, as of criticise --simulate).
+    colour
+        Correlation of neighbouring rows' errors, with --likelihood simulation.
+    replications
+        Simulated histories.
+    jobs
+        Processes.
+    draws
+        Posterior draws of each chain.
+    """
     with interruptible(f"finished replications are in {output}; the same command goes on"):
         if trajectories is not None:  # older spellings
             likelihood = "trajectories" if trajectories else "transitions"

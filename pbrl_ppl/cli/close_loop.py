@@ -42,54 +42,46 @@ class Method(StrEnum):
     LAPLACE = "laplace"
 
 
-Draws = Annotated[int | None, typer.Option(min=100, help="Posterior draws of each chain.")]
-Sampler = Annotated[
-    Method,
-    typer.Option(
-        help="importance weights proposals by the engine; metropolis runs chains; laplace takes"
-        " Gaussians at the modes, on which the verdict then stands."
-    ),
-]
+Draws = Annotated[int | None, typer.Option(min=100)]
 
 
 @command("close-loop", 5, "pbrl-ppl close-loop scene.toml train.csv -o report/")
 def close_loop(
     context: typer.Context,
-    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.toml).")],
-    train: Annotated[
-        Path, typer.Argument(metavar="TRAIN", help="Measured history (.csv, .parquet, .nc).")
-    ],
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the results.")
-    ],
+    scene: Path,
+    train: Path,
+    output: options.OutputFolder,
     reading: options.SceneReading,
-    test: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="TEST",
-            help="Held-out history; without it, a quarter of TRAIN's trajectories.",
-        ),
-    ] = None,
+    test: Path | None = None,
     seed: options.Seed = 1,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Write to a folder that is not empty.")
-    ] = False,
+    overwrite: bool = False,
     draws: Draws = None,
-    method: Sampler = Method.IMPORTANCE,
-    learn_remainder: Annotated[
-        bool,
-        typer.Option(
-            "--learn-remainder",
-            help="Where something stays unexplained, learn a force for it, into remainder.nc; it"
-            " gets no name.",
-        ),
-    ] = False,
+    method: Method = Method.IMPORTANCE,
+    learn_remainder: bool = False,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Find what the declared model lacks, add it, refit, and report before and after.
 
     Exits with 3 if the chains have not converged: then there is no verdict.
+
+    Parameters
+    ----------
+    train : TRAIN
+        Measured history (.csv, .parquet, .nc).
+    output
+        Folder for the results.
+    test : TEST
+        Held-out history; without it, a quarter of TRAIN's trajectories.
+    overwrite
+        Write to a folder that is not empty.
+    draws
+        Posterior draws of each chain.
+    method
+        importance weights proposals by the engine; metropolis runs chains; laplace takes Gaussians
+        at the modes, on which the verdict then stands.
+    learn_remainder
+        Where something stays unexplained, learn a force for it, into remainder.nc; it gets no name.
     """
     with interruptible(), stages(quiet) as progress:
         check_can_make(output)  # before the long work, which would be lost
@@ -175,26 +167,25 @@ def _remainder(
 @command("demo", 0, "pbrl-ppl demo")
 def demo(
     context: typer.Context,
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the results.")
-    ] = Path("pbrl-ppl-demo"),
-    method: Annotated[
-        Method,
-        typer.Option(
-            help="laplace takes seconds; importance and metropolis draw from the posterior itself,"
-            " in minutes."
-        ),
-    ] = Method.LAPLACE,
+    output: options.OutputFolder = Path("pbrl-ppl-demo"),
+    method: Method = Method.LAPLACE,
     seed: options.Seed = 1,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Write to a folder that has content.")
-    ] = False,
+    overwrite: bool = False,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Close the loop on a recording that comes with the package, and write its report.
 
     A shopping cart is pushed. Its castor resists turning, which the scene does not declare.
+
+    Parameters
+    ----------
+    output
+        Folder for the results.
+    method
+        laplace takes seconds; importance and metropolis draw from the posterior itself, in minutes.
+    overwrite
+        Write to a folder that has content.
     """
     cart = models_folder() / "shopping_cart"
     if not (as_json or quiet):

@@ -33,56 +33,23 @@ if TYPE_CHECKING:
 
 @command("fit", 3, "pbrl-ppl fit scene.toml train.csv -o cart.nc")
 def fit(
-    scene: options.SceneFile,
-    history: options.HistoryFile,
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="FILE", help="The posterior file (.nc).")
-    ],
+    scene: Path,
+    history: Path,
+    output: options.OutputFile,
     reading: options.SceneReading,
-    likelihood: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME",
-            help="trajectories (whole ones with process noise, as of close-loop), transitions"
-            " (single ones from exact states, the paper's Eq. 11) or simulation (trajectories"
-            " without process noise, as of criticise --simulate).",
-        ),
-    ] = "trajectories",
-    trajectories: Annotated[
-        bool | None, typer.Option("--trajectories/--transitions", hidden=True)
-    ] = None,
-    horizon: Annotated[
-        int,
-        typer.Option(min=1, help="Intervals that are predicted, with --likelihood transitions."),
-    ] = 1,
-    scalar: Annotated[
-        bool,
-        typer.Option("--scalar-sigma", help="One sigma for all, with --likelihood transitions."),
-    ] = False,
-    nu: Annotated[
-        float | None,
-        typer.Option(min=0.1, help="Degrees of freedom of Student-t noise; else Gaussian."),
-    ] = None,
-    method: Annotated[
-        str,
-        typer.Option(
-            help="importance, metropolis, paper, demetropolisz, smc, nuts, laplace or map."
-        ),
-    ] = "importance",
-    draws: Annotated[
-        int | None, typer.Option(min=1, max=1_000_000, help="Posterior draws of each chain.")
-    ] = None,
-    tune: Annotated[
-        int | None, typer.Option(min=0, max=1_000_000, help="Tuning draws of each chain.")
-    ] = None,
-    chains: Annotated[int | None, typer.Option(min=1, max=1000, help="Chains.")] = None,
-    thin: Annotated[int | None, typer.Option(min=1, max=10_000, help="Steps a draw.")] = None,
-    resume: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Go on with this posterior: its chains, or more draws."),
-    ] = None,
+    likelihood: str = "trajectories",
+    trajectories: options.OldLikelihood = None,
+    horizon: options.Count = 1,
+    scalar: Annotated[bool, typer.Option("--scalar-sigma")] = False,
+    nu: Annotated[float | None, typer.Option(min=0.1)] = None,
+    method: str = "importance",
+    draws: Annotated[int | None, typer.Option(min=1, max=1_000_000)] = None,
+    tune: Annotated[int | None, typer.Option(min=0, max=1_000_000)] = None,
+    chains: Annotated[int | None, typer.Option(min=1, max=1000)] = None,
+    thin: Annotated[int | None, typer.Option(min=1, max=10_000)] = None,
+    resume: Path | None = None,
     seed: options.Seed = 1,
-    overwrite: options.Overwrite = False,
+    overwrite: bool = False,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
 ) -> None:
@@ -90,6 +57,33 @@ def fit(
 
     Exits with 3 if chains have not converged or draws are too few, and with 130 if it was
     interrupted; the draws of chains so far are kept.
+
+    Parameters
+    ----------
+    output
+        The posterior file (.nc).
+    likelihood : NAME
+        trajectories (whole ones with process noise, as of close-loop), transitions (single ones
+        from exact states, the paper's Eq. 11) or simulation (trajectories without process noise, as
+        of criticise --simulate).
+    horizon
+        Intervals that are predicted, with --likelihood transitions.
+    scalar
+        One sigma for all, with --likelihood transitions.
+    nu
+        Degrees of freedom of Student-t noise; else Gaussian.
+    method
+        importance, metropolis, paper, demetropolisz, smc, nuts, laplace or map.
+    draws
+        Posterior draws of each chain.
+    tune
+        Tuning draws of each chain.
+    chains
+        Chains.
+    thin
+        Steps a draw.
+    resume : FILE
+        Go on with this posterior: its chains, or more draws.
     """
     with interruptible(), stages(quiet) as progress:
         check_file(output, (".nc",), overwrite)
@@ -185,24 +179,27 @@ def _rows(table: pd.DataFrame) -> list[list[str]]:
 
 @command("update", 9, "pbrl-ppl update cart.nc since.csv -o new.nc")
 def update(
-    posterior: Annotated[
-        Path, typer.Argument(metavar="POSTERIOR", help="Posterior file (.nc); it has the scene.")
-    ],
-    history: Annotated[
-        Path, typer.Argument(metavar="HISTORY", help="What was recorded since (.csv, ...).")
-    ],
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="FILE", help="The new posterior file.")
-    ],
+    posterior: Path,
+    history: Path,
+    output: options.OutputFile,
     reading: options.PosteriorReading,
     seed: options.Seed = 1,
-    overwrite: options.Overwrite = False,
+    overwrite: bool = False,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Bring a posterior up to date with new transitions, without a fit from scratch.
 
     Exits with 3 if the new posterior has not converged.
+
+    Parameters
+    ----------
+    posterior : POSTERIOR
+        Posterior file (.nc); it has the scene.
+    history : HISTORY
+        What was recorded since (.csv, ...).
+    output
+        The new posterior file.
     """
     with interruptible(), stages(quiet) as progress:
         check_file(output, (".nc",), overwrite)
@@ -255,18 +252,19 @@ def update(
 @command("report", 8, "pbrl-ppl report cart.nc")
 def report(
     context: typer.Context,
-    posterior: options.PosteriorFile,
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "-o", "--output", metavar="FILE", help="The page; POSTERIOR with .html if not given."
-        ),
-    ] = None,
-    overwrite: options.Overwrite = False,
+    posterior: Path,
+    output: options.OutputFile | None = None,
+    overwrite: bool = False,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Diagnose a posterior on one self-contained page: chains, prior, predictions, LOO."""
+    """Diagnose a posterior on one self-contained page: chains, prior, predictions, LOO.
+
+    Parameters
+    ----------
+    output
+        The page; POSTERIOR with .html if not given.
+    """
     with interruptible(), stages(quiet) as progress:
         page = posterior.with_suffix(".html") if output is None else output
         check_file(page, (".html",), overwrite)
