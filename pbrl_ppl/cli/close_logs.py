@@ -6,7 +6,7 @@ import pickle
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -65,53 +65,33 @@ def close_logs(
         progress("reading the manifest")
         import pbrl_ppl.reporting as report
 
-        settings = reading.settings()
         catalogue = reading.catalogue() if reading.effect_file else None
         logs = report.read_manifest(manifest)  # its errors come before a cluster is sought
         with _executor(jobs, scheduler) as executor:
             loops = report.close_loop_many(
-                logs,
-                output,
-                executor=executor,
-                progress=progress,
-                source=report.Source(command=options.command_line(context)),
-                again=overwrite,
-                seed=seed,
-                draws=draws,
-                method=method.value,
-                catalogue=catalogue,
-                **reading.scene_settings(),
-                columns=settings["columns"],
-                units=settings["units"],
-                estimate_velocities=settings["estimate_velocities"],
-                trim=settings["trim"],
-            )
+                logs, output, executor=executor, progress=progress, again=overwrite, seed=seed,
+                source=report.Source(command=options.command_line(context)), draws=draws,
+                method=method.value, catalogue=catalogue, **reading.scene_settings(),
+                **reading.settings(),
+            )  # fmt: skip
     effects = loops.effects().drop_duplicates(["name", "effect", "body"])
     lines = [
         f"{effect}[{body}]: {', '.join(rows['name'])}"
         for (effect, body), rows in effects.groupby(["effect", "body"], sort=False)
     ]
     page = output / "index.html"
-    print_result(
-        as_json,
-        {"page": page, "logs": loops.rows},
-        [*lines, report.in_words(loops.rows), f"page: {page}"],
-    )
+    lines += [report.in_words(loops.rows), f"page: {page}"]
+    print_result(as_json, {"page": page, "logs": loops.rows}, lines)
     if loops.failed:
         raise typer.Exit(FAILED)
 
 
-@contextmanager
-def _executor(jobs: int, scheduler: str | None) -> Iterator[Executor | None]:
-    """Yield the executor of a Dask cluster, processes of this machine, or None."""
+def _executor(jobs: int, scheduler: str | None) -> AbstractContextManager[Executor | None]:
+    """Return the executor of a Dask cluster, processes of this machine, or None, as a context."""
     if scheduler is not None:
-        with _cluster(scheduler) as executor:
-            yield executor
-    elif jobs == 1:
-        yield None
-    else:
-        with OneProcessEach(jobs) as pool:  # close_loop_many cancels what has not begun
-            yield pool
+        return _cluster(scheduler)
+    # close_loop_many cancels what has not begun
+    return nullcontext() if jobs == 1 else OneProcessEach(jobs)
 
 
 @contextmanager

@@ -96,14 +96,11 @@ def close_loop(
         criticism.check_folder(output, overwrite)
         if learn_remainder:
             criticism.check_scikit_learn()
-        loop, stopped = _finished(
-            declared, histories, progress, seed=seed, draws=draws, method=method.value,
-            catalogue=catalogue,
-        )  # fmt: skip
+        settings = {"seed": seed, "draws": draws, "method": method.value, "catalogue": catalogue}
+        loop, stopped = _finished(declared, histories, progress, **settings)
         progress("writing the report")
-        source = report.Source(
-            str(scene), str(train), str(test or ""), options.command_line(context)
-        )
+        files = str(scene), str(train), str(test or "")
+        source = report.Source(*files, options.command_line(context))
         loop.save(output, overwrite, page=report.render(loop, source))
         remainder = _remainder(loop, output, source, seed, progress) if learn_remainder else {}
     words = remainder["learned_remainder"]["words"] if remainder else ""
@@ -193,17 +190,9 @@ def demo(
             "A shopping cart is pushed; the scene does not declare that its castor resists turning."
         )
     close_loop(
-        context,
-        cart / "scene.toml",
-        cart / "recorded" / "train.csv",
-        output,
-        options.SceneReading(),
-        cart / "recorded" / "test.csv",
-        method=method,
-        seed=seed,
-        overwrite=overwrite,
-        as_json=as_json,
-        quiet=quiet,
-    )
+        context, cart / "scene.toml", cart / "recorded" / "train.csv", output,
+        options.SceneReading(), cart / "recorded" / "test.csv", method=method, seed=seed,
+        overwrite=overwrite, as_json=as_json, quiet=quiet,
+    )  # fmt: skip
     if not (as_json or quiet):
         typer.echo("With a recording of yours: pbrl-ppl new scene.toml --history train.csv")

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import sys
-import warnings
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -17,6 +16,7 @@ from pbrl_ppl.cli.terminal import (
     UNDECIDED,
     check_file,
     interruptible,
+    noted_warnings,
     print_json,
     print_result,
     print_table,
@@ -113,7 +113,7 @@ def fit(
         except ValueError as error:  # an option that the model refuses
             raise FitError(f"fit: {error}") from None
     # the sampler shows its own progress
-    with interruptible() as interrupts, warnings.catch_warnings(record=True) as caught:
+    with interruptible() as interrupts, noted_warnings("was interrupted") as caught:
         with redirect_stdout(sys.stderr):
             idata = sampling.fit(
                 model, method=method, seed=seed, draws=draws, tune=tune, chains=chains, thin=thin,
@@ -122,21 +122,14 @@ def fit(
         save_posterior(idata, output)
     record = PosteriorRecord.of(idata)
     cut = bool(interrupts) or record.interrupted is not None
-    for warning in caught:
-        if not (cut and "was interrupted" in str(warning.message)):
-            warnings.warn(warning.message, stacklevel=1)
-    converged = not any(issubclass(warning.category, ConvergenceWarning) for warning in caught)
+    converged = not any(isinstance(warning, ConvergenceWarning) for warning in caught)
     table = _summary(idata)
     if as_json:
+        numbers = {"max_rhat": record.max_rhat, "min_ess": record.min_ess}
+        reached = None if record.max_rhat is None else converged
         print_json(
-            {
-                "posterior": output,
-                "converged": None if record.max_rhat is None else converged,
-                "max_rhat": record.max_rhat,
-                "min_ess": record.min_ess,
-                "parameters": {str(name): row.to_dict() for name, row in table.iterrows()},
-                "warnings": list(record.warnings or ()),
-            }
+            {"posterior": output, "converged": reached, **numbers}
+            | {"parameters": table.to_dict("index"), "warnings": list(record.warnings or ())}
         )
     else:
         print_table(None, ["parameter", *table.columns], _rows(table))
@@ -205,36 +198,21 @@ def update(
         check_file(output, (".nc",), overwrite)
         catalogue = reading.catalogue()
         progress("reading the posterior and the history")
-        from pbrl_ppl.posterior import (
-            PosteriorRecord,
-            load_posterior,
-            save_posterior,
-            scene_of,
-        )  # fmt: skip
+        from pbrl_ppl import posterior as posteriors
 
-        idata = load_posterior(posterior)
-        new = reading.recording(history, scene_of(idata))
+        idata = posteriors.load_posterior(posterior)
+        new = reading.recording(history, posteriors.scene_of(idata))
         progress("updating")
         from pbrl_ppl.sampling import updating
 
-        caught: list[type[Warning]] = []
-        with warnings.catch_warnings():
-            show = warnings.showwarning
-
-            def shown(
-                message: Warning | str, category: type[Warning], *place: Any, **more: Any
-            ) -> None:
-                caught.append(category)
-                show(message, category, *place, **more)  # at once: a refit takes long
-
-            warnings.showwarning = shown
+        with noted_warnings() as caught:
             idata = updating.update(idata, new, effects=catalogue, seed=seed, progress=False)
-        record = PosteriorRecord.of(idata)
+        record = posteriors.PosteriorRecord.of(idata)
         if record.interrupted is not None:  # half a posterior is no prior for the next update
             raise KeyboardInterrupt
-        save_posterior(idata, output)
+        posteriors.save_posterior(idata, output)
         (*_, last) = record.updates or ()
-    converged = not any(issubclass(category, ConvergenceWarning) for category in caught)
+    converged = not any(isinstance(warning, ConvergenceWarning) for warning in caught)
     share = last["share"]
     print_result(
         as_json,

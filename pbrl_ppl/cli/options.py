@@ -197,13 +197,9 @@ class Reading:
 
     def settings(self, **others: Any) -> dict[str, Any]:
         """Return arguments of `history.read_recording`: what the options say, and others."""
-        named = {"columns": columns_of(self.columns), "units": units_of(self.units)}
-        return {
-            **named,
-            "estimate_velocities": self.estimate_velocities,
-            "trim": self.trim,
-            **others,
-        }
+        flags = {"estimate_velocities": self.estimate_velocities, "trim": self.trim}
+        read = {"columns": columns_of(self.columns), "units": units_of(self.units)}
+        return read | flags | others
 
     def catalogue(self) -> tuple[Effect, ...]:
         """Return the catalogue and after it the effects of effect files."""
@@ -282,19 +278,24 @@ def command_line(context: typer.Context) -> str:
     return shlex.join([*words, *options])
 
 
+def given(**values: Any) -> dict[str, Any]:
+    """Return the options that were given: all but None."""
+    return {name: value for name, value in values.items() if value is not None}
+
+
 def noise_of(texts: list[str] | None) -> dict[str, float]:
     """Return standard deviations by state dimension from ``--noise``."""
-    return dict(pairs(texts, "--noise", "x=0.002", float))
+    return pairs(texts, "--noise", "x=0.002", float)
 
 
 def columns_of(texts: list[str] | None) -> dict[str, str | float]:
     """Return column names, or numbers, from options such as ``x=pos_x,force_x=0``."""
-    return dict(pairs(texts, "--columns", "x=pos_x", _number_or_name))
+    return pairs(texts, "--columns", "x=pos_x", _number_or_name)
 
 
 def units_of(texts: list[str] | None) -> dict[str, str]:
     """Return units from options such as ``x=mm,theta=deg``."""
-    return dict(pairs(texts, "--units", "x=mm", str))
+    return pairs(texts, "--units", "x=mm", str)
 
 
 def _number_or_name(text: str) -> str | float:
@@ -307,19 +308,19 @@ def _number_or_name(text: str) -> str | float:
 
 def pairs(
     texts: list[str] | None, option: str, example: str, kind: Callable[[str], T]
-) -> list[tuple[str, T]]:
-    """Return names and values from ``NAME=VALUE,...``."""
-    pairs_read = []
+) -> dict[str, T]:
+    """Return values by name from ``NAME=VALUE,...``."""
+    values = {}
     for item in ",".join(texts).split(",") if texts else ():
         name, _, value = (part.strip() for part in item.partition("="))
         try:
             if not (name and value):
                 raise ValueError
-            pairs_read.append((name, kind(value)))
+            values[name] = kind(value)
         except ValueError:
             message = f"{item!r} is not NAME=VALUE, such as {example}"
             raise typer.BadParameter(message, param_hint=option) from None
-    return pairs_read
+    return values
 
 
 def pose(text: str, bodies: Sequence[str], option: str) -> tuple[str, list[float | None]]:
@@ -333,13 +334,12 @@ def pose(text: str, bodies: Sequence[str], option: str) -> tuple[str, list[float
             raise GoalError(f"{option} {text}: say which body: {bodies[0]}={text}")
         name = bodies[0]
     values: list[float | None] = []
-    for number in numbers.split(","):
+    for number in map(str.strip, numbers.split(",")):
         try:
-            values.append(None if number.strip() == "-" else float(number))
+            values.append(None if number == "-" else float(number))
         except ValueError:
-            raise GoalError(
-                f"{option} {text}: {number.strip()!r} is not a number; expected BODY=X,Y,THETA"
-            ) from None
+            why = f"{number!r} is not a number; expected BODY=X,Y,THETA"
+            raise GoalError(f"{option} {text}: {why}") from None
     return name.strip(), values
 
 
@@ -349,6 +349,6 @@ def starts_of(texts: list[str] | None, bodies: Sequence[str]) -> dict[str, list[
     for text in texts or ():
         name, values = pose(text, bodies, "--start")
         starts[name] = [value for value in values if value is not None]
-        if len(starts[name]) < len(values):
+        if None in values:
             raise GoalError(f"--start {text}: a start has no free coordinates; give a number for -")
     return starts

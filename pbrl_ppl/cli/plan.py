@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import typer
 
@@ -85,12 +84,9 @@ def plan(
 
         idata = load_posterior(posterior)
         bodies = [body.name for body in scene_of(idata).dynamic]
-        costs = {
-            "tolerance": tolerance,
-            "angle_tolerance": angle_tolerance,
-            "contact_penalty": contact_penalty,
-        }
-        weights = {name: value for name, value in costs.items() if value is not None}
+        weights = options.given(
+            tolerance=tolerance, angle_tolerance=angle_tolerance, contact_penalty=contact_penalty
+        )
         if goal and goal[0].endswith(".toml"):
             if len(goal) > 1 or weights:
                 raise GoalError("--goal: a file has the whole goal; drop the other options of it")
@@ -100,15 +96,13 @@ def plan(
             wanted = Goal.of(targets, **weights)
         starts = options.starts_of(start, bodies)
         allowed = None if actions is None else ActionSet.load(actions)
-        limit: dict[str, Any] = {} if nodes is None else {"nodes": nodes}
-        if weight is not None:
-            if method != "astar":
-                raise GoalError(f"--weight: it is for astar, not --method {method}; leave it out")
-            limit["weight"] = weight
+        if weight is not None and method != "astar":
+            raise GoalError(f"--weight: it is for astar, not --method {method}; leave it out")
         progress("planning")
         result = make_plan(
             idata, starts, wanted, allowed, method=method, draws=draws, tail=tail, noise=noise,
-            seconds=seconds, effects=catalogue, seed=seed, progress=progress, **limit,
+            seconds=seconds, effects=catalogue, seed=seed, progress=progress,
+            **options.given(nodes=nodes, weight=weight),
         )  # fmt: skip
         if output is not None:
             result.save(output)
@@ -119,15 +113,9 @@ def plan(
             animate_plan(result, animate)
     written = [path for path in (output, animate) if path is not None]
     words = result.in_words()
+    facts = {"reached": result.reached, "duration": result.duration, "words": words}
     print_result(
-        as_json,
-        {
-            "reached": result.reached,
-            "duration": result.duration,
-            "words": words,
-            "written": written,
-        },
-        [words, *(f"plan: {path}" for path in written)],
+        as_json, facts | {"written": written}, [words, *(f"plan: {path}" for path in written)]
     )
     if not result.reached:
         raise typer.Exit(FAILED)
@@ -186,11 +174,8 @@ def suggest(
 
         idata = load_posterior(posterior)
         if len(effect or ()) < 2 and (effect or not kept_groups(idata)):
-            why = (
-                f"got --effect '{effect[0]}' alone"
-                if effect
-                else (f"{posterior} names no effects that its data cannot separate")
-            )
+            why = f"{posterior} names no effects that its data cannot separate"
+            why = f"got --effect '{effect[0]}' alone" if effect else why
             raise EffectError(
                 f"suggest: {why}; name two or more, such as --effect linear_drag --effect"
                 " quadratic_drag"

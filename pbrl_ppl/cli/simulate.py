@@ -54,7 +54,7 @@ def simulate(
     """
     with interruptible(), stages(quiet) as progress:
         check_file(output, (".csv", ".parquet", ".nc"), overwrite)
-        values = dict(options.pairs(given, "--set", "mass=8", float))
+        values = options.pairs(given, "--set", "mass=8", float)
         errors = options.noise_of(noise)
         progress("reading the parameters and the history")
         catalogue = reading.catalogue()
