@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import nullcontext
+from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,48 +16,46 @@ from pbrl_ppl.cli.terminal import FAILED, check_can_make, interruptible, print_r
 from pbrl_ppl.errors import FitError, PbrlError
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor
-
     from pbrl_ppl.sampling import Calibration
 
 
 @command("calibrate", 12, "pbrl-ppl calibrate scene.toml train.csv -o ranks/ --jobs 4")
 def calibrate(
-    scene: options.SceneFile,
-    history: Annotated[
-        Path, typer.Argument(metavar="HISTORY", help="History whose design is kept (.csv, ...).")
-    ],
-    output: Annotated[
-        Path,
-        typer.Option("-o", "--output", metavar="DIR", help="Folder for results; goes on there."),
-    ],
+    scene: Path,
+    history: Path,
+    output: options.OutputFolder,
     reading: options.SceneReading,
-    likelihood: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME",
-            help="transitions (single ones from exact states, the paper's Eq. 11), trajectories"
-            " (whole ones with process noise, as of close-loop; it takes several times as long) or"
-            " simulation (trajectories without process noise, as of criticise --simulate).",
-        ),
-    ] = "transitions",
-    trajectories: Annotated[
-        bool | None, typer.Option("--trajectories/--transitions", hidden=True)
-    ] = None,
-    colour: Annotated[
-        float,
-        typer.Option(
-            min=0.0, help="Correlation of neighbouring rows' errors, with --likelihood simulation."
-        ),
-    ] = 0.0,
-    replications: Annotated[int, typer.Option(min=2, help="Simulated histories.")] = 200,
+    likelihood: str = "transitions",
+    trajectories: options.OldLikelihood = None,
+    colour: Annotated[float, typer.Option(min=0.0)] = 0.0,
+    replications: Annotated[int, typer.Option(min=2)] = 200,
     seed: options.Seed = 1,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
-    draws: Annotated[int, typer.Option(min=100, help="Posterior draws of each chain.")] = 1500,
+    jobs: options.Count = 1,
+    draws: Annotated[int, typer.Option(min=100)] = 1500,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Simulate from the prior, fit, and test whether the true values' ranks are uniform."""
+    """Simulate from the prior, fit, and test whether the true values' ranks are uniform.
+
+    Parameters
+    ----------
+    history : HISTORY
+        History whose design is kept (.csv, ...).
+    output
+        Folder for results; goes on there.
+    likelihood : NAME
+        transitions (single ones from exact states, the paper's Eq. 11), trajectories (whole ones
+        with process noise, as of close-loop; it takes several times as long) or simulation
+        (trajectories without process noise, as of criticise --simulate).
+    colour
+        Correlation of neighbouring rows' errors, with --likelihood simulation.
+    replications
+        Simulated histories.
+    jobs
+        Processes.
+    draws
+        Posterior draws of each chain.
+    """
     with interruptible(f"finished replications are in {output}; the same command goes on"):
         if trajectories is not None:  # older spellings
             likelihood = "trajectories" if trajectories else "transitions"
@@ -67,12 +66,13 @@ def calibrate(
         from pbrl_ppl.files import write_atomically
         from pbrl_ppl.sampling import calibration
 
-        with _pool(jobs) as executor:
+        # fresh processes: PyMC's threads do not survive a fork
+        with ProcessPoolExecutor(jobs, get_context("spawn")) if jobs > 1 else nullcontext() as pool:
             try:
                 result = calibration.calibrate(
                     declared, design, effects=effects, likelihood=likelihood, colour=colour,
                     seed=seed, draws=draws, replications=replications, folder=output,
-                    executor=executor, progress=not quiet,
+                    executor=pool, progress=not quiet,
                 )  # fmt: skip
             except PbrlError:
                 raise
@@ -82,30 +82,14 @@ def calibrate(
         write_atomically(output / "table.csv", result.table().to_csv)
         picture = report.png(report.plot_calibration(result))
         write_atomically(output / "ranks.png", lambda to: to.write_bytes(picture))
-    table = {name: row.to_dict() for name, row in result.table().iterrows()}
+    table, page = result.table().to_dict("index"), output / "ranks.png"
     print_result(
         as_json,
-        {"passed": result.passed, "parameters": table, "picture": output / "ranks.png"},
-        [
-            _calibrated(result),
-            f"{'passed' if result.passed else 'failed'}: {output / 'ranks.png'}",
-        ],
+        {"passed": result.passed, "parameters": table, "picture": page},
+        [_calibrated(result), f"{'passed' if result.passed else 'failed'}: {page}"],
     )
     if not result.passed:
         raise typer.Exit(FAILED)
-
-
-@contextmanager
-def _pool(jobs: int) -> Iterator[Executor | None]:
-    """Yield a pool of fresh processes: PyMC's threads do not survive a fork."""
-    if jobs == 1:
-        yield None
-        return
-    from concurrent.futures import ProcessPoolExecutor
-    from multiprocessing import get_context
-
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        yield pool
 
 
 def _calibrated(calibration: Calibration) -> str:

@@ -6,17 +6,17 @@ import pickle
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import cloudpickle
 import typer
 
 from pbrl_ppl.cli import options
-from pbrl_ppl.cli.close_loop import Draws, Method, Sampler
+from pbrl_ppl.cli.close_loop import Draws, Method
 from pbrl_ppl.cli.options import command
 from pbrl_ppl.cli.terminal import FAILED, check_can_make, interruptible, print_result, stages
 from pbrl_ppl.errors import OutputError
@@ -25,33 +25,39 @@ from pbrl_ppl.errors import OutputError
 @command("close-logs", 6, "pbrl-ppl close-logs logs.csv -o results/ --jobs 4")
 def close_logs(
     context: typer.Context,
-    manifest: Annotated[
-        Path,
-        typer.Argument(
-            metavar="MANIFEST", help="A CSV file with the columns name, scene, train, test, kind."
-        ),
-    ],
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the results.")
-    ],
+    manifest: Path,
+    output: options.OutputFolder,
     reading: options.SceneReading,
     seed: options.Seed = 1,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Run finished logs again.")
-    ] = False,
+    overwrite: bool = False,
     draws: Draws = None,
-    method: Sampler = Method.IMPORTANCE,
-    jobs: Annotated[int, typer.Option(min=1, help="Logs at a time.")] = 1,
-    scheduler: Annotated[
-        str | None,
-        typer.Option(metavar="ADDRESS", help="A Dask scheduler that has the workers."),
-    ] = None,
+    method: Method = Method.IMPORTANCE,
+    jobs: options.Count = 1,
+    scheduler: str | None = None,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Close the loop on each log of a manifest, and report which effects are where.
 
     The same command goes on after an interrupt. Exits with 1 if some logs failed.
+
+    Parameters
+    ----------
+    manifest : MANIFEST
+        A CSV file with the columns name, scene, train, test, kind.
+    output
+        Folder for the results.
+    overwrite
+        Run finished logs again.
+    draws
+        Posterior draws of each chain.
+    method
+        importance weights proposals by the engine; metropolis runs chains; laplace takes Gaussians
+        at the modes, on which the verdict then stands.
+    jobs
+        Logs at a time.
+    scheduler : ADDRESS
+        A Dask scheduler that has the workers.
     """
     kept = f"finished logs are in {output}; the same command goes on"
     with interruptible(kept), stages(quiet) as progress:
@@ -59,53 +65,33 @@ def close_logs(
         progress("reading the manifest")
         import pbrl_ppl.reporting as report
 
-        settings = reading.settings()
         catalogue = reading.catalogue() if reading.effect_file else None
         logs = report.read_manifest(manifest)  # its errors come before a cluster is sought
         with _executor(jobs, scheduler) as executor:
             loops = report.close_loop_many(
-                logs,
-                output,
-                executor=executor,
-                progress=progress,
-                source=report.Source(command=options.command_line(context)),
-                again=overwrite,
-                seed=seed,
-                draws=draws,
-                method=method.value,
-                catalogue=catalogue,
-                **reading.scene_settings(),
-                columns=settings["columns"],
-                units=settings["units"],
-                estimate_velocities=settings["estimate_velocities"],
-                trim=settings["trim"],
-            )
+                logs, output, executor=executor, progress=progress, again=overwrite, seed=seed,
+                source=report.Source(command=options.command_line(context)), draws=draws,
+                method=method.value, catalogue=catalogue, **reading.scene_settings(),
+                **reading.settings(),
+            )  # fmt: skip
     effects = loops.effects().drop_duplicates(["name", "effect", "body"])
     lines = [
         f"{effect}[{body}]: {', '.join(rows['name'])}"
         for (effect, body), rows in effects.groupby(["effect", "body"], sort=False)
     ]
     page = output / "index.html"
-    print_result(
-        as_json,
-        {"page": page, "logs": loops.rows},
-        [*lines, report.in_words(loops.rows), f"page: {page}"],
-    )
+    lines += [report.in_words(loops.rows), f"page: {page}"]
+    print_result(as_json, {"page": page, "logs": loops.rows}, lines)
     if loops.failed:
         raise typer.Exit(FAILED)
 
 
-@contextmanager
-def _executor(jobs: int, scheduler: str | None) -> Iterator[Executor | None]:
-    """Yield the executor of a Dask cluster, processes of this machine, or None."""
+def _executor(jobs: int, scheduler: str | None) -> AbstractContextManager[Executor | None]:
+    """Return the executor of a Dask cluster, processes of this machine, or None, as a context."""
     if scheduler is not None:
-        with _cluster(scheduler) as executor:
-            yield executor
-    elif jobs == 1:
-        yield None
-    else:
-        with OneProcessEach(jobs) as pool:  # close_loop_many cancels what has not begun
-            yield pool
+        return _cluster(scheduler)
+    # close_loop_many cancels what has not begun
+    return nullcontext() if jobs == 1 else OneProcessEach(jobs)
 
 
 @contextmanager

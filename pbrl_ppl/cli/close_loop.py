@@ -42,54 +42,46 @@ class Method(StrEnum):
     LAPLACE = "laplace"
 
 
-Draws = Annotated[int | None, typer.Option(min=100, help="Posterior draws of each chain.")]
-Sampler = Annotated[
-    Method,
-    typer.Option(
-        help="importance weights proposals by the engine; metropolis runs chains; laplace takes"
-        " Gaussians at the modes, on which the verdict then stands."
-    ),
-]
+Draws = Annotated[int | None, typer.Option(min=100)]
 
 
 @command("close-loop", 5, "pbrl-ppl close-loop scene.toml train.csv -o report/")
 def close_loop(
     context: typer.Context,
-    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.toml).")],
-    train: Annotated[
-        Path, typer.Argument(metavar="TRAIN", help="Measured history (.csv, .parquet, .nc).")
-    ],
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the results.")
-    ],
+    scene: Path,
+    train: Path,
+    output: options.OutputFolder,
     reading: options.SceneReading,
-    test: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="TEST",
-            help="Held-out history; without it, a quarter of TRAIN's trajectories.",
-        ),
-    ] = None,
+    test: Path | None = None,
     seed: options.Seed = 1,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Write to a folder that is not empty.")
-    ] = False,
+    overwrite: bool = False,
     draws: Draws = None,
-    method: Sampler = Method.IMPORTANCE,
-    learn_remainder: Annotated[
-        bool,
-        typer.Option(
-            "--learn-remainder",
-            help="Where something stays unexplained, learn a force for it, into remainder.nc; it"
-            " gets no name.",
-        ),
-    ] = False,
+    method: Method = Method.IMPORTANCE,
+    learn_remainder: bool = False,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Find what the declared model lacks, add it, refit, and report before and after.
 
     Exits with 3 if the chains have not converged: then there is no verdict.
+
+    Parameters
+    ----------
+    train : TRAIN
+        Measured history (.csv, .parquet, .nc).
+    output
+        Folder for the results.
+    test : TEST
+        Held-out history; without it, a quarter of TRAIN's trajectories.
+    overwrite
+        Write to a folder that is not empty.
+    draws
+        Posterior draws of each chain.
+    method
+        importance weights proposals by the engine; metropolis runs chains; laplace takes Gaussians
+        at the modes, on which the verdict then stands.
+    learn_remainder
+        Where something stays unexplained, learn a force for it, into remainder.nc; it gets no name.
     """
     with interruptible(), stages(quiet) as progress:
         check_can_make(output)  # before the long work, which would be lost
@@ -104,14 +96,11 @@ def close_loop(
         criticism.check_folder(output, overwrite)
         if learn_remainder:
             criticism.check_scikit_learn()
-        loop, stopped = _finished(
-            declared, histories, progress, seed=seed, draws=draws, method=method.value,
-            catalogue=catalogue,
-        )  # fmt: skip
+        settings = {"seed": seed, "draws": draws, "method": method.value, "catalogue": catalogue}
+        loop, stopped = _finished(declared, histories, progress, **settings)
         progress("writing the report")
-        source = report.Source(
-            str(scene), str(train), str(test or ""), options.command_line(context)
-        )
+        files = str(scene), str(train), str(test or "")
+        source = report.Source(*files, options.command_line(context))
         loop.save(output, overwrite, page=report.render(loop, source))
         remainder = _remainder(loop, output, source, seed, progress) if learn_remainder else {}
     words = remainder["learned_remainder"]["words"] if remainder else ""
@@ -175,26 +164,25 @@ def _remainder(
 @command("demo", 0, "pbrl-ppl demo")
 def demo(
     context: typer.Context,
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the results.")
-    ] = Path("pbrl-ppl-demo"),
-    method: Annotated[
-        Method,
-        typer.Option(
-            help="laplace takes seconds; importance and metropolis draw from the posterior itself,"
-            " in minutes."
-        ),
-    ] = Method.LAPLACE,
+    output: options.OutputFolder = Path("pbrl-ppl-demo"),
+    method: Method = Method.LAPLACE,
     seed: options.Seed = 1,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Write to a folder that has content.")
-    ] = False,
+    overwrite: bool = False,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Close the loop on a recording that comes with the package, and write its report.
 
     A shopping cart is pushed. Its castor resists turning, which the scene does not declare.
+
+    Parameters
+    ----------
+    output
+        Folder for the results.
+    method
+        laplace takes seconds; importance and metropolis draw from the posterior itself, in minutes.
+    overwrite
+        Write to a folder that has content.
     """
     cart = models_folder() / "shopping_cart"
     if not (as_json or quiet):
@@ -203,17 +191,9 @@ def demo(
             "\nThis takes some 30 s on an idle machine, the first time a minute more to compile."
         )
     close_loop(
-        context,
-        cart / "scene.toml",
-        cart / "recorded" / "train.csv",
-        output,
-        options.SceneReading(),
-        cart / "recorded" / "test.csv",
-        method=method,
-        seed=seed,
-        overwrite=overwrite,
-        as_json=as_json,
-        quiet=quiet,
-    )
+        context, cart / "scene.toml", cart / "recorded" / "train.csv", output,
+        options.SceneReading(), cart / "recorded" / "test.csv", method=method, seed=seed,
+        overwrite=overwrite, as_json=as_json, quiet=quiet,
+    )  # fmt: skip
     if not (as_json or quiet):
         typer.echo("With a recording of yours: pbrl-ppl new scene.toml --history train.csv")

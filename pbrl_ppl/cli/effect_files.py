@@ -6,25 +6,13 @@ import traceback
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from pbrl_ppl.errors import EffectError
 
 if TYPE_CHECKING:
     from pbrl_ppl.effects import Attached, Effect
     from pbrl_ppl.scene import Scene
-
-EffectFiles = Annotated[
-    list[Path] | None,
-    typer.Option(
-        "--effect-file",
-        metavar="FILE",
-        help="Python file (.py) whose Effect values at module level are effects of your own; it is"
-        " run. Repeat for others.",
-    ),
-]
 
 
 def own_effects(paths: Sequence[Path] | None) -> tuple[Effect, ...]:

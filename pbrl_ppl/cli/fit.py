@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import sys
-import warnings
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -17,6 +16,7 @@ from pbrl_ppl.cli.terminal import (
     UNDECIDED,
     check_file,
     interruptible,
+    noted_warnings,
     print_json,
     print_result,
     print_table,
@@ -33,56 +33,23 @@ if TYPE_CHECKING:
 
 @command("fit", 3, "pbrl-ppl fit scene.toml train.csv -o cart.nc")
 def fit(
-    scene: options.SceneFile,
-    history: options.HistoryFile,
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="FILE", help="The posterior file (.nc).")
-    ],
+    scene: Path,
+    history: Path,
+    output: options.OutputFile,
     reading: options.SceneReading,
-    likelihood: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME",
-            help="trajectories (whole ones with process noise, as of close-loop), transitions"
-            " (single ones from exact states, the paper's Eq. 11) or simulation (trajectories"
-            " without process noise, as of criticise --simulate).",
-        ),
-    ] = "trajectories",
-    trajectories: Annotated[
-        bool | None, typer.Option("--trajectories/--transitions", hidden=True)
-    ] = None,
-    horizon: Annotated[
-        int,
-        typer.Option(min=1, help="Intervals that are predicted, with --likelihood transitions."),
-    ] = 1,
-    scalar: Annotated[
-        bool,
-        typer.Option("--scalar-sigma", help="One sigma for all, with --likelihood transitions."),
-    ] = False,
-    nu: Annotated[
-        float | None,
-        typer.Option(min=0.1, help="Degrees of freedom of Student-t noise; else Gaussian."),
-    ] = None,
-    method: Annotated[
-        str,
-        typer.Option(
-            help="importance, metropolis, paper, demetropolisz, smc, nuts, laplace or map."
-        ),
-    ] = "importance",
-    draws: Annotated[
-        int | None, typer.Option(min=1, max=1_000_000, help="Posterior draws of each chain.")
-    ] = None,
-    tune: Annotated[
-        int | None, typer.Option(min=0, max=1_000_000, help="Tuning draws of each chain.")
-    ] = None,
-    chains: Annotated[int | None, typer.Option(min=1, max=1000, help="Chains.")] = None,
-    thin: Annotated[int | None, typer.Option(min=1, max=10_000, help="Steps a draw.")] = None,
-    resume: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Go on with this posterior: its chains, or more draws."),
-    ] = None,
+    likelihood: str = "trajectories",
+    trajectories: options.OldLikelihood = None,
+    horizon: options.Count = 1,
+    scalar: Annotated[bool, typer.Option("--scalar-sigma")] = False,
+    nu: Annotated[float | None, typer.Option(min=0.1)] = None,
+    method: str = "importance",
+    draws: Annotated[int | None, typer.Option(min=1, max=1_000_000)] = None,
+    tune: Annotated[int | None, typer.Option(min=0, max=1_000_000)] = None,
+    chains: Annotated[int | None, typer.Option(min=1, max=1000)] = None,
+    thin: Annotated[int | None, typer.Option(min=1, max=10_000)] = None,
+    resume: Path | None = None,
     seed: options.Seed = 1,
-    overwrite: options.Overwrite = False,
+    overwrite: bool = False,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
 ) -> None:
@@ -90,6 +57,33 @@ def fit(
 
     Exits with 3 if chains have not converged or draws are too few, and with 130 if it was
     interrupted; the draws of chains so far are kept.
+
+    Parameters
+    ----------
+    output
+        The posterior file (.nc).
+    likelihood : NAME
+        trajectories (whole ones with process noise, as of close-loop), transitions (single ones
+        from exact states, the paper's Eq. 11) or simulation (trajectories without process noise, as
+        of criticise --simulate).
+    horizon
+        Intervals that are predicted, with --likelihood transitions.
+    scalar
+        One sigma for all, with --likelihood transitions.
+    nu
+        Degrees of freedom of Student-t noise; else Gaussian.
+    method
+        importance, metropolis, paper, demetropolisz, smc, nuts, laplace or map.
+    draws
+        Posterior draws of each chain.
+    tune
+        Tuning draws of each chain.
+    chains
+        Chains.
+    thin
+        Steps a draw.
+    resume : FILE
+        Go on with this posterior: its chains, or more draws.
     """
     with interruptible(), stages(quiet) as progress:
         check_file(output, (".nc",), overwrite)
@@ -119,7 +113,7 @@ def fit(
         except ValueError as error:  # an option that the model refuses
             raise FitError(f"fit: {error}") from None
     # the sampler shows its own progress
-    with interruptible() as interrupts, warnings.catch_warnings(record=True) as caught:
+    with interruptible() as interrupts, noted_warnings("was interrupted") as caught:
         with redirect_stdout(sys.stderr):
             idata = sampling.fit(
                 model, method=method, seed=seed, draws=draws, tune=tune, chains=chains, thin=thin,
@@ -128,21 +122,14 @@ def fit(
         save_posterior(idata, output)
     record = PosteriorRecord.of(idata)
     cut = bool(interrupts) or record.interrupted is not None
-    for warning in caught:
-        if not (cut and "was interrupted" in str(warning.message)):
-            warnings.warn(warning.message, stacklevel=1)
-    converged = not any(issubclass(warning.category, ConvergenceWarning) for warning in caught)
+    converged = not any(isinstance(warning, ConvergenceWarning) for warning in caught)
     table = _summary(idata)
     if as_json:
+        numbers = {"max_rhat": record.max_rhat, "min_ess": record.min_ess}
+        reached = None if record.max_rhat is None else converged
         print_json(
-            {
-                "posterior": output,
-                "converged": None if record.max_rhat is None else converged,
-                "max_rhat": record.max_rhat,
-                "min_ess": record.min_ess,
-                "parameters": {str(name): row.to_dict() for name, row in table.iterrows()},
-                "warnings": list(record.warnings or ()),
-            }
+            {"posterior": output, "converged": reached, **numbers}
+            | {"parameters": table.to_dict("index"), "warnings": list(record.warnings or ())}
         )
     else:
         print_table(None, ["parameter", *table.columns], _rows(table))
@@ -187,59 +174,47 @@ def _rows(table: pd.DataFrame) -> list[list[str]]:
 
 @command("update", 9, "pbrl-ppl update cart.nc since.csv -o new.nc")
 def update(
-    posterior: Annotated[
-        Path, typer.Argument(metavar="POSTERIOR", help="Posterior file (.nc); it has the scene.")
-    ],
-    history: Annotated[
-        Path, typer.Argument(metavar="HISTORY", help="What was recorded since (.csv, ...).")
-    ],
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="FILE", help="The new posterior file.")
-    ],
+    posterior: Path,
+    history: Path,
+    output: options.OutputFile,
     reading: options.PosteriorReading,
     seed: options.Seed = 1,
-    overwrite: options.Overwrite = False,
+    overwrite: bool = False,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Bring a posterior up to date with new transitions, without a fit from scratch.
 
     Exits with 3 if the new posterior has not converged.
+
+    Parameters
+    ----------
+    posterior : POSTERIOR
+        Posterior file (.nc); it has the scene.
+    history : HISTORY
+        What was recorded since (.csv, ...).
+    output
+        The new posterior file.
     """
     with interruptible(), stages(quiet) as progress:
         check_file(output, (".nc",), overwrite)
         catalogue = reading.catalogue()
         progress("reading the posterior and the history")
-        from pbrl_ppl.posterior import (
-            PosteriorRecord,
-            load_posterior,
-            save_posterior,
-            scene_of,
-        )  # fmt: skip
+        from pbrl_ppl import posterior as posteriors
 
-        idata = load_posterior(posterior)
-        new = reading.recording(history, scene_of(idata))
+        idata = posteriors.load_posterior(posterior)
+        new = reading.recording(history, posteriors.scene_of(idata))
         progress("updating")
         from pbrl_ppl.sampling import updating
 
-        caught: list[type[Warning]] = []
-        with warnings.catch_warnings():
-            show = warnings.showwarning
-
-            def shown(
-                message: Warning | str, category: type[Warning], *place: Any, **more: Any
-            ) -> None:
-                caught.append(category)
-                show(message, category, *place, **more)  # at once: a refit takes long
-
-            warnings.showwarning = shown
+        with noted_warnings() as caught:
             idata = updating.update(idata, new, effects=catalogue, seed=seed, progress=False)
-        record = PosteriorRecord.of(idata)
+        record = posteriors.PosteriorRecord.of(idata)
         if record.interrupted is not None:  # half a posterior is no prior for the next update
             raise KeyboardInterrupt
-        save_posterior(idata, output)
+        posteriors.save_posterior(idata, output)
         (*_, last) = record.updates or ()
-    converged = not any(issubclass(category, ConvergenceWarning) for category in caught)
+    converged = not any(isinstance(warning, ConvergenceWarning) for warning in caught)
     share = last["share"]
     print_result(
         as_json,
@@ -257,18 +232,19 @@ def update(
 @command("report", 8, "pbrl-ppl report cart.nc")
 def report(
     context: typer.Context,
-    posterior: options.PosteriorFile,
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "-o", "--output", metavar="FILE", help="The page; POSTERIOR with .html if not given."
-        ),
-    ] = None,
-    overwrite: options.Overwrite = False,
+    posterior: Path,
+    output: options.OutputFile | None = None,
+    overwrite: bool = False,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Diagnose a posterior on one self-contained page: chains, prior, predictions, LOO."""
+    """Diagnose a posterior on one self-contained page: chains, prior, predictions, LOO.
+
+    Parameters
+    ----------
+    output
+        The page; POSTERIOR with .html if not given.
+    """
     with interruptible(), stages(quiet) as progress:
         page = posterior.with_suffix(".html") if output is None else output
         check_file(page, (".html",), overwrite)

@@ -1,15 +1,47 @@
-"""How a command is declared, and the options that commands share."""
+"""How a command is declared, and the options that commands share.
+
+Parameters
+----------
+scene : SCENE
+    Scene file (.toml).
+history : HISTORY
+    Measured history (.csv, .parquet, .nc).
+posterior : POSTERIOR
+    Posterior file (.nc); all that is needed.
+columns : NAME=COLUMN,...
+    Column names in the files (x=pos_x,time=t), or numbers (force_x=0); with several bodies in a
+    row, cart.x=cart_px. Other columns are left out.
+units : NAME=UNIT,...
+    What columns are measured in, if not SI (x=mm,theta=deg).
+start : BODY=X,Y,THETA
+    Where a body starts (m, rad), at rest or with ,VX,VY,OMEGA; once a body.
+noise : NAME=SD
+    Known measurement noise of a state dimension (x=0.002, in m; repeat for others).
+effect_file : FILE
+    Python file (.py) whose Effect values at module level are effects of your own; it is run. Repeat
+    for others.
+seed
+    Same seed, same answer.
+overwrite
+    Replace what exists.
+as_json
+    Print one JSON object, and nothing else.
+quiet
+    Show no progress.
+"""
 
 from __future__ import annotations
 
 import importlib
 import inspect
 import pkgutil
+import re
 import shlex
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypedDict, TypeVar, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import typer
 
@@ -41,11 +73,14 @@ _COMMANDS: dict[str, Command] = {}
 def command(name: str, rank: int, example: str) -> Callable[[F], F]:
     """Declare a function of this room to be a command.
 
-    An argument that is a dataclass stands for the options that are its fields.
+    An argument that is a dataclass stands for the options that are its fields. The help of an
+    argument, and after a colon what stands for its value, are in the docstring of the function or
+    of the dataclass, or in that of this module. An argument without a default is one of the
+    command, others are its options.
     """
 
     def declare(function: F) -> F:
-        _COMMANDS[name] = Command(name, rank, example, _with_fields(function))
+        _COMMANDS[name] = Command(name, rank, example, _bound(function))
         return function
 
     return declare
@@ -59,92 +94,81 @@ def commands() -> list[Command]:
     return sorted(_COMMANDS.values(), key=lambda command: command.rank)
 
 
-def _with_fields(function: Callable[..., None]) -> Callable[..., None]:
-    """Return a function that takes the fields of dataclasses in place of dataclasses."""
-    groups, parameters = {}, []
+def _bound(function: Callable[..., None]) -> Callable[..., None]:
+    """Return the function as Typer takes it: fields in place of dataclasses, each with its help."""
+    summary, documented = _documented(function.__doc__)
+    groups: dict[str, type] = {}
+    parameters = []
     for parameter in inspect.signature(function, eval_str=True).parameters.values():
         kind = parameter.annotation
-        if not (isinstance(kind, type) and is_dataclass(kind)):
-            parameters.append(parameter.replace(kind=parameter.KEYWORD_ONLY))
-            continue
-        groups[parameter.name] = kind
-        hints = get_type_hints(kind, include_extras=True)
-        parameters += [
-            parameter.replace(
-                name=field.name, default=field.default, annotation=hints[field.name],
-                kind=parameter.KEYWORD_ONLY,
-            )
-            for field in fields(kind)
-        ]  # fmt: skip
+        if isinstance(kind, type) and is_dataclass(kind):
+            groups[parameter.name] = kind
+            hints = get_type_hints(kind, include_extras=True)
+            for base in kind.__mro__:
+                documented = _documented(base.__doc__)[1] | documented
+            parameters += [
+                parameter.replace(name=each.name, default=each.default, annotation=hints[each.name])
+                for each in fields(kind)
+            ]
+        else:
+            parameters.append(parameter)
 
     def call(**given: object) -> None:
         for name, kind in groups.items():
             given[name] = kind(**{field.name: given.pop(field.name) for field in fields(kind)})
         function(**given)
 
-    call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    call.__doc__ = function.__doc__
+    documented = _documented(__doc__)[1] | documented
+    call.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+        [
+            _declared(parameter, *documented.get(parameter.name, ("", "")))
+            for parameter in parameters
+        ]
+    )
+    call.__doc__ = summary
     return call
 
 
-SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.toml).")]
-HistoryFile = Annotated[
-    Path, typer.Argument(metavar="HISTORY", help="Measured history (.csv, .parquet, .nc).")
-]
-PosteriorFile = Annotated[
-    Path, typer.Argument(metavar="POSTERIOR", help="Posterior file (.nc); all that is needed.")
-]
-Seed = Annotated[int, typer.Option(min=0, help="Same seed, same answer.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object, and nothing else.")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what exists.")]
-Noise = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--noise",
-        metavar="NAME=SD",
-        help="Known measurement noise of a state dimension (x=0.002, in m; repeat for others).",
-    ),
-]
-Columns = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="NAME=COLUMN,...",
-        help="Column names in the files (x=pos_x,time=t), or numbers (force_x=0); with several"
-        " bodies in a row, cart.x=cart_px. Other columns are left out.",
-    ),
-]
-Units = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="NAME=UNIT,...", help="What columns are measured in, if not SI (x=mm,theta=deg)."
-    ),
-]
-Starts = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="BODY=X,Y,THETA",
-        help="Where a body starts (m, rad), at rest or with ,VX,VY,OMEGA; once a body.",
-    ),
-]
+def _declared(parameter: inspect.Parameter, metavar: str, said: str) -> inspect.Parameter:
+    """Return a parameter with the declaration, metavar and help of an option or argument."""
+    kind = parameter.annotation
+    optional = [each for each in get_args(kind) if get_origin(each) is Annotated]
+    if get_origin(kind) is Annotated:
+        kind, info = get_args(kind)
+    elif optional:  # Annotated[...] | None
+        kind, info = get_args(optional[0])
+        kind |= None
+    elif kind is typer.Context:
+        return parameter.replace(kind=parameter.KEYWORD_ONLY)
+    elif parameter.default is parameter.empty:
+        info = typer.Argument()
+    else:
+        info = typer.Option(f"--{parameter.name.replace('_', '-')}")
+    info = copy(info)
+    info.metavar, info.help = info.metavar or metavar or None, info.help or said or None
+    return parameter.replace(annotation=Annotated[kind, info], kind=parameter.KEYWORD_ONLY)
 
 
-class ReadingSettings(TypedDict):
-    """Arguments of `history.read_recording`."""
-
-    columns: dict[str, str | float]
-    units: dict[str, str]
-    estimate_velocities: bool
-    trim: bool
-    resample: bool
+def _documented(docstring: str | None) -> tuple[str, dict[str, tuple[str, str]]]:
+    """Return a docstring up to its parameters, and the metavar and help of each of them."""
+    text = inspect.cleandoc(docstring or "")
+    summary, _, listed = text.partition("\n\nParameters\n----------\n")
+    entries = re.findall(r"^(\w+)(?: : (.+))?\n((?:    .+(?:\n|$))+)", listed, re.MULTILINE)
+    return summary, {name: (metavar, " ".join(said.split())) for name, metavar, said in entries}
 
 
-class SceneSettings(TypedDict):
-    """Arguments of `history.read_scene`."""
-
-    noise: dict[str, float]
-    substeps: int | None
-    time_step: float | None
+SceneFile = Path
+HistoryFile = Path
+OutputFile = Annotated[Path, typer.Option("-o", "--output", metavar="FILE")]
+OutputFolder = Annotated[Path, typer.Option("-o", "--output", metavar="DIR")]
+OldLikelihood = Annotated[bool | None, typer.Option("--trajectories/--transitions", hidden=True)]
+Seed = Annotated[int, typer.Option(min=0)]
+Count = Annotated[int, typer.Option(min=1)]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q")]
+AsJson = Annotated[bool, typer.Option("--json")]
+Overwrite = bool
+Columns = list[str] | None
+Units = list[str] | None
 
 
 @dataclass(frozen=True)
@@ -152,40 +176,30 @@ class Reading:
     """Options of each command that reads a recording.
 
     Each is in place of what the scene file's ``[recording]`` says.
+
+    Parameters
+    ----------
+    estimate_velocities
+        Start predictions from velocities estimated from positions, if none were measured.
+    trim
+        Leave out rows at a trajectory's ends that belong to no model: a body still held, an abrupt
+        stop.
     """
 
-    columns: Columns = None
-    units: Units = None
-    estimate_velocities: Annotated[
-        bool,
-        typer.Option(
-            "--estimate-velocities",
-            help="Start predictions from velocities estimated from positions, if none were"
-            " measured.",
-        ),
-    ] = False
-    trim: Annotated[
-        bool,
-        typer.Option(
-            "--trim",
-            help="Leave out rows at a trajectory's ends that belong to no model: a body still held,"
-            " an abrupt stop.",
-        ),
-    ] = False
-    effect_file: effect_files.EffectFiles = None
+    columns: list[str] | None = None
+    units: list[str] | None = None
+    estimate_velocities: bool = False
+    trim: bool = False
+    effect_file: list[Path] | None = None
 
     def __post_init__(self) -> None:
         self.settings()  # bad usage is reported before any file is read
 
-    def settings(self, resample: bool = False) -> ReadingSettings:
-        """Return what the options say of a recording."""
-        return {
-            "columns": columns_of(self.columns),
-            "units": units_of(self.units),
-            "estimate_velocities": self.estimate_velocities,
-            "trim": self.trim,
-            "resample": resample,
-        }
+    def settings(self, **others: Any) -> dict[str, Any]:
+        """Return arguments of `history.read_recording`: what the options say, and others."""
+        flags = {"estimate_velocities": self.estimate_velocities, "trim": self.trim}
+        read = {"columns": columns_of(self.columns), "units": units_of(self.units)}
+        return read | flags | others
 
     def catalogue(self) -> tuple[Effect, ...]:
         """Return the catalogue and after it the effects of effect files."""
@@ -198,55 +212,51 @@ class Reading:
 
 @dataclass(frozen=True)
 class PosteriorReading(Reading):
-    """Options of a command that reads a recording with the scene of a posterior."""
+    """Options of a command that reads a recording with the scene of a posterior.
 
-    resample: Annotated[
-        bool,
-        typer.Option(
-            "--resample",
-            help="Interpolate uneven samples to the scene's time step. There is no --time-step as"
-            " in other commands, which sets another: a posterior holds for one time step.",
-        ),
-    ] = False
+    Parameters
+    ----------
+    resample
+        Interpolate uneven samples to the scene's time step. There is no --time-step as in other
+        commands, which sets another: a posterior holds for one time step.
+    """
+
+    resample: bool = False
 
     def recording(self, path: Path, scene: Scene) -> History:
         """Return the history of a file."""
         from pbrl_ppl.history import read_recording
 
-        return read_recording(path, scene, **self.settings(self.resample))
+        return read_recording(path, scene, **self.settings(resample=self.resample))
 
 
 @dataclass(frozen=True)
 class SceneReading(Reading):
-    """Options of a command that reads a scene file and recordings."""
+    """Options of a command that reads a scene file and recordings.
 
-    noise: Noise = None
-    substeps: Annotated[
-        int | None, typer.Option(min=1, help="Engine steps per interval, in place of the scene's.")
-    ] = None
-    time_step: Annotated[
-        float | None,
-        typer.Option(
-            min=1e-9,
-            metavar="SECONDS",
-            help="In place of the scene's time_step; uneven samples are interpolated to it.",
-        ),
-    ] = None
+    Parameters
+    ----------
+    substeps
+        Engine steps per interval, in place of the scene's.
+    time_step : SECONDS
+        In place of the scene's time_step; uneven samples are interpolated to it.
+    """
 
-    def scene_settings(self) -> SceneSettings:
-        """Return what the options say of a scene."""
-        return {
-            "noise": noise_of(self.noise),
-            "substeps": self.substeps,
-            "time_step": self.time_step,
-        }
+    noise: list[str] | None = None
+    substeps: Count | None = None
+    time_step: Annotated[float | None, typer.Option(min=1e-9)] = None
+
+    def scene_settings(self) -> dict[str, Any]:
+        """Return arguments of `history.read_scene`: what the options say of a scene."""
+        noise = noise_of(self.noise)
+        return {"noise": noise, "substeps": self.substeps, "time_step": self.time_step}
 
     def read(self, scene: Path, histories: Sequence[Path]) -> tuple[Scene, list[History]]:
         """Return the scene and its histories."""
         from pbrl_ppl.history import read_recording, read_scene
 
         declared = read_scene(scene, **self.scene_settings())
-        settings = self.settings(self.time_step is not None)
+        settings = self.settings(resample=self.time_step is not None)
         return declared, [read_recording(path, declared, **settings) for path in histories]
 
 
@@ -268,19 +278,24 @@ def command_line(context: typer.Context) -> str:
     return shlex.join([*words, *options])
 
 
+def given(**values: Any) -> dict[str, Any]:
+    """Return the options that were given: all but None."""
+    return {name: value for name, value in values.items() if value is not None}
+
+
 def noise_of(texts: list[str] | None) -> dict[str, float]:
     """Return standard deviations by state dimension from ``--noise``."""
-    return dict(pairs(texts, "--noise", "x=0.002", float))
+    return pairs(texts, "--noise", "x=0.002", float)
 
 
 def columns_of(texts: list[str] | None) -> dict[str, str | float]:
     """Return column names, or numbers, from options such as ``x=pos_x,force_x=0``."""
-    return dict(pairs(texts, "--columns", "x=pos_x", _number_or_name))
+    return pairs(texts, "--columns", "x=pos_x", _number_or_name)
 
 
 def units_of(texts: list[str] | None) -> dict[str, str]:
     """Return units from options such as ``x=mm,theta=deg``."""
-    return dict(pairs(texts, "--units", "x=mm", str))
+    return pairs(texts, "--units", "x=mm", str)
 
 
 def _number_or_name(text: str) -> str | float:
@@ -293,19 +308,19 @@ def _number_or_name(text: str) -> str | float:
 
 def pairs(
     texts: list[str] | None, option: str, example: str, kind: Callable[[str], T]
-) -> list[tuple[str, T]]:
-    """Return names and values from ``NAME=VALUE,...``."""
-    pairs_read = []
+) -> dict[str, T]:
+    """Return values by name from ``NAME=VALUE,...``."""
+    values = {}
     for item in ",".join(texts).split(",") if texts else ():
         name, _, value = (part.strip() for part in item.partition("="))
         try:
             if not (name and value):
                 raise ValueError
-            pairs_read.append((name, kind(value)))
+            values[name] = kind(value)
         except ValueError:
             message = f"{item!r} is not NAME=VALUE, such as {example}"
             raise typer.BadParameter(message, param_hint=option) from None
-    return pairs_read
+    return values
 
 
 def pose(text: str, bodies: Sequence[str], option: str) -> tuple[str, list[float | None]]:
@@ -319,13 +334,12 @@ def pose(text: str, bodies: Sequence[str], option: str) -> tuple[str, list[float
             raise GoalError(f"{option} {text}: say which body: {bodies[0]}={text}")
         name = bodies[0]
     values: list[float | None] = []
-    for number in numbers.split(","):
+    for number in map(str.strip, numbers.split(",")):
         try:
-            values.append(None if number.strip() == "-" else float(number))
+            values.append(None if number == "-" else float(number))
         except ValueError:
-            raise GoalError(
-                f"{option} {text}: {number.strip()!r} is not a number; expected BODY=X,Y,THETA"
-            ) from None
+            why = f"{number!r} is not a number; expected BODY=X,Y,THETA"
+            raise GoalError(f"{option} {text}: {why}") from None
     return name.strip(), values
 
 
@@ -335,6 +349,6 @@ def starts_of(texts: list[str] | None, bodies: Sequence[str]) -> dict[str, list[
     for text in texts or ():
         name, values = pose(text, bodies, "--start")
         starts[name] = [value for value in values if value is not None]
-        if len(starts[name]) < len(values):
+        if None in values:
             raise GoalError(f"--start {text}: a start has no free coordinates; give a number for -")
     return starts

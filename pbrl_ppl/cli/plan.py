@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
 
 import typer
 
@@ -16,62 +15,61 @@ from pbrl_ppl.errors import EffectError, GoalError
 
 @command("plan", 10, "pbrl-ppl plan cart.nc --start -2,0,0 --goal 2,1,1.57 -o plan.csv")
 def plan(
-    posterior: options.PosteriorFile,
-    start: options.Starts = None,
-    goal: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="BODY=X,Y,THETA",
-            help="Where a body should be, - where free; once a body. Or a goal file (.toml).",
-        ),
-    ] = None,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="FILE", help="The plan (.csv).")
-    ] = None,
-    actions: Annotated[
-        Path | None,
-        typer.Option(help="Actions (.toml); such as the posterior's data were recorded with."),
-    ] = None,
-    method: Annotated[str, typer.Option(help="astar or mppi.")] = "astar",
-    draws: Annotated[
-        int | None, typer.Option(min=1, help="Posterior draws to plan with; the MAP if not given.")
-    ] = None,
-    weight: Annotated[
-        float | None,
-        typer.Option(help="Of A*'s heuristic: 1 is A* itself, more is quicker; 3 if not given."),
-    ] = None,
-    tail: Annotated[
-        float, typer.Option(help="Share of the worst draws that count; 1 is the expectation.")
-    ] = 1.0,
-    noise: Annotated[bool, typer.Option("--noise", help="Plan with Eq. 13's noise.")] = False,
-    tolerance: Annotated[
-        float | None,
-        typer.Option(
-            help="Position tolerance (m); by default a fifth of the body's bounding radius."
-        ),
-    ] = None,
-    angle_tolerance: Annotated[float | None, typer.Option(help="Angle tolerance (rad).")] = None,
-    contact_penalty: Annotated[
-        float | None, typer.Option(help="Cost of a second in contact (s); inf forbids it.")
-    ] = None,
-    nodes: Annotated[
-        int | None, typer.Option(min=1, help="States that the search generates at most.")
-    ] = None,
-    seconds: Annotated[
-        float | None,
-        typer.Option(help="Another limit (s); the plan then depends on the machine's load."),
-    ] = None,
-    effect_file: effect_files.EffectFiles = None,
+    posterior: Path,
+    start: list[str] | None = None,
+    goal: list[str] | None = None,
+    output: options.OutputFile | None = None,
+    actions: Path | None = None,
+    method: str = "astar",
+    draws: options.Count | None = None,
+    weight: float | None = None,
+    tail: float = 1.0,
+    noise: bool = False,
+    tolerance: float | None = None,
+    angle_tolerance: float | None = None,
+    contact_penalty: float | None = None,
+    nodes: options.Count | None = None,
+    seconds: float | None = None,
+    effect_file: list[Path] | None = None,
     seed: options.Seed = 1,
-    animate: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Show the plan as a picture that moves (.gif)."),
-    ] = None,
-    overwrite: options.Overwrite = False,
+    animate: Path | None = None,
+    overwrite: bool = False,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Plan from a start to a goal with a posterior file alone."""
+    """Plan from a start to a goal with a posterior file alone.
+
+    Parameters
+    ----------
+    goal : BODY=X,Y,THETA
+        Where a body should be, - where free; once a body. Or a goal file (.toml).
+    output
+        The plan (.csv).
+    actions
+        Actions (.toml); such as the posterior's data were recorded with.
+    method
+        astar or mppi.
+    draws
+        Posterior draws to plan with; the MAP if not given.
+    weight
+        Of A*'s heuristic: 1 is A* itself, more is quicker; 3 if not given.
+    tail
+        Share of the worst draws that count; 1 is the expectation.
+    noise
+        Plan with Eq. 13's noise.
+    tolerance
+        Position tolerance (m); by default a fifth of the body's bounding radius.
+    angle_tolerance
+        Angle tolerance (rad).
+    contact_penalty
+        Cost of a second in contact (s); inf forbids it.
+    nodes
+        States that the search generates at most.
+    seconds
+        Another limit (s); the plan then depends on the machine's load.
+    animate : FILE
+        Show the plan as a picture that moves (.gif).
+    """
     with interruptible(), stages(quiet) as progress:
         if output is None and animate is None:
             raise GoalError("plan: say where it should be written: -o plan.csv")
@@ -86,12 +84,9 @@ def plan(
 
         idata = load_posterior(posterior)
         bodies = [body.name for body in scene_of(idata).dynamic]
-        costs = {
-            "tolerance": tolerance,
-            "angle_tolerance": angle_tolerance,
-            "contact_penalty": contact_penalty,
-        }
-        weights = {name: value for name, value in costs.items() if value is not None}
+        weights = options.given(
+            tolerance=tolerance, angle_tolerance=angle_tolerance, contact_penalty=contact_penalty
+        )
         if goal and goal[0].endswith(".toml"):
             if len(goal) > 1 or weights:
                 raise GoalError("--goal: a file has the whole goal; drop the other options of it")
@@ -101,15 +96,13 @@ def plan(
             wanted = Goal.of(targets, **weights)
         starts = options.starts_of(start, bodies)
         allowed = None if actions is None else ActionSet.load(actions)
-        limit: dict[str, Any] = {} if nodes is None else {"nodes": nodes}
-        if weight is not None:
-            if method != "astar":
-                raise GoalError(f"--weight: it is for astar, not --method {method}; leave it out")
-            limit["weight"] = weight
+        if weight is not None and method != "astar":
+            raise GoalError(f"--weight: it is for astar, not --method {method}; leave it out")
         progress("planning")
         result = make_plan(
             idata, starts, wanted, allowed, method=method, draws=draws, tail=tail, noise=noise,
-            seconds=seconds, effects=catalogue, seed=seed, progress=progress, **limit,
+            seconds=seconds, effects=catalogue, seed=seed, progress=progress,
+            **options.given(nodes=nodes, weight=weight),
         )  # fmt: skip
         if output is not None:
             result.save(output)
@@ -120,15 +113,9 @@ def plan(
             animate_plan(result, animate)
     written = [path for path in (output, animate) if path is not None]
     words = result.in_words()
+    facts = {"reached": result.reached, "duration": result.duration, "words": words}
     print_result(
-        as_json,
-        {
-            "reached": result.reached,
-            "duration": result.duration,
-            "words": words,
-            "written": written,
-        },
-        [words, *(f"plan: {path}" for path in written)],
+        as_json, facts | {"written": written}, [words, *(f"plan: {path}" for path in written)]
     )
     if not result.reached:
         raise typer.Exit(FAILED)
@@ -136,49 +123,43 @@ def plan(
 
 @command("suggest", 7, "pbrl-ppl suggest report/after.nc --start 0,0,0 -o next.csv")
 def suggest(
-    posterior: Annotated[
-        Path,
-        typer.Argument(
-            metavar="POSTERIOR",
-            help="Posterior file of whole trajectories: after.nc of close-loop.",
-        ),
-    ],
-    start: options.Starts = None,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="FILE", help="The experiment (.csv).")
-    ] = None,
-    effect: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME",
-            help="Effects to tell apart, such as spring or 'spring on cart'; two or more. What the"
-            " loop could not separate if not given.",
-        ),
-    ] = None,
-    bounds: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="BODY.NAME=LOW,HIGH",
-            help="What is allowed: cart.force_x=-20,20 (N, world frame; torque N m); repeat for"
-            " others.",
-        ),
-    ] = None,
-    actions: Annotated[
-        Path | None,
-        typer.Option(help="Or actions (.toml), as of plan; if neither, such as were recorded."),
-    ] = None,
-    steps: Annotated[int, typer.Option(min=1, help="Sampling intervals.")] = 20,
-    hold: Annotated[
-        int | None, typer.Option(min=1, help="Intervals for which a wrench within bounds is held.")
-    ] = None,
-    draws: Annotated[int, typer.Option(min=1, help="Posterior draws of each effect's model.")] = 16,
-    effect_file: effect_files.EffectFiles = None,
+    posterior: Path,
+    start: list[str] | None = None,
+    output: options.OutputFile | None = None,
+    effect: list[str] | None = None,
+    bounds: list[str] | None = None,
+    actions: Path | None = None,
+    steps: options.Count = 20,
+    hold: options.Count | None = None,
+    draws: options.Count = 16,
+    effect_file: list[Path] | None = None,
     seed: options.Seed = 1,
-    overwrite: options.Overwrite = False,
+    overwrite: bool = False,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Suggest the actions that tell apart effects which the data so far cannot separate."""
+    """Suggest the actions that tell apart effects which the data so far cannot separate.
+
+    Parameters
+    ----------
+    posterior : POSTERIOR
+        Posterior file of whole trajectories: after.nc of close-loop.
+    output
+        The experiment (.csv).
+    effect : NAME
+        Effects to tell apart, such as spring or 'spring on cart'; two or more. What the loop could
+        not separate if not given.
+    bounds : BODY.NAME=LOW,HIGH
+        What is allowed: cart.force_x=-20,20 (N, world frame; torque N m); repeat for others.
+    actions
+        Or actions (.toml), as of plan; if neither, such as were recorded.
+    steps
+        Sampling intervals.
+    hold
+        Intervals for which a wrench within bounds is held.
+    draws
+        Posterior draws of each effect's model.
+    """
     with interruptible(), stages(quiet) as progress:
         if output is None:
             raise GoalError("suggest: say where it should be written: -o next.csv")
@@ -193,11 +174,8 @@ def suggest(
 
         idata = load_posterior(posterior)
         if len(effect or ()) < 2 and (effect or not kept_groups(idata)):
-            why = (
-                f"got --effect '{effect[0]}' alone"
-                if effect
-                else (f"{posterior} names no effects that its data cannot separate")
-            )
+            why = f"{posterior} names no effects that its data cannot separate"
+            why = f"got --effect '{effect[0]}' alone" if effect else why
             raise EffectError(
                 f"suggest: {why}; name two or more, such as --effect linear_drag --effect"
                 " quadratic_drag"

@@ -24,31 +24,15 @@ if TYPE_CHECKING:
 
 @command("simulate", 11, "pbrl-ppl simulate cart.nc plan.csv -o predicted.csv --draws 20")
 def simulate(
-    source: Annotated[
-        Path,
-        typer.Argument(metavar="SOURCE", help="Posterior file (.nc), or scene (.toml) with --set."),
-    ],
-    history: options.HistoryFile,
-    output: Annotated[
-        Path,
-        typer.Option("-o", "--output", metavar="FILE", help="The history (.csv, .parquet, .nc)."),
-    ],
+    source: Path,
+    history: Path,
+    output: options.OutputFile,
     reading: options.PosteriorReading,
-    given: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="NAME=VALUE",
-            help="A parameter (SI units): mass=8 for all bodies, or 'mass[cart]=8'; repeat.",
-        ),
-    ] = None,
-    draws: Annotated[
-        int | None,
-        typer.Option(min=1, help="Posterior draws, a copy of each trajectory for each; else MAP."),
-    ] = None,
-    noise: options.Noise = None,
+    given: Annotated[list[str] | None, typer.Option("--set")] = None,
+    draws: options.Count | None = None,
+    noise: list[str] | None = None,
     seed: options.Seed = 1,
-    overwrite: options.Overwrite = False,
+    overwrite: bool = False,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
 ) -> None:
@@ -56,10 +40,21 @@ def simulate(
 
     Each trajectory is followed from its first complete state to its end. With --noise, measurement
     noise is added; without, the states are the engine's.
+
+    Parameters
+    ----------
+    source : SOURCE
+        Posterior file (.nc), or scene (.toml) with --set.
+    output
+        The history (.csv, .parquet, .nc).
+    given : NAME=VALUE
+        A parameter (SI units): mass=8 for all bodies, or 'mass[cart]=8'; repeat.
+    draws
+        Posterior draws, a copy of each trajectory for each; else MAP.
     """
     with interruptible(), stages(quiet) as progress:
         check_file(output, (".csv", ".parquet", ".nc"), overwrite)
-        values = dict(options.pairs(given, "--set", "mass=8", float))
+        values = options.pairs(given, "--set", "mass=8", float)
         errors = options.noise_of(noise)
         progress("reading the parameters and the history")
         catalogue = reading.catalogue()

@@ -116,6 +116,22 @@ def warnings_in_a_line() -> Iterator[None]:
         yield
 
 
+@contextmanager
+def noted_warnings(hidden: str | None = None) -> Iterator[list[Warning]]:
+    """Yield the warnings so far; show each at once, but those with the `hidden` text."""
+    noted: list[Warning] = []
+    with warnings.catch_warnings():
+        show = warnings.showwarning
+
+        def note(message: Any, category: type[Warning], *place: Any, **more: Any) -> None:
+            noted.append(message)
+            if hidden is None or hidden not in str(message):
+                show(message, category, *place, **more)
+
+        warnings.showwarning = note
+        yield noted
+
+
 def print_json(contents: Mapping[str, Any]) -> None:
     """Print one JSON object; numbers that are not finite become null."""
     typer.echo(json.dumps(json_values(contents), indent=1, allow_nan=False))

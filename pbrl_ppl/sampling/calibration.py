@@ -152,13 +152,9 @@ def calibrate(
             f"colour is {colour} with likelihood {likelihood!r}, expected 0: coloured errors are"
             f" for {OutputErrorLikelihood.name!r}"
         )
-    design = declared_problem(
-        Physics.declare(with_units(scene, history), effects, substeps=substeps),
-        history,
-        horizon=horizon,
-        likelihood=TransitionLikelihood.declare(sigma, nu),
-        kind=likelihood,
-    )
+    noise = TransitionLikelihood.declare(sigma, nu)
+    physics = Physics.declare(with_units(scene, history), effects, substeps=substeps)
+    design = declared_problem(physics, history, horizon=horizon, likelihood=noise, kind=likelihood)
     if design.layout.discrete.any():
         raise FitError(
             "calibrate: which bodies a joint joins is unknown, and ranks are for parameters that"
@@ -170,34 +166,26 @@ def calibrate(
     settings = {"draws": draws, "tune": tune, "chains": chains, **options}
     # of the declared scene: its natural units follow from the history
     about = _about(design, seed, settings) | {"scene": scene.to_toml(), "colour": colour}
-    store = None if folder is None else _opened(Path(folder), about)
+    files = [] if folder is None else _opened(Path(folder), about, replications)
     truths, redrawn = draw_truths(design, replications, seed, colour)
-    done: dict[int, Record] = {}
+    done = {i: _read(path) for i, path in enumerate(files) if path.is_file()}
     failures: dict[int, str] = {}
-    tasks = {}
-    for i, truth in enumerate(truths):
-        if store is not None and _file(store, i).is_file():
-            done[i] = _read(_file(store, i))
-        else:
-            fit_seed = int(np.random.SeedSequence([seed, i]).generate_state(1)[0])
-            tasks[i] = partial(replicate, design, truth, fit_seed, settings)
+    tasks = {
+        i: partial(replicate, design, truth, _seed(seed, i), settings)
+        for i, truth in enumerate(truths)
+        if i not in done
+    }
+    label = f"calibrating, {len(done)} of {replications} done before"
+    shown: dict[str, Any] = {"console": Console(stderr=True), "disable": not progress}
     with closing(as_ended(tasks, executor)) as results:
-        shown = track(
-            results,
-            f"calibrating, {len(done)} of {replications} done before",
-            total=len(tasks),
-            console=Console(stderr=True),
-            disable=not progress,
-        )
-        for i, result in shown:
+        for i, result in track(results, label, len(tasks), **shown):
             try:
-                record = result()
+                done[i] = result()
             except Exception as error:  # whatever it was, the other replications go on
                 failures[i] = f"replication {i}: {type(error).__name__}: {error}"
                 continue
-            if store is not None:
-                write_text(_file(store, i), json.dumps(record) + "\n")
-            done[i] = record
+            if files:
+                write_text(files[i], json.dumps(done[i]) + "\n")
     failed = tuple(failures[i] for i in sorted(failures))
     if not done:
         raise FitError(f"calibrate: all {replications} replications failed; {failed[0]}")
@@ -206,15 +194,18 @@ def calibrate(
     numbers = sorted(done)
     columns = {name: np.array([done[i][name] for i in numbers]) for name in done[numbers[0]]}
     return Calibration.of(
-        columns.pop("rank"),
-        columns.pop("size"),
-        list(labels(design)),
+        parameters=list(labels(design)),
         judged=design.layout.labels if colour else None,
         replication=np.array(numbers),
         failures=failed,
         attrs={key: json.dumps(value) for key, value in about.items()} | {"redrawn": redrawn},
         **columns,
     )
+
+
+def _seed(seed: int, number: int) -> int:
+    """Return the seed of a replication's fit."""
+    return int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
 
 
 def _about(design: Problem, seed: int, settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -236,8 +227,8 @@ def _about(design: Problem, seed: int, settings: Mapping[str, Any]) -> dict[str,
     return dict(json.loads(json.dumps(about)))
 
 
-def _opened(folder: Path, about: Mapping[str, Any]) -> Path:
-    """Make the folder of a calibration, or check that it holds this calibration."""
+def _opened(folder: Path, about: Mapping[str, Any], n: int) -> list[Path]:
+    """Make the folder of a calibration, or check it; return the files of n replications."""
     path = folder / _DESIGN
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -246,9 +237,9 @@ def _opened(folder: Path, about: Mapping[str, Any]) -> Path:
                 raise OutputError(f"{folder}: holds other files; choose a new or an empty folder")
             write_text(path, json.dumps(about, indent=1) + "\n")
         stored = json.loads(path.read_text(encoding="utf-8"))
+    except OutputError:
+        raise
     except (OSError, ValueError) as error:
-        if isinstance(error, OutputError):
-            raise
         raise OutputError(f"{path}: cannot be made or read: {error}") from error
     changed = [key for key, value in about.items() if stored.get(key) != value]
     if changed:
@@ -257,11 +248,7 @@ def _opened(folder: Path, about: Mapping[str, Any]) -> Path:
             f" ({changed[0]}: {stored.get(changed[0])!r:.80}, expected {about[changed[0]]!r:.80});"
             " choose another folder, or the arguments it was begun with"
         )
-    return folder
-
-
-def _file(folder: Path, number: int) -> Path:
-    return folder / f"replication-{number:05d}.json"
+    return [folder / f"replication-{number:05d}.json" for number in range(n)]
 
 
 def _read(path: Path) -> Record:

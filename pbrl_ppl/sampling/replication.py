@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
+from scipy.signal import lfilter
 
 from pbrl_ppl.errors import (
     BoundWarning,
@@ -129,7 +130,10 @@ def _trajectories(design: Problem, phi: Floats, sigma: Floats, seed: int, colour
     """Return measured states of whole trajectories, one set a draw; 0 where nothing is measured."""
     rngs = [np.random.default_rng([seed, i]) for i in range(len(phi))]
     if design.likelihood.simulated:
-        every = _simulations(design, phi)
+        every = np.repeat(design.data.smoothed_states[None], len(phi), axis=0)
+        # without process noise; each piece of the design is a whole trajectory
+        simulated_states = design.one_world(phi, design.segments.start, design.inputs)
+        every[:, design.segments.trajectory, 1:] = simulated_states
         columns = list(design.observations.columns)
         for states, noise, rng in zip(every, sigma, rngs, strict=True):
             states[..., columns] += noise * coloured((*states.shape[:3], len(columns)), colour, rng)
@@ -138,18 +142,6 @@ def _trajectories(design: Problem, phi: Floats, sigma: Floats, seed: int, colour
         every = np.array([simulated_trajectories(design, *draw) for draw in drawn])
     measured = np.isfinite(design.data.history.dataset["observed"].to_numpy())
     return np.where(measured, every, 0.0)
-
-
-def _simulations(design: Problem, phi: Floats) -> Floats:
-    """Return trajectories without process noise from the design's start states.
-
-    Shape (draw, trajectory, time, body, 6), for phi of shape (draw, p).
-    """
-    states, segments = design.data.smoothed_states, design.segments
-    every = np.repeat(states[None], len(phi), axis=0)
-    # each piece of the design is a whole trajectory
-    every[:, segments.trajectory, 1:] = design.one_world(phi, segments.start, design.inputs)
-    return every
 
 
 def coloured(shape: tuple[int, ...], colour: float, rng: np.random.Generator) -> Floats:
@@ -166,9 +158,7 @@ def coloured(shape: tuple[int, ...], colour: float, rng: np.random.Generator) ->
     """
     errors = rng.standard_normal(shape)
     errors[:, 1:] *= np.sqrt(1.0 - colour**2)
-    for row in range(1, shape[1]):
-        errors[:, row] += colour * errors[:, row - 1]
-    return errors
+    return np.asarray(lfilter([1.0], [1.0, -colour], errors, axis=1))
 
 
 def simulated(design: Problem, values: Floats) -> Problem:
@@ -201,11 +191,9 @@ def _remeasured(design: Problem, observed: Floats) -> Problem:
     """Return the problem of simulations with other measurements, its noise prior the design's."""
     dataset = design.data.history.dataset
     start = np.where(np.isfinite(observed), observed, dataset["start"])
+    copies = {"observed": observed, "start": start}
     history = History(
-        dataset.assign(
-            observed=dataset["observed"].copy(data=observed),
-            start=dataset["start"].copy(data=start),
-        )
+        dataset.assign({key: dataset[key].copy(data=value) for key, value in copies.items()})
     )
     centre = np.array([prior.centre for prior in design.layout.priors])
     problem = along_trajectories(design.with_data(history=history, states=None), centre)
@@ -258,13 +246,10 @@ def replicate(
         sizes = group(idata, "posterior").sizes
         likelihood = group(idata, "log_likelihood")["next_state"].sum("transition").values
         drawn = quantities(problem, *parameter_draws(problem, idata), likelihood.ravel())
-        shape = (sizes["chain"], sizes["draw"])
-        data = {
-            name: (("chain", "draw"), column.reshape(shape))
-            for name, column in zip(labels(problem), drawn.T, strict=True)
-        }
+        columns = drawn.T.reshape(-1, sizes["chain"], sizes["draw"])
+        data = xr.DataArray(columns, {"name": list(labels(problem))}, ("name", "chain", "draw"))
         # of folded draws: a change between equal descriptions of a wheel is no failure to mix
-        r_hat, ess = convergence(from_groups({"posterior": xr.Dataset(data)}, {}))
+        r_hat, ess = convergence(from_groups({"posterior": data.to_dataset("name")}, {}))
         if min(ess.values()) >= MOST_DRAWS or again == most_repeats:
             break
         settings |= {key: longer * settings[key] for key in ("draws", "tune")}
@@ -272,17 +257,9 @@ def replicate(
     residual = problem.residual(truth.phi)
     of_truth = problem.log_density(residual, truth.sigma, truth.phi).sum(keepdims=True)
     true = quantities(problem, truth.phi[None], truth.sigma[None], of_truth)[0]
-    ranks = [
-        rank(column, value, effective)
-        for column, value, effective in zip(drawn.T, true, ess.values(), strict=True)
-    ]
-    return {
-        "rank": [pair[0] for pair in ranks],
-        "size": [pair[1] for pair in ranks],
-        "truth": true.tolist(),
-        "ess": list(ess.values()),
-        "r_hat": list(r_hat.values()),
-    }
+    ranks, counts = zip(*map(rank, drawn.T, true, ess.values()), strict=True)
+    found = {"truth": true.tolist(), "ess": list(ess.values()), "r_hat": list(r_hat.values())}
+    return {"rank": list(ranks), "size": list(counts), **found}
 
 
 def quantities(problem: Problem, phi: Floats, sigma: Floats, likelihood: Floats) -> Floats:
