@@ -133,7 +133,7 @@ def fit(
         )
     else:
         print_table(None, ["parameter", *table.columns], _rows(table))
-        if any(issubclass(one.category, LinearisationWarning) for one in caught):
+        if any(isinstance(one, LinearisationWarning) for one in caught):
             typer.echo("intervals: not to be trusted, the likelihood does not hold (warning above)")
         typer.echo(f"posterior: {output}")
     if cut:

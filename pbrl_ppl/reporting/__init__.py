@@ -15,8 +15,8 @@ from pbrl_ppl.reporting.posterior_plots import plot_calibration as plot_calibrat
 from pbrl_ppl.reporting.posterior_plots import plot_prior_check as plot_prior_check
 from pbrl_ppl.reporting.posterior_plots import plot_rank as plot_rank
 from pbrl_ppl.reporting.posterior_plots import plot_trace as plot_trace
-from pbrl_ppl.reporting.posterior_plots import summary as summary
 from pbrl_ppl.reporting.posterior_report import render_posterior as render_posterior
+from pbrl_ppl.reporting.posterior_summary import summary as summary
 from pbrl_ppl.reporting.scene_plots import animate_plan as animate_plan
 from pbrl_ppl.reporting.scene_plots import draw_goal as draw_goal
 from pbrl_ppl.reporting.scene_plots import draw_motion as draw_motion

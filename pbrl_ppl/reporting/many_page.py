@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -13,9 +12,18 @@ from markupsafe import Markup
 
 from pbrl_ppl.criticism import NOT_CONVERGED
 from pbrl_ppl.reporting.logs import Row
-from pbrl_ppl.reporting.page import Cell, Section, Source, Table, render_page
+from pbrl_ppl.reporting.page import Section, Source, render_page
+from pbrl_ppl.reporting.tables import Cell, Table
 from pbrl_ppl.reporting.words import chance, joined, number, plain, quantity
 from pbrl_ppl.sampling import Pooled
+
+SECTIONS = (
+    Section("logs", "Logs", "Logs"),
+    Section("effects", "Which effects were found where", "Effects"),
+    Section("kinds", "Kinds of robots", "Kinds of robots"),
+    Section("warnings", "Warnings", "Warnings"),
+    Section("logs_source", "Where this came from", "Source"),
+)
 
 
 def summary_table(rows: Iterable[Row]) -> pd.DataFrame:
@@ -62,114 +70,27 @@ def page(
     source: Source,
 ) -> str:
     """Render one page of HTML with links to each log's report."""
-    logs_of: dict[tuple[str, str], list[str]] = {}
+    found: dict[tuple[str, str], list[str]] = {}
     for row in rows:
         for effect in row.get("effects", ()):
-            logs_of.setdefault((effect["effect"], effect["body"]), []).append(row["name"])
-    warnings = {row["name"]: row["warnings"] for row in rows if row.get("warnings")}
-    sections = [
-        Logs(rows),
-        logs_of and Effects(rows, list(logs_of)),
-        (pooled or not_pooled) and Kinds(pooled, not_pooled),
-        warnings and Warnings(warnings),
-        LogsSource(source),
-    ]
+            found.setdefault((effect["effect"], effect["body"]), []).append(row["name"])
+    # more than four effects side by side would not fit beside the names of the logs
+    pairs, tables = list(found), -(-len(found) // 4)
+    parts = pairwise(i * len(pairs) // tables for i in range(tables + 1)) if pairs else ()
     return render_page(
         f"{len(rows)} logs",
-        LogsHeader(rows, logs_of),
-        [section for section in sections if isinstance(section, Section)],
+        "logs_header",
+        SECTIONS,
+        rows=rows,
+        headline=_verdict(in_words(rows)),
+        found={_title(*pair): names for pair, names in found.items()},
+        logs=_logs(rows),
+        effects=[_effects(rows, pairs[i:j]) for i, j in parts],
+        kinds={kind: (each.names, _pooled(each, kind)) for kind, each in pooled.items()},
+        not_pooled=not_pooled,
+        warnings={row["name"]: row["warnings"] for row in rows if row.get("warnings")},
+        source=source,
     )
-
-
-@dataclass(frozen=True, eq=False)
-class LogsHeader(Section):
-    """Header: how many logs have which verdict, which effects were found, what failed."""
-
-    rows: Sequence[Row]
-    found: Mapping[tuple[str, str], Sequence[str]]
-
-    template = "logs_header"
-
-    def context(self) -> Mapping[str, object]:
-        return {
-            "count": len(self.rows),
-            "headline": _verdict(in_words(self.rows)),
-            "found": {_title(*pair): names for pair, names in self.found.items()},
-            "failed": [row["name"] for row in self.rows if row["status"] == "failed"],
-        }
-
-
-@dataclass(frozen=True, eq=False)
-class Logs(Section):
-    """Verdict, effects and errors of each log."""
-
-    rows: Sequence[Row]
-
-    template = "logs"
-    title = "Logs"
-    link = title
-
-    def context(self) -> Mapping[str, object]:
-        return {"logs": _logs(self.rows)}
-
-
-@dataclass(frozen=True, eq=False)
-class Effects(Section):
-    """Size of each effect in each log, or its detection limit."""
-
-    rows: Sequence[Row]
-    pairs: Sequence[tuple[str, str]]
-
-    template = "effects"
-    title = "Which effects were found where"
-    link = "Effects"
-
-    def context(self) -> Mapping[str, object]:
-        # more than four effects side by side would not fit beside the names of the logs
-        count, tables = len(self.pairs), -(-len(self.pairs) // 4)
-        parts = pairwise(i * count // tables for i in range(tables + 1))
-        return {"effects": [_effects(self.rows, self.pairs[i:j]) for i, j in parts]}
-
-
-@dataclass(frozen=True, eq=False)
-class Kinds(Section):
-    """Hyper-parameters that robots of one kind share."""
-
-    pooled: Mapping[str, Pooled]
-    not_pooled: Mapping[str, str]
-
-    template = "kinds"
-    title = "Kinds of robots"
-    link = title
-
-    def context(self) -> Mapping[str, object]:
-        kinds = {
-            kind: (population.names, _pooled(population, kind))
-            for kind, population in self.pooled.items()
-        }
-        return vars(self) | {"kinds": kinds}
-
-
-@dataclass(frozen=True, eq=False)
-class Warnings(Section):
-    """Warnings of the logs."""
-
-    warnings: Mapping[str, Sequence[str]]
-
-    template = "warnings"
-    title = "Warnings"
-    link = title
-
-
-@dataclass(frozen=True, eq=False)
-class LogsSource(Section):
-    """The command that makes the page again, and the files beside it."""
-
-    source: Source
-
-    template = "logs_source"
-    title = "Where this came from"
-    link = "Source"
 
 
 def _logs(rows: Iterable[Row]) -> Table:

@@ -1,14 +1,13 @@
-"""Plots of posteriors, of the prior against the data, of calibration; and ArviZ's summary."""
+"""Plots of posteriors, of the prior against the data, and of calibration."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Sequence
-from typing import Literal, NamedTuple
+from collections.abc import Sequence
+from typing import Literal
 
 import arviz as az
 import numpy as np
-import pandas as pd
 import xarray as xr
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
@@ -18,20 +17,12 @@ from matplotlib.patches import Patch
 from scipy.stats import binom, gaussian_kde, rankdata
 
 from pbrl_ppl.criticism import PriorCheck
-from pbrl_ppl.errors import PosteriorError
-from pbrl_ppl.posterior import (
-    DATATREE,
-    HDI_PROB,
-    SIZE,
-    Idata,
-    convergence,
-    from_groups,
-    group,
-    groups,
-    left_out,
-    loo_pit,
-    scalars,
-    separate,
+from pbrl_ppl.posterior import DATATREE, Idata, convergence, from_groups, loo_pit, scalars
+from pbrl_ppl.reporting.posterior_summary import (
+    most_interesting,
+    prior_draws,
+    rank_correlations,
+    summary,
 )
 from pbrl_ppl.reporting.style import (
     AFTER,
@@ -46,49 +37,6 @@ from pbrl_ppl.reporting.style import (
 )
 from pbrl_ppl.sampling import Calibration, bins
 from pbrl_ppl.state import Floats
-
-
-def summary(posterior: Idata) -> pd.DataFrame:
-    """Return ArviZ's summary of every scalar parameter, with the same columns on every ArviZ.
-
-    Parameters
-    ----------
-    posterior : InferenceData or DataTree
-        With a group ``posterior``.
-
-    Returns
-    -------
-    pandas.DataFrame
-        Columns mean, sd, lower, upper (94 % highest density), ess_bulk, ess_tail, r_hat. Resampled
-        draws are worth no more than their weights say, see `convergence`.
-    """
-    # the same interval has other names before and after ArviZ 1.0
-    options = {"ci_prob": HDI_PROB, "ci_kind": "hdi"} if DATATREE else {"hdi_prob": HDI_PROB}
-    with np.errstate(all="ignore"):  # a parameter that never moved has no R-hat
-        table = az.summary(scalars(posterior), round_to="none", **options)
-    names = {table.columns[2]: "lower", table.columns[3]: "upper"}
-    columns = ["mean", "sd", "lower", "upper", "ess_bulk", "ess_tail", "r_hat"]
-    result: pd.DataFrame = table.rename(columns=names)[columns]
-    sizes, most = ["ess_bulk", "ess_tail"], float(posterior.attrs.get(SIZE, np.inf))
-    result[sizes] = result[sizes].clip(upper=most)
-    return result
-
-
-def most_interesting(table: pd.DataFrame, added: Iterable[str] = (), most: int = 6) -> list[str]:
-    """Return the parameters to look at first: those of added effects, then the worst by R-hat.
-
-    Parameters
-    ----------
-    table : pandas.DataFrame
-        The posterior's :func:`summary`.
-    added : iterable of str
-        Labels of the added effects' parameters.
-    most : int
-        As many parameters, at most.
-    """
-    worst = table["r_hat"].fillna(np.inf).sort_values(ascending=False, kind="stable").index
-    first = [name for name in added if name in table.index]
-    return list(dict.fromkeys([*first, *worst]))[:most]
 
 
 def plot_trace(
@@ -235,28 +183,13 @@ def plot_prior(posterior: Idata, parameters: Sequence[str], width: float = WIDE)
     return figure
 
 
-def most_dependent(posterior: Idata, most: int = 4) -> list[str]:
-    """Return the parameters whose draws depend most on each other, by rank correlation."""
-    draws = scalars(posterior)
-    names = [str(name) for name, v in draws.items() if float(v.max() - v.min()) > 0]
-    if len(names) < 2:
-        return []
-    strength = np.abs(np.nan_to_num(_correlations(draws, names)))
-    np.fill_diagonal(strength, 0.0)
-    chosen = list(divmod(int(strength.argmax()), len(names)))
-    while len(chosen) < min(most, len(names)):
-        rest = [i for i in range(len(names)) if i not in chosen]
-        chosen.append(max(rest, key=lambda i: float(strength[i, chosen].max())))
-    return [names[i] for i in chosen]
-
-
 def plot_pairs(
     posterior: Idata, parameters: Sequence[str], width: float = WIDE, points: int = 800
 ) -> Figure:
     """Plot some draws of each pair of parameters, with the rank correlation of all."""
     draws = scalars(posterior)
     n = len(parameters) - 1
-    correlation = _correlations(draws, parameters)
+    correlation = rank_correlations(draws, parameters)
     height = 0.4 + min(width, 6.4) * n / max(n, 2) * 0.9
     figure, panels = blank_figure(width, height, n, n, None, stack=False)
     for row in range(n):
@@ -309,45 +242,6 @@ def plot_predictions(posterior: Idata, width: float = WIDE) -> Figure:
     return figure
 
 
-class Coverage(NamedTuple):
-    """Shares of measurements in the central 50 % and 94 % of predictions, and their number."""
-
-    half: float
-    wide: float
-    measurements: int
-
-
-def coverage(posterior: Idata) -> dict[str, Coverage]:
-    """Return the coverage of leave-one-out predictions, by state dimension."""
-    pit = loo_pit(posterior)
-    result = {}
-    for name in (str(state) for state in pit["state"].values):
-        values = pit.sel(state=name).to_numpy()
-        values = values[np.isfinite(values)]
-        if values.size:
-            off = np.abs(values - 0.5)
-            half, wide = (float((off < edge).mean()) for edge in (0.25, 0.47))
-            result[name] = Coverage(half, wide, values.size)
-    return result
-
-
-def pareto_k(posterior: Idata) -> tuple[Floats, float, str]:
-    """Return Pareto k, the threshold above which it is bad, and the unit left out at a time.
-
-    Raises
-    ------
-    PosteriorError
-        If ArviZ cannot compute it.
-    """
-    with warnings.catch_warnings(), np.errstate(all="ignore"):
-        warnings.simplefilter("ignore")  # ArviZ warns of a high k, which the result shows
-        try:
-            loo = az.loo(separate(posterior), pointwise=True)
-        except (TypeError, ValueError, KeyError, IndexError) as error:  # no finite likelihood
-            raise PosteriorError(f"leave-one-out cross-validation: {error}") from error
-    return np.asarray(loo.pareto_k, dtype=float).ravel(), float(loo.good_k), left_out(posterior)
-
-
 def plot_pareto(k: Floats, good: float, unit: str, width: float = WIDE) -> Figure:
     """Plot Pareto k of every unit left out, and the threshold above which LOO is unreliable."""
     figure, (axes,) = blank_figure(width, 2.8, 1, 1)
@@ -358,19 +252,6 @@ def plot_pareto(k: Floats, good: float, unit: str, width: float = WIDE) -> Figur
     axes.set_xlabel(unit)
     axes.set_ylabel("Pareto k")
     return figure
-
-
-def prior_draws(posterior: Idata) -> xr.Dataset:
-    """Return one variable per scalar parameter of the prior; none if there are no prior draws."""
-    if "prior" not in groups(posterior):
-        return xr.Dataset()
-    return scalars(from_groups({"posterior": group(posterior, "prior")}, {}))
-
-
-def _correlations(draws: xr.Dataset, names: Sequence[str]) -> Floats:
-    """Return rank correlations, shape (parameter, parameter)."""
-    table = pd.DataFrame({name: draws[name].to_numpy().ravel() for name in names})
-    return np.asarray(table.corr("spearman"))
 
 
 def plot_prior_check(check: PriorCheck) -> Figure:

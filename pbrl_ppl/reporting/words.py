@@ -101,7 +101,7 @@ def _gained(loop: Loop) -> str:
 def _remains(loop: Loop) -> str:
     """Write what remains, and whether it matters."""
     if diverges(loop):
-        return f"forecasts of {number(loop.rollout_horizon * loop.scene.time_step)} s diverge"
+        return f"forecasts of {number(seconds_ahead(loop))} s diverge"
     left, name = loop.unexplained, remaining_acceleration(loop)
     where = _where(loop, left.dimension, left.body) if left is not None and left.body else ""
     if loop.verdict == UNEXPLAINED:
@@ -174,7 +174,7 @@ def remains_in_words(loop: Loop) -> str:
         chance_of = f" ({p_equals(left.p_value)})" if left.body else ""
         return f"{left.sentence[:1].upper()}{left.sentence[1:]}{chance_of}."
     tested = sum(test.tested for test in loop.tests)
-    model = "revised" if loop.added else "declared"
+    model = model_of(loop)
     passed = f"The {model} model passes all {tested} tests of its residual"
     if untested := [test.name for test in loop.tests if not test.tested]:
         passed += f" that these data can fail (not {joined(untested, 'nor')})"
@@ -207,6 +207,16 @@ def remaining_acceleration(loop: Loop) -> str:
     return max(sure, key=sure.__getitem__, default="")
 
 
+def model_of(loop: Loop) -> str:
+    """Return the name of the model of which the page says what remains: revised, or declared."""
+    return "revised" if loop.added else "declared"
+
+
+def seconds_ahead(loop: Loop) -> float:
+    """Return how far ahead rollouts predict (s)."""
+    return loop.rollout_horizon * loop.scene.time_step
+
+
 def accepted(loop: Loop) -> tuple[Added, ...]:
     """Return the added effects, main laws first, or none without a verdict."""
     main_first = tuple(sorted(loop.added, key=lambda one: not one.main))
@@ -221,7 +231,7 @@ def depends_on_records(loop: Loop) -> bool:
 
 def error_in_words(loop: Loop) -> str:
     """Explain a held-out error that seems to contradict the verdict; empty if none does."""
-    model, after = "revised" if loop.added else "declared", loop.after.normalised_rmse
+    model, after = model_of(loop), loop.after.normalised_rmse
     if loop.unexplained is not None or remaining_acceleration(loop):
         return "The noise is that of the measurements alone, one interval ahead."
     if after > _TOO_LARGE and loop.verdict != NOT_CONVERGED:
@@ -322,7 +332,7 @@ def _sizes(added: Added) -> str:
 def _worst_error(loop: Loop) -> list[str]:
     """Write the held-out error far ahead that is worst, before and after if something was added."""
     every = (loop.before, loop.after, loop.noise_floor)
-    ahead = f" {number(loop.rollout_horizon * loop.scene.time_step)} s ahead"
+    ahead = f" {number(seconds_ahead(loop))} s ahead"
     before, after, floor = (errors.rollout_rmse for errors in every)
     if loop.after.simulated_rmse and loop.held_out is not None:
         before, after, floor = (errors.simulated_rmse for errors in every)
@@ -473,7 +483,7 @@ def share(relative: float) -> str:
 
 
 def gains_in_words(
-    before: Mapping[str, float], after: Mapping[str, float], units: Mapping[str, str]
+    before: Mapping[str, float], after: Mapping[str, float], units: Mapping[str, str] = UNITS
 ) -> str:
     """Return how the errors of all state dimensions changed.
 

@@ -9,7 +9,7 @@ from pbrl_ppl.criticism.results import Acceleration, Candidate, Unexplained
 from pbrl_ppl.effects import Effect, EffectParameter, catalogue
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.reporting import in_brief, render
-from pbrl_ppl.reporting.loop_tables import limits_in_words
+from pbrl_ppl.reporting.tables import limits_in_words
 from pbrl_ppl.reporting.words import gains_in_words, remains_in_words, verdict_in_words
 from tests.helpers.html import Page
 from tests.helpers.made_up import made_up

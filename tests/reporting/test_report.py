@@ -23,8 +23,7 @@ from pbrl_ppl.reporting import in_brief, render
 from pbrl_ppl.reporting.effect_plots import plot_added, plot_search
 from pbrl_ppl.reporting.error_plots import plot_rollout, unwrap
 from pbrl_ppl.reporting.page import Source
-from pbrl_ppl.reporting.posterior_plots import most_interesting, summary
-from pbrl_ppl.reporting.posterior_sections import PARAMETERS
+from pbrl_ppl.reporting.posterior_summary import PARAMETERS, most_interesting, summary
 from pbrl_ppl.reporting.words import number, rejected_in_words, remains_in_words, verdict_in_words
 from tests.helpers.html import Page, stands_alone
 from tests.helpers.made_up import DRAG, idata, made_up, made_up_posterior

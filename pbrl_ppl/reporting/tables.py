@@ -1,22 +1,59 @@
-"""Tables of a closed loop: errors, residual tests, candidates, detection limits, evidence."""
+"""Tables of pages: of a closed loop, and of a posterior."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
 from pbrl_ppl.criticism import Candidate, Loop
 from pbrl_ppl.effects import Sensor
 from pbrl_ppl.parameters import Prior
-from pbrl_ppl.posterior import Comparison
+from pbrl_ppl.posterior import Comparison, Identifiability, interval, scalars
 from pbrl_ppl.reporting.evidence import Evidence
-from pbrl_ppl.reporting.page import Table
+from pbrl_ppl.reporting.posterior_summary import Parameters, prior_draws
 from pbrl_ppl.reporting.style import UNITS, acceleration_unit
-from pbrl_ppl.reporting.words import chance, error, number, percent, plain, quantity, share
+from pbrl_ppl.reporting.words import (
+    chance,
+    digits_of,
+    error,
+    number,
+    percent,
+    plain,
+    quantity,
+    share,
+)
 from pbrl_ppl.scene import units_of
 from pbrl_ppl.state import STATE, Floats
+
+#: Text of a cell of a table, or text and a small note beside it.
+Cell = str | tuple[str, str]
+
+
+class Table(NamedTuple):
+    """A table as a page shows it; on a telephone each row becomes a card.
+
+    Parameters
+    ----------
+    caption : str
+        Title of the table.
+    columns : sequence of str
+        Their heads.
+    rows : sequence of sequence
+        Cells, as many as there are columns.
+    words : tuple of int
+        Columns that hold words; others hold numbers, and the first one the row's name.
+    marks : sequence of str
+        ``added`` or ``bad`` for rows that stand out; as many as rows, or none.
+    """
+
+    caption: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+    words: Sequence[int] = ()
+    marks: Sequence[str] = ()
 
 
 def measured_parameters(candidate: Candidate, loop: Loop) -> tuple[str, ...]:
@@ -262,3 +299,77 @@ def carrier_table(evidence: Evidence, most: int = 8) -> Table:
         ],
         words=(3, 8),
     )  # fmt: skip
+
+
+def parameter_table(parameters: Parameters) -> Table:
+    """Tabulate the posterior of all parameters, in their units."""
+    return Table(
+        "Posterior of all parameters",
+        ("Parameter", "Mean", "sd", "94 % interval", "Unit", "R-hat", "ESS bulk", "ESS tail"),
+        [
+            (
+                (str(label), row["meaning"]),
+                number(row["mean"]),
+                number(row["sd"]),
+                _span(row["lower"], row["upper"]),
+                row["unit"],
+                number(row["r_hat"], 4),
+                number(row["ess_bulk"]),
+                number(row["ess_tail"]),
+            )
+            for label, row in parameters.summary.iterrows()
+        ],
+        words=(4,),
+        marks=["bad" if wrong else "" for wrong in parameters.summary["wrong"]],
+    )
+
+
+def _span(low: float, high: float) -> str:
+    """Return an interval as text, with the digits that tell its ends apart."""
+    digits = min(digits_of(low, high), 6)
+    return f"{number(low, digits)} to {number(high, digits)}"
+
+
+def width_table(known: Identifiability, parameters: Parameters) -> Table:
+    """Tabulate the intervals of each parameter before and after the data."""
+    both = [draws(parameters.posterior) for draws in (prior_draws, scalars)]
+    units = parameters.summary["unit"]
+    data = {
+        "informed": "inform it",
+        "weak": "inform it weakly",
+        "prior only": "say nothing beyond the prior",
+    }
+    rows = [
+        (
+            width.parameter,
+            *(
+                _span(*interval(draws[width.parameter].to_numpy()))
+                if width.parameter in draws
+                else "–"
+                for draws in both
+            ),
+            units.get(width.parameter, ""),
+            f"{100 * width.ratio:.3g} %",
+            data[width.verdict],
+        )
+        for width in known.parameters
+    ]
+    return Table(
+        "What was believed, and what is known now (94 % intervals)",
+        ("Parameter", "Before the data", "After", "Unit", "Width left", "The data"),
+        rows,
+        words=(3, 5),
+        marks=["bad" if width.verdict == "prior only" else "" for width in known.parameters],
+    )
+
+
+def coverage_table(covered: Mapping[str, tuple[float, float, int]]) -> Table:
+    """Tabulate the shares of measurements inside leave-one-out predictions."""
+    return Table(
+        "Measurements inside leave-one-out predictions",
+        ("State dimension", "In the central 50 %", "In the central 94 %", "Measurements"),
+        [
+            (name, f"{100 * half:.1f} %", f"{100 * wide:.1f} %", str(count))
+            for name, (half, wide, count) in covered.items()
+        ],
+    )
