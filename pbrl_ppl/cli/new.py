@@ -132,7 +132,9 @@ def recorded(
                 )
             except LayoutError as proposal:
                 said.append(str(proposal).removeprefix(f"history {path}: "))
-                layout = layout.with_entries(**proposal.entries)
+                before, layout = layout, layout.with_entries(**proposal.entries)
+                if layout == before:
+                    raise
     said += [str(warning.message).removeprefix(f"history {path}: ") for warning in caught]
     for name in ("trajectory", "body"):
         if name not in table:

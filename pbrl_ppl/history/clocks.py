@@ -413,8 +413,8 @@ def in_order(frame: pd.DataFrame, say: Say, *, far: float = 5.0) -> pd.DataFrame
         frame = frame.assign(trajectory=prefix + pd.Series(run, frame.index).astype(str))
     if swapped:
         say(f"{swapped} rows are out of order by less than {far:g} rows: sorted by time")
-    if swapped:
-        frame = frame.iloc[np.lexsort((time, run, pd.factorize(frame["trajectory"])[0]))]
+    # bodies one below the other are brought side by side
+    frame = frame.iloc[np.lexsort((time, run, pd.factorize(frame["trajectory"])[0]))]
     keys = ["trajectory", "body", "time"]
     again = frame.duplicated(keys) & frame["time"].notna()
     if again.any():

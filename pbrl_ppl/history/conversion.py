@@ -283,7 +283,7 @@ def _repaired(
     if layout.velocities == "computed":
         frame = frame.drop(columns=[name for name in STATE[3:] if name in frame])
     frame = in_order(frame, said.append)
-    frame = without_lost_rows(frame, said.append)
+    frame = without_lost_rows(frame, scene, said.append)
     frame = _held(frame, scene, said.append)
     if layout.cut:
         before = len(frame)

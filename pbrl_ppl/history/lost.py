@@ -8,16 +8,23 @@ import numpy as np
 import pandas as pd
 
 from pbrl_ppl.history.kinematics import finest_step
+from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE, Bools, Floats
 
 
-def without_lost_rows(frame: pd.DataFrame, say: Callable[[str], None]) -> pd.DataFrame:
+def without_lost_rows(
+    frame: pd.DataFrame, scene: Scene, say: Callable[[str], None]
+) -> pd.DataFrame:
     """Return a table whose states are empty where tracking was lost.
+
+    Paths of kinematic bodies are kept: they need every row.
 
     Parameters
     ----------
     frame : pandas.DataFrame
         With ``trajectory``, ``body`` and states in SI units, rows in order of time.
+    scene : Scene
+        Says which bodies are kinematic.
     say : callable
         Takes a sentence on each kind of lost rows.
     """
@@ -26,7 +33,10 @@ def without_lost_rows(frame: pd.DataFrame, say: Callable[[str], None]) -> pd.Dat
         return frame
     poses = frame[places].apply(pd.to_numeric, errors="coerce").to_numpy(float, copy=True)
     zero, frozen = (np.zeros(len(frame), dtype=bool) for _ in range(2))
+    follows = {body.name for body in scene.moving if body.kinematic}
     for rows in frame.groupby(["trajectory", "body"], sort=False).indices.values():
+        if frame["body"].iloc[rows[0]] in follows:
+            continue
         if len(places) > 1:  # an angle alone may pass through 0 turn by turn
             zero[rows] = zero_poses(poses[rows])
         seen = rows[~zero[rows]]

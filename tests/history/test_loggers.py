@@ -383,6 +383,17 @@ def test_frozen_and_zeroed_poses_are_missing() -> None:
     assert np.flatnonzero(np.isnan(of(history, "x"))).tolist() == [20, 21, 22, 23, 24, 40, 41]
 
 
+def test_the_path_of_a_finger_is_kept() -> None:
+    finger = PUCK.replace(bodies=(*PUCK.bodies, Body("finger", Shape.circle(0.01), kinematic=True)))
+    frame = moving().assign(theta=0.0, body="finger")
+    frame.loc[20:24, ["x", "y"]] = frame.loc[19, ["x", "y"]].to_numpy()
+    both = pd.concat([frame, frame.assign(body="puck")])
+    with pytest.warns(RecordingWarning, match="^history: 5 rows repeat the pose"):
+        history = load(both, finger, columns={"time": "t"})
+    lost = history.dataset["observed"].isnull().sel(state="x").sum(("trajectory", "time"))
+    assert lost.sel(body=["puck", "finger"]).to_numpy().tolist() == [5, 0]
+
+
 def test_rest_quantisation_and_a_slow_camera() -> None:
     time = 0.02 * np.arange(500)
     braked = np.where(time < 5.0, time - time**2 / 10, 2.5)[:, None]
