@@ -2,6 +2,7 @@
 
 import inspect
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 
 _PACKAGE = str(Path(__file__).parent)
@@ -25,6 +26,22 @@ class SceneError(PbrlError, ValueError):
 
 class HistoryError(PbrlError, ValueError):
     """An invalid history: missing columns, bad times, values that are not numbers."""
+
+
+class LayoutError(HistoryError):
+    """A recording that needs an entry of ``[recording]`` first: the message proposes it.
+
+    Parameters
+    ----------
+    message : str
+        What is wrong, and the entry as the cure.
+    **entries
+        The entries, such as ``units={"time": "ms"}``.
+    """
+
+    def __init__(self, message: str, **entries: Mapping[str, object]) -> None:
+        super().__init__(message)
+        self.entries = entries
 
 
 class ParameterError(PbrlError, ValueError):

@@ -18,7 +18,7 @@ import typer
 from pbrl_ppl.cli import options
 from pbrl_ppl.cli.options import command
 from pbrl_ppl.cli.terminal import check_file, interruptible, print_json
-from pbrl_ppl.errors import HistoryError, OutputError, RecordingWarning, SceneError
+from pbrl_ppl.errors import HistoryError, LayoutError, OutputError, RecordingWarning, SceneError
 from pbrl_ppl.files import write_text
 from pbrl_ppl.scene import WORLD, Body, Joint, Recording, Scene, Shape, nearest
 from pbrl_ppl.scene import toml as scene_toml
@@ -89,7 +89,6 @@ def recorded(
     import pandas as pd
 
     from pbrl_ppl.history import (
-        LayoutError,
         as_history,
         is_history,
         propose,

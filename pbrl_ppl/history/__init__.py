@@ -1,41 +1,6 @@
 """Measured files to a validated `xarray.Dataset`; trajectories and segments."""
 
-from .bad_frames import bad_frames as bad_frames
-from .bad_frames import without_bad_frames as without_bad_frames
-from .bad_frames import without_measurements as without_measurements
-from .clocks import LayoutError as LayoutError
-from .clocks import command_step as command_step
-from .conversion import as_history as as_history
-from .conversion import is_history as is_history
-from .cuts import propose as propose
-from .ends import End as End
-from .ends import strange_ends as strange_ends
-from .ends import trimmed as trimmed
-from .files import read_commands as read_commands
-from .files import read_table as read_table
-from .files import table_of_arrays as table_of_arrays
-from .guesses import unused_columns as unused_columns
-from .guesses import with_guesses as with_guesses
-from .history import History as History
-from .history import Segments as Segments
-from .history import check_start as check_start
-from .history import from_segments as from_segments
-from .history import longest_gap as longest_gap
-from .history import unseen as unseen
-from .history import with_paths as with_paths
-from .kinematics import column_noise as column_noise
-from .kinematics import estimate_rates as estimate_rates
-from .kinematics import fill_hinges as fill_hinges
-from .kinematics import hung_bodies as hung_bodies
-from .kinematics import lever as lever
-from .reading import read_recording as read_recording
-from .reading import read_scene as read_scene
-from .units import mass_contradictions as mass_contradictions
-from .units import unit_mismatches as unit_mismatches
-from .units import with_units as with_units
-from .velocities import UnusedVelocity as UnusedVelocity
-from .velocities import computed_lag as computed_lag
-from .velocities import measured_alone as measured_alone
-from .velocities import measurement_noise as measurement_noise
-from .velocities import unused_velocities as unused_velocities
-from .velocities import velocity_lag as velocity_lag
+import lazy_loader
+
+# readers of raw logs are loaded by those who read one
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

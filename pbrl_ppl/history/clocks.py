@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pbrl_ppl.errors import HistoryError
+from pbrl_ppl.errors import HistoryError, LayoutError
 from pbrl_ppl.history.text import unit_in_name
 from pbrl_ppl.scene import Recording
 from pbrl_ppl.state import STATE, WRENCH, Bools, Floats, Ints
@@ -24,22 +24,6 @@ _EPOCH = (1e9, 2.1e9)
 _SLOWEST = 2.0
 
 Say = Callable[[str], None]
-
-
-class LayoutError(HistoryError):
-    """A recording that needs an entry of ``[recording]`` first: the message proposes it.
-
-    Parameters
-    ----------
-    message : str
-        What is wrong, and the entry as the cure.
-    **entries
-        The entries, such as ``units={"time": "ms"}``.
-    """
-
-    def __init__(self, message: str, **entries: Any) -> None:
-        super().__init__(message)
-        self.entries = entries
 
 
 def likely_unit(stamps: Floats) -> str:
@@ -158,7 +142,7 @@ def _seconds(frame: pd.DataFrame, name: str, layout: Recording, source: str) -> 
             raise LayoutError(
                 f'{source}: the times of column "{name}" rise by'
                 f" {np.nanmedian(np.abs(np.diff(stamps))):.4g} a row, which is no time in s: looks"
-                f' like {unit}: units = {{ time = "{unit}" }} in [recording] (--units time={unit});'
+                f' like {unit}: units = {{ time = "{unit}" }} in [recording] (or --units);'
                 ' or units = { time = "s" }',
                 units={"time": unit},
             )

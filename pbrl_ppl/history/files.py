@@ -12,8 +12,6 @@ import xarray as xr
 from pbrl_ppl.errors import HistoryError, OutputError
 from pbrl_ppl.files import write_atomically
 from pbrl_ppl.history import bags
-from pbrl_ppl.history.foreign import read_mat, read_sysid
-from pbrl_ppl.history.text import read_text
 from pbrl_ppl.scene import Recording
 from pbrl_ppl.state import STATE, WRENCH, Floats
 
@@ -22,7 +20,7 @@ SUFFIXES = (".csv", ".parquet", ".nc")
 #: Suffixes of text tables that are read, and never written.
 _TEXTS = (".csv", ".txt", ".tsv", ".dat")
 #: Suffixes of other programs' tables that are read, and never written.
-_FOREIGN = {".json": read_sysid, ".mat": read_mat}
+_FOREIGN = (".json", ".mat")
 
 
 def read_table(
@@ -58,9 +56,13 @@ def read_table(
         if suffix in _TEXTS:
             columns = {**dict(layout.columns), **(names or {})}
             named = [column for column in columns.values() if isinstance(column, str)]
+            from pbrl_ppl.history.text import read_text
+
             return read_text(path, layout, ["step", "time", *STATE, *WRENCH, *named])
         if suffix in _FOREIGN:
-            return _FOREIGN[suffix](path)
+            from pbrl_ppl.history.foreign import read_mat, read_sysid
+
+            return read_mat(path) if suffix == ".mat" else read_sysid(path)
         return _read_parquet(path) if suffix == ".parquet" else _read_netcdf(path)
     except FileNotFoundError:
         raise HistoryError(f"history {path}: there is no such file; check the path") from None

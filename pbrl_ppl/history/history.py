@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Unpack
+from typing import TYPE_CHECKING, Unpack
 
 import numpy as np
 import numpy.typing as npt
@@ -15,13 +15,15 @@ import pandas as pd
 import xarray as xr
 
 from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.history.conversion import Reading, as_history
 from pbrl_ppl.history.files import read_commands, read_table, to_table, write_dataset
 from pbrl_ppl.history.kinematics import complete_start, kinematic_bodies, path_velocities
 from pbrl_ppl.history.resampling import resampled
 from pbrl_ppl.history.rows import Rows, padded, rows_of_arrays, rows_of_table, with_lines
 from pbrl_ppl.scene import Recording, Scene
 from pbrl_ppl.state import STATE, STATE_UNITS, WRENCH, WRENCH_UNITS, Bools, Floats, Ints
+
+if TYPE_CHECKING:
+    from pbrl_ppl.history.conversion import Reading
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,6 +161,8 @@ class History:
         """
         if not isinstance(frame, pd.DataFrame):
             raise HistoryError(f"{source}: got {type(frame).__name__}, expected a pandas.DataFrame")
+        from pbrl_ppl.history.conversion import as_history
+
         frame = with_lines(frame, source)
         table = as_history(frame, scene, source, layout, commands=commands, **reading)
         rows = rows_of_table(table, scene, source, cut=layout is not None and bool(layout.cut))

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 
-from pbrl_ppl.errors import HistoryError, ResamplingWarning, warn
-from pbrl_ppl.history.clocks import LayoutError
+from pbrl_ppl.errors import HistoryError, LayoutError, ResamplingWarning, warn
 from pbrl_ppl.history.kinematics import column_noise, unwrapped
 from pbrl_ppl.history.rows import TIME_TOLERANCE, Rows, rows_of_arrays
 from pbrl_ppl.scene import Scene

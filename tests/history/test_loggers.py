@@ -11,8 +11,14 @@ import scipy.io
 
 from pbrl_ppl.cli import main
 from pbrl_ppl.effects import attach
-from pbrl_ppl.errors import HistoryError, RecordingWarning, ResamplingWarning, SceneError
-from pbrl_ppl.history import History, LayoutError, read_recording
+from pbrl_ppl.errors import (
+    HistoryError,
+    LayoutError,
+    RecordingWarning,
+    ResamplingWarning,
+    SceneError,
+)
+from pbrl_ppl.history import History, read_recording
 from pbrl_ppl.history.derived import planar_yaw
 from pbrl_ppl.history.lost import frozen_poses, zero_poses
 from pbrl_ppl.physics import Physics

@@ -39,7 +39,7 @@ from pbrl_ppl.posterior import (
 from pbrl_ppl.sampling import fit, physics_model, update
 from pbrl_ppl.sampling.ensemble import Posterior, Reference
 from pbrl_ppl.sampling.importance import draw_proposals, resample
-from pbrl_ppl.scene import Body, Scene, Shape
+from pbrl_ppl.scene import Body, Scene, Shape, Wall
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
 
@@ -383,7 +383,7 @@ def test_an_uninformed_parameter_s_draws_follow_the_prior() -> None:
 
     Of the resampled draws as many count as they are worth.
     """
-    scene = pucks(known={"mu_c": 0.3, "mass": 2.0})
+    scene = pucks(known={"mu_c": 0.3, "mass": 2.0}, walls=(Wall((50.0, -1.0), (50.0, 1.0)),))
     model = physics_model(scene, pushed(scene))
     start = find_mode(model.problem, seed=1)
     labels = list(model.problem.layout.labels)
