@@ -22,7 +22,7 @@ from pbrl_ppl.criticism.unexplained import (
 from pbrl_ppl.effects import Noise
 from pbrl_ppl.likelihood import bodies_acceleration
 from pbrl_ppl.modes import Mode
-from pbrl_ppl.state import STATE, Floats
+from pbrl_ppl.state import STATE, STATE_UNITS, Floats
 
 #: Names of the tests that a model must pass to predict well.
 ACCELERATION, FORECASTS, PRIOR = "unexplained acceleration", "forecasts", "prior"
@@ -221,8 +221,7 @@ def simulation_test(
         error, times = simulated[name], simulated[name] / noise[name]
     sentence = (
         f"held-out trajectories, simulated over {seconds:.3g} s, are {error:.3g}"
-        f" {'rad' if name in ('theta', 'omega') else 'm'}{'/s' * (name in STATE[3:])} off in"
-        f" {name}, {times:.3g} times the measurement noise"
+        f" {STATE_UNITS[STATE.index(name)]} off in {name}, {times:.3g} times the measurement noise"
     )
     return ResidualTest(
         SIMULATION, float("nan"), times, passed, sentence, body="", dimension="" if passed else name

@@ -308,12 +308,13 @@ class Search:
         found = self._judged(mode, declared, model, regression, tuple(rungs), tried)
         if found.laws:
             found = self._beside(declared, found)
+        found = _with_contacts(found, mode, first)
         named = {law: "" for rung in rungs for law in rung.accepted}
         named |= {_name(law): f": {why}" for law, why in found.rejected.items()}
         for law, why in named.items():
             if law not in map(_name, found.laws):
                 self.say(f"dropped {law}{why or ': longer simulations do not need it'}")
-        return _with_contacts(found, mode, first)
+        return found
 
     def _beside(self, declared: Mode, found: SearchResult) -> SearchResult:
         """Return the laws beside the declared model; none if one trajectory shows too little."""

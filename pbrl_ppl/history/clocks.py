@@ -10,8 +10,9 @@ import numpy as np
 import pandas as pd
 
 from pbrl_ppl.errors import HistoryError, LayoutError
+from pbrl_ppl.history.resampling import held_means
 from pbrl_ppl.history.text import unit_in_name
-from pbrl_ppl.scene import Recording
+from pbrl_ppl.scene import Recording, column_of
 from pbrl_ppl.state import STATE, WRENCH, Bools, Floats, Ints
 
 #: Units of time in s.
@@ -166,8 +167,8 @@ def _at_rate(
             )
         count = pd.to_numeric(frame[clocks["counter"]], errors="coerce").to_numpy(float)
     else:
-        count = (frame.groupby(keys).cumcount() if keys else np.arange(len(frame))) * np.ones(1)
-        count = np.asarray(count, dtype=float)
+        order = frame.groupby(keys).cumcount() if keys else np.arange(len(frame))
+        count = np.asarray(order, dtype=float)
     time = count / float(clocks["rate"])
     off = (time - stamps) - np.nanmedian(time - stamps)
     if np.isfinite(off).any() and np.ptp(stamps) > 0 and not keys:
@@ -221,7 +222,7 @@ def _moves_within(frame: pd.DataFrame, layout: Recording, rows: Ints, hair: Bool
     If not, the stamps are true, and rows are twice.
     """
     for key, column in (*layout.columns, *((name, name) for name in STATE)):
-        name = str(column).removeprefix("-")
+        name = column_of(column)
         if key.rpartition(".")[2] in STATE and name in frame:
             values = pd.to_numeric(frame[name].iloc[rows], errors="coerce").to_numpy(float)
             change = np.abs(np.diff(values))
@@ -269,18 +270,8 @@ def _at_times(times: Floats, stamps: Floats, values: Floats, *, hold: bool) -> F
     if not hold:
         return np.asarray(np.interp(times, stamps, values, left=np.nan, right=np.nan))
     rows, back = np.unique(times, return_inverse=True)
-    impulse = np.concatenate([[0.0], np.cumsum(values[:-1] * np.diff(stamps))])
-
-    def until(when: Floats) -> Floats:
-        """Return the impulse of the held values from the first stamp until then."""
-        which = np.clip(np.searchsorted(stamps, when, side="right") - 1, 0, None)
-        return np.asarray(impulse[which] + values[which] * (when - stamps[which]))
-
-    ends = np.append(rows[1:], rows[-1])
-    last = values[np.clip(np.searchsorted(stamps, rows, side="right") - 1, 0, None)]
-    with np.errstate(invalid="ignore"):
-        mean = np.where(ends > rows, (until(ends) - until(rows)) / (ends - rows), last)
-    return np.asarray(mean[back])
+    last = values[np.clip(np.searchsorted(stamps, rows[-1:], side="right") - 1, 0, None)]
+    return np.append(held_means(rows, stamps, values), last)[back]
 
 
 def _holds(layout: Recording, stamps: Floats, values: Floats) -> bool:

@@ -12,7 +12,7 @@ from pbrl_ppl.history.clocks import TIMES, Say
 from pbrl_ppl.history.derived import derived_columns, with_derived
 from pbrl_ppl.history.files import COLUMNS
 from pbrl_ppl.history.text import unit_in_name
-from pbrl_ppl.scene import Recording
+from pbrl_ppl.scene import Recording, column_of
 
 #: Names, in lower case, of each column of a history: of a message's field the last two parts.
 _GUESSES = {
@@ -73,8 +73,7 @@ def with_guesses(
 def unused_columns(frame: pd.DataFrame, layout: Recording) -> list[str]:
     """Return the columns of a table that vary, and that its layout leaves out."""
     named = [*dict(layout.columns).values(), *dict(layout.time).values()]
-    named = [dict(c)["column"] if isinstance(c, tuple) else c for c in named]
-    used = {str(name).removeprefix("-") for name in named} | {*COLUMNS}
+    used = {*map(column_of, named), *COLUMNS}
     for name, parts in derived_columns(frame).items():
         used |= {*parts} if name in used else set()
     left = [str(name) for name in frame.columns if not {name, unit_in_name(str(name))[0]} & used]
@@ -88,6 +87,6 @@ def _plain(name: str) -> str:
 
 def _stamps_of(plain: Mapping[str, str], column: Any) -> str:
     """Return the column that has a column's stamps by its name, or an empty text."""
-    base = plain.get(str(column).removeprefix("-"))
+    base = plain.get(column_of(column))
     wanted = {f"{base}_time", f"{base}_stamp", f"{base}_t", f"time_{base}", f"t_{base}"}
     return next((name for name, text in plain.items() if text in wanted), "")

@@ -11,7 +11,7 @@ import pandas as pd
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history.clocks import TIME
 from pbrl_ppl.history.text import unit_in_name
-from pbrl_ppl.scene import nearest
+from pbrl_ppl.scene import column_of, nearest
 
 _LENGTH = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "km": 1e3, "in": 0.0254, "ft": 0.3048,
            "yd": 0.9144}  # fmt: skip
@@ -67,11 +67,9 @@ def stated_units(frame: pd.DataFrame, columns: Mapping[str, Any]) -> dict[str, s
     row, units = frame.attrs.get("units", {}), {}
     for key in dict.fromkeys((*columns, *(name for name in _UNITS if name in frame))):
         column, name = columns.get(key, key), key.rpartition(".")[2]
-        if isinstance(column, tuple):
-            column = dict(column)["column"]
-        if not isinstance(column, str) or name not in _UNITS or name == "time":
+        if isinstance(column, int | float) or name not in _UNITS or name == "time":
             continue
-        column = column.removeprefix("-")
+        column = column_of(column)
         whole = next((c for c in frame.columns if column in (c, unit_in_name(str(c))[0])), column)
         text = row.get(whole) or unit_in_name(str(whole))[1]
         unit = _SAME.get(text, text)

@@ -241,15 +241,33 @@ def _interpolated(time: Floats, values: Floats, rate: Floats | None, grid: Float
 
 
 def _mean_wrenches(track: _Track, grid: Floats) -> Floats:
-    """Return the mean wrench of each step, shape (step, 3); NaN on the last.
+    """Return the mean wrench of each step, shape (step, 3); NaN on the last."""
+    # the last wrench acts in an interval that was not measured
+    means = [held_means(grid, track.time[:-1], column) for column in track.action[:-1].T]
+    return np.append(np.stack(means, axis=1), np.full((1, len(WRENCH)), np.nan), axis=0)
 
-    A wrench is held from sample to sample.
+
+def held_means(times: Floats, stamps: Floats, values: Floats) -> Floats:
+    """Return the means between times of what holds from each stamp to the next, shape (n - 1,).
+
+    They keep its impulse. Before the first stamp its value holds.
+
+    Parameters
+    ----------
+    times, stamps : ndarray
+        Rising, shapes (n,) and (m,), s.
+    values : ndarray
+        Shape (m,); the last holds after its stamp.
+
+    Examples
+    --------
+    >>> held_means(np.arange(3.0), np.array([0.0, 1.5]), np.array([1.0, 3.0]))
+    array([1., 2.])
     """
-    impulse = np.cumsum(track.action[:-1] * np.diff(track.time)[:, None], axis=0)
-    impulse = np.concatenate([np.zeros((1, len(WRENCH))), impulse])
-    at = np.stack([np.interp(grid, track.time, column) for column in impulse.T], axis=1)
-    mean = np.diff(at, axis=0) / np.diff(grid)[:, None]
-    return np.concatenate([mean, np.full((1, len(WRENCH)), np.nan)])
+    which = np.clip(np.searchsorted(stamps, times, side="right") - 1, 0, None)
+    impulse = np.append(0.0, np.cumsum(values[:-1] * np.diff(stamps)))
+    impulse = impulse[which] + values[which] * (times - stamps[which])
+    return np.asarray(np.diff(impulse) / np.diff(times))
 
 
 def _weights(time: Floats, grid: Floats, dt: float) -> tuple[Floats, Ints]:

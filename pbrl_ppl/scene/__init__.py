@@ -9,6 +9,7 @@ from .joints import WORLD as WORLD
 from .joints import Joint as Joint
 from .recording import SEPARATORS as SEPARATORS
 from .recording import Recording as Recording
+from .recording import column_of as column_of
 from .scene import Scene as Scene
 from .shape import Shape as Shape
 from .units import MASS_PRIOR as MASS_PRIOR

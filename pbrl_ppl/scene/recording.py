@@ -185,3 +185,15 @@ def _thawed(value: object) -> object:
     """Return a table of pairs as a dict, and other values as they are."""
     is_table = isinstance(value, tuple) and value and isinstance(value[0], tuple)
     return dict(value) if is_table else value  # type: ignore[call-overload]
+
+
+def column_of(entry: object) -> str:
+    """Return the name of the file's column of an entry of `Recording.columns`, without a sign.
+
+    Examples
+    --------
+    >>> column_of("-heading"), column_of((("column", "knee"), ("zero", "hanging")))
+    ('heading', 'knee')
+    """
+    name = dict(entry)["column"] if isinstance(entry, tuple) else entry
+    return str(name).removeprefix("-")
