@@ -6,8 +6,9 @@ import shlex
 import shutil
 import sys
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -121,20 +122,8 @@ def recorded(
             f"history {path}: it has no column time; say which it is (--columns time=COLUMN, or"
             " duration=COLUMN for times since the row before), or give --time-step"
         )
-    table = None
-    while table is None:
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", RecordingWarning)
-            try:
-                table = as_history(
-                    frame, stand_in, f"history {path}", None if plain else layout, commands=commands
-                )
-            except LayoutError as proposal:
-                said.append(str(proposal).removeprefix(f"history {path}: "))
-                before, layout = layout, layout.with_entries(**proposal.entries)
-                if layout == before:
-                    raise
-    said += [str(warning.message).removeprefix(f"history {path}: ") for warning in caught]
+    read = partial(as_history, frame, stand_in, f"history {path}", commands=commands)
+    table, layout = _read_with_cures(read, layout, f"history {path}: ", said, plain=plain)
     for name in ("trajectory", "body"):
         if name not in table:
             raise HistoryError(
@@ -173,6 +162,33 @@ def recorded(
         shown.append(f"columns that are not used: {', '.join(unused)}")
     as_is = plain and not shown
     return Recorded(tuple(names), step, None if as_is else proposed, [*said, *shown], hung, circles)
+
+
+def _read_with_cures(
+    read: Callable[..., pd.DataFrame],
+    layout: Recording,
+    prefix: str,
+    said: list[str],
+    *,
+    plain: bool,
+) -> tuple[pd.DataFrame, Recording]:
+    """Return a table as ``read`` returns it, and the layout with the entries that it needed.
+
+    What was proposed and repaired is added to ``said``, without the ``prefix``.
+    """
+    while True:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", RecordingWarning)
+            try:
+                table = read(layout=None if plain else layout)
+            except LayoutError as proposal:
+                said.append(str(proposal).removeprefix(prefix))
+                before, layout = layout, layout.with_entries(**proposal.entries)
+                if layout == before:
+                    raise
+                continue
+        said += [str(warning.message).removeprefix(prefix) for warning in caught]
+        return table, layout
 
 
 def _longer_step(

@@ -134,8 +134,7 @@ def _seconds(frame: pd.DataFrame, name: str, layout: Recording, source: str) -> 
             ) from None
         since = (dates - pd.Timestamp(0, tz="UTC")) / pd.Timedelta(seconds=1)
         return np.array(since, dtype=float)
-    stated = frame.attrs.get("units", {}).get(name) or unit_in_name(name)[1]
-    unit = units.get("time", stated if stated in TIME else "")
+    unit = units.get("time", _stated_unit(frame, name))
     stamps = np.array(numeric, dtype=np.float64)
     if not unit:
         unit = likely_unit(stamps)
@@ -150,6 +149,12 @@ def _seconds(frame: pd.DataFrame, name: str, layout: Recording, source: str) -> 
     if unit not in TIME:
         raise HistoryError(f'units: "{unit}" is none of time; expected one of {", ".join(TIME)}')
     return np.array(stamps * TIME[unit])
+
+
+def _stated_unit(frame: pd.DataFrame, name: str) -> str:
+    """Return the unit of time that a file states of a column, or an empty text."""
+    stated = frame.attrs.get("units", {}).get(name) or unit_in_name(name)[1]
+    return stated if stated in TIME else ""
 
 
 def _at_rate(
@@ -312,8 +317,7 @@ def command_stamps(commands: pd.DataFrame, layout: Recording, source: str = "his
             f' time = {{ commands = "..." }}; it has {", ".join(plain)}'
         )
     numeric = np.asarray(pd.to_numeric(commands[time], errors="coerce"), dtype=float)
-    unit = commands.attrs.get("units", {}).get(time) or unit_in_name(str(time))[1]
-    unit = unit if unit in TIME else likely_unit(numeric)
+    unit = _stated_unit(commands, str(time)) or likely_unit(numeric)
     return np.asarray(numeric * TIME[unit] + float(clocks.get("offset", 0.0)))
 
 
