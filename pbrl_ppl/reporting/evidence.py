@@ -204,8 +204,6 @@ class Law:
         The quantity that it depends on.
     x : ndarray
         That quantity at each transition, shape (transition,).
-    bins : Bins
-        Means of the residual in bins of x.
     curve : Curve
         The simplest curve that follows the residual.
     """
@@ -214,7 +212,6 @@ class Law:
     quantity: str
     unit: str
     x: Floats
-    bins: Bins
     curve: Curve
 
 
@@ -281,7 +278,7 @@ def _residual_force(
 def _law(residual: ResidualForce, quantity: str, unit: str, x: Floats) -> Law:
     """Return the means in bins of a quantity, and the simplest curve that follows them."""
     y = residual.values
-    return Law(residual, quantity, unit, x, bin_means(x, y), _simplest(x, y))
+    return Law(residual, quantity, unit, x, _simplest(x, y))
 
 
 def _simplest(x: Floats, y: Floats) -> Curve:
