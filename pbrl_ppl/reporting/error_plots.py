@@ -98,14 +98,14 @@ def plot_errors(loop: Loop, width: float = WIDE) -> Figure:
         scale = floor if has_floor else {d: e if np.isfinite(e) else 1.0 for d, e in before.items()}
         models = _models(loop, before, after)
         for i, (_, values, colour) in enumerate(models):
-            sizes = [values.get(d, np.nan) / (scale[d] or np.nan) for d in before]
-            texts = [f"{values.get(d, np.nan):.3g} {UNITS.get(d, '')}" for d in before]
-            bars(
-                axes, list(before), [0.0 if np.isinf(size) else size for size in sizes], colour,
-                ["" if np.isnan(s) else "diverged" if np.isinf(s) else t
-                 for s, t in zip(sizes, texts, strict=True)],
-                shift=0.38 * (i - (len(models) - 1) / 2), height=0.36,
-            )  # fmt: skip
+            found = {d: values.get(d, np.nan) for d in before}
+            shown = [np.nan_to_num(v / (scale[d] or np.nan), posinf=0.0) for d, v in found.items()]
+            texts = [
+                "diverged" if np.isinf(v) else f"{v:.3g} {UNITS.get(d, '')}" * bool(np.isfinite(v))
+                for d, v in found.items()
+            ]
+            shift = 0.38 * (i - (len(models) - 1) / 2)
+            bars(axes, list(before), shown, colour, texts, shift=shift, height=0.36)
         axes.axvline(1.0, color="black", linewidth=1.0, linestyle=":")
         axes.margins(x=0.3)
         axes.set_xlim(left=0.0)
@@ -131,11 +131,11 @@ def plot_rollout(loop: Loop, width: float = WIDE) -> Figure:
         axes.plot(rollout.time, measured, "o", color="black", markersize=2.5)
         notes = [("black", _measured_until(rollout.time, measured))]
         shown = [measured]
-        for (which, values, colour), style in zip(models, styles, strict=True):
+        for (which, values, colour), dashes in zip(models, styles, strict=True):
             line = values[:, place]
             if unit == "rad":
                 line = _beside(unwrap(line), measured)
-            axes.plot(rollout.time, line, linestyle=style, color=colour, linewidth=1.6)
+            axes.plot(rollout.time, line, linestyle=dashes, color=colour, linewidth=1.6)
             end = diverged_after(rollout.time, values)
             if end is None:
                 shown.append(line)
@@ -156,8 +156,8 @@ def plot_rollout(loop: Loop, width: float = WIDE) -> Figure:
             axes.set_xlabel("time (s)")
     handles = [Line2D([], [], color="black", label="measured", marker="o", ls="", markersize=3)]
     handles += [
-        Line2D([], [], color=colour, linestyle=style, label=name)
-        for (name, _, colour), style in zip(models, styles, strict=True)
+        Line2D([], [], color=colour, linestyle=dashes, label=name)
+        for (name, _, colour), dashes in zip(models, styles, strict=True)
     ]
     legend(figure, handles)
     return figure

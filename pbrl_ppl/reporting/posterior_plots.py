@@ -14,9 +14,10 @@ from matplotlib.patches import Patch
 from scipy.stats import binom, rankdata
 
 from pbrl_ppl.criticism import PriorCheck
-from pbrl_ppl.posterior import DATATREE, Idata, convergence, from_groups, loo_pit, scalars
+from pbrl_ppl.posterior import DATATREE, Idata, convergence, from_groups, scalars
 from pbrl_ppl.reporting.posterior_summary import (
     most_interesting,
+    pit_values,
     prior_draws,
     rank_correlations,
     summary,
@@ -55,10 +56,31 @@ def plot_trace(
         Width of the figure (inches).
     """
     draws = _chosen(posterior, parameters)
+    count = len(draws.data_vars)
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         # ArviZ uses what newer Matplotlib deprecates, and a constant parameter makes it complain
         warnings.simplefilter("ignore")
-        return _trace(draws, width)
+        if not DATATREE:
+            figure, panels = blank_figure(width, 1.5, 2 * count, 2, None, spare=0.6)
+            grid = np.array(panels, dtype=object).reshape(count, 2)
+            az.plot_trace(draws, axes=grid, compact=False, trace_kwargs={"linewidth": 0.5})
+            for axes in panels:
+                for text in (axes.title, axes.xaxis.label, axes.yaxis.label):
+                    text.set_fontsize(9)
+            return figure
+        columns = 1 if count == 1 or width <= NARROW else 2
+        size = (width, 0.6 + 1.7 * -(-count // columns))
+        trace = {"alpha": 0.5, "width": 0.5}
+        collection = az.plot_trace(
+            draws,
+            backend="matplotlib",
+            visuals={"title": {"size": 9}, "xlabel": {"size": 8}, "trace": trace},
+            col_wrap=columns,
+            figure_kwargs={"figsize": size, "layout": "constrained"},
+        )
+    result: Figure = collection.viz["figure"].item()
+    plt.close(result)  # ArviZ 1.x registers it with pyplot, which would never release it
+    return result
 
 
 def plot_rank(
@@ -96,33 +118,6 @@ def _chosen(posterior: Idata, parameters: Sequence[str] | None) -> xr.Dataset:
     if parameters is None:
         parameters = most_interesting(summary(posterior))
     return scalars(posterior)[list(parameters)]
-
-
-def _trace(draws: xr.Dataset, width: float) -> Figure:
-    """Draw with ArviZ; the one place where traces of 0.x and 1.x differ."""
-    count = len(draws.data_vars)
-    if not DATATREE:
-        figure, panels = blank_figure(width, 1.5, 2 * count, 2, None, spare=0.6)
-        grid = np.array(panels, dtype=object).reshape(count, 2)
-        az.plot_trace(draws, axes=grid, compact=False, trace_kwargs={"linewidth": 0.5})
-        for axes in panels:
-            axes.title.set_fontsize(9)
-            axes.xaxis.label.set_fontsize(9)
-            axes.yaxis.label.set_fontsize(9)
-        return figure
-    columns = 1 if count == 1 or width <= NARROW else 2
-    size = (width, 0.6 + 1.7 * -(-count // columns))
-    trace = {"alpha": 0.5, "width": 0.5}
-    collection = az.plot_trace(
-        draws,
-        backend="matplotlib",
-        visuals={"title": {"size": 9}, "xlabel": {"size": 8}, "trace": trace},
-        col_wrap=columns,
-        figure_kwargs={"figsize": size, "layout": "constrained"},
-    )
-    result: Figure = collection.viz["figure"].item()
-    plt.close(result)  # ArviZ 1.x registers it with pyplot, which would never release it
-    return result
 
 
 def plot_prior(posterior: Idata, parameters: Sequence[str], width: float = WIDE) -> Figure:
@@ -193,10 +188,7 @@ def plot_predictions(posterior: Idata, width: float = WIDE) -> Figure:
     A curve is the share of measurements below each quantile, less what calibrated predictions give;
     those of independent measurements stay in the band 99 times of 100.
     """
-    pit = loo_pit(posterior)
-    every = {str(name): pit.sel(state=name).to_numpy().ravel() for name in pit["state"].values}
-    seen = {name: values[np.isfinite(values)] for name, values in every.items()}
-    seen = {name: values for name, values in seen.items() if values.size}
+    seen = pit_values(posterior)
     figure, (axes,) = blank_figure(width, 3.4)
     axes.set_prop_cycle(LINES)
     shares_below(axes, seen, min((len(values) for values in seen.values()), default=1))

@@ -85,16 +85,10 @@ def limits_in_words(candidate: Candidate, loop: Loop) -> str:
             continue
         size, unit = candidate.detectable[name], candidate.units[name]
         null = priors[name].null if name in priors else 0.0
-        if not np.isfinite(size) or (
-            name in priors and not _plausible(priors[name].prior, null, size, candidate.caps)
-        ):
-            limits[name] = ""
-        elif candidate.caps:
-            limits[name] = f"{plain(name)} up to {quantity(size, unit)}"
-        elif null:
-            limits[name] = f"{plain(name)} {number(null)} ± {quantity(size, unit)}"
-        else:
-            limits[name] = f"{plain(name)} {quantity(size, unit)}"
+        shown = name not in priors or _plausible(priors[name].prior, null, size, candidate.caps)
+        how = "up to " if candidate.caps else f"{number(null)} ± " if null else ""
+        known = f"{plain(name)} {how}{quantity(size, unit)}"
+        limits[name] = known if shown and np.isfinite(size) else ""
     if not any(limits.values()):
         return "no plausible size" if limits else ""
     return ", ".join(text or f"{plain(name)} no plausible size" for name, text in limits.items())
@@ -250,25 +244,21 @@ def search_tables(loop: Loop) -> list[Table]:
 def carrier_table(evidence: Evidence, most: int = 8) -> Table:
     """Tabulate the transitions that carry most of the evidence."""
     gains = evidence.by_transition
-    shown = np.argsort(-gains, kind="stable")[:most]
-    return Table(
-        f"The {len(shown)} transitions with most evidence",
-        ("Trajectory", "Time (s)", "Gain (nats)", "Mostly in", "Speed (m/s)",
-         "Force x (N)", "Force y (N)", "Torque (N m)", "Touching"),
-        [
-            (
-                str(evidence.trajectory[i]),
-                f"{evidence.time[i]:.4g}",
-                number(float(gains[i])),
-                evidence.names[int(np.argmax(evidence.nats[i]))],
-                number(float(evidence.speed[i])),
-                *(number(float(value)) for value in evidence.wrench[i]),
-                "yes" if evidence.touching[i] else "no",
-            )
-            for i in shown
-        ],
-        words=(3, 8),
-    )  # fmt: skip
+    heads = ("Trajectory", "Time (s)", "Gain (nats)", "Mostly in", "Speed (m/s)", "Force x (N)",
+             "Force y (N)", "Torque (N m)", "Touching")  # fmt: skip
+    rows = [
+        (
+            str(evidence.trajectory[i]),
+            f"{evidence.time[i]:.4g}",
+            number(gains[i]),
+            evidence.names[int(np.argmax(evidence.nats[i]))],
+            number(evidence.speed[i]),
+            *map(number, evidence.wrench[i]),
+            "yes" if evidence.touching[i] else "no",
+        )
+        for i in np.argsort(-gains, kind="stable")[:most]
+    ]
+    return Table(f"The {len(rows)} transitions with most evidence", heads, rows, (3, 8))
 
 
 def parameter_table(parameters: Parameters) -> Table:

@@ -53,7 +53,10 @@ def _found(loop: Loop) -> str:
         return f"Nothing{matters} was found missing"
     first, *more = main_laws(loop)
     sentence = _listed([_named(one) for one in (first, *more)], "and")
-    return f"{sentence[0].upper()}{sentence[1:]}{'' if more else _size(first)}"
+    if not more and has_size(first):
+        (size,) = first.parameters.values()
+        sentence += f", {with_interval(size)}"
+    return f"{sentence[0].upper()}{sentence[1:]}"
 
 
 def main_laws(loop: Loop) -> tuple[Added, ...]:
@@ -72,14 +75,6 @@ def _named(added: Added) -> str:
 def has_size(added: Added) -> bool:
     """Return whether an effect's size fits into a headline: one number of one effect."""
     return len(added.parameters) == 1 and not added.not_separable_from
-
-
-def _size(added: Added) -> str:
-    """Write the size of an effect with one parameter and its interval; empty for others."""
-    if not has_size(added):
-        return ""
-    (size,) = added.parameters.values()
-    return f", {with_interval(size)}"
 
 
 def with_interval(size: Estimate, name: str = "94 %") -> str:
