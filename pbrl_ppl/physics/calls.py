@@ -165,7 +165,9 @@ class Pointers(NamedTuple):
     iterations: int
     chained: NDArray[np.bool_]
     padding: int
-    normal_gravity: float  # m/s^2
+    gravity_x: float  # m/s^2
+    gravity_y: float
+    normal_gravity: float
     size: float  # m
     fastest: float  # m/s
     far: float  # m
@@ -179,6 +181,7 @@ class Pointers(NamedTuple):
     limited: NDArray[np.int64]
     body_settings: NDArray[np.void]  # of dtype SETTING, as the others
     strengths: NDArray[np.void]
+    pivots: NDArray[np.int64]  # (hinge, 3): body, joint, column of its anchor on the body
     joint_settings: NDArray[np.void]
     discs: NDArray[np.int64]
     patches: NDArray[np.int64]  # (2, patch, point of the ring): what holds it, the rod
@@ -219,6 +222,8 @@ def pointers(world: World) -> Pointers:
         iterations=world.iterations,
         chained=world.chained,
         padding=world.padding,
+        gravity_x=world.scene.gravity[0],
+        gravity_y=world.scene.gravity[1],
         normal_gravity=world.scene.normal_gravity,
         size=world.size,
         fastest=world.fastest,
@@ -234,6 +239,7 @@ def pointers(world: World) -> Pointers:
         body_settings=table(p for p in world.body_settings if p.setting.attribute != "max_force"),
         strengths=table(p for p in world.body_settings if p.setting.attribute == "max_force"),
         joint_settings=table(world.joint_settings),
+        pivots=whole(*chain(*world.pivots)).reshape(-1, 3),
         discs=at(*(disc._shape for disc in world.discs)),
         patches=constraints(*(p.first for p in patches), *(p.second for p in patches)).reshape(
             2, -1, len(RING)

@@ -29,6 +29,10 @@ class Batch(NamedTuple):
     given: tuple[Floats, ...]
     commands: Ints
     forces: Ints
+    frictions: Ints
+    slots: int
+    late: bool
+    follows: NDArray[np.bool_]
     start: Floats
     inputs: Floats
     time_step: float

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.physics.compilation import compiled
 from pbrl_ppl.physics.joints import LENGTH
+from pbrl_ppl.physics.laws import ACTED, COMMAND, MORE, bound
 from pbrl_ppl.physics.properties import COLUMN
 from pbrl_ppl.physics.tree import (
     ACROSS,
@@ -32,6 +33,7 @@ from pbrl_ppl.physics.tree import (
     PARENT,
     PIVOT,
     TURN,
+    TURNING,
     UNDER,
     Tree,
 )
@@ -45,14 +47,16 @@ from pbrl_ppl.physics.world import RING
     COS, SIN, X, Y, V_X, V_Y, B_X, B_Y,
 ) = range(19)  # fmt: skip
 #: Columns of a row's numbers: its greatest force and the one with which it sticks, its acceleration
-#: without that of the speeds, a wheel's place from the joint's and direction; then G.
-BOUND, FORCE, BIAS, W_X, W_Y, W_COS, W_SIN, G = range(8)
+#: without that of the speeds, a wheel's place from the joint's and direction, its greatest force
+#: but for laws that change it; then G.
+BOUND, FORCE, BIAS, W_X, W_Y, W_COS, W_SIN, BASE, G = range(9)
 #: Rows of what each coordinate has: coordinates and speeds now and at the end of a step, natural
 #: sizes, forces Q; then seven slopes (speed, acceleration), and M.
 Q, U, END_Q, END_U, SIZE, LOAD, SLOPES, M = 0, 1, 2, 3, 4, 5, 6, 20
 #: Rows of a ring's numbers: greatest force of a point and reaction on a ring that holds; twist
-#: where a step begins, and at its end; then its points, from the joint's place.
-GRIP, TWIST, TWIST_END, POINTS = range(4)
+#: where a step begins (and the greatest force but for laws), at its end, and now; then its points,
+#: from the joint's place.
+GRIP, TWIST, TWIST_END, TWIST_NOW, POINTS = range(5)
 #: Modes of a row beside slipping in its positive (1) or negative direction: it sticks, or has no
 #: friction. A ring slides or sticks.
 STICK, SMOOTH, SLIDE = 0, 2, 1
@@ -79,7 +83,7 @@ WORK = np.dtype(
         ("motion", np.float64, (M + MOST, MOST)),
         ("system", np.float64, (4 * MOST, 4 * MOST + 1)),
         ("states", np.float64, (MOST, 6)),
-        ("acted", np.float64, (MOST + 1, 9)),  # see `compiled.act`
+        ("acted", np.float64, (MOST + MORE, ACTED)),  # see `laws.act`
     ],
     align=True,
 )
@@ -146,13 +150,16 @@ def set_numbers(work, gravity, normal_gravity, ring, bodies, joints):  # type: i
                 point = work.rings[r - work.n_rows, POINTS + j]
                 point[0], point[1] = x, y
         if kind < 0:
-            work.rings[r - work.n_rows, GRIP, 0] = row[COLUMN.patch_mu] * load / len(ring)
+            grip = row[COLUMN.patch_mu] * load / len(ring)
+            work.rings[r - work.n_rows, GRIP, 0] = work.rings[r - work.n_rows, TWIST, 3] = grip
             continue
         numbers = work.rows[r]
         if kind == PIVOT:
             numbers[BOUND] = bodies[work.tree[i, OWNER], COLUMN.pivot_torque]
         elif kind == UNDER:
             numbers[BOUND] = row[COLUMN.patch_mu] * load * lever
+        elif kind == TURNING:
+            numbers[BOUND] = row[COLUMN.turn_torque]
         else:
             angle = row[COLUMN.w_theta] + (0.5 * math.pi if kind == ACROSS else 0.0)
             numbers[BOUND] = load * (row[COLUMN.mu_x] if kind == ALONG else row[COLUMN.mu_y])
@@ -161,6 +168,7 @@ def set_numbers(work, gravity, normal_gravity, ring, bodies, joints):  # type: i
                 row[COLUMN.w_y] - link[OWN_Y],
             )
             numbers[W_COS], numbers[W_SIN] = math.cos(angle), math.sin(angle)
+        numbers[BASE] = numbers[BOUND]
 
 
 @compiled
@@ -282,7 +290,7 @@ def set_forces(work, u):  # type: ignore[no-untyped-def]
         turn = tree[i, TURN]
         for j in range(n):
             rows[r, G + j] = 0.0
-        if kind in (PIVOT, UNDER):
+        if kind in (PIVOT, UNDER, TURNING):
             rows[r, G + turn] = 1.0
             if kind == PIVOT and tree[i, PARENT] >= 0:
                 rows[r, G + tree[tree[i, PARENT], TURN]] = -1.0
@@ -298,6 +306,36 @@ def set_forces(work, u):  # type: ignore[no-untyped-def]
         v_x, v_y = links[i, V_X] - omega * y, links[i, V_Y] + omega * x
         b_x, b_y = links[i, B_X] - omega * omega * x, links[i, B_Y] - omega * omega * y
         rows[r, BIAS] = omega * (n_x * v_y - n_y * v_x) + n_x * b_x + n_y * b_y
+
+
+@compiled
+def set_bounds(work, laws, u):  # type: ignore[no-untyped-def]
+    """Set the greatest forces of dry friction that laws change, where forces and rows are set."""
+    if len(laws.frictions) == 0:
+        return
+    tree, motion, acted, states = work.tree, work.motion, work.acted, work.states
+    for r in range(work.n_kinds):
+        kind, i = work.kinds[r, 0], work.kinds[r, 1]
+        turn, body = tree[i, TURN], tree[i, BODY]
+        if kind == PIVOT:
+            owner, torque = tree[i, OWNER], acted[body, COMMAND + 2]
+            speed = row_speed(work, r, u)
+            rest = motion[LOAD, turn] + work.links[i, DAMPING] * speed - torque
+            work.rows[r, BOUND] = bound(
+                work.rows[r, BASE], laws, owner, 0, states, torque, rest, abs(speed), acted
+            )
+        elif kind == UNDER:
+            x, y = work.links[i, OWN_X], work.links[i, OWN_Y]
+            speed = abs(motion[u, turn]) * math.sqrt(x * x + y * y)
+            work.rows[r, BOUND] = bound(
+                work.rows[r, BASE], laws, body, 1, states, 0.0, 0.0, speed, acted
+            )
+        elif kind < 0:
+            ring = r - work.n_rows
+            points, base = work.rings.shape[1] - POINTS, work.rings[ring, TWIST, 3]
+            speed = math.sqrt(set_twist(work, ring, i, u, TWIST_NOW))
+            most = bound(points * base, laws, body, 1, states, 0.0, 0.0, speed, acted)
+            work.rings[ring, GRIP, 0] = most / points
 
 
 @compiled
@@ -514,7 +552,7 @@ def set_twist(work, ring, i, u, field):  # type: ignore[no-untyped-def]
 def strain(work, ring, i, tries=40):  # type: ignore[no-untyped-def]
     """Return by how much the reaction on a ring that holds exceeds what it can hold, as a share.
 
-    With a wheel under the same body, which holds with it.
+    With a wheel under the same body, or friction against turning, which hold with it.
 
     The greatest power of the reaction over that of friction, less one (S. Goyal, A. Ruina and
     J. Papadopoulos, Wear 143, 1991), by reweighted least squares.
@@ -547,13 +585,15 @@ def strain(work, ring, i, tries=40):  # type: ignore[no-untyped-def]
             system[0, 2] -= weight * y
             system[1, 2] += weight * x
             system[2, 2] += weight * (x * x + y * y)
-        for r in range(work.n_rows):  # of a wheel on the same body
-            if work.kinds[r, 1] == i and work.kinds[r, 0] >= ALONG:
+        for r in range(work.n_rows):  # of a wheel, or against turning, on the same body
+            if work.kinds[r, 1] == i and work.kinds[r, 0] >= TURNING:
                 row = work.rows[r]
-                n_x = c * row[W_COS] - s * row[W_SIN]
-                n_y = s * row[W_COS] + c * row[W_SIN]
-                x, y = c * row[W_X] - s * row[W_Y], s * row[W_X] + c * row[W_Y]
-                lever = n_y * x - n_x * y
+                n_x, n_y, lever = 0.0, 0.0, 1.0
+                if work.kinds[r, 0] >= ALONG:
+                    n_x = c * row[W_COS] - s * row[W_SIN]
+                    n_y = s * row[W_COS] + c * row[W_SIN]
+                    x, y = c * row[W_X] - s * row[W_Y], s * row[W_X] + c * row[W_Y]
+                    lever = n_y * x - n_x * y
                 along = n_x * t_x + n_y * t_y + lever * rate
                 speed = math.sqrt(along * along + _SLOW * _SLOW)
                 lost += row[BOUND] * speed

@@ -13,6 +13,7 @@ from pbrl_ppl.effects import (
     Clock,
     Command,
     Force,
+    Friction,
     Properties,
     Sensor,
     Structure,
@@ -27,13 +28,15 @@ from pbrl_ppl.state import Floats
 
 #: Columns of a body's properties. ``moment`` is about the centre of mass (kg m^2), which is at
 #: ``com_x`` and ``com_y`` of the body's frame (m); ``pivot_torque`` (N m) and ``pivot_damping``
-#: (N m s) act in the body's hinge, ``patch_mu`` (1) and ``patch_radius`` (m) describe the friction
-#: under it, ``extra_gravity_x`` and ``extra_gravity_y`` (m/s^2) are added to the scene's gravity.
+#: (N m s) act in the body's hinge, ``turn_torque`` (N m) against any turning of a free one;
+#: ``patch_mu`` (1) and ``patch_radius`` (m) describe the friction under it, ``extra_gravity_x`` and
+#: ``extra_gravity_y`` (m/s^2) are added to the scene's gravity.
 COLUMNS = (
     *BODY_PARAMETERS,
     "moment",
     "pivot_torque",
     "pivot_damping",
+    "turn_torque",
     "patch_mu",
     "patch_radius",
     "extra_gravity_x",
@@ -44,8 +47,8 @@ COLUMNS = (
 #: Index of each column, by name.
 COLUMN: Any = namedtuple("COLUMN", COLUMNS)(*range(len(COLUMNS)))
 _POSITIVE = ("mass", "moment")
-#: Columns of the friction coefficients of a ring under a body, and of a wheel.
-_PATCH, _WHEEL = ("patch_mu",), ("mu_x", "mu_y")
+#: Columns of friction of a ring under a body, of a wheel, and against turning.
+_PATCH, _WHEEL, _TURN = ("patch_mu",), ("mu_x", "mu_y"), ("turn_torque",)
 _ANY_SIGN = ("w_x", "w_y", "w_theta", "extra_gravity_x", "extra_gravity_y", "com_x", "com_y")
 #: Names that effects see in place of a column: moment per mass and the whole gravity.
 SEEN = {
@@ -72,8 +75,8 @@ class EngineInput(NamedTuple):
         Shape (proposal, joint, 5), columns as in :data:`JOINT_COLUMNS`, m.
     discs : ndarray
         x, y and radius of hidden discs, shape (proposal, disc, 3), m.
-    commands, forces : ndarray
-        Parameters of the command and of the force laws, one after the other, shape (proposal, q).
+    commands, forces, frictions : ndarray
+        Parameters of the laws of each stage, one after the other, shape (proposal, q).
     indices : ndarray
         Indices into ``scene.joinable`` of an inferred joint's bodies, shape (proposal, free
         joint, 2).
@@ -84,6 +87,7 @@ class EngineInput(NamedTuple):
     discs: Floats
     commands: Floats
     forces: Floats
+    frictions: Floats
     indices: NDArray[np.int64]
 
 
@@ -128,7 +132,7 @@ class EngineProperties:
         self._moved = np.array(moved, dtype=int).reshape(-1, 3).T
         self._unit_moment = np.array([body.shape.unit_moment for body in scene.moving])
         self._places = places
-        stages = (Structure, Properties, Command, Force, Sensor)
+        stages = (Structure, Properties, Command, Force, Friction, Sensor)
         self._acting: dict[type, list[Attached]] = {s: at_stage(effects, s) for s in stages}
         self._bodies = bodies
         #: Whether a body's numbers depend on time.
@@ -143,8 +147,8 @@ class EngineProperties:
         ]
         #: Number of discs that the structure stage adds.
         self.n_discs = self._discs(np.zeros((1, layout.size))).shape[1]
-        #: Bodies under which effects put a ring of friction, and a wheel.
-        self.under = (self._changed(effects, _PATCH), self._changed(effects, _WHEEL))
+        #: Bodies under which effects put a ring of friction, a wheel, and friction against turning.
+        self.under = tuple(self._changed(effects, names) for names in (_PATCH, _WHEEL, _TURN))
         #: Body and row among all joints of each rod that an effect adds.
         self.tied = tuple(
             (bodies.index(attached.body), len(scene.joints) + j)
@@ -208,8 +212,11 @@ class EngineProperties:
         joints, indices = self.joints(phi)
         if self._tying:
             joints = np.concatenate([joints, self._rods(phi)], axis=1)
-        commands, forces = (self._law_parameters(phi, stage) for stage in (Command, Force))
-        return EngineInput(bodies, joints, self._discs(phi), commands, forces, indices)
+        commands, forces, frictions = (
+            self._law_parameters(phi, stage) for stage in (Command, Force, Friction)
+        )
+        discs = self._discs(phi)
+        return EngineInput(bodies, joints, discs, commands, forces, frictions, indices)
 
     def _modified(self, bodies: Floats, phi: Floats, clock: Clock | None) -> Floats:
         """Return properties after the properties stage, with the moments of inertia."""
@@ -241,9 +248,15 @@ class EngineProperties:
         return result
 
     def _law_parameters(self, phi: Floats, stage: type) -> Floats:
-        """Return the parameters of the laws of a stage, one after another, shape (proposal, q)."""
-        laws = self._acting[stage]
-        columns = [column for law in laws for column in self.values(law, phi).values()]
+        """Return parameters and constants of a stage's laws, one after another, (proposal, q)."""
+        columns = [
+            column
+            for law in self._acting[stage]
+            for column in (
+                *self.values(law, phi).values(),
+                *(np.full(len(phi), constant) for constant in law.effect.constants),
+            )
+        ]
         return np.stack(columns, axis=1) if columns else np.empty((len(phi), 0))
 
     def _discs(self, phi: Floats) -> Floats:

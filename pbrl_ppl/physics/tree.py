@@ -18,9 +18,9 @@ from pbrl_ppl.state import Floats, Ints
 
 #: Kinds of links.
 FREE, HINGE, BAR = range(3)
-#: Kinds of rows of dry friction: in a hinge, under a body that a hinge leaves one coordinate, and
-#: along and across a wheel.
-PIVOT, UNDER, ALONG, ACROSS = range(4)
+#: Kinds of rows of dry friction: in a hinge, under a body that a hinge leaves one coordinate,
+#: against turning, and along and across a wheel.
+PIVOT, UNDER, TURNING, ALONG, ACROSS = range(5)
 #: Columns of a link: the link that it hangs on (-1: the world), its body (-1: a rod), its first
 #: coordinate and that of its angle, its row among all joints (-1: none), the columns of the anchor
 #: on its parent (-1: a rod's end) and of its own (-1: its origin), and the body whose friction acts
@@ -109,6 +109,7 @@ def tree_of(world: World) -> Tree | None:
     if left:
         return None
     rows = [(PIVOT, i) for i, link in enumerate(links) if link[OWNER] >= 0]
+    rows += [(TURNING, place[turner.body]) for turner in world.turners]
     for wheel in world.wheels:
         rows += [(ALONG, place[wheel.body]), (ACROSS, place[wheel.body])]
     under = [place[patch.body] for patch in world.patches]

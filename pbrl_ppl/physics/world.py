@@ -11,7 +11,7 @@ import pymunk
 from pymunk import autogeometry
 
 from pbrl_ppl.effects import hanging_body
-from pbrl_ppl.physics.joints import HINGE, JOINT_KINDS, ROD, JointKind, Setting
+from pbrl_ppl.physics.joints import A_X, B_X, HINGE, JOINT_KINDS, ROD, JointKind, Setting
 from pbrl_ppl.physics.properties import COLUMN
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene, smallest_radius
 
@@ -46,7 +46,8 @@ class ConstraintKind(NamedTuple):
 #: resists motion along a line and leaves motion across it alone. (Off-centre, its groove joint
 #: turns motion along the groove into a force across it.)
 #:
-#: ``pivot`` is friction and damping in a hinge, with the parameters of the hanging body.
+#: ``pivot`` is friction and damping in a hinge, with the parameters of the hanging body, and
+#: ``turning`` friction against the turning of a free one.
 #:
 #: ``patch`` is Coulomb friction under a body, at points of a ring that share its weight. A pivot
 #: joint to the ground, whose force is limited as a vector, holds a point if it rests; a rod along
@@ -75,6 +76,12 @@ BODY_CONSTRAINTS = {
             limited=False,
         ),
     ),
+    "turning": (
+        ConstraintKind(
+            lambda a, b: pymunk.SimpleMotor(a, b, 0.0),
+            (Setting("max_force", "cpConstraintSetMaxForce", (COLUMN.turn_torque,)),),
+        ),
+    ),
     "patch": tuple(
         ConstraintKind(
             kind.constraint, (Setting("anchor_a", function, 2 * (COLUMN.patch_radius,)),)
@@ -94,11 +101,11 @@ class Placed(NamedTuple):
 
 
 class OnBody(NamedTuple):
-    """The two kinds of constraints on a body: one each of a wheel, one a point of a patch."""
+    """The kinds of constraints on a body: one each of a wheel, one a point of a patch."""
 
     body: int
     first: tuple[pymunk.Constraint, ...]
-    second: tuple[pymunk.Constraint, ...]
+    second: tuple[pymunk.Constraint, ...] = ()
 
 
 class Link(NamedTuple):
@@ -129,8 +136,8 @@ class World:
         Number of hidden static discs; their places and sizes are properties.
     patches : tuple of int
         Bodies with friction under them.
-    wheels : tuple of int
-        Bodies with a wheel that an effect adds.
+    wheels, turners : tuple of int
+        Bodies with a wheel that an effect adds, and with friction against turning.
     rods : tuple of (int, int)
         Body and row among all joints of each rod that an effect adds.
     """
@@ -143,6 +150,7 @@ class World:
         discs: int = 0,
         patches: tuple[int, ...] = (),
         wheels: tuple[int, ...] = (),
+        turners: tuple[int, ...] = (),
         rods: tuple[tuple[int, int], ...] = (),
     ) -> None:
         self.scene = scene
@@ -163,6 +171,8 @@ class World:
         self.shapes: list[tuple[int, pymunk.Shape]] = []
         self.wheels: list[OnBody] = []
         self.links: list[Link] = []
+        #: Body whose friction acts in a hinge, the joint, and the column of its anchor on the body.
+        self.pivots: list[tuple[int, int, int]] = []
         #: Constraints whose force is limited and others, and the settings of all of them by the
         #: bodies' and the joints' numbers.
         self.limited: list[pymunk.Constraint] = []
@@ -197,6 +207,9 @@ class World:
         self.patches = [
             self._constrain("patch", i, self.bodies[i], self.space.static_body, RING)
             for i in patches
+        ]
+        self.turners = [
+            self._constrain("turning", i, self.bodies[i], self.space.static_body) for i in turners
         ]
         #: Which dynamic bodies are joined to other moving ones.
         self.chained = np.logical_not(self.can_touch.all(axis=1)) & ~self.kinematic
@@ -311,6 +324,8 @@ class World:
         if joint is not None and joint.bodies is not None and JOINT_KINDS[joint.kind].friction:
             pivot = self.bodies.index(self._by_name[hanging_body(self.scene, joint)])
             self._constrain("pivot", pivot, a, b)
+            column = A_X if a is self.bodies[pivot] else B_X
+            self.pivots.append((pivot, position, column))
         self.links.append(Link(position, kind, link, pivot))
         self.joint_settings += [Placed(link, setting, position) for setting in kind.settings]
 
