@@ -136,8 +136,8 @@ def _apart(scene: Scene, poses: Floats) -> Iterator[tuple[int, str]]:
             poses[:, moving[name]] if name in moving else pose
             for name, pose in zip(joint.bodies, fixed, strict=True)
         ]
-        length = JOINT_KINDS[joint.kind].gap(_anchor_distance(joint, fixed)[0])
-        distance = _anchor_distance(joint, now)
+        length = JOINT_KINDS[joint.kind].gap(_anchor_distance(scene, joint, fixed)[0])
+        distance = _anchor_distance(scene, joint, now)
         smaller = min(scene.body(n).shape.bounding_radius for n in joint.bodies if n in moving)
         off = np.flatnonzero(np.abs(distance - length) > ALLOWED * smaller)
         if len(off):
@@ -150,10 +150,16 @@ def _apart(scene: Scene, poses: Floats) -> Iterator[tuple[int, str]]:
             )
 
 
-def _anchor_distance(joint: Joint, poses: list[Floats]) -> Floats:
+def _anchor_distance(scene: Scene, joint: Joint, poses: list[Floats]) -> Floats:
+    """Return the distance of a joint's anchors, of a slider across its axis, shape (n,)."""
     anchors = (joint.anchor_a or (0.0, 0.0), joint.anchor_b or (0.0, 0.0))
     a, b = (put(np.array([at]), pose) for at, pose in zip(anchors, poses, strict=True))
-    return np.asarray(np.hypot(*np.moveaxis(a - b, -1, 0))[:, 0])
+    x, y = np.moveaxis(a - b, -1, 0)[..., 0]
+    if joint.traits.slides and joint.bodies:
+        second = joint.bodies[1]
+        angle = poses[1][:, 2] + scene.direction(joint) - scene.reference_angle(second)
+        return np.asarray(np.abs(np.cos(angle) * y - np.sin(angle) * x))
+    return np.asarray(np.hypot(x, y))
 
 
 def _colliding(scene: Scene) -> Pairs:

@@ -11,7 +11,19 @@ import pymunk
 from pymunk import autogeometry
 
 from pbrl_ppl.effects import hanging_body
-from pbrl_ppl.physics.joints import HINGE, JOINT_KINDS, ROD, JointKind, Setting
+from pbrl_ppl.errors import SimulationError
+from pbrl_ppl.physics.joints import (
+    B_X,
+    B_Y,
+    HIGH_X,
+    HIGH_Y,
+    HINGE,
+    JOINT_KINDS,
+    ROD,
+    JointKind,
+    Setting,
+    never_turning,
+)
 from pbrl_ppl.physics.properties import COLUMN
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene, smallest_radius
 
@@ -32,11 +44,23 @@ FINER = 8
 
 
 class ConstraintKind(NamedTuple):
-    """What a constraint on a body is in the engine: a maker, properties, a limit of its force."""
+    """What a constraint on a body is in the engine: a maker, properties, a limit of its force.
+
+    ``joint_settings`` are those properties that are numbers of the joint in which it acts.
+    """
 
     constraint: Callable[[pymunk.Body, pymunk.Body], pymunk.Constraint]
     settings: tuple[Setting, ...]
     limited: bool = True
+    joint_settings: tuple[Setting, ...] = ()
+
+
+def _on_line(name: str) -> tuple[Setting, ...]:
+    """Return the settings of a constraint along a slider's line, to an end that is far away."""
+    return (
+        Setting("anchor_a", f"{name}SetAnchorA", (HIGH_X, HIGH_Y)),
+        Setting("anchor_b", f"{name}SetAnchorB", (B_X, B_Y)),
+    )
 
 
 #: Beside joints, two kinds of constraints on a body for each use, with their settings.
@@ -47,6 +71,8 @@ class ConstraintKind(NamedTuple):
 #: turns motion along the groove into a force across it.)
 #:
 #: ``pivot`` is friction and damping in a hinge, with the parameters of the hanging body.
+#:
+#: ``rail`` is the same in a slider: a rod with limited force, and a damper, along its line.
 #:
 #: ``patch`` is Coulomb friction under a body, at points of a ring that share its weight. A pivot
 #: joint to the ground, whose force is limited as a vector, holds a point if it rests; a rod along
@@ -73,6 +99,19 @@ BODY_CONSTRAINTS = {
             lambda a, b: pymunk.DampedRotarySpring(a, b, 0.0, 0.0, 0.0),
             (Setting("damping", "cpDampedRotarySpringSetDamping", (COLUMN.pivot_damping,)),),
             limited=False,
+        ),
+    ),
+    "rail": (
+        ConstraintKind(
+            ROD.constraint,
+            (Setting("max_force", "cpConstraintSetMaxForce", (COLUMN.pivot_torque,)),),
+            joint_settings=_on_line("cpPinJoint"),
+        ),
+        ConstraintKind(
+            lambda a, b: pymunk.DampedSpring(a, b, (0, 0), (0, 0), 0.0, 0.0, 0.0),
+            (Setting("damping", "cpDampedSpringSetDamping", (COLUMN.pivot_damping,)),),
+            limited=False,
+            joint_settings=_on_line("cpDampedSpring"),
         ),
     ),
     "patch": tuple(
@@ -104,13 +143,15 @@ class OnBody(NamedTuple):
 class Link(NamedTuple):
     """Joint constraint J_d, its kind and its row among all joints.
 
-    ``pivot`` is the body whose friction acts in it, -1 for none.
+    ``pivot`` is the body whose friction acts in it, -1 for none; ``axis`` the direction of a slider
+    in the bodies' reference poses (rad).
     """
 
     joint: int
     kind: JointKind
     constraint: pymunk.Constraint
     pivot: int
+    axis: float = 0.0
 
 
 class World:
@@ -216,6 +257,28 @@ class World:
         fixed += [(-self.far, -self.far, -self.far, -self.far, 0.0)] * discs  # the last ones
         self.obstacles = np.array(fixed, dtype=float).reshape(-1, 5)
 
+    def check_steps(self) -> None:
+        """Refuse sliders on what turns, for which the engine has no right joint.
+
+        Raises
+        ------
+        SimulationError
+            If there is one.
+        """
+        upright = {
+            body.name
+            for body, fixed in zip(self.scene.moving, never_turning(self.scene), strict=True)
+            if fixed
+        }
+        for joint in self.scene.joints:
+            if joint.traits.slides and not upright.intersection(joint.bodies or ()):
+                a, b = joint.bodies or ("", "")
+                raise SimulationError(
+                    f"the slider of {a} and {b} turns, and Chipmunk has no such joint for contacts"
+                    " and closed chains: expected a slider to the world or to a body that slides on"
+                    " it; keep the bodies apart from others, or use engine 'auto'"
+                )
+
     def _add_shapes(self) -> None:
         """Add the moving shapes so that contacts have one order, whatever was simulated before.
 
@@ -261,6 +324,7 @@ class World:
         a: pymunk.Body,
         b: pymunk.Body,
         points: tuple[tuple[float, float], ...] = ((1.0, 1.0),),
+        joint: int = -1,
     ) -> OnBody:
         """Add the constraints of a use, which resist motion but do not correct drift."""
         made = []
@@ -271,6 +335,7 @@ class World:
                     constraint.max_bias = constraint.max_force = 0.0
                 self._add_constraint(constraint, kind.limited)
                 self.body_settings += [Placed(constraint, s, row, point) for s in kind.settings]
+                self.joint_settings += [Placed(constraint, s, joint) for s in kind.joint_settings]
         return OnBody(row, *made)
 
     def _add_constraint(self, constraint: pymunk.Constraint, limited: bool) -> None:
@@ -310,8 +375,9 @@ class World:
         pivot = -1
         if joint is not None and joint.bodies is not None and JOINT_KINDS[joint.kind].friction:
             pivot = self.bodies.index(self._by_name[hanging_body(self.scene, joint)])
-            self._constrain("pivot", pivot, a, b)
-        self.links.append(Link(position, kind, link, pivot))
+            self._constrain(kind.friction, pivot, a, b, joint=position)
+        axis = self.scene.direction(joint) if joint is not None and joint.axis else 0.0
+        self.links.append(Link(position, kind, link, pivot, axis))
         self.joint_settings += [Placed(link, setting, position) for setting in kind.settings]
 
 
