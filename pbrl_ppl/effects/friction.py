@@ -1,4 +1,4 @@
-"""Friction in hinges and sliders, on the floor and of wheels; the engine solves it together with contacts."""
+"""Friction in joints, on the floor and of wheels; the engine solves it together with contacts."""
 
 from itertools import product
 
@@ -48,7 +48,11 @@ pivot_friction = Effect(
 
 slider_damping = Effect(
     "slider_damping",
-    (EffectParameter("coefficient", "N s/m", Prior("half_normal", sigma=1.0), scale="force/speed"),),
+    (
+        EffectParameter(
+            "coefficient", "N s/m", Prior("half_normal", sigma=1.0), scale="force/speed"
+        ),
+    ),
     "viscous friction in the slider: a force against the sliding that grows with its speed",
     "viscous force on the relative velocity along the axis, F = -c v",
     Properties(_add_pivot_damping),

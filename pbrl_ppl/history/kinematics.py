@@ -129,8 +129,8 @@ def path_velocities(poses: Floats, time_step: float) -> Floats:
 def complete_start(state: Floats, scene: Scene) -> tuple[Floats, Bools]:
     """Return states completed for a simulation to start from, and their columns without data.
 
-    Measured values are kept. Hinges, sliders and paths give what follows from them; a position that was
-    never measured is that of the scene; velocities that were never measured are estimated.
+    Measured values are kept. Hinges, sliders and paths give what follows from them; a position that
+    was never measured is that of the scene; velocities that were never measured are estimated.
 
     Parameters
     ----------

@@ -31,9 +31,10 @@ def mjcf_ranges(
     The model has each body at its posterior mean: mass, moment of inertia and centre of mass,
     friction in contacts (MuJoCo takes the larger one of two geoms, the scene their product), and
     the damping and dry friction of its joints (``pivot_damping``, ``pivot_friction``,
-    ``slider_damping``, ``slider_friction``, ``linear_drag``, ``angular_drag``). In its reference configuration all angles are zero, so that
-    positions of its hinges are the scene's angles, those of a chain relative to the body above, and
-    of sliders the ways of their anchors along the axis.
+    ``slider_damping``, ``slider_friction``, ``linear_drag``, ``angular_drag``). In its
+    reference configuration all angles are zero (a slider's as in the poses), so that positions of
+    its hinges are the scene's angles, those of a chain relative to the body above, and positions of
+    sliders the distances of their anchors along the axis.
 
     Parameters
     ----------
@@ -172,7 +173,9 @@ class _Writer:
             if joint.traits.hangs and joint.known:
                 kept.append(joint)
             else:
-                self.left_out.append(f'joint "{name}", which is not a hinge or slider with known anchors')
+                self.left_out.append(
+                    f'joint "{name}", which is not a hinge or slider with known anchors'
+                )
         return kept
 
     def release(self, body: Body) -> None:

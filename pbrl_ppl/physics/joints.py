@@ -198,7 +198,7 @@ class SceneJoints:
         joints[..., :4] = self._anchors
         place, joint, column = self._moved_anchors
         joints[:, joint, column] = phi[:, place]
-        joints[..., LOW_X:] = self._ends + np.tile(joints[..., : B_X], 2)
+        joints[..., LOW_X:] = self._ends + np.tile(joints[..., :B_X], 2)
         indices = phi[:, self._free[:, 1:]]
         choices = len(self._scene.joinable)
         wrong = (indices != np.floor(indices)) | (indices < 0) | (indices >= choices)

@@ -24,9 +24,9 @@ FREE, HINGE, BAR, RAIL = range(4)
 PIVOT, UNDER, ALONG, ACROSS = range(4)
 #: Columns of a link: the link that it hangs on (-1: the world), its body (-1: a rod), its first
 #: coordinate and that of its angle (of a body that never turns the one after the last, whose speed
-#: is 0 and whose forces count for nothing), its row among all joints (-1: none), the columns of the anchor
-#: on its parent (-1: a rod's end) and of its own (-1: its origin), and the body whose friction acts
-#: in its hinge or slider (-1: none).
+#: is 0 and whose forces count for nothing), its row among all joints (-1: none), the columns of the
+#: anchor on its parent (-1: a rod's end) and of its own (-1: its origin), and the body whose
+#: friction acts in its hinge or slider (-1: none).
 KIND, PARENT, BODY, FIRST, TURN, JOINT, NEAR, FAR, OWNER = range(9)
 
 

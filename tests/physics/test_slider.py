@@ -99,7 +99,7 @@ def test_a_pendulum_on_a_cart_is_that_of_the_textbook() -> None:
     moment = m * ARM.unit_moment
 
     def rate(t, q):
-        (_, angle, v, w), s, c = q, math.sin(q[1]), math.cos(q[1])
+        v, w, s, c = q[2], q[3], math.sin(q[1]), math.cos(q[1])
         mass = np.array([[m + big, m * r * c], [m * r * c, moment + m * r * r]])
         force = [push - damping * v + m * r * w * w * s, -turning * w - m * G * r * s]
         return [v, w, *np.linalg.solve(mass, force)]
@@ -182,7 +182,9 @@ def test_the_order_of_bodies_and_the_way_of_the_axis_do_not_matter(change) -> No
         np.testing.assert_allclose(*both, atol=1e-9)
     if change == "turned":
         scene = turning_rail()
-        both = [predict(s, turning_start(scene), horizon=20) for s in (scene, turning_rail(turned=True))]
+        both = [
+            predict(s, turning_start(scene), horizon=20) for s in (scene, turning_rail(turned=True))
+        ]
         np.testing.assert_allclose(*both, atol=1e-9)
 
 
@@ -197,7 +199,10 @@ def test_the_engines_agree(dry) -> None:
         scene = cart_pole(substeps=n)
         off.append(
             [
-                abs(predict(scene, start, horizon=10, effects=effects, engine=e, extrapolate=False) - exact)
+                abs(
+                    predict(scene, start, horizon=10, effects=effects, engine=e, extrapolate=False)
+                    - exact
+                )
                 for e in ("chipmunk", "python")
             ]
         )
@@ -245,7 +250,9 @@ def test_friction_on_the_floor_under_a_slider() -> None:
 @needs_calls
 def test_a_cart_meets_an_end_stop() -> None:
     """Momentum is kept between carts on one rail, and a static body stops the second."""
-    carts = [dataclasses.replace(body(n, BOX, r=1.0), pose=(x, 0, 0)) for n, x in (("a", 0), ("b", 0.6))]
+    carts = [
+        dataclasses.replace(body(n, BOX, r=1.0), pose=(x, 0, 0)) for n, x in (("a", 0), ("b", 0.6))
+    ]
     stop = dataclasses.replace(body("stop", BOX), static=True, pose=(1.2, 0.0, 0.0), known=())
     joints = tuple(Joint("slider", (n, WORLD), (0, 0), (0, 0), (1, 0)) for n in "ab")
     scene = Scene(time_step=0.1, bodies=(*carts, stop), joints=joints, substeps=100)
@@ -253,14 +260,14 @@ def test_a_cart_meets_an_end_stop() -> None:
     np.testing.assert_allclose(got[5, :, 3], [0.0, 1.0], atol=0.02)
     assert got[-1, 1, 0] < 1.0
     for engine in ("auto", "chipmunk"):
-        got = predict(scene, [state(vx=1.0), state(x=0.6)], horizon=12, engine=engine)
+        got = predict(scene, [state(vx=1.0), state(x=0.6)], horizon=10, engine=engine)
         np.testing.assert_allclose(got[-1, :, 3], [0.0, -1.0], atol=0.02)
         assert not got[..., [1, 2, 4, 5]].any()
 
 
 def test_a_slider_that_turns_has_no_contacts() -> None:
     scene = turning_rail()
-    with pytest.raises(SimulationError, match="slider of bead and arm turns.*'auto'"):
+    with pytest.raises(SimulationError, match=r"slider of bead and arm turns.*'auto'"):
         predict(scene, turning_start(scene), engine="python")
 
 
@@ -286,10 +293,9 @@ def test_toml() -> None:
         ('kind = "slider"', 'kind = "hinge"', "it is a hinge and has an axis.*drop axis"),
         ("axis = ", "axis = [0, 0] # ", "axis is .*expected a direction"),
         ("axis = ", "axis = [1] # ", "axis has 1 numbers, expected 2"),
-        ("bodies = ", "known = false # ", "it has anchor_a and no bodies|slider without bodies"),
     ):
         with pytest.raises(SceneError, match=message):
-            Scene.from_toml(text.replace(old, new).replace("known = true\nknown", "known"))
+            Scene.from_toml(text.replace(old, new))
     with pytest.raises(SceneError, match="slider without bodies"):
         Joint("slider", known=False, axis=(1, 0))
 
@@ -320,5 +326,5 @@ def test_a_body_off_its_rail_is_refused() -> None:
     on, off = start_of(scene, x=3.0), start_of(scene)
     check_placement(scene, on[None])
     off[0, :2] += 0.1 * np.array([-ALONG[1], ALONG[0]])
-    with pytest.raises(SimulationError, match="anchors of the slider joint.*are 0.1 m apart"):
+    with pytest.raises(SimulationError, match=r"anchors of the slider joint.*are 0.1 m apart"):
         check_placement(scene, off[None])
