@@ -63,8 +63,6 @@ class Joint:
     anchor_a, anchor_b : tuple of float, optional
         Where it holds the first and the second, each in that body's frame (m). Of a joint that is
         not known these are the centres of the anchors' priors, or None for the default.
-    axis : tuple of float, optional
-        Direction of a slider in the second body's frame (the world's own), of any length.
     known : bool
         Whether the anchors are given (True) or to be inferred.
     name : str, optional
@@ -73,6 +71,8 @@ class Joint:
         Of a joint of unknown bodies: probabilities of the indices by name, such as
         ``{"i_a": {"cart": 0.7, "world": 0.3}}``, scaled to add up to one; a mapping of mappings is
         accepted. Names left out have none; all are equally probable for an index left out.
+    axis : tuple of float, optional
+        Direction of a slider in the second body's frame (the world's own), of any length.
 
     Raises
     ------
@@ -89,10 +89,10 @@ class Joint:
     bodies: tuple[str, str] | None = None
     anchor_a: Point | None = None
     anchor_b: Point | None = None
-    axis: Point | None = None
     known: bool = True
     name: str | None = None
     prior: tuple[tuple[str, Named], ...] = ()
+    axis: Point | None = None
 
     def __post_init__(self) -> None:
         if self.name is not None:

@@ -29,7 +29,7 @@ def on_a_rail(*, turned: bool = False, backwards: bool = False, **options) -> Sc
     angle = SLOPE + math.pi * backwards - 0.3 * turned
     ends = [("cart", (0.05, 0.02)), (WORLD, (0.1, 0.2))]
     (a, at_a), (b, at_b) = ends[::-1] if turned else ends
-    joint = Joint("slider", (a, b), at_a, at_b, (math.cos(angle), math.sin(angle)))
+    joint = Joint("slider", (a, b), at_a, at_b, axis=(math.cos(angle), math.sin(angle)))
     given = {"time_step": 0.1, "gravity": (0.0, -G), "bodies": (cart,), "joints": (joint,)}
     return Scene(**given | options)
 
@@ -45,7 +45,7 @@ def start_of(scene: Scene, x: float = 0.0, speed: float = 0.0) -> np.ndarray:
 def cart_pole(**options) -> Scene:
     bodies = (body("cart", BOX, mass=1.5), body("pole", ARM, mass=0.7))
     joints = (
-        Joint("slider", ("cart", WORLD), (0.0, 0.0), (0.0, 0.0), (1.0, 0.0)),
+        Joint("slider", ("cart", WORLD), (0.0, 0.0), (0.0, 0.0), axis=(1.0, 0.0)),
         Joint("hinge", ("pole", "cart"), (0.0, 0.3), (0.0, 0.0)),
     )
     given = {"time_step": 0.05, "gravity": (0.0, -G), "bodies": bodies, "joints": joints}
@@ -129,7 +129,7 @@ def turning_rail(*, turned: bool = False) -> Scene:
     (a, at_a, _), (b, at_b, angle) = ends[::-1] if turned else ends  # 1.2 + 0.2 = 0.5 + 0.9
     joints = (
         Joint("hinge", ("arm", WORLD), (0.0, 0.2), (0.0, 0.0)),
-        Joint("slider", (a, b), at_a, at_b, (math.cos(angle), math.sin(angle))),
+        Joint("slider", (a, b), at_a, at_b, axis=(math.cos(angle), math.sin(angle))),
         Joint("hinge", ("bead", "pole"), (0.0, -0.05), (0.0, 1.5)),
     )
     return Scene(time_step=0.05, gravity=(0.0, -G), bodies=bodies, joints=joints)
@@ -215,8 +215,8 @@ def test_the_engines_agree(dry) -> None:
 def test_a_table_of_two_sliders() -> None:
     bodies = (body("low", BOX), body("high", Shape.circle(0.05), mass=0.5))
     joints = (
-        Joint("slider", (WORLD, "low"), (0.0, 0.0), (0.0, 0.0), (1.0, 0.0)),
-        Joint("slider", ("high", "low"), (0.0, 0.0), (0.0, 0.05), (0.0, 2.0)),
+        Joint("slider", (WORLD, "low"), (0.0, 0.0), (0.0, 0.0), axis=(1.0, 0.0)),
+        Joint("slider", ("high", "low"), (0.0, 0.0), (0.0, 0.05), axis=(0.0, 2.0)),
     )
     scene = Scene(time_step=0.1, bodies=bodies, joints=joints, normal_gravity=G, substeps=100)
     start = [state(vx=0.2), state(y=0.1, vx=0.2, vy=-0.3)]
@@ -254,7 +254,7 @@ def test_a_cart_meets_an_end_stop() -> None:
         dataclasses.replace(body(n, BOX, r=1.0), pose=(x, 0, 0)) for n, x in (("a", 0), ("b", 0.6))
     ]
     stop = dataclasses.replace(body("stop", BOX), static=True, pose=(1.2, 0.0, 0.0), known=())
-    joints = tuple(Joint("slider", (n, WORLD), (0, 0), (0, 0), (1, 0)) for n in "ab")
+    joints = tuple(Joint("slider", (n, WORLD), (0, 0), (0, 0), axis=(1, 0)) for n in "ab")
     scene = Scene(time_step=0.1, bodies=(*carts, stop), joints=joints, substeps=100)
     got = predict(scene, [state(vx=1.0), state(x=0.6)], horizon=7)
     np.testing.assert_allclose(got[5, :, 3], [0.0, 1.0], atol=0.02)
