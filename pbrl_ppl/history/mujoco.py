@@ -203,7 +203,9 @@ def _joints(model: mujoco.MjModel, name: str, axes: Floats, reach: float) -> lis
         joints.append(_Joint(number, kind, axis, place, rate, reference, above))
     slides = [joint for joint in joints if joint.kind == SLIDE]
     turns = np.abs(np.asarray(body.quat)[1:]).max()
-    if (len(slides) == 1 and len(joints) > 1) or (joints and joints[0].kind != FREE and turns > FLAT):
+    if (len(slides) == 1 and len(joints) > 1) or (
+        joints and joints[0].kind != FREE and turns > FLAT
+    ):
         raise HistoryError(
             f'body "{name}": expected slides along both axes, one slide alone or none, and a body'
             " that is not turned in the model; a free joint has all"

@@ -52,10 +52,11 @@ def scene_from_mjcf(
     Bodies keep their names. A body with a free joint, or with slides along both axes of the plane
     and a hinge about its normal, is free; one with a hinge or a slide alone has a hinge or slider
     to its parent or the world. Their damping and dry friction become the effects ``pivot_damping``
-    and ``pivot_friction``, or ``slider_damping`` and ``slider_friction``, damping of equal slides ``linear_drag`` and of a free body's hinge
-    ``angular_drag``. An inertia or a centre of mass that differs from that of an even outline
-    becomes ``inertia_scale`` or ``com_offset``. The priors of these effects, and of the masses, are
-    about the model's values. Geoms of the world become walls (planes) and static bodies (others).
+    and ``pivot_friction``, or ``slider_damping`` and ``slider_friction``, damping of equal slides
+    ``linear_drag`` and of a free body's hinge ``angular_drag``. An inertia or a centre of mass that
+    differs from that of an even outline becomes ``inertia_scale`` or ``com_offset``. The priors of
+    these effects, and of the masses, are about the model's values. Geoms of the world become walls
+    (planes) and static bodies (others).
 
     Parameters
     ----------
