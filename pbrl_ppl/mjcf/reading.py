@@ -241,14 +241,14 @@ class _View:
         )
         if held is None:
             return body, None
-        parent, anchor, axis = held
+        parent, anchor, way = held
         above, turn = self.poses.get(parent, (np.zeros(2), 0.0))
         other = self.name(parent) if parent else WORLD
         at_parent = pair(rotation(-turn) @ (anchor - above))
         at_child = pair(rotation(-theta) @ (anchor - origin))
-        if axis is None:
+        if way is None:
             return body, Joint("hinge", (other, name), at_parent, at_child)
-        along = pair(rotation(-turn) @ axis)
+        along = pair(rotation(-turn) @ way)
         return body, Joint("slider", (name, other), at_child, at_parent, axis=along)
 
     def angle(self, i: int) -> float:

@@ -55,7 +55,7 @@ Q, U, END_Q, END_U, SIZE, LOAD, SLOPES, M = 0, 1, 2, 3, 4, 5, 6, 20
 #: Rows of a ring's numbers: greatest force of a point and reaction on a ring that holds; twist
 #: where a step begins, and at its end; then its points, from the joint's place.
 GRIP, TWIST, TWIST_END, POINTS = range(4)
-#: Columns of a link's pose beside the place: what its angle lacks to its heading and slider.
+#: Columns of a link's pose: heading and slider's direction, less the coordinate of its angle.
 HEADING, AXIS = 4, 5
 #: Modes of a row beside slipping in its positive (1) or negative direction: it sticks, or has no
 #: friction. A ring slides or sticks.

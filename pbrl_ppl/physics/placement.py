@@ -11,7 +11,7 @@ from pbrl_ppl.history import History, Segments
 from pbrl_ppl.physics.joints import JOINT_KINDS
 from pbrl_ppl.physics.solids import Pairs, circles, depth, put, scenery
 from pbrl_ppl.scene import WORLD, Joint, Scene
-from pbrl_ppl.state import Floats
+from pbrl_ppl.state import Floats, wrapped
 
 #: Violation that noise and resting contact may explain, as a share of the smaller body's size.
 ALLOWED = 0.25
@@ -42,8 +42,9 @@ def check_placement(scene: Scene, start: Floats, where: Callable[[int], str] | N
     SimulationError
         If two shapes overlap by more than a quarter of the width of the smaller one (a wall has
         none, a concave polygon that of its widest convex part), or the anchors of a known joint are
-        off by more than a quarter of the bounding radius of the smaller moving body. The first such
-        transition is named. Also if ``start`` has the wrong shape.
+        off by more than a quarter of the bounding radius of the smaller moving body, or a known
+        slider's bodies turned by more than a quarter radian. The first such transition is named.
+        Also if ``start`` has the wrong shape.
 
     Examples
     --------
@@ -147,6 +148,15 @@ def _apart(scene: Scene, poses: Floats) -> Iterator[tuple[int, str]]:
                 f"the anchors of the {joint.kind} joint of {a} and {b} are {distance[off[0]]:.3g} m"
                 f" apart, expected {length:.3g} m to within {ALLOWED * smaller:.3g} m (a quarter of"
                 " the smaller moving body's bounding radius); correct the poses or the anchors",
+            )
+        turned = wrapped(now[0][:, 2] - now[1][:, 2] - fixed[0][:, 2] + fixed[1][:, 2])
+        off = np.flatnonzero(np.abs(turned) > ALLOWED)
+        if joint.traits.slides and len(off):
+            yield (
+                int(off[0]),
+                f"{joint.bodies[0]} is turned by {turned[off[0]]:.3g} rad against"
+                f" {joint.bodies[1]} from their reference poses, whose angle the slider keeps,"
+                f" expected 0 to within {ALLOWED} rad; correct theta in the bodies' pose",
             )
 
 

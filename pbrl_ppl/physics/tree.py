@@ -1,9 +1,9 @@
 """Bodies of a world as a tree of links, whose motion is described in reduced coordinates.
 
 A hinge leaves one coordinate, the absolute angle of the link that hangs on it; a slider one, the
-way along its axis, and no angle of its own; a rod is a link
-without mass, with a hinge at both ends; a free body has three. Nothing has to hold the joints
-together, and nothing drifts (R. Featherstone, Rigid Body Dynamics Algorithms, 2008).
+position along its axis, and no angle of its own; a rod is a link without mass, with a hinge at both
+ends; a free body has three. Nothing has to hold the joints together, and nothing drifts
+(R. Featherstone, Rigid Body Dynamics Algorithms, 2008).
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ class Tree:
     links : ndarray of int
         Shape (link, 9), columns as above.
     poses : ndarray
-        x, y, cos and sin of the fixed body that a link hangs on; and what its coordinate of an
-        angle lacks to its heading, and to its slider's direction (rad). Shape (link, 6).
+        x, y, cos and sin of the fixed body that a link hangs on; heading of a link in a slider, and
+        direction of the slider, less the coordinate of its angle (rad). Shape (link, 6).
     rows : ndarray of int
         Kind and link of each row of dry friction, shape (row, 2).
     rings : ndarray of int
@@ -76,7 +76,7 @@ def tree_of(world: World) -> Tree | None:
     headings: list[tuple[float, float]] = []
     place: dict[int, int] = {}
     references = [world.scene.reference_angle(body.name) for body in world.scene.moving]
-    offsets = [-angle for angle in references]  # of an angle's coordinate from the turn, by body
+    turns = [-angle for angle in references]  # since the poses, less the coordinate of an angle
     left = [(_ends(world, link), link) for link in world.links]
     size, nowhere = 0, (0.0, 0.0, 1.0, 0.0)
     if any(end >= 0 and world.kinematic[end] for ends, _ in left for end in ends):
@@ -115,21 +115,14 @@ def tree_of(world: World) -> Tree | None:
         if link.kind is ROD:
             parent = add(BAR, parent, -1, pose, link.joint, near, -1, -1)
             pose, near = nowhere, -1
-        slides = link.kind is SLIDER
-        kind = RAIL if slides else HINGE
+        kind = RAIL if link.kind is SLIDER else HINGE
         place[body] = add(kind, parent, body, pose, link.joint, near, far, link.pivot)
-        if slides:
-            offsets[body] = offsets[holder] if holder >= 0 else 0.0
-            headings[-1] = references[body] + offsets[body], link.axis + offsets[body]
+        if kind == RAIL:
+            turns[body] = turns[holder] if holder >= 0 else 0.0
+            headings[-1] = references[body] + turns[body], link.axis + turns[body]
     if left:
         return None
-    rows = [(PIVOT, i) for i, link in enumerate(links) if link[OWNER] >= 0]
-    for wheel in world.wheels:
-        rows += [(ALONG, place[wheel.body]), (ACROSS, place[wheel.body])]
-    under = [place[patch.body] for patch in world.patches]
-    alone = [links[i][KIND] != FREE and links[i][PARENT] < 0 for i in under]
-    rows += [(UNDER, i) for i, one in zip(under, alone, strict=True) if one]
-    rings = [i for i, one in zip(under, alone, strict=True) if not one]
+    rows, rings = _friction(world, links, place)
     if any(links[i][TURN] < 0 for i in rings):
         return None
     upright = any(link[TURN] < 0 for link in links)
@@ -145,6 +138,18 @@ def tree_of(world: World) -> Tree | None:
         bodies=np.array([place.get(i, -1) for i in range(len(world.bodies))], dtype=np.int64),
         size=size,
     )
+
+
+def _friction(
+    world: World, links: list[list[int]], place: dict[int, int]
+) -> tuple[list[tuple[int, int]], list[int]]:
+    """Return kind and link of each row of dry friction, and the links of the rings."""
+    rows = [(PIVOT, i) for i, link in enumerate(links) if link[OWNER] >= 0]
+    for wheel in world.wheels:
+        rows += [(ALONG, place[wheel.body]), (ACROSS, place[wheel.body])]
+    under = [place[patch.body] for patch in world.patches]
+    alone = [i for i in under if links[i][KIND] != FREE and links[i][PARENT] < 0]
+    return rows + [(UNDER, i) for i in alone], [i for i in under if i not in alone]
 
 
 def _ends(world: World, link: Link) -> tuple[int, int]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
@@ -265,18 +266,15 @@ class World:
         SimulationError
             If there is one.
         """
-        upright = {
-            body.name
-            for body, fixed in zip(self.scene.moving, never_turning(self.scene), strict=True)
-            if fixed
-        }
+        moving = [body.name for body in self.scene.moving]
+        upright = set(compress(moving, never_turning(self.scene)))
         for joint in self.scene.joints:
             if joint.traits.slides and not upright.intersection(joint.bodies or ()):
                 a, b = joint.bodies or ("", "")
                 raise SimulationError(
-                    f"the slider of {a} and {b} turns, and Chipmunk has no such joint for contacts"
-                    " and closed chains: expected a slider to the world or to a body that slides on"
-                    " it; keep the bodies apart from others, or use engine 'auto'"
+                    f"the slider of {a} and {b} turns, and Chipmunk, which steps contacts and"
+                    " closed chains, has no such joint; expected a slider to the world, or to a body that"
+                    " slides on it. Use engine 'auto', and keep other bodies and walls away"
                 )
 
     def _add_shapes(self) -> None:

@@ -12,7 +12,7 @@ from pbrl_ppl.errors import SceneError, SimulationError
 from pbrl_ppl.history import History, fill_joints
 from pbrl_ppl.physics import calls, check_placement
 from pbrl_ppl.physics.joints import LENGTH
-from pbrl_ppl.scene import WORLD, Joint, Scene, Shape
+from pbrl_ppl.scene import WORLD, Body, Joint, Scene, Shape
 from tests.helpers.worlds import G, body, predict, simulator, state
 
 needs_calls = pytest.mark.skipif(
@@ -20,17 +20,29 @@ needs_calls = pytest.mark.skipif(
 )
 BOX, ARM = Shape.box(0.2, 0.1), Shape.box(0.04, 0.6)
 SLOPE = 0.5
+C, S = math.cos(0.4), math.sin(0.4)
 ALONG = np.array([math.cos(SLOPE), math.sin(SLOPE)])
 
 
-def on_a_rail(*, turned: bool = False, backwards: bool = False, **options) -> Scene:
-    """A mass of 2 kg on an inclined rail, with a given angle against it."""
+def on_a_rail(
+    *, turned: bool = False, backwards: bool = False, post: bool = False, **options
+) -> Scene:
+    """A mass of 2 kg on an inclined rail, with a given angle against it.
+
+    It is that of the world, or of a static body that is turned by 0.4 rad.
+    """
     cart = dataclasses.replace(body("cart", BOX, mass=2.0), pose=(0.0, 0.0, 0.3))
     angle = SLOPE + math.pi * backwards - 0.3 * turned
     ends = [("cart", (0.05, 0.02)), (WORLD, (0.1, 0.2))]
     (a, at_a), (b, at_b) = ends[::-1] if turned else ends
     joint = Joint("slider", (a, b), at_a, at_b, axis=(math.cos(angle), math.sin(angle)))
-    given = {"time_step": 0.1, "gravity": (0.0, -G), "bodies": (cart,), "joints": (joint,)}
+    bodies = (cart,)
+    if post:
+        at = np.array([[C, S], [-S, C]]) @ (0.1 - 2.0, 0.2 - 1.0)
+        way = (math.cos(angle - 0.4), math.sin(angle - 0.4))
+        joint = Joint("slider", ("cart", "post"), (0.05, 0.02), tuple(at), axis=way)
+        bodies += (Body("post", BOX, static=True, pose=(2.0, 1.0, 0.4)),)
+    given = {"time_step": 0.1, "gravity": (0.0, -G), "bodies": bodies, "joints": (joint,)}
     return Scene(**given | options)
 
 
@@ -145,9 +157,13 @@ def turning_start(scene: Scene) -> np.ndarray:
 
 
 @needs_calls
-def test_energy_is_kept_on_a_turning_rail() -> None:
+@pytest.mark.parametrize("free", [False, True])
+def test_energy_is_kept_on_a_turning_rail(free) -> None:
+    """Which a hinge holds, or which falls."""
     scene = turning_rail()
     start = turning_start(scene)
+    if free:
+        scene = scene.replace(joints=scene.joints[1:])
     got = np.concatenate([start[None], predict(scene, start, horizon=40, tolerance=1e-10)])
     mass = np.array([1.2, 0.4, 0.3])
     moment = mass * [b.shape.unit_moment for b in scene.bodies]
@@ -157,20 +173,15 @@ def test_energy_is_kept_on_a_turning_rail() -> None:
     np.testing.assert_allclose(energy, energy[0], atol=1e-8)
     np.testing.assert_allclose(got[:, 1, 2] - got[:, 0, 2], 0.7, atol=1e-12)
     check_placement(scene, got)
-    again = fill_joints_from_one_coordinate(got, scene)
-    np.testing.assert_allclose(again, got, atol=1e-9)
-
-
-def fill_joints_from_one_coordinate(got: np.ndarray, scene: Scene) -> np.ndarray:
-    again = got[None].copy()
-    again[:, :, [0, 2]] = np.where(np.arange(6) % 3 == 2, again[:, :, [0, 2]], np.nan)
-    again[:, :, 1] = np.where(np.arange(6) % 3 == 1, again[:, :, 1], np.nan)
-    fill_joints(again, scene)
-    return again[0]
+    if not free:  # all follows from two angles and one position
+        known = np.array([2, 1, 2])[:, None] == np.arange(6) % 3
+        again = np.where(known, got, np.nan)[None]
+        fill_joints(again, scene)
+        np.testing.assert_allclose(again[0], got, atol=1e-9)
 
 
 @needs_calls
-@pytest.mark.parametrize("change", ["turned", "backwards"])
+@pytest.mark.parametrize("change", ["turned", "backwards", "post"])
 def test_the_order_of_bodies_and_the_way_of_the_axis_do_not_matter(change) -> None:
     effects = {"slider_friction": 3.0, "slider_damping": 0.5, "com_offset": (0.02, 0.01)}
     one, other = on_a_rail(), on_a_rail(**{change: True})
@@ -328,3 +339,6 @@ def test_a_body_off_its_rail_is_refused() -> None:
     off[0, :2] += 0.1 * np.array([-ALONG[1], ALONG[0]])
     with pytest.raises(SimulationError, match=r"anchors of the slider joint.*are 0.1 m apart"):
         check_placement(scene, off[None])
+    on[0, 2] += 0.5
+    with pytest.raises(SimulationError, match=r"cart is turned by 0.5 rad against world.*pose"):
+        check_placement(scene, on[None])
