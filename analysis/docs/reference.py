@@ -98,6 +98,7 @@ APPLIES = {
     "is_pivoted": "a body that hangs in a hinge",
     "is_sliding": "a body that a slider holds",
     "is_unpivoted": "a body that hangs in no hinge",
+    "is_unjoined": "a body that hangs in no hinge or slider",
     "_has_gravity": "any body, in a scene with `gravity`",
     "_is_pressed": "any body, in a scene with `normal_gravity` (a top view)",
     "_lacks_wheel": "a body without `wheel = true`, in a scene with `normal_gravity` (a top view)",

@@ -258,6 +258,11 @@ def is_unpivoted(scene: Scene, body: Body) -> bool:
     return not is_pivoted(scene, body)
 
 
+def is_unjoined(scene: Scene, body: Body) -> bool:
+    """Return whether the body hangs in no hinge or slider: a rod would hold its one coordinate."""
+    return not (is_pivoted(scene, body) or is_sliding(scene, body))
+
+
 def hanging_body(scene: Scene, joint: Joint) -> str:
     """Return the name of the body that hangs in a hinge or slider: the farther from the world.
 

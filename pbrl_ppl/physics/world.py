@@ -273,7 +273,7 @@ class World:
                 a, b = joint.bodies or ("", "")
                 raise SimulationError(
                     f"the slider of {a} and {b} turns, and Chipmunk, which steps contacts and"
-                    " closed chains, has no such joint; expected a slider to the world, or to a body"
+                    " closed chains, has no such joint; expected a slider to the world, or to one"
                     " that slides on it. Use engine 'auto', and keep other bodies and walls away"
                 )
 

@@ -10,6 +10,7 @@ from scipy.integrate import solve_ivp
 
 from pbrl_ppl.errors import SceneError, SimulationError
 from pbrl_ppl.history import History, fill_joints
+from pbrl_ppl.likelihood.coordinates import observed_coordinates
 from pbrl_ppl.physics import calls, check_placement
 from pbrl_ppl.physics.joints import LENGTH
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene, Shape
@@ -330,6 +331,11 @@ def test_missing_cells_are_completed(measured) -> None:
     speed = 0.3 * np.cos(time)[:, None] * ALONG
     np.testing.assert_allclose(start[2:-2, 3:5], speed[2:-2], atol=2e-3)
     assert history.dataset["observed"].isnull().to_numpy()[0, :, 0, 2].all()
+    # a filter takes one coordinate and its rate, from which the others follow
+    coordinates = observed_coordinates(scene, history)
+    assert coordinates.places.tolist() == ([1, 4] if measured == "y" else [0, 3])
+    states = np.where(np.isin(np.arange(6), coordinates.places), start, 7.0)[:, None]
+    np.testing.assert_allclose(coordinates.completed(scene, states)[:, 0], start, atol=1e-9)
 
 
 def test_a_body_off_its_rail_is_refused() -> None:
