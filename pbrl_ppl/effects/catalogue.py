@@ -10,13 +10,15 @@ from pbrl_ppl.effects.effect import Attached, Effect
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.scene import Scene
 
-#: Of effects that the data cannot separate, the earlier one is named: friction of a hinge before
+#: Of effects that the data cannot separate, the earlier one is named: friction of a joint before
 #: drag on a body, which looks the same on a single pendulum, and the simpler before the richer.
 catalogue: tuple[Effect, ...] = (
     friction.pivot_damping,
     friction.pivot_friction,
     friction.pivot_load_friction,
     friction.pivot_stribeck,
+    friction.slider_damping,
+    friction.slider_friction,
     drag.linear_drag,
     drag.quadratic_drag,
     drag.angular_drag,

@@ -268,8 +268,14 @@ def needs_inputs(effects: tuple[Attached, ...]) -> bool:
 
 def is_pivoted(scene: Scene, body: Body) -> bool:
     """Return whether the body hangs in a hinge: the hinge's friction acts on this body."""
-    hinges = (joint for joint in scene.joints if joint.kind == "hinge" and joint.bodies)
+    hinges = (joint for joint in scene.joints if joint.traits.pins_anchors and joint.bodies)
     return any(hanging_body(scene, joint) == body.name for joint in hinges)
+
+
+def is_sliding(scene: Scene, body: Body) -> bool:
+    """Return whether the body slides on an axis: the slider's friction acts on this body."""
+    sliders = (joint for joint in scene.joints if joint.traits.slides)
+    return any(hanging_body(scene, joint) == body.name for joint in sliders)
 
 
 def is_unpivoted(scene: Scene, body: Body) -> bool:
@@ -277,18 +283,23 @@ def is_unpivoted(scene: Scene, body: Body) -> bool:
     return not is_pivoted(scene, body)
 
 
+def is_unjoined(scene: Scene, body: Body) -> bool:
+    """Return whether the body hangs in no hinge or slider: a rod would hold its one coordinate."""
+    return not (is_pivoted(scene, body) or is_sliding(scene, body))
+
+
 def hanging_body(scene: Scene, joint: Joint) -> str:
-    """Return the name of the body that hangs in a hinge: the farther from the world by hinges.
+    """Return the name of the body that hangs in a hinge or slider: the farther from the world.
 
     Raises
     ------
     EffectError
-        If it is not known which bodies the hinge joins.
+        If it is not known which bodies the joint joins.
     """
     if joint.bodies is None:
-        raise EffectError("which bodies the hinge joins is to be inferred; none hangs in it yet")
+        raise EffectError("which bodies the joint joins is to be inferred; none hangs in it yet")
     depth = {body.name: 0 for body in scene.bodies if body.static or body.kinematic} | {WORLD: 0}
-    pairs = [hinge.bodies for hinge in scene.joints if hinge.kind == "hinge" and hinge.bodies]
+    pairs = [each.bodies for each in scene.joints if each.traits.hangs and each.bodies]
     for _ in pairs:
         for pair in pairs:
             for near, far in (pair, pair[::-1]):

@@ -1,4 +1,4 @@
-"""Friction in hinges, on the floor and of wheels; the engine solves it together with contacts."""
+"""Friction in joints, on the floor and of wheels; the engine solves it together with contacts."""
 
 import math
 from itertools import product
@@ -10,6 +10,7 @@ from pbrl_ppl.effects.effect import (
     EffectParameter,
     body_points,
     is_pivoted,
+    is_sliding,
     is_unpivoted,
 )
 from pbrl_ppl.effects.stages import Clock, Force, Friction, Properties, Values
@@ -60,6 +61,34 @@ pivot_friction = Effect(
     "Coulomb's law of friction",
     Properties(_add_pivot_torque),
     applies=is_pivoted,
+)
+
+
+slider_damping = Effect(
+    "slider_damping",
+    (
+        EffectParameter(
+            "coefficient", "N s/m", Prior("half_normal", sigma=1.0), scale="force/speed"
+        ),
+    ),
+    "viscous friction in the slider: a force against the sliding that grows with its speed",
+    "viscous force on the relative velocity along the axis, F = -c v",
+    Properties(_add_pivot_damping),
+    applies=is_sliding,
+)
+
+
+def _add_slider_force(properties: dict[str, Floats], parameters: Values, clock: Clock) -> None:
+    properties["pivot_torque"] = properties["pivot_torque"] + parameters["force"]
+
+
+slider_friction = Effect(
+    "slider_friction",
+    (EffectParameter("force", "N", Prior("half_normal", sigma=1.0), scale="force"),),
+    "dry friction in the slider: a steady force against the sliding that can also hold it still",
+    "Coulomb's law of friction",
+    Properties(_add_slider_force),
+    applies=is_sliding,
 )
 
 

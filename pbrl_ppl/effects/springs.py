@@ -6,7 +6,7 @@ from math import floor, pi
 import numpy as np
 from scipy.optimize import least_squares
 
-from pbrl_ppl.effects.effect import Effect, EffectParameter, body_points, is_unpivoted
+from pbrl_ppl.effects.effect import Effect, EffectParameter, body_points, is_unjoined, is_unpivoted
 from pbrl_ppl.effects.stages import Force, Rod, Structure, Values
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
@@ -371,7 +371,7 @@ distance_joint = Effect(
     " distance from a place",
     "J_d of Scholz et al., ICML 2014, section 3.2, to the world",
     Structure(rod=_rod),
-    applies=is_unpivoted,
+    applies=is_unjoined,
     scan=_scan_rods,
     log_odds=-8.0,
 )

@@ -44,7 +44,12 @@ Functions = namedtuple(
 #: C functions that set properties of constraints.
 SETTERS = sorted(
     {s.function for kind in JOINT_KINDS.values() for s in kind.settings}
-    | {s.function for kinds in BODY_CONSTRAINTS.values() for kind in kinds for s in kind.settings}
+    | {
+        s.function
+        for kinds in BODY_CONSTRAINTS.values()
+        for kind in kinds
+        for s in (*kind.settings, *kind.joint_settings)
+    }
 )
 _PLACE, _DOUBLE = ir.IntType(64), ir.DoubleType()
 

@@ -47,7 +47,7 @@ from pbrl_ppl.physics.motion import (
     strain,
 )
 from pbrl_ppl.physics.solids import near_contact
-from pbrl_ppl.physics.tree import ALONG, TURNING
+from pbrl_ppl.physics.tree import ALONG, FIRST, TURNING
 from pbrl_ppl.state import Floats
 
 #: Times of the stages, weights of earlier slopes, and those of the error estimate.
@@ -133,6 +133,14 @@ def _slowest(work, laws, r):  # type: ignore[no-untyped-def]
 
 
 @compiled
+def _size(work, laws, r):  # type: ignore[no-untyped-def]
+    """Return the natural size of a row's way: of a wheel's in m, or of its joint's coordinate."""
+    if work.kinds[r, 0] >= ALONG:
+        return laws.length
+    return work.motion[SIZE, work.tree[work.kinds[r, 1], FIRST]]
+
+
+@compiled
 def _set_wheel(work, r, mode):  # type: ignore[no-untyped-def]
     """Set the mode of rows of a wheel, or against turning, under the body of a ring at place r."""
     for row in range(work.n_rows):
@@ -161,7 +169,7 @@ def _decide(work, laws, inputs, share, low, high):  # type: ignore[no-untyped-de
             continue
         if r < count:
             speed = row_speed(work, r, U)
-            size = laws.length if kinds[r, 0] >= ALONG else 1.0
+            size = _size(work, laws, r)
             if abs(speed) * laws.time_step > still * size:
                 kinds[r, 2] = 1 if speed > 0.0 else -1
             moved = speed != 0.0
@@ -237,7 +245,7 @@ def _margin(work, laws, u):  # type: ignore[no-untyped-def]
             bound = max(work.rows[r, BOUND], 1e-300)
             least = min(least, 1.0 - abs(work.rows[r, FORCE]) / bound)
         elif mode != SMOOTH:
-            size = laws.length if work.kinds[r, 0] >= ALONG else 1.0
+            size = _size(work, laws, r)
             least = min(least, mode * row_speed(work, r, u) * laws.time_step / size)
     return least
 

@@ -62,6 +62,7 @@ def rollout(
     touched : bool
         Whether shapes came into contact.
     """
+    world.check_steps()
     properties, joints = numbers.bodies[proposal], numbers.joints[proposal]
     timed = len(properties) > 1
     bodies = properties[item * len(inputs) if timed else 0]

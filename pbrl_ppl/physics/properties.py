@@ -22,14 +22,15 @@ from pbrl_ppl.effects import (
 )
 from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.parameters import BODY_PARAMETERS, Layout
-from pbrl_ppl.physics.joints import JOINT_COLUMNS, SceneJoints
+from pbrl_ppl.physics.joints import JOINT_COLUMNS, LENGTH, SceneJoints, never_turning
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats
 
 #: Columns of a body's properties. ``moment`` is about the centre of mass (kg m^2), which is at
 #: ``com_x`` and ``com_y`` of the body's frame (m); ``pivot_torque`` (N m) and ``pivot_damping``
-#: (N m s) act in the body's hinge, ``turn_torque`` (N m) against any turning of a free one;
-#: ``patch_mu`` (1) and ``patch_radius`` (m) describe the friction under it, ``extra_gravity_x`` and
+#: (N m s) act in the body's hinge (along its slider: N and N s/m), ``turn_torque`` (N m) against any
+#: turning of a free one; ``patch_mu`` (1) and ``patch_radius`` (m) describe the friction under it,
+#: ``extra_gravity_x`` and
 #: ``extra_gravity_y`` (m/s^2) are added to the scene's gravity.
 COLUMNS = (
     *BODY_PARAMETERS,
@@ -72,7 +73,7 @@ class EngineInput(NamedTuple):
         Shape (proposal, 1, body, column), columns as in :data:`COLUMNS`, SI units; or (proposal,
         interval, body, column) where they depend on the time.
     joints : ndarray
-        Shape (proposal, joint, 5), columns as in :data:`JOINT_COLUMNS`, m.
+        Shape (proposal, joint, 9), columns as in :data:`JOINT_COLUMNS`, m.
     discs : ndarray
         x, y and radius of hidden discs, shape (proposal, disc, 3), m.
     commands, forces, frictions : ndarray
@@ -135,6 +136,9 @@ class EngineProperties:
         stages = (Structure, Properties, Command, Force, Friction, Sensor)
         self._acting: dict[type, list[Attached]] = {s: at_stage(effects, s) for s in stages}
         self._bodies = bodies
+        #: Which bodies never turn, and all reference angles.
+        self.upright = never_turning(scene)
+        self.angles = np.array([scene.reference_angle(name) for name in bodies])
         #: Whether a body's numbers depend on time.
         self.timed = any(
             isinstance(attached.effect.stage, Properties) and attached.effect.stage.timed
@@ -209,6 +213,7 @@ class EngineProperties:
         bodies[:, body, column] = phi[:, place]
         bodies = self._modified(bodies, phi, clock)
         self._check(bodies)
+        bodies[..., self.upright, COLUMN.moment] = np.inf
         joints, indices = self.joints(phi)
         if self._tying:
             joints = np.concatenate([joints, self._rods(phi)], axis=1)
@@ -278,12 +283,12 @@ class EngineProperties:
         return discs
 
     def _rods(self, phi: Floats) -> Floats:
-        """Return the structure stage's rods, shape (proposal, rod, 5)."""
-        rods = np.empty((len(phi), len(self._tying), len(JOINT_COLUMNS)))
+        """Return the structure stage's rods, shape (proposal, rod, 9)."""
+        rods = np.zeros((len(phi), len(self._tying), len(JOINT_COLUMNS)))
         for j, (attached, rod) in enumerate(self._tying):
             ends = rod(self.values(attached, phi))
-            rods[:, j] = np.stack(np.broadcast_arrays(*ends), axis=-1)
-        if not (np.isfinite(rods).all() and (rods[..., 4] >= 0).all()):
+            rods[:, j, : LENGTH + 1] = np.stack(np.broadcast_arrays(*ends), axis=-1)
+        if not (np.isfinite(rods).all() and (rods[..., LENGTH] >= 0).all()):
             raise ParameterError(
                 "a rod that an effect adds has an end or a length that is not finite, or a length"
                 " below 0; give finite numbers, and 0 for no rod"

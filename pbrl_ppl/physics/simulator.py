@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.effects import Clock, Command, Force, Friction, at_stage, needs_inputs
 from pbrl_ppl.errors import SimulationError
-from pbrl_ppl.history import fill_hinges, hung_bodies
+from pbrl_ppl.history import fill_joints, joint_coordinates
 from pbrl_ppl.parameters import Layout, differentiate
 from pbrl_ppl.physics import calls, plain
 from pbrl_ppl.physics.engines import Batch, Engine, share_out
-from pbrl_ppl.physics.joints import on_rod
+from pbrl_ppl.physics.joints import LENGTH, on_rod
 from pbrl_ppl.physics.properties import EngineInput, EngineProperties
 from pbrl_ppl.physics.world import FINER, World
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import INPUT, WRENCH, Floats, Ints
+from pbrl_ppl.state import INPUT, STATE, THETA, VELOCITY, WRENCH, Floats, Ints
 
 if TYPE_CHECKING:
     from pbrl_ppl.physics.physics import Physics
@@ -121,6 +121,10 @@ class Simulator:
         n, horizon, k = actions.shape[:3]
         begin = None if clock is None else clock.begin.reshape(1, n, horizon)[..., 0]
         starts = self._on_rods(self._states(proposals, start, begin), numbers.joints)
+        if (upright := self._properties.upright).any():
+            starts = starts.copy()
+            starts[..., upright, THETA] = self._properties.angles[upright]
+            starts[..., upright, THETA + VELOCITY] = 0.0
         out = np.full((len(proposals), n, horizon, k, 6), np.nan)
         plain = self.physics.engine == "python" or not calls.AVAILABLE
         run = self._run_plain if plain else self._run_compiled
@@ -146,7 +150,7 @@ class Simulator:
         Friction under bodies does not, where its coefficient is zero: a derivative there is not to
         see the difference of two solvers.
         """
-        tied = numbers.joints[:, len(self.physics.scene.joints) :, -1] > 0
+        tied = numbers.joints[:, len(self.physics.scene.joints) :, LENGTH] > 0
         proposals, joints, _ = numbers.indices.shape
         indices = numbers.indices.reshape(proposals, 2 * joints)
         keys = np.column_stack([tied, indices])
@@ -182,11 +186,12 @@ class Simulator:
             if sensor.timed and begin is not None:
                 flat["time"] = begin
             states[:, :, i] = sensor.invert(states[:, :, i], flat)
-        # a hinged body's place follows from its angle
+        # of a body in joints all follows from one coordinate
         names = [body.name for body in self.physics.scene.moving]
-        hung = [names.index(name) for name in hung_bodies(self.physics.scene)]
-        states[:, :, hung, 0:2] = states[:, :, hung, 3:5] = np.nan
-        fill_hinges(states, self.physics.scene)
+        for name, column in joint_coordinates(self.physics.scene).items():
+            others = [d for d in range(len(STATE)) if d % VELOCITY != column]
+            states[:, :, names.index(name), others] = np.nan
+        fill_joints(states, self.physics.scene)
         return states
 
     def _on_rods(self, states: Floats, joints: Floats) -> Floats:
@@ -195,7 +200,7 @@ class Simulator:
             states = _each(states, len(joints))
         for i, position in self._properties.tied:
             moment = self.physics.scene.moving[i].shape.unit_moment
-            states[:, :, i] = on_rod(states[:, :, i], joints[:, position], moment)
+            states[:, :, i] = on_rod(states[:, :, i], joints[:, position, : LENGTH + 1], moment)
         return states
 
     def jacobian(self, phi: Floats, start: Floats, actions: Floats, step: float = 1e-5) -> Floats:
