@@ -68,6 +68,7 @@ def grid_points(
         return []
     body = problem.scene.body(candidate.body)
     wide = problem.with_physics(effects=(*problem.physics.effects, candidate)).rough
+    coarse = proposed is None
     if proposed is None:
         proposed, wide = effect.scan(problem.scene, problem.data.history, body), wide.coarse
     declared = wide.layout.places(problem.layout.labels)
@@ -85,19 +86,21 @@ def grid_points(
     lower, upper = np.array([p.prior.support for p in effect.parameters]).T
     # one-sided where the null is the least that there can be
     ahead, behind = np.minimum(null + steps, upper) - null, np.maximum(null - steps, lower) - null
-    nothing = whitened(null[None])[0]
+    if coarse:  # one side will do to choose from
+        behind = np.where(ahead > 0.0, 0.0, behind)
+    nothing = whitened(null[None])
     kept = []
     for begin in range(0, len(proposed), at_once):
         part = slice(begin, begin + at_once)
         points, plan = _points(proposed[part], free[part], null, (ahead, behind))
-        states = whitened(points)
+        states = np.vstack([nothing, whitened(points)])
         for values, columns, rows in plan:
             if columns:
                 ends = states[rows].reshape(len(columns), 2, -1)
                 width = (ahead - behind)[list(columns)]
                 signature = ((ends[:, 0] - ends[:, 1]) / width[:, None]).T
             else:
-                signature = (states[rows] - nothing).T
+                signature = (states[rows] - states[0]).T
             if np.any(signature):
                 kept.append(GridPoint(values, signature, columns))
     return kept
@@ -106,21 +109,27 @@ def grid_points(
 def _points(
     proposed: Floats, free: Floats, null: Floats, steps: tuple[Floats, Floats]
 ) -> tuple[Floats, list[tuple[Floats, tuple[int, ...], list[int]]]]:
-    """Return points to simulate, and each grid point's values, free columns and rows of points."""
+    """Return points to simulate, and each grid point's values, free columns and rows of states.
+
+    Row 0 is that at the null value, where no column has an effect.
+    """
     points: list[Floats] = []
     plan = []
     for row, unknown in zip(proposed, free, strict=True):
         values = np.where(unknown, null, row)
         columns = tuple(int(i) for i in np.flatnonzero(unknown))
-        begin = len(points)
+        rows = []
         for column in columns:
             for step in steps:
                 moved = values.copy()
                 moved[column] += step[column]
-                points.append(moved)
+                if step[column] != 0.0:
+                    points.append(moved)
+                rows.append(len(points) if step[column] != 0.0 else 0)
         if not columns:
             points.append(values)
-        plan.append((values, columns, list(range(begin, len(points)))))
+            rows = [len(points)]
+        plan.append((values, columns, rows))
     return np.array(points), plan
 
 

@@ -398,14 +398,47 @@ class Search:
         top = max(one[0].nats for one in enough)
         tied = [one for one in enough if one[0].nats > top - limits.least_nats]
         _, subset, fitted = min(tied, key=lambda one: (len(one[2].phi), -one[0].nats))
+        subset, fitted = self._best_of_family(mode, subset, fitted, regression, weight)
         self.say(f"simulations name {' and '.join(map(_name, subset.laws))}")
         rivals = {
-            law: _rivals(regression, subset, law, limits.least_nats) for law in subset.laws
+            law: _rivals(regression, subset, law, limits.least_nats)
+            for law in subset.laws
+            if law in regression.same
         }  # each law has to be worth its price
         paid = {law: -price for law, price in subset.prices.items()}
         grown = _Model(fitted, {**model.earlier, **paid}, {**model.rivals, **rivals})
         pruned = self._pruned(grown.fitted())
         return pruned if set(pruned.earlier) - set(model.earlier) else model
+
+    def _best_of_family(
+        self, before: Mode, subset: Subset, fitted: Mode, regression: Regression, weight: Floats
+    ) -> tuple[Subset, Mode]:
+        """Return the subset and its refit, with the laws of each one's family that do better."""
+        scored = {one.attached: one for one in regression.signatures if one.linear}
+        for law in subset.laws:
+            there = fitted.problem.physics.effects
+            rivals = [
+                one for one in scored
+                if law.effect.family and one.effect.family == law.effect.family
+                and one.body == law.body and one not in there
+            ]  # fmt: skip
+            sizes = {one: np.array(list(scored[one].candidate.estimate.values())) for one in rivals}
+            swaps = in_parallel(partial(_swapped, fitted, law, sizes), rivals)
+            nats = [
+                Evidence.of(before, mode, -one.effect.log_odds, weight).nats
+                for one, mode in zip((law, *rivals), (fitted, *swaps), strict=True)
+            ]
+            best = int(np.argmax(nats))
+            if nats[best] > nats[0] + self.criteria.search.least_nats:
+                better, fitted = rivals[best - 1], swaps[best - 1]
+                price = subset.prices[law] + law.effect.log_odds - better.effect.log_odds
+                subset = replace(
+                    subset,
+                    sizes={better if one == law else one: v for one, v in subset.sizes.items()},
+                    prices={better if one == law else one: v for one, v in subset.prices.items()}
+                    | {better: price},
+                )
+        return subset, fitted
 
     def _pruned(self, model: _Model, least: float = 0.0) -> _Model:
         """Drop laws whose evidence, summed over lengths, does not pay their price.

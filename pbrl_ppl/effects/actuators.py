@@ -139,6 +139,7 @@ actuator_delay = Effect(
     "pure time delay of a held input, u(t - share dt)",
     Command(_delay, memory=_LATEST - 1, remember=_remember_past, jumps=True),
     scan=_scan_delays,
+    family="late command",
 )
 
 
@@ -169,6 +170,7 @@ first_order_lag = Effect(
     "first-order lag, T df/dt = u - f",
     Command(_lag, memory=1, remember=_remember_lag),
     scan=_scan_lags,
+    family="late command",
 )
 
 
@@ -216,6 +218,7 @@ rate_limit = Effect(
     Command(_ramp, memory=1, remember=_remember_ramp),
     scan=_scan_rates,
     log_odds=-2.0,
+    family="late command",
 )
 
 
@@ -237,6 +240,7 @@ actuator_backlash = Effect(
     "play operator (G. Tao and P. V. Kokotovic, 1996)",
     Command(_play, memory=1, remember=_remember_play),
     log_odds=-2.0,
+    family="late command",
 )
 
 
@@ -272,6 +276,7 @@ dead_zone = Effect(
     Command(_subtract_threshold),
     scan=_scan_dead_zones,
     log_odds=-2.0,
+    family="shape of the command",
 )
 
 
@@ -298,6 +303,7 @@ force_cutoff = Effect(
     Command(_cut_off),
     scan=_scan_cutoffs,
     log_odds=-3.0,
+    family="shape of the command",
 )
 
 
@@ -329,6 +335,7 @@ saturation = Effect(
     Command(_saturate),
     scan=_scan_limits,
     log_odds=-2.0,
+    family="shape of the command",
 )
 
 
@@ -402,6 +409,7 @@ gain_by_sign = Effect(
     "gain of an actuator by sign, f = u + a |u|",
     Command(_by_sign),
     log_odds=-1.0,
+    family="shape of the command",
 )
 
 
@@ -423,6 +431,7 @@ command_power = Effect(
     Command(_by_power),
     constants=("force", "torque"),
     log_odds=-1.0,
+    family="shape of the command",
 )
 
 
@@ -445,6 +454,7 @@ gain_by_speed = Effect(
     Command(_by_speed),
     constants=("speed", "turn_rate"),
     log_odds=-1.0,
+    family="shape of the command",
 )
 
 
@@ -521,4 +531,5 @@ power_limit = Effect(
     Command(_limit_power),
     scan=_scan_powers,
     log_odds=-3.0,
+    family="shape of the command",
 )

@@ -26,6 +26,7 @@ linear_drag = Effect(
     "a force against the motion that grows with the speed, as in oil or at low speed in air",
     "Stokes' law, F = -c v",
     Force(_linear),
+    family="drag",
 )
 
 
@@ -41,6 +42,7 @@ quadratic_drag = Effect(
     "a force against the motion that grows with the square of the speed, as in air or water",
     "Rayleigh's drag equation, F = -c |v| v",
     Force(_quadratic),
+    family="drag",
 )
 
 
@@ -54,6 +56,7 @@ angular_drag = Effect(
     "a torque against the rotation that grows with the angular speed",
     "viscous torque, tau = -c omega",
     Force(_angular),
+    family="angular drag",
 )
 
 
@@ -68,6 +71,7 @@ quadratic_angular_drag = Effect(
     " a stirrer",
     "drag of a rotor, tau = -c |omega| omega",
     Force(_quadratic_angular),
+    family="angular drag",
 )
 
 
@@ -98,6 +102,7 @@ power_drag = Effect(
     scan=_scan_exponents,
     constants=("speed",),
     log_odds=-2.0,
+    family="drag",
 )
 
 
@@ -117,6 +122,7 @@ power_angular_drag = Effect(
     scan=_scan_exponents,
     constants=("turn_rate",),
     log_odds=-2.0,
+    family="angular drag",
 )
 
 
@@ -139,6 +145,7 @@ drag_by_axis = Effect(
     "linear drag with two coefficients in the body's frame (T. I. Fossen, 2011)",
     Force(_linear_by_axis),
     log_odds=-1.0,
+    family="drag",
 )
 
 
@@ -162,6 +169,7 @@ quadratic_drag_by_axis = Effect(
     Force(_quadratic_by_axis),
     applies=is_unpivoted,
     log_odds=-1.0,
+    family="drag",
 )
 
 

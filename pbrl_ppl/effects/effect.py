@@ -127,6 +127,9 @@ class Effect:
         Products of natural units of the body, as for a parameter's scale: the law finds their SI
         values after its parameters, so that a shape that is no power of a unit suits a rig of any
         size.
+    family : str
+        Name of laws of which one may be taken for another, such as a lag and a delay: where one is
+        found the others are tried in its place.
     log_odds : float
         Logarithm of the prior odds that a rig has this effect, beside common ones such as drag,
         friction or a constant force (nats, at most 0): part of the price of a law in a search.
@@ -163,6 +166,7 @@ class Effect:
     applies: Callable[[Scene, Body], bool] = always
     scan: Scan | None = None
     constants: tuple[str | float, ...] = ()
+    family: str = ""
     log_odds: float = 0.0
     force: InitVar[Law | None] = None
 

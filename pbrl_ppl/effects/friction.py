@@ -61,6 +61,7 @@ pivot_friction = Effect(
     "Coulomb's law of friction",
     Properties(_add_pivot_torque),
     applies=is_pivoted,
+    family="dry friction",
 )
 
 
@@ -89,6 +90,7 @@ slider_friction = Effect(
     "Coulomb's law of friction",
     Properties(_add_slider_force),
     applies=is_sliding,
+    family="dry friction",
 )
 
 
@@ -116,6 +118,7 @@ pivot_stribeck = Effect(
     applies=is_pivoted,
     scan=_scan_turn_rates,
     log_odds=-2.0,
+    family="dry friction",
 )
 
 
@@ -132,6 +135,7 @@ pivot_load_friction = Effect(
     Friction(_grow_with_load),
     applies=is_pivoted,
     log_odds=-1.0,
+    family="dry friction",
 )
 
 
@@ -150,6 +154,7 @@ pivot_angle_friction = Effect(
     Friction(_vary_with_angle),
     applies=is_pivoted,
     log_odds=-3.0,
+    family="dry friction",
 )
 
 

@@ -227,7 +227,7 @@ cable = Effect(
         EffectParameter("stiffness", "N/m", Prior("half_normal", sigma=3.0), scale="force/length"),
         EffectParameter("anchor_x", "m", _PLACE, scale="range", origin="x"),
         EffectParameter("anchor_y", "m", _PLACE, scale="range", origin="y"),
-        EffectParameter("length", "m", Prior("half_normal", sigma=1.0), null=1.0, scale="range"),
+        EffectParameter("length", "m", Prior("half_normal", sigma=1.0), scale="range"),
     ),
     "a pull towards a place that begins beyond a distance: a springy cable that gets taut",
     "one-sided spring, F = -k max(0, r - l)",

@@ -155,7 +155,8 @@ class Command:
     timed : bool
         Whether the law depends on the time.
     jumps : bool
-        Whether the wrench may jump within an interval, as a late one does.
+        Whether the wrench jumps within an interval, as a late one does: at the fractional part of
+        the first parameter, as a share of it.
 
     Raises
     ------

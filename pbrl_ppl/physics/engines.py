@@ -31,7 +31,6 @@ class Batch(NamedTuple):
     forces: Ints
     frictions: Ints
     slots: int
-    late: bool
     follows: NDArray[np.bool_]
     start: Floats
     inputs: Floats

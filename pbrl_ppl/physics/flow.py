@@ -15,7 +15,17 @@ from typing import NamedTuple
 import numpy as np
 
 from pbrl_ppl.physics.compilation import compiled
-from pbrl_ppl.physics.laws import COMMAND, LATE, WRENCHES, Laws, act, laws_of, set_memory
+from pbrl_ppl.physics.laws import (
+    COMMAND,
+    FIRST,
+    JUMPS,
+    LATE,
+    WRENCHES,
+    Laws,
+    act,
+    laws_of,
+    set_memory,
+)
 from pbrl_ppl.physics.motion import (
     BIAS,
     BOUND,
@@ -47,7 +57,8 @@ from pbrl_ppl.physics.motion import (
     strain,
 )
 from pbrl_ppl.physics.solids import near_contact
-from pbrl_ppl.physics.tree import ALONG, FIRST, TURNING
+from pbrl_ppl.physics.tree import ALONG, TURNING
+from pbrl_ppl.physics.tree import FIRST as COORDINATE
 from pbrl_ppl.state import Floats
 
 #: Times of the stages, weights of earlier slopes, and those of the error estimate.
@@ -98,30 +109,17 @@ def _load(work, flow, u, inputs, share, low, high):  # type: ignore[no-untyped-d
 
 
 @compiled
-def _switch(work, laws, inputs, low):  # type: ignore[no-untyped-def]
-    """Return the first time after ``low`` at which commands jump, as a share of the interval; or 1.
-
-    Of commands that change steadily it is none.
-    """
-    k, begin, end = work.n_bodies, low, 1.0
-    first = np.empty((k, 3))
-    for tries in range(52):
-        share = low if tries == 0 else 1.0 if tries == 1 else 0.5 * (begin + end)
-        share = max(low, min(share, 1.0 - _WINDOW))
-        act(work.states, inputs, laws.laws, share, share + _WINDOW, work.acted, laws.memory[1])
-        same = True
-        for i in range(k):
-            for w in range(3):
-                if tries == 0:
-                    first[i, w] = work.acted[i, COMMAND + w]
-                same &= first[i, w] == work.acted[i, COMMAND + w]
-        if tries == 1 and same:
-            return 1.0
-        if tries > 1 and same:
-            begin = share
-        elif tries > 1:
-            end = share
-    return begin + _WINDOW if low + _SHORTEST < begin < 1.0 - _SHORTEST else 1.0
+def _switch(laws, low):  # type: ignore[no-untyped-def]
+    """Return the first time after ``low`` at which a command jumps, as a share of the interval."""
+    high = 1.0
+    for e in range(len(laws.commands)):
+        law = laws.commands[e]
+        if law[JUMPS] > 0:
+            share = laws.command_parameters[law[FIRST]]
+            share -= math.floor(share)
+            if low + _SHORTEST < share < high - _SHORTEST:
+                high = share
+    return high
 
 
 @compiled
@@ -137,7 +135,7 @@ def _size(work, laws, r):  # type: ignore[no-untyped-def]
     """Return the natural size of a row's way: of a wheel's in m, or of its joint's coordinate."""
     if work.kinds[r, 0] >= ALONG:
         return laws.length
-    return work.motion[SIZE, work.tree[work.kinds[r, 1], FIRST]]
+    return work.motion[SIZE, work.tree[work.kinds[r, 1], COORDINATE]]
 
 
 @compiled
@@ -451,9 +449,7 @@ def rollout(works, still, batch, items, begins, out):  # type: ignore[no-untyped
                         work.states[k, 3 + w] = inputs[k, w]
             while high < 1.0 and budget > 0:
                 low, high = high, 1.0
-                if batch.late:
-                    set_places(work, Q, U)
-                    high = _switch(work, flow, inputs, low)
+                high = _switch(laws, low)
                 budget, wanted = _advance(work, flow, still, inputs, low, high, budget, wanted)
             if batch.slots > 0:
                 act(work.states, inputs, laws, LATE, 1.0, work.acted, memory[1], True)

@@ -18,8 +18,9 @@ COMMAND, PREVIOUS, WRENCHES, TIME, INTERVAL, ACTED = 0, 3, 6, 9, 10, 12
 #: Further rows of what acts: a law's command and its memory, and the wrench of a law of one number.
 MORE = 4
 #: Columns of a law: its address, body, first parameter, the address of `remember`, its first number
-#: in the memory, how many, the component that is alone (-1: none), and whether it is under a body.
-LAW, ON, FIRST, REMEMBER, SLOT, SLOTS, ALONE, UNDER = range(8)
+#: in the memory, how many, the component that is alone (-1: none), whether it is under a body, and
+#: whether the command jumps in an interval, at the fractional part of the first parameter.
+LAW, ON, FIRST, REMEMBER, SLOT, SLOTS, ALONE, UNDER, JUMPS = range(9)
 
 
 class Laws(NamedTuple):

@@ -28,10 +28,9 @@ from pbrl_ppl.state import Floats
 
 #: Columns of a body's properties. ``moment`` is about the centre of mass (kg m^2), which is at
 #: ``com_x`` and ``com_y`` of the body's frame (m); ``pivot_torque`` (N m) and ``pivot_damping``
-#: (N m s) act in the body's hinge (along its slider: N and N s/m), ``turn_torque`` (N m) against any
-#: turning of a free one; ``patch_mu`` (1) and ``patch_radius`` (m) describe the friction under it,
-#: ``extra_gravity_x`` and
-#: ``extra_gravity_y`` (m/s^2) are added to the scene's gravity.
+#: (N m s) act in the body's hinge (along its slider: N and N s/m), ``turn_torque`` (N m) against
+#: any turning of a free one; ``patch_mu`` (1) and ``patch_radius`` (m) describe the friction under
+#: it, ``extra_gravity_x`` and ``extra_gravity_y`` (m/s^2) are added to the scene's gravity.
 COLUMNS = (
     *BODY_PARAMETERS,
     "moment",

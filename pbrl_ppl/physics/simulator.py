@@ -248,11 +248,8 @@ class Simulator:
         return np.array(counts, dtype=np.int64), np.array(weights, dtype=float)
 
     @cached_property
-    def _laws(self) -> tuple[Ints, Ints, Ints, int, bool]:
-        """Rows of the laws of commands, forces and friction as in `laws`, numbers remembered.
-
-        And whether commands may jump within an interval.
-        """
+    def _laws(self) -> tuple[Ints, Ints, Ints, int]:
+        """Rows of the laws of commands, forces and friction as in `laws`, numbers remembered."""
         names, slots = [body.name for body in self.physics.scene.moving], 0
         tables = []
         for kind in (Command, Force, Friction):
@@ -267,13 +264,13 @@ class Simulator:
                 rows.append((
                     calls.law_address(stage.law), names.index(attached.body), first, remember or 0,
                     slots, count, alone, int(getattr(stage, "under", False)),
+                    int(getattr(stage, "jumps", False)),
                 ))  # fmt: skip
                 first += len(attached.effect.parameters) + len(attached.effect.constants)
                 slots += count
-            tables.append(np.array(rows, dtype=np.int64).reshape(-1, 8))
+            tables.append(np.array(rows, dtype=np.int64).reshape(-1, 9))
         commands, forces, frictions = tables
-        late = any(one.effect.stage.jumps for one in at_stage(self.physics.effects, Command))  # type: ignore[union-attr]
-        return commands, forces, frictions, slots, late
+        return commands, forces, frictions, slots
 
     def _new_world(self, choice: Choice) -> World:
         joined, there = choice

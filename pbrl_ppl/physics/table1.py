@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pbrl_ppl.effects import Attached
+from pbrl_ppl.effects import Attached, EffectParameter
 from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.parameters import (
     BODY_PARAMETERS,
@@ -238,12 +238,15 @@ def build_layout(scene: Scene, effects: tuple[Attached, ...] = ()) -> Layout:
     blocks += _joint_blocks(scene)
     for effect in dict.fromkeys(attached.effect.name for attached in effects):
         those = [attached.in_si(scene) for attached in effects if attached.effect.name == effect]
-        on = tuple(attached.body for attached in those)
-        parameters = zip(*(attached.effect.parameters for attached in those), strict=True)
-        for name, alike in zip(those[0].variables, parameters, strict=True):
+        by_name: dict[str, dict[str, EffectParameter]] = {}  # not every body has all
+        for attached in those:
+            for name, parameter in zip(attached.variables, attached.effect.parameters, strict=True):
+                by_name.setdefault(name, {})[attached.body] = parameter
+        for name, alike in by_name.items():
             priors = tuple(
                 declared_prior(scene.body(owner), name, parameter.prior)
-                for owner, parameter in zip(on, alike, strict=True)
+                for owner, parameter in alike.items()
             )
-            blocks.append(Block(name, on, alike[0].unit, priors, effect=effect))
+            unit = next(iter(alike.values())).unit
+            blocks.append(Block(name, tuple(alike), unit, priors, effect=effect))
     return Layout(tuple(blocks))

@@ -21,13 +21,19 @@ BOX = Shape.box(0.9, 0.55)
 MASS = 2.0
 INERTIA = MASS * BOX.unit_moment
 NAMES = [effect.name for effect in catalogue]
+#: Limits that nothing reaches.
+LIMITS = ("saturation", "torque_saturation", "rate_limit", "torque_rate_limit", "power_limit")
 #: How far from nothing shows an effect, where 0.3 is too little or too much.
 AWAY = {
     "dead_zone": 5.0,
     "force_cutoff": 5.0,
     "magnus_force": 0.01,
-    "saturation": 1.0 - BY_NAME["saturation"].null[0],
+    "quadratic_angular_drag": 1e-3,
+    "power_angular_drag": 1e-3,
+    "cubic_torsion_spring": 1e-2,
 }
+#: What changes dry friction under a body needs some.
+BESIDE = dict.fromkeys(("sliding_stribeck", "friction_by_place"), "sliding_friction")
 PATHS = pytest.mark.parametrize("path", ["auto", "python"])
 
 
@@ -87,12 +93,23 @@ def test_null_value_is_no_effect(name, path) -> None:
     rng = np.random.default_rng(8)
     start = rng.normal(0, 1, (15, 2, 6)) * [0.2, 0.2, 1, 2, 2, 2]
     actions = rng.normal(0, 5, (15, 2, 2, 3))
-    without = simulator(scene, engine=path)(np.zeros(0), start, actions)
-    effect = BY_NAME[name]
-    sim = simulator(scene, (effect,), engine=path)
-    null = np.repeat(effect.null, sim.physics.layout.size // len(effect.parameters))
-    np.testing.assert_array_equal(sim(null, start, actions), without)
-    away = sim(null + AWAY.get(name, 0.3), start, actions)
+    inputs = np.concatenate([actions, 0.5 * actions, 0.0 * actions], axis=-1)
+    inputs[..., 7] = np.array([0.3, 0.4])[:, None]
+    inputs[..., 8] = inputs[..., 7] + scene.time_step
+    effect, beside = BY_NAME[name], [BY_NAME[BESIDE[name]]] if name in BESIDE else []
+    plain = simulator(scene, beside, engine=path)
+    without = plain(np.full(plain.physics.layout.size, 0.3), start, inputs)
+    sim = simulator(scene, (*beside, effect), engine=path)
+    values = {
+        label: null
+        for one in sim.physics.effects
+        for label, null in zip(one.labels, one.effect.null, strict=True)
+    }
+    null, moved = np.array([(values[x], x.startswith(name)) for x in sim.physics.layout.labels]).T
+    null = np.where(moved > 0, null, 0.3)
+    np.testing.assert_array_equal(sim(null, start, inputs), without)
+    there = np.where(moved > 0, 1.0, null) if name in LIMITS else null + moved * AWAY.get(name, 0.3)
+    away = sim(there, start, inputs)
     if isinstance(effect.stage, Noise):  # it changes the likelihood alone
         np.testing.assert_array_equal(away, without)
     else:
