@@ -82,7 +82,7 @@ def _slope(work, laws, u, a, inputs, share, low, high):  # type: ignore[no-untyp
     ``low`` and ``high`` are the ends of the piece, as shares of the interval.
     """
     if len(laws.commands) + len(laws.forces) > 0:
-        begin = max(low, min(share, high - _WINDOW))
+        begin = min(max(low + _SHORTEST, share), high - _WINDOW)  # past a jump that is no switch
         act(
             work.states, inputs, laws.commands, laws.command_parameters, laws.forces,
             laws.force_parameters, begin, begin + _WINDOW, work.acted,
@@ -101,7 +101,7 @@ def _switch(work, laws, inputs, low):  # type: ignore[no-untyped-def]
     first = np.empty((k, 3))
     for tries in range(52):
         share = low if tries == 0 else 1.0 if tries == 1 else 0.5 * (begin + end)
-        share = max(low, min(share, 1.0 - _WINDOW))
+        share = min(max(low + _SHORTEST, share), 1.0 - _WINDOW)
         act(
             work.states, inputs, laws.commands, laws.command_parameters, laws.forces,
             laws.force_parameters, share, share + _WINDOW, work.acted,
@@ -118,7 +118,7 @@ def _switch(work, laws, inputs, low):  # type: ignore[no-untyped-def]
             begin = share
         elif tries > 1:
             end = share
-    return begin + _WINDOW if low + _SHORTEST < begin < 1.0 - _SHORTEST else 1.0
+    return begin + _WINDOW if begin < 1.0 - _SHORTEST else 1.0
 
 
 @compiled
