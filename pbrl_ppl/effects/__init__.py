@@ -10,6 +10,7 @@ from .effect import EffectParameter as EffectParameter
 from .effect import at_stage as at_stage
 from .effect import hanging_body as hanging_body
 from .effect import needs_inputs as needs_inputs
+from .effect import is_pivoted as is_pivoted
 from .learned_remainder import LEARNED_REMAINDER as LEARNED_REMAINDER
 from .learned_remainder import LearnedRemainder as LearnedRemainder
 from .learned_remainder import learned_remainder as learned_remainder
