@@ -11,24 +11,23 @@ import numpy as np
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.score import ScoreTest, linearised, named_beside, null_sides
+from pbrl_ppl.criticism.search import LIKELY
 from pbrl_ppl.criticism.subsets import Term, worth
-from pbrl_ppl.effects import Attached, Effect, Noise, attach, candidates, is_pivoted
+from pbrl_ppl.criticism.trial_recording import measured, parameters_of, simulated
+from pbrl_ppl.effects import Attached, Effect, Noise, attach, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
-from pbrl_ppl.errors import HistoryError, ParameterError
 from pbrl_ppl.history import History, with_units
 from pbrl_ppl.likelihood import Problem, in_pieces, output_error
 from pbrl_ppl.modes import MOST_GROWTH, Mode, corrected, fit_pieces, growth, piece_lengths
-from pbrl_ppl.physics import Physics, simulated_recording, touching
-from pbrl_ppl.scene import Scene, motion_time, nearest, state_sizes, units_of
-from pbrl_ppl.state import STATE, Floats
+from pbrl_ppl.physics import Physics, touching
+from pbrl_ppl.scene import Scene
+from pbrl_ppl.state import Floats
 from pbrl_ppl.threads import in_parallel, one_blas_thread
 
-#: Measurement noise where none is known, as a share of the motion.
-_NOISE = 1e-3
 #: Names are compared at this many times the least size that is seen.
 _WELL_SEEN = 3.0
 #: Sizes that are tried, as multiples of the one that is found in white noise.
-_FACTORS = 1.2 ** np.arange(-2, 20)
+_FACTORS = 1.3 ** np.arange(20)
 
 
 @dataclass(frozen=True)
@@ -40,8 +39,10 @@ class RehearsedLaw:
     effect, body, sentence : str
         Names of the effect and of the body, and the effect in words.
     sizes : dict of str to float
-        Least change of each parameter from its null value with which the law is found, the others
-        at their null values, SI units; of a threshold, the value nearest to none. Empty if unseen.
+        Change of each parameter from its null value from which on the law is found, the others at
+        their null values, SI units; empty if unseen.
+    levels : dict of str to float
+        Of a threshold or a limit, the value nearest to none at which it is found, SI units.
     null, units : dict of str to float or str
         Null value and unit of each parameter.
     share : float
@@ -60,6 +61,7 @@ class RehearsedLaw:
     body: str
     sentence: str
     sizes: Mapping[str, float]
+    levels: Mapping[str, float]
     null: Mapping[str, float]
     units: Mapping[str, str]
     share: float
@@ -153,12 +155,13 @@ def rehearse(
     >>> law.named, 0.0 < law.sizes["coefficient"] < 0.1  # kg/s
     ('linear_drag', True)
     """
-    say, rng, catalogue = progress or (lambda stage: None), np.random.default_rng(seed), (*catalogue,)
+    say, catalogue = progress or (lambda stage: None), tuple(catalogue)
+    rng = np.random.default_rng(seed)
     say("simulating the declared model")
     physics = Physics(scene, attach(scene, (), catalogue), threads=2)
-    phi = _parameters(physics, parameters or {})
-    commands, states = _simulated(physics, phi, commands, rng)
-    history, noise = _measured(scene, commands, states, rng)
+    phi = parameters_of(physics, parameters or {})
+    commands, states = simulated(physics, phi, commands, rng)
+    history, noise = measured(scene, commands, states, rng)
     physics = physics.changed(scene=with_units(scene, history))
     problem = _apart(Problem.of(physics, history), states)
     tried = [
@@ -184,78 +187,13 @@ def rehearse(
     )
 
 
-def _simulated(
-    physics: Physics, phi: Floats, commands: History | None, rng: np.random.Generator
-) -> tuple[History, Floats]:
-    """Return commands and simulated states, shape (trajectory, time, body, 6), SI units.
-
-    Pushes are proposed that move each body by its size, or turn it in its hinge by 0.25 rad.
-    """
-    # the engine of the pieces, so that their residual is noise alone
-    if commands is not None:
-        return commands, simulated_recording(physics.rough, phi[None], commands)[0]
-    first = rng.bit_generator.state
-    for push in (0.25, 1.0, 4.0):
-        rng.bit_generator.state = first
-        commands = _proposed(physics.scene, rng, push)
-        (states,) = simulated_recording(physics.rough, phi[None], commands)
-        x, y, theta = np.ptp(states[..., :3], axis=1).mean(axis=0).T
-        bodies = zip(physics.scene.moving, np.hypot(x, y), theta, strict=True)
-        if all(
-            turn > 0.25 if is_pivoted(physics.scene, body) else way > body.shape.bounding_radius
-            for body, way, turn in bodies
-        ):
-            break
-    return commands, states
-
-
-def _proposed(
-    scene: Scene,
-    rng: np.random.Generator,
-    push: float,
-    *,
-    trajectories: int = 4,
-    intervals: int = 100,
-    turn: float = 0.2,
-) -> History:
-    """Return pushes, pauses and pushes back of random sizes, from rest at the scene's poses.
-
-    Each is held for the time in which a typical force changes the motion. A body in a hinge is
-    turned with ``push`` typical torques at most, another is pushed with as many typical forces and
-    turned with a share ``turn`` of them.
-
-    Raises
-    ------
-    HistoryError
-        If a body follows a path.
-    """
-    bodies = scene.moving
-    if any(body.kinematic for body in bodies):
-        raise HistoryError("rehearse: a body follows a path; give a file of commands that has it")
-    hold = max(2, round(motion_time(scene) / scene.time_step))
-    states = np.full((trajectories, intervals + 1, len(bodies), len(STATE)), np.nan)
-    most = np.zeros((len(bodies), 3))
-    for i, body in enumerate(bodies):
-        units, hinged = units_of(scene, body.name), is_pivoted(scene, body)
-        states[:, 0, i] = (*(body.pose or (0.0, 0.0, 0.0)), 0.0, 0.0, 0.0)
-        if hinged:  # the hinge says where it is
-            states[:, 0, i, [0, 1, 3, 4]] = np.nan
-        force = 0.0 if hinged else push * units.force
-        most[i] = force, force, (1.0 if hinged else turn) * push * units.torque
-    count = -(-intervals // (4 * hold))
-    size = rng.uniform(-1.0, 1.0, (trajectories, count, len(bodies), 3)) * most
-    pieces = np.stack([size, 0.0 * size, -size, 0.0 * size], axis=2)
-    wrenches = np.repeat(pieces.reshape(trajectories, -1, len(bodies), 3), hold, axis=1)
-    return History.of_arrays(states, scene, wrenches[:, :intervals])
-
-
 def _apart(problem: Problem, states: Floats) -> Problem:
     """Return the problem with breaks where bodies touch, if that is not most of the time.
 
     The instant of a collision is no smooth function of anything.
     """
-    rows = np.isfinite(states).all(axis=(2, 3))
-    touched = rows[:, :-1] & rows[:, 1:]
+    rows = np.asarray(np.isfinite(states).all(axis=(2, 3)))
+    touched = np.logical_and(rows[:, :-1], rows[:, 1:])
     begin, end = states[:, :-1][touched], states[:, 1:][touched]
     touched[touched] = touching(problem.scene, begin, end)
     return problem.with_data(breaks=touched) if 0.0 < touched.mean() < 0.5 else problem
@@ -276,49 +214,29 @@ def _known_modes(problem: Problem, phi: Floats, states: Floats) -> list[Mode]:
     return [corrected(mode) for mode in kept or [longest]]
 
 
-def _parameters(physics: Physics, given: Mapping[str, float]) -> Floats:
-    """Return the parameters that are given by label or name, others at the prior's centre, (p,)."""
-    labels = physics.layout.labels
-    names = [label.partition("[")[0] for label in labels]
-    for name in given:
-        if name not in (*labels, *names):
-            raise ParameterError(
-                f'parameters: there is no parameter "{name}"{nearest(name, [*names, *labels])}'
-            )
-    return np.array(
-        [
-            given.get(label, given.get(name, prior.centre))
-            for label, name, prior in zip(labels, names, physics.layout.priors, strict=True)
-        ]
-    )
-
-
-def _measured(
-    scene: Scene, commands: History, states: Floats, rng: np.random.Generator
-) -> tuple[History, dict[str, float]]:
-    """Return the recording of simulated states, and its noise by dimension, SI units."""
-    dataset, known = commands.dataset.copy(), dict(scene.noise)
-    seen = np.isfinite(dataset["observed"].to_numpy())
-    if not seen[:, 1:].any():
-        seen = np.isin(STATE, list(known) or STATE[:3]) & np.isfinite(states)
-    motion = np.nanstd(states, axis=(0, 1)).max(axis=0)
-    sd = _NOISE * np.where(motion > 0, motion, state_sizes(scene))
-    sd = np.array([known.get(name, size) for name, size in zip(STATE, sd, strict=True)])
-    free = ~dataset["kinematic"].to_numpy()[:, None]
-    noisy = states + free * sd * rng.standard_normal(states.shape)
-    dataset["observed"] = dataset["observed"].copy(data=np.where(seen, noisy, np.nan))
-    dataset["start"] = dataset["start"].copy(data=states)
-    recorded = seen.any(axis=(0, 1, 2))
-    noise = {name: float(sd[d]) for d, name in enumerate(STATE) if recorded[d]}
-    return History(dataset), noise
-
-
 class _Way(NamedTuple):
-    """A size of a law: of one of its parameters (None: of all of them), in a term's direction."""
+    """A law of some size: by one of its parameters at a grid point, or by all of them.
 
-    share: float  # of the parameter's scale, or of a whole change
-    factor: float  # least size that is found
+    Parameters
+    ----------
+    share : float
+        The size over the scale of the parameter's prior.
+    size : float
+        Change of the parameter; of a whole change, its share that is found in white noise.
+    place : int or None
+        The parameter; None for a whole change.
+    direction : ndarray
+        What a unit of it adds to the residual, to first order, in units of noise, shape (n,).
+    term : Term
+        The grid point.
+    rung : _Rung
+        Pieces of one length.
+    """
+
+    share: float
+    size: float
     place: int | None
+    direction: Floats
     term: Term
     rung: _Rung
 
@@ -373,23 +291,21 @@ class _Rung:
         return np.maximum(output_error(self.mode.problem).starts.counts, 1.0)
 
     def ways(self, law: Attached) -> list[_Way]:
-        """Return the sizes of a law that are found, and of whole changes those that are."""
-        ways, parameters = list[_Way](), law.effect.parameters
+        """Return the sizes of a law that pay its price in white noise, the least share first."""
+        ways, parameters, sides = list[_Way](), law.effect.parameters, null_sides(law)
         for term in (term for term in self.terms if term.law == law):
-            places = term.linear.columns or (None,)
-            for place, unit in zip(places, np.linalg.pinv(term.linear.back).T, strict=True):
-                if np.any(unit):
-                    scale = 1.0 if place is None else parameters[place].prior.scale
-                    factor = self.needed(term) / float(np.linalg.norm(unit))
-                    ways.append(_Way(factor / scale, factor, place, term, self))
+            linear, n = term.linear, float(self.counts.sum())
+            paid = self.criteria.search.least_nats + term.price - worth(0.0, len(term.columns), n)
+            places = linear.columns or (None,)
+            for place, unit in zip(places, np.linalg.pinv(linear.back).T, strict=True):
+                if not np.any(unit):
+                    continue
+                size = float(np.sqrt(2.0 * paid) / np.linalg.norm(unit))
+                scale = 1.0 if place is None else parameters[place].prior.scale
+                side = -1.0 if place is not None and sides[place] < 0 else 1.0
+                direction = linear.basis @ (side * unit)
+                ways.append(_Way(size / scale, size, place, direction, term, self))
         return sorted(ways, key=lambda way: way.share)
-
-    def needed(self, term: Term) -> float:
-        """Return the size of a signature, in units of noise, that pays its price in white noise."""
-        n = float(self.counts.sum())
-        paid = self.criteria.search.least_nats + term.price - worth(0.0, len(term.columns), n)
-        share = max(-np.expm1(-2.0 * paid / n), 1.0 - (1.0 - self.least_share) ** 2)
-        return float(np.sqrt(n * share / (1.0 - share)))
 
     def finds(self, term: Term, added: Floats) -> bool:
         """Return whether what a law adds is proposed and accepted.
@@ -397,47 +313,62 @@ class _Rung:
         A regression proposes it with the residual's autocorrelation time, which a slow law makes
         long; a refit, whose residual is white, confirms it.
         """
-        n, likelihood = self.counts, output_error(self.mode.problem)
-        rows = (self.tests.residual + added)[: len(self.mode.whitened_residual.ravel())]
-        rows = rows.reshape(self.mode.whitened_residual.shape)
-        shape = self.mode.problem.observations.values.shape
-        residual = rows[:, : np.prod(shape[1:])].reshape(shape) * self.mode.sigma
-        square = np.maximum((residual**2).sum((0, 1, 2)) / self.mode.sigma**2 / n, 1.0)
-        tau = likelihood.correlation_times(residual, self.mode.sigma * np.sqrt(square))
+        n, sigma, square = self.counts, self.mode.sigma, np.ones(len(self.counts))
+        for _ in range(3):  # noise and parameters depend on each other
+            residual = self.fitted(self.tests.residual + added, square)
+            square = np.maximum((residual**2).sum((0, 1, 2)) / self.before, 1.0)
+        likelihood = output_error(self.mode.problem)
+        tau = likelihood.correlation_times(residual * sigma, sigma * np.sqrt(square))
         share = min(float((n / tau * (1.0 - 1.0 / square)).sum() / (n / tau).sum()), 1.0 - 1e-12)
-        proposed = worth(share, len(term.columns), (n / tau).sum()) - term.price
+        proposed = worth(share, len(term.columns), (n / tau).sum()) > term.price
+        proposed &= share >= 1.0 - (1.0 - LIKELY * self.least_share) ** 2
         gain, total = float((0.5 * n * np.log(square)).sum()), float(n.sum())
         accepted = gain + worth(0.0, len(term.columns), total) - term.price
         enough = -np.expm1(-gain / total) >= self.least_share
-        return bool(proposed > 0 and accepted >= self.criteria.search.least_nats and enough)
+        return bool(proposed and accepted >= self.criteria.search.least_nats and enough)
 
-    def least(self, way: _Way) -> float:
-        """Return the factor from which on a way is found, one of a few, or inf.
+    @cached_property
+    def before(self) -> Floats:
+        """Squared residual of each dimension without any law, shape (state,)."""
+        residual = self.fitted(self.tests.residual, np.ones(len(self.counts)))
+        return np.asarray((residual**2).sum((0, 1, 2)))
 
-        Of a whole change, 1 where that is found.
+    def fitted(self, z: Floats, square: Floats) -> Floats:
+        """Return whitened rows after a refit of the declared parameters with other noise.
+
+        Shape (piece, H, body, state), in units of the noise; ``square`` are the squared sizes of
+        the other noise in these units, shape (state,).
         """
-        direction = way.term.linear.basis @ self.unit(way)
-        if way.place is None:
-            return 1.0 if way.factor < 1.0 and self.finds(way.term, direction) else np.inf
-        factors = way.factor * _FACTORS
-        lost = [i for i, each in enumerate(factors) if not self.finds(way.term, each * direction)]
-        first = lost[-1] + 1 if lost else 0
-        return float(factors[first]) if first < len(factors) else np.inf
+        pieces = self.mode.whitened_residual.shape
+        shape = self.mode.problem.observations.values.shape
+        column = output_error(self.mode.problem).starts.column
+        weight = 1.0 / np.sqrt(square)
+        begin = np.where(column < 0, 1.0, weight[column])
+        rows = np.concatenate([np.tile(weight, shape[1] * shape[2]), begin])
+        weight = np.append(np.tile(rows, pieces[0]), np.ones(len(self.mode.phi)))
+        q = np.linalg.qr(weight[:, None] * self.tests.q)[0]
+        left = (weight * z - q @ (q.T @ (weight * z))) / weight
+        return left[: np.prod(pieces)].reshape(pieces)[:, : np.prod(shape[1:])].reshape(shape)
 
-    def unit(self, way: _Way) -> Floats:
-        """Return the coordinates of a unit of a way in the term's basis, on the allowed side."""
-        units = np.linalg.pinv(way.term.linear.back)
-        if way.place is None:
-            return np.asarray(units[:, 0])
-        side = -1.0 if null_sides(way.term.law)[way.place] < 0 else 1.0
-        return np.asarray(side * units[:, way.term.linear.columns.index(way.place)])
+    def least(self, way: _Way) -> _Way | None:
+        """Return the least of a few sizes from which on a law is found, or None.
 
-    def added(self, way: _Way, factor: float) -> Floats:
+        A whole change has one size.
+        """
+        if way.place is None:
+            return way if way.size < 1.0 and self.finds(way.term, way.direction) else None
+        found = [self.finds(way.term, each * way.size * way.direction) for each in _FACTORS]
+        factor = _FACTORS[found[::-1].index(False) * -1 :][0] if False in found else _FACTORS[0]
+        if not found[-1]:
+            return None
+        return way._replace(share=factor * way.share, size=float(factor * way.size))
+
+    def added(self, way: _Way, size: float) -> Floats:
         """Return what a law adds to the residual, simulated, in units of noise, shape (n,)."""
         law, problem = way.term.law, self.mode.problem
         values = way.term.linear.values.astype(float)
         if way.place is not None:
-            values[way.place] += -factor if null_sides(law)[way.place] < 0 else factor
+            values[way.place] += -size if null_sides(law)[way.place] < 0 else size
         wide = problem.with_physics(effects=(*problem.physics.effects, law)).rough
         phi = np.tile(wide.layout.from_layout(problem.layout, self.mode.phi), (2, 1))
         phi[:, wide.layout.places(law.labels)] = law.effect.null, values
@@ -445,7 +376,7 @@ class _Rung:
         return self.tests.left(np.pad(null - there, (0, len(self.mode.phi))))
 
     def named(self, law: Attached, added: Floats) -> tuple[str, tuple[str, ...]]:
-        """Return which law is named where one adds to the residual, and which explain it as well."""
+        """Return which law is named where one adds to the residual, and those within some nats."""
         residual, within = self.tests.residual + added, self.criteria.search.least_nats
         towards, total = self.basis.T @ residual, float(residual @ residual)
         nats: dict[Attached, float] = {}
@@ -457,12 +388,14 @@ class _Rung:
             share = min(float(coordinates @ coordinates) / total, 1.0 - 1e-12)
             value = worth(share, len(term.columns), float(self.counts.sum())) - term.price
             nats[term.law] = max(value, nats.get(term.law, -np.inf))
-        if law not in nats:
-            return "", ()
         tied = [one for one, value in nats.items() if value > max(nats.values()) - within]
-        first = min(tied, key=lambda one: (len(one.labels), -round(nats[one], 2)))
+        few = min(len(one.labels) for one in tied)
+        simple = [one for one in tied if len(one.labels) == few]
+        # of the same physics the first in the catalogue
+        first = next(one for one in simple if nats[one] > max(map(nats.__getitem__, simple)) - 1.0)
         evidence = {one: value - one.effect.log_odds for one, value in nats.items()}
-        close = [one for one in nats if one != law and evidence[one] > evidence[law] - within]
+        least = evidence.get(law, max(evidence.values())) - within
+        close = [one for one in nats if one != law and evidence[one] > least]
         return named_beside(first, law), tuple(named_beside(one, law) for one in close)
 
 
@@ -471,35 +404,33 @@ def _rehearsed(rungs: Sequence[_Rung], law: Attached) -> RehearsedLaw:
     effect, parameters = law.effect, law.effect.parameters
     names = [parameter.name for parameter in parameters]
     unseen = RehearsedLaw(
-        effect.name, law.body, effect.sentence, {}, dict(zip(names, effect.null, strict=True)),
+        effect.name, law.body, effect.sentence, {}, {}, dict(zip(names, effect.null, strict=True)),
         {parameter.name: parameter.unit for parameter in parameters}, np.inf, "", (),
         "declared parameters absorb it, or it changes nothing here",
     )  # fmt: skip
     ways = [way for rung in rungs for way in rung.ways(law)]
     if not ways:
         return unseen
-    sized = {(way.rung, way.place): way for way in reversed(ways) if way.place is not None}
-    found = []
-    for way in sized.values() or ways:
-        factor = way.rung.least(way)
-        share = way.share if way.place is None else factor / parameters[way.place].prior.scale
-        if factor < np.inf and share < rungs[0].criteria.far_out:
-            found.append(way._replace(share=share, factor=factor))
+    sized = {(id(way.rung), way.place): way for way in reversed(ways) if way.place is not None}
+    tried = [way.rung.least(way) for way in sized.values() or ways]
+    found = sorted(
+        (way for way in tried if way is not None and way.share < way.rung.criteria.far_out),
+        key=lambda way: way.share,
+    )
     if not found:
-        return replace(unseen, note="too small, or it looks like the sensor's correlated error")
+        return replace(unseen, note="too small, or like a correlated error of the sensor")
+    best, note, levels = found[0], "", dict[str, float]()
     sizes: dict[str, float] = {}
-    for way in sorted(found, key=lambda way: way.share):
+    for way in found:
         if way.place is not None:
-            sizes.setdefault(names[way.place], way.factor)
-    best = min(found, key=lambda way: way.share)
-    note = ""
+            sizes.setdefault(names[way.place], way.size)
     if best.place is None:
         note = f"seen at {len(found)} of {len(ways)} places, times or levels"
         if len(names) == 1:
-            levels = [float(way.term.linear.values[0]) for way in found]
-            sizes[names[0]] = min(levels, key=lambda level: abs(level - effect.null[0]))
-    times = 1.0 if best.place is None else _WELL_SEEN * best.factor
-    named, confounded = best.rung.named(law, best.rung.added(best, times))
-    return replace(
-        unseen, sizes=sizes, share=best.share, named=named, confounded=confounded, note=note
-    )
+            seen = [float(way.term.linear.values[0]) for way in found]
+            levels[names[0]] = min(seen, key=lambda level: abs(level - effect.null[0]))
+    named, confounded = best.rung.named(law, best.rung.added(best, _WELL_SEEN * best.size))
+    return RehearsedLaw(
+        effect.name, law.body, effect.sentence, sizes, levels, unseen.null, unseen.units,
+        best.share, named, confounded, note,
+    )  # fmt: skip

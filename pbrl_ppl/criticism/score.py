@@ -402,7 +402,9 @@ def _best_grid_point(mode: Mode, attached: Attached, test: ScoreTest, again: int
         finer = grid_points(mode, attached, np.array([tried[i].proposed for i in leading]))
     linear: tuple[Linearisation, ...] = ()
     if finer:  # with more engine steps a body may pass by
-        judged = sorted(((test.at(trial, attached), trial) for trial in finer), key=lambda x: x[0].log_p)
+        judged = sorted(
+            ((test.at(trial, attached), trial) for trial in finer), key=lambda x: x[0].log_p
+        )
         linear = tuple(one.about(at.values, at.columns) for one, at in judged if one.statistic > 0)
         best, point = judged[0]
         values = point.values.copy()

@@ -41,6 +41,8 @@ from pbrl_ppl.scene import state_sizes
 from pbrl_ppl.state import Bools, Floats
 from pbrl_ppl.threads import in_parallel
 
+#: A refit takes a share of the error away if the regression says this of it.
+LIKELY = 0.7
 #: Share of the joint sizes from which refits begin a second time.
 _SHORTER = 0.3
 
@@ -637,13 +639,10 @@ def _carried(mode: Mode, length: int) -> Mode:
 
 
 def _proposals(
-    regression: Regression, refits: int, singles: int, least_share: float, likely: float = 0.7
+    regression: Regression, refits: int, singles: int, least_share: float
 ) -> list[Subset]:
-    """Return the subsets to refit: the best, and single laws, of those that may be accepted.
-
-    ``likely``: a refit takes a share of ``least_share`` away if the regression says this of it.
-    """
-    least = 1.0 - (1.0 - likely * least_share) ** 2
+    """Return the subsets to refit: the best, and single laws, of those that may be accepted."""
+    least = 1.0 - (1.0 - LIKELY * least_share) ** 2
     subsets = [one for one in regression.subsets if one.nats > 0]
     # structures cost contact in the engine: they are refitted where they lead
     first = _structures(subsets[0]) if subsets else set()
