@@ -11,7 +11,7 @@ import numpy as np
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.score import ScoreTest, linearised, named_beside, null_sides
-from pbrl_ppl.criticism.search import LIKELY
+from pbrl_ppl.criticism.search import LIKELY, is_out_of_phase
 from pbrl_ppl.criticism.subsets import Term, worth
 from pbrl_ppl.criticism.trial_recording import measured, parameters_of, simulated
 from pbrl_ppl.effects import Attached, Effect, Noise, attach, candidates
@@ -168,14 +168,11 @@ def rehearse(
         one for one in candidates(problem.scene, physics.effects, catalogue)
         if not isinstance(one.effect.stage, Noise)
     ]  # fmt: skip
-    modes = _known_modes(problem, phi, states)
-    single = history.n_trajectories == 1
-    rungs = []
-    for mode in modes:
-        rows, limits = mode.problem.data.horizon, criteria.search
-        say(f"linearising {len(tried)} laws on pieces of {rows * scene.time_step:.3g} s")
-        share = limits.small_share if mode is modes[-1] else limits.least_share
-        rungs.append(_Rung.of(mode, tried, criteria, limits.alone if single else share))
+    rungs: list[_Rung] = []
+    for mode in _known_modes(problem, phi, states)[::-1]:
+        seconds = mode.problem.data.horizon * scene.time_step
+        say(f"linearising {len(tried)} laws on pieces of {seconds:.3g} s")
+        rungs.append(_Rung.of(mode, tried, criteria, rungs[-1] if rungs else None))
     say("adding each law to the simulation")
     laws = in_parallel(partial(_rehearsed, rungs), tried)
     return Rehearsal(
@@ -183,7 +180,7 @@ def rehearse(
         history,
         dict(zip(physics.layout.labels, phi.tolist(), strict=True)),
         noise,
-        rows * scene.time_step,
+        rungs[0].mode.problem.data.horizon * scene.time_step,
     )
 
 
@@ -259,6 +256,8 @@ class _Rung:
         Share of the simulation error that a law takes away.
     criteria : Criteria
         Other thresholds.
+    longer : _Rung or None
+        That on longer pieces.
     """
 
     mode: Mode
@@ -267,10 +266,11 @@ class _Rung:
     basis: Floats
     least_share: float
     criteria: Criteria
+    longer: _Rung | None
 
     @classmethod
     def of(
-        cls, mode: Mode, tried: Sequence[Attached], criteria: Criteria, least_share: float
+        cls, mode: Mode, tried: Sequence[Attached], criteria: Criteria, longer: _Rung | None
     ) -> _Rung:
         """Linearise candidates at a mode."""
         tests, linear = linearised(mode, tried, criteria)
@@ -283,7 +283,10 @@ class _Rung:
                 terms.append(Term(law, point, columns, float(price)))
                 bases.append(point.basis)
                 width += len(columns)
-        return cls(mode, tests, tuple(terms), np.hstack(bases), least_share, criteria)
+        limits = criteria.search
+        least = limits.least_share if longer else limits.small_share
+        least = limits.alone if mode.problem.data.history.n_trajectories == 1 else least
+        return cls(mode, tests, tuple(terms), np.hstack(bases), least, criteria, longer)
 
     @cached_property
     def counts(self) -> Floats:
@@ -307,25 +310,44 @@ class _Rung:
                 ways.append(_Way(size / scale, size, place, direction, term, self))
         return sorted(ways, key=lambda way: way.share)
 
-    def finds(self, term: Term, added: Floats) -> bool:
-        """Return whether what a law adds is proposed and accepted.
+    def finds(self, way: _Way, size: float = 1.0) -> bool:
+        """Return whether what a law of a size adds is proposed and accepted.
 
         A regression proposes it with the residual's autocorrelation time, which a slow law makes
-        long; a refit, whose residual is white, confirms it.
+        long; a refit, whose residual is white, confirms it. Where longer pieces are out of phase,
+        its share does not matter.
         """
-        n, sigma, square = self.counts, self.mode.sigma, np.ones(len(self.counts))
-        for _ in range(3):  # noise and parameters depend on each other
-            residual = self.fitted(self.tests.residual + added, square)
-            square = np.maximum((residual**2).sum((0, 1, 2)) / self.before, 1.0)
+        n, sigma = self.counts, self.mode.sigma
+        residual, square = self.refitted(size * way.direction)
         likelihood = output_error(self.mode.problem)
         tau = likelihood.correlation_times(residual * sigma, sigma * np.sqrt(square))
         share = min(float((n / tau * (1.0 - 1.0 / square)).sum() / (n / tau).sum()), 1.0 - 1e-12)
-        proposed = worth(share, len(term.columns), (n / tau).sum()) > term.price
-        proposed &= share >= 1.0 - (1.0 - LIKELY * self.least_share) ** 2
-        gain, total = float((0.5 * n * np.log(square)).sum()), float(n.sum())
-        accepted = gain + worth(0.0, len(term.columns), total) - term.price
+        gain, total, q = (
+            float((0.5 * n * np.log(square)).sum()),
+            float(n.sum()),
+            len(way.term.columns),
+        )
+        accepted = gain + worth(0.0, q, total) - way.term.price >= self.criteria.search.least_nats
+        if worth(share, q, (n / tau).sum()) < way.term.price or not accepted:
+            return False
         enough = -np.expm1(-gain / total) >= self.least_share
-        return bool(proposed and accepted >= self.criteria.search.least_nats and enough)
+        if enough and share >= 1.0 - (1.0 - LIKELY * self.least_share) ** 2:
+            return True
+        return self.longer is not None and self.longer.is_lost(way, size, sigma * np.sqrt(square))
+
+    def is_lost(self, way: _Way, size: float, shorter: Floats) -> bool:
+        """Return whether a law's error nears the motion's size; ``shorter`` is that before."""
+        values = self.mode.problem.observations.values
+        square = self.refitted(self.added(way, size))[1]
+        return is_out_of_phase(self.mode.sigma * np.sqrt(square), shorter, values)
+
+    def refitted(self, added: Floats) -> tuple[Floats, Floats]:
+        """Return the residual of a refit with what a law adds, and its squared size, (state,)."""
+        square = np.ones(len(self.counts))
+        for _ in range(3):  # noise and parameters depend on each other
+            residual = self.fitted(self.tests.residual + added, square)
+            square = np.maximum((residual**2).sum((0, 1, 2)) / self.before, 1.0)
+        return residual, square
 
     @cached_property
     def before(self) -> Floats:
@@ -356,12 +378,13 @@ class _Rung:
         A whole change has one size.
         """
         if way.place is None:
-            return way if way.size < 1.0 and self.finds(way.term, way.direction) else None
-        found = [self.finds(way.term, each * way.size * way.direction) for each in _FACTORS]
-        factor = _FACTORS[found[::-1].index(False) * -1 :][0] if False in found else _FACTORS[0]
+            return way if way.size < 1.0 and self.finds(way) else None
+        found = [self.finds(way, each * way.size) for each in _FACTORS]
         if not found[-1]:
             return None
-        return way._replace(share=factor * way.share, size=float(factor * way.size))
+        first = len(found) - found[::-1].index(False) if False in found else 0
+        factor = float(_FACTORS[first])
+        return way._replace(share=factor * way.share, size=factor * way.size)
 
     def added(self, way: _Way, size: float) -> Floats:
         """Return what a law adds to the residual, simulated, in units of noise, shape (n,)."""

@@ -777,16 +777,31 @@ def _alone(regression: Regression) -> dict[Attached, Evidence]:
     return alone
 
 
-def _is_lost(shorter: Mode, mode: Mode, *, far: float = 0.2, more: float = 3.0) -> bool:
+def _is_lost(shorter: Mode, mode: Mode) -> bool:
     """Return whether pieces are too long to tell a law from.
 
     Their starts are magnified, or the error nears the motion's size, where it is out of phase.
     """
-    if growth(mode.problem) > MOST_GROWTH:
-        return True
     values = mode.problem.observations.values
+    return growth(mode.problem) > MOST_GROWTH or is_out_of_phase(mode.sigma, shorter.sigma, values)
+
+
+def is_out_of_phase(
+    error: Floats, shorter: Floats, values: Floats, *, far: float = 0.2, more: float = 3.0
+) -> bool:
+    """Return whether a simulation error nears the size of the motion.
+
+    Parameters
+    ----------
+    error, shorter : ndarray
+        Errors on pieces and on shorter ones, shape (state,), SI units.
+    values : ndarray
+        Measurements, shape (piece, H, body, state), SI units.
+    far, more : float
+        Share of the motion, and multiple of the shorter pieces' error, from which it does.
+    """
     motion = np.nanstd(values, axis=(0, 1, 2))
-    return bool(((mode.sigma > far * motion) & (mode.sigma > more * shorter.sigma)).any())
+    return bool(((error > far * motion) & (error > more * shorter)).any())
 
 
 def _error(mode: Mode) -> dict[str, float]:
