@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import takewhile
 from typing import NamedTuple
 
 import numpy as np
@@ -379,12 +380,11 @@ class _Rung:
         """
         if way.place is None:
             return way if way.size < 1.0 and self.finds(way) else None
-        found = [self.finds(way, each * way.size) for each in _FACTORS]
-        if not found[-1]:
+        found = takewhile(lambda each: self.finds(way, each * way.size), _FACTORS[::-1])
+        factor = min(found, default=None)
+        if factor is None:
             return None
-        first = len(found) - found[::-1].index(False) if False in found else 0
-        factor = float(_FACTORS[first])
-        return way._replace(share=factor * way.share, size=factor * way.size)
+        return way._replace(share=float(factor * way.share), size=float(factor * way.size))
 
     def added(self, way: _Way, size: float) -> Floats:
         """Return what a law adds to the residual, simulated, in units of noise, shape (n,)."""
@@ -435,20 +435,22 @@ def _rehearsed(rungs: Sequence[_Rung], law: Attached) -> RehearsedLaw:
     if not ways:
         return unseen
     sized = {(id(way.rung), way.place): way for way in reversed(ways) if way.place is not None}
-    tried = [way.rung.least(way) for way in sized.values() or ways]
-    found = sorted(
-        (way for way in tried if way is not None and way.share < way.rung.criteria.far_out),
-        key=lambda way: way.share,
-    )
+    least: dict[tuple[int | None, bytes], _Way] = {}
+    for way in sorted(sized.values(), key=lambda way: way.share) or ways:
+        # of a whole change, each point
+        key = way.place, b"" if way.place is not None else way.term.linear.values.tobytes()
+        if key not in least or way.share < least[key].share:  # of white noise, the least
+            one = way.rung.least(way)
+            if one is not None and one.share < way.rung.criteria.far_out:
+                least[key] = min(one, least.get(key, one), key=lambda way: way.share)
+    found = sorted(least.values(), key=lambda way: way.share)
     if not found:
         return replace(unseen, note="too small, or like a correlated error of the sensor")
     best, note, levels = found[0], "", dict[str, float]()
-    sizes: dict[str, float] = {}
-    for way in found:
-        if way.place is not None:
-            sizes.setdefault(names[way.place], way.size)
+    sizes = {names[way.place]: way.size for way in found if way.place is not None}
     if best.place is None:
-        note = f"seen at {len(found)} of {len(ways)} places, times or levels"
+        points = {way.term.linear.values.tobytes() for way in ways}
+        note = f"seen at {len(found)} of {len(points)} places, times or levels"
         if len(names) == 1:
             seen = [float(way.term.linear.values[0]) for way in found]
             levels[names[0]] = min(seen, key=lambda level: abs(level - effect.null[0]))
