@@ -28,7 +28,7 @@ import pytensor.tensor as pt
 
 from pbrl_ppl import Body, Scene, Shape, SimulatorOp
 from pbrl_ppl.effects import attach
-from pbrl_ppl.history import History, fill_hinges
+from pbrl_ppl.history import History, fill_joints
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.parameters import Layout, box, differentiate
 from pbrl_ppl.physics import PartedSimulator, Physics, Simulator, build_layout, calls
@@ -105,7 +105,7 @@ def hung(scene: Scene, start: np.ndarray) -> np.ndarray:
     for i, body in enumerate(scene.dynamic):
         if any(body.name in (joint.bodies or ()) for joint in scene.joints):
             start[:, i, [0, 1, 3, 4]] = np.nan  # they follow from theta and omega
-    fill_hinges(start[:, None], scene)
+    fill_joints(start[:, None], scene)
     return start
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl import Body, Scene, Shape
-from pbrl_ppl.history import fill_hinges
+from pbrl_ppl.history import fill_joints
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Joint
 
@@ -55,7 +55,7 @@ def run(
     if scene.joints:
         start[..., 2] = rng.uniform(-2.0, 2.0, (n, k))
         start[..., [0, 1, 3, 4]] = np.nan
-        fill_hinges(start[:, None], scene)
+        fill_joints(start[:, None], scene)
         wrenches[..., 2] = 0.05 * rng.normal(size=(n, intervals, k))
     else:
         start[..., 3:] = rng.normal(0.0, (0.5, 0.5, 2.5), (n, k, 3))

@@ -21,6 +21,8 @@ ROOT = Path(__file__).parents[2]
 FORMULAS = {
     "pivot_damping": "torque = −coefficient · ω, ω relative to the other body of the hinge",
     "pivot_friction": "torque = −torque · sign(ω); at rest, any torque up to it",
+    "slider_damping": "F = −coefficient · v along the axis, v relative to the other body",
+    "slider_friction": "F = −force · sign(v) along the axis; at rest, any force up to it",
     "linear_drag": "F = −coefficient · v",
     "quadratic_drag": "F = −coefficient · |v| v",
     "angular_drag": "torque = −coefficient · ω",
@@ -59,6 +61,8 @@ LOOK_ALIKES = (
      "on one arm in a hinge they are the same data"),
     (("pivot_friction", "pivot_damping", "quadratic_drag"),
      "over a narrow range of speeds; record slow motion up to the stop, and fast motion"),
+    (("slider_damping", "linear_drag"), "on one body on a rail they are the same data"),
+    (("slider_friction", "sliding_friction"), "on a rail in a top view they are the same data"),
     (("linear_drag", "quadratic_drag", "sliding_friction"),
      "over a narrow range of speeds; record slow and fast motion"),
     (("angular_drag", "sliding_friction"), "over a narrow range of angular speeds"),
@@ -92,7 +96,9 @@ LOOK_ALIKES = (
 APPLIES = {
     "always": "any body that moves freely",
     "is_pivoted": "a body that hangs in a hinge",
+    "is_sliding": "a body that a slider holds",
     "is_unpivoted": "a body that hangs in no hinge",
+    "is_unjoined": "a body that hangs in no hinge or slider",
     "_has_gravity": "any body, in a scene with `gravity`",
     "_is_pressed": "any body, in a scene with `normal_gravity` (a top view)",
     "_lacks_wheel": "a body without `wheel = true`, in a scene with `normal_gravity` (a top view)",

@@ -188,9 +188,10 @@ def example_rollout(declared: HeldOut, revised: HeldOut) -> Rollout:
     sensors = revised.mode.problem.trajectory_noise.coordinates.sensors
     noise = dict(zip(sensors, revised.mode.sigma.tolist(), strict=False))
     sizes = state_sizes(scene)
-    spread = np.nanstd(measured[..., columns], axis=0) / [
-        noise.get(d, float(sizes[d])) for d in columns
-    ]
+    seen = measured[..., columns]
+    with np.errstate(invalid="ignore"):  # one body may lack what was measured of another
+        spread = np.fmax.reduce(seen, axis=0) - np.fmin.reduce(seen, axis=0)
+    spread /= [noise.get(d, float(sizes[d])) for d in columns]
     free = np.array([not body.kinematic for body in scene.moving])
     body = int(np.argmax(np.where(free, np.nansum(spread, axis=1), -1.0)))
     predicted = []

@@ -18,6 +18,7 @@ from .stages import Clock as Clock
 from .stages import Command as Command
 from .stages import Disc as Disc
 from .stages import Force as Force
+from .stages import Friction as Friction
 from .stages import Law as Law
 from .stages import Noise as Noise
 from .stages import Properties as Properties

@@ -1,10 +1,12 @@
 """Actuators: gains, rotation, delay, dead zone, cut-off and saturation of the command."""
 
 import math
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from pbrl_ppl.effects.effect import Effect, EffectParameter
+from pbrl_ppl.effects.effect import Effect, EffectParameter, Scan
 from pbrl_ppl.effects.stages import Command
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
@@ -13,10 +15,12 @@ from pbrl_ppl.state import Floats
 
 _GAIN = Prior("log_normal", mu=0.0, sigma=0.5)
 _THRESHOLD = EffectParameter("threshold", "N", Prior("half_normal", sigma=0.5), scale="force")
-#: Force levels that a scan tries.
-_LEVELS = 20
+#: Force levels that a scan tries, and torques.
+_LEVELS, _FEW = 20, 8
 #: No actuator reaches this force, in typical forces.
 _UNREACHED = 1e9
+#: Intervals by which a push may be late.
+_LATEST = 8
 
 
 def _rotate(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
@@ -99,26 +103,146 @@ anisotropic_gain = Effect(
 def _delay(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
     # a delay that ends inside a substep is blended: the likelihood stays smooth in it
     begin, end = command[6], command[7]
-    late = min(1.0, max(0.0, (parameters[0] - begin) / (end - begin)))
+    whole = min(math.floor(parameters[0]), _LATEST - 1)
+    late = min(1.0, max(0.0, (parameters[0] - whole - begin) / (end - begin)))
     for i in range(3):
-        wrench[i] = late * command[3 + i] + (1.0 - late) * wrench[i]
+        before = command[3 + i] if whole == 0 else command[9 + 3 * whole + i]
+        now = command[i] if whole == 0 else command[3 + i]
+        if whole > 1:
+            now = command[6 + 3 * whole + i]
+        wrench[i] = late * before + (1.0 - late) * now
 
 
-_SHARE = Prior("truncated_normal", mu=0.0, sigma=0.5, lower=0.0, upper=1.0)
+def _remember_past(state: Floats, command: Floats, parameters: Floats, memory: Floats) -> None:
+    for i in range(3 * _LATEST - 4, 2, -1):
+        memory[i] = memory[i - 3]
+    for i in range(3):
+        memory[i] = command[3 + i]
+
+
+def _scan_delays(scene: Scene, history: History, body: Body) -> Floats:
+    """Return the null value, where the derivative is taken, and longer delays (intervals)."""
+    return np.array([[np.nan], [1.5], [2.5], [4.5]])
+
 
 actuator_delay = Effect(
     "actuator_delay",
-    (EffectParameter("share", "1", _SHARE),),
-    "the push arrives late, by this share of the sampling interval (actuator_delay), or what is"
-    " measured does (sensor_delay); with one clock in the log the two are the same data",
+    (
+        EffectParameter(
+            "share",
+            "1",
+            Prior("truncated_normal", mu=0.0, sigma=2.0, lower=0.0, upper=float(_LATEST)),
+        ),
+    ),
+    "the push arrives late, by so many sampling intervals (actuator_delay), or what is measured"
+    " does (sensor_delay); with one clock in the log the two are the same data",
     "pure time delay of a held input, u(t - share dt)",
-    Command(_delay, memory=True),
+    Command(_delay, memory=_LATEST - 1, remember=_remember_past, jumps=True),
+    scan=_scan_delays,
 )
 
 
-def _force_levels(history: History, body: Body, most: int) -> Floats:
-    """Return at most so many forces between the sizes of those commanded, shape (level, 1), N."""
-    action = history.dataset["action"].sel(body=body.name).to_numpy()[..., :2]
+def _lag(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
+    if parameters[0] > 0.0:
+        since = 0.5 * (command[6] + command[7]) * command[10]
+        left = math.exp(-since / parameters[0])
+        for i in range(3):
+            wrench[i] = command[i] + left * (command[12 + i] - command[i])
+
+
+def _remember_lag(state: Floats, command: Floats, parameters: Floats, memory: Floats) -> None:
+    left = math.exp(-command[10] / parameters[0]) if parameters[0] > 0.0 else 0.0
+    for i in range(3):
+        memory[i] = command[i] + left * (memory[i] - command[i])
+
+
+def _scan_lags(scene: Scene, history: History, body: Body) -> Floats:
+    """Return the null value, where the derivative is taken, and time constants (s)."""
+    return np.array([[np.nan], *([scene.time_step * share] for share in (1.0, 3.0, 10.0))])
+
+
+first_order_lag = Effect(
+    "first_order_lag",
+    (EffectParameter("time", "s", Prior("half_normal", sigma=5.0), scale="interval"),),
+    "the push follows the command slowly, as a motor or a fan that has to spin up: after this time"
+    " two thirds of a change have arrived",
+    "first-order lag, T df/dt = u - f",
+    Command(_lag, memory=1, remember=_remember_lag),
+    scan=_scan_lags,
+)
+
+
+def _ramp(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
+    most = parameters[0] * 0.5 * (command[6] + command[7]) * command[10]
+    off = math.hypot(command[0] - command[12], command[1] - command[13])
+    share = min(1.0, most / off) if off > 0.0 else 1.0
+    for i in range(2):
+        wrench[i] = command[12 + i] + share * (command[i] - command[12 + i])
+
+
+def _remember_ramp(state: Floats, command: Floats, parameters: Floats, memory: Floats) -> None:
+    off = math.hypot(command[0] - memory[0], command[1] - memory[1])
+    share = min(1.0, parameters[0] * command[10] / off) if off > 0.0 else 1.0
+    for i in range(2):
+        memory[i] += share * (command[i] - memory[i])
+
+
+def _scan_rates(scene: Scene, history: History, body: Body) -> Floats:
+    """Return rates at which the largest change of the force takes some intervals."""
+    return _rates(history, body, scene.time_step, slice(0, 2))
+
+
+def _scan_torque_rates(scene: Scene, history: History, body: Body) -> Floats:
+    """Return the same of the torque."""
+    return _rates(history, body, scene.time_step, slice(2, 3))
+
+
+def _rates(history: History, body: Body, interval: float, components: slice) -> Floats:
+    action = history.dataset["action"].sel(body=body.name).to_numpy()[..., components]
+    jumps = np.linalg.norm(np.diff(action, axis=1), axis=-1)
+    most = float(np.nanmax(jumps, initial=0.0))
+    return np.array([[most / (interval * n)] for n in (1.5, 4.0, 10.0) if most > 0.0]).reshape(
+        -1, 1
+    )
+
+
+_RATE = Prior("log_normal", mu=0.0, sigma=2.0)
+
+rate_limit = Effect(
+    "rate_limit",
+    (EffectParameter("rate", "N/s", _RATE, null=_UNREACHED, scale="force/interval"),),
+    "the push changes no faster than at a limit, whatever is commanded",
+    "rate limit of an actuator",
+    Command(_ramp, memory=1, remember=_remember_ramp),
+    scan=_scan_rates,
+    log_odds=-2.0,
+)
+
+
+def _play(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
+    for i in range(2):
+        low, high = command[i] - parameters[0], command[i] + parameters[0]
+        wrench[i] = min(max(command[12 + i], low), high)
+
+
+def _remember_play(state: Floats, command: Floats, parameters: Floats, memory: Floats) -> None:
+    for i in range(2):
+        memory[i] = min(max(memory[i], command[i] - parameters[0]), command[i] + parameters[0])
+
+
+actuator_backlash = Effect(
+    "actuator_backlash",
+    (_THRESHOLD,),
+    "after a turn the push lags behind the command until the play is taken up",
+    "play operator (G. Tao and P. V. Kokotovic, 1996)",
+    Command(_play, memory=1, remember=_remember_play),
+    log_odds=-2.0,
+)
+
+
+def _levels(history: History, body: Body, most: int, components: slice = slice(0, 2)) -> Floats:
+    """Return at most so many sizes between those commanded, shape (level, 1), N or N m."""
+    action = history.dataset["action"].sel(body=body.name).to_numpy()[..., components]
     size = np.linalg.norm(action, axis=-1)
     size = size[size > 0]  # not NaN either
     _, first = np.unique(np.round(size / size.max(initial=0.0), 9), return_index=True)
@@ -137,7 +261,7 @@ def _subtract_threshold(state: Floats, command: Floats, parameters: Floats, wren
 
 def _scan_dead_zones(scene: Scene, history: History, body: Body) -> Floats:
     """Return the null value, where the derivative is taken, and thresholds to try."""
-    return np.vstack([[[np.nan]], _force_levels(history, body, _LEVELS)])
+    return np.vstack([[[np.nan]], _levels(history, body, _LEVELS)])
 
 
 dead_zone = Effect(
@@ -163,7 +287,7 @@ def _scan_cutoffs(scene: Scene, history: History, body: Body, *, levels: int = 2
     ``levels``: the likelihood jumps where the cut-off passes a commanded force, and an optimiser
     cannot follow it: many levels.
     """
-    return _force_levels(history, body, levels)
+    return _levels(history, body, levels)
 
 
 force_cutoff = Effect(
@@ -186,7 +310,7 @@ def _saturate(state: Floats, command: Floats, parameters: Floats, wrench: Floats
 
 def _scan_limits(scene: Scene, history: History, body: Body) -> Floats:
     """Return limits to try."""
-    return _force_levels(history, body, _LEVELS)
+    return _levels(history, body, _LEVELS)
 
 
 saturation = Effect(
@@ -205,4 +329,196 @@ saturation = Effect(
     Command(_saturate),
     scan=_scan_limits,
     log_odds=-2.0,
+)
+
+
+def _of_torque(effect: Effect, name: str, sentence: str, scan: Scan | None) -> Effect:
+    """Return a law of the commanded force for the commanded torque."""
+    parameters = tuple(
+        replace(p, unit=p.unit.replace("N", "N m"), scale=p.scale.replace("force", "torque"))
+        for p in effect.parameters
+    )
+    stage: Any = effect.stage
+    return replace(
+        effect,
+        name=name,
+        parameters=parameters,
+        sentence=sentence,
+        stage=replace(stage, alone="torque"),
+        scan=scan,
+    )
+
+
+def _scan_torque_dead_zones(scene: Scene, history: History, body: Body) -> Floats:
+    """Return the null value, where the derivative is taken, and thresholds to try."""
+    return np.vstack([[[np.nan]], _levels(history, body, _FEW, slice(2, 3))])
+
+
+def _scan_torque_levels(scene: Scene, history: History, body: Body) -> Floats:
+    """Return limits to try."""
+    return _levels(history, body, _FEW, slice(2, 3))
+
+
+torque_dead_zone = _of_torque(
+    dead_zone,
+    "torque_dead_zone",
+    "only what exceeds a threshold of the torque acts: the motor has play or friction",
+    _scan_torque_dead_zones,
+)
+torque_saturation = _of_torque(
+    saturation,
+    "torque_saturation",
+    "the torque is never stronger than a limit, whatever is commanded: the motor saturates",
+    _scan_torque_levels,
+)
+torque_rate_limit = _of_torque(
+    rate_limit,
+    "torque_rate_limit",
+    "the torque changes no faster than at a limit, whatever is commanded",
+    _scan_torque_rates,
+)
+torque_backlash = _of_torque(
+    actuator_backlash,
+    "torque_backlash",
+    "after a turn the torque lags behind the command until the play is taken up",
+    None,
+)
+
+
+def _by_sign(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
+    for i in range(3):
+        wrench[i] += parameters[0] * abs(wrench[i])
+
+
+gain_by_sign = Effect(
+    "gain_by_sign",
+    (
+        EffectParameter(
+            "share", "1", Prior("truncated_normal", mu=0.0, sigma=0.3, lower=-1.0, upper=1.0)
+        ),
+    ),
+    "pushes one way are stronger than the other way, by this share of the command each: a propeller"
+    " or a valve is not symmetric",
+    "gain of an actuator by sign, f = u + a |u|",
+    Command(_by_sign),
+    log_odds=-1.0,
+)
+
+
+def _by_power(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
+    force, torque = math.hypot(wrench[0], wrench[1]) / parameters[1], abs(wrench[2]) / parameters[2]
+    if force > 0.0:
+        wrench[0] *= force ** (parameters[0] - 1.0)
+        wrench[1] *= force ** (parameters[0] - 1.0)
+    if torque > 0.0:
+        wrench[2] *= torque ** (parameters[0] - 1.0)
+
+
+command_power = Effect(
+    "command_power",
+    (EffectParameter("exponent", "1", Prior("log_normal", mu=0.0, sigma=0.5), null=1.0),),
+    "the push grows with a power of the command, not in proportion: the thrust of a propeller grows"
+    " with the square of its speed",
+    "f = f0 (u / f0)^p, with a typical force f0",
+    Command(_by_power),
+    constants=("force", "torque"),
+    log_odds=-1.0,
+)
+
+
+def _by_speed(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
+    size = math.hypot(wrench[0], wrench[1])
+    if size > 0.0:
+        along = (wrench[0] * state[3] + wrench[1] * state[4]) / size
+        share = 1.0 - parameters[0] * along / parameters[1]
+        wrench[0] *= share
+        wrench[1] *= share
+    wrench[2] -= parameters[0] * abs(wrench[2]) * state[5] / parameters[2]
+
+
+gain_by_speed = Effect(
+    "gain_by_speed",
+    (EffectParameter("share", "1", Prior("half_normal", sigma=0.3)),),
+    "a push is weaker the faster the body already moves its way, by this share at the typical"
+    " speed: a propeller in its own wind, a motor near its idle speed",
+    "f = u (1 - a v / v0), with a typical speed v0",
+    Command(_by_speed),
+    constants=("speed", "turn_rate"),
+    log_odds=-1.0,
+)
+
+
+def _by_place(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
+    share = 1.0 + parameters[0] * (state[0] - parameters[2]) / parameters[4]
+    share += parameters[1] * (state[1] - parameters[3]) / parameters[4]
+    for i in range(3):
+        wrench[i] *= share
+
+
+gain_by_place = Effect(
+    "gain_by_place",
+    (
+        EffectParameter("along_x", "1", Prior("normal", sigma=0.3)),
+        EffectParameter("along_y", "1", Prior("normal", sigma=0.3)),
+    ),
+    "pushes are stronger at one end of the room than at the other, by this share of the command at"
+    " the typical distance from the middle",
+    "f = u (1 + a . (x - x0) / r0), with the mean place x0 and a typical range r0",
+    Command(_by_place),
+    constants=("x", "y", "range"),
+    log_odds=-2.0,
+)
+
+
+def _fade(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
+    if command[9] < math.inf:  # after the recording the battery is full
+        left = math.exp(-parameters[0] * command[9])
+        for i in range(3):
+            wrench[i] *= left
+
+
+fading_gain = Effect(
+    "fading_gain",
+    (EffectParameter("rate", "1/s", Prior("half_normal", sigma=0.5), scale="/time"),),
+    "pushes get weaker in the course of each trajectory: a battery runs down, a motor gets hot",
+    "f = u exp(-a t)",
+    Command(_fade, timed=True),
+    log_odds=-3.0,
+)
+
+
+def _limit_power(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
+    power = wrench[0] * state[3] + wrench[1] * state[4] + wrench[2] * state[5]
+    if power > parameters[0]:
+        for i in range(3):
+            wrench[i] *= parameters[0] / power
+
+
+def _scan_powers(scene: Scene, history: History, body: Body, *, most: int = 6) -> Floats:
+    """Return powers between those that the commands would have, shape (point, 1), W."""
+    data = history.dataset.sel(body=body.name)
+    action, start = data["action"].to_numpy(), data["start"].to_numpy()[..., 3:]
+    power = np.nansum(action * start, axis=-1)
+    power = power[power > 0.0]
+    if not len(power):
+        return np.empty((0, 1))
+    return np.unique(np.quantile(power, np.linspace(0.3, 0.98, most)))[:, None]
+
+
+power_limit = Effect(
+    "power_limit",
+    (
+        EffectParameter(
+            "power",
+            "W",
+            Prior("log_normal", mu=0.0, sigma=1.5),
+            null=_UNREACHED,
+            scale="force speed",
+        ),
+    ),
+    "a push never does more work in a second than a limit: the motor's or the supply's power",
+    "power limit of an actuator, f . v <= P",
+    Command(_limit_power),
+    scan=_scan_powers,
+    log_odds=-3.0,
 )

@@ -2,9 +2,13 @@
 
 import math
 
-from pbrl_ppl.effects.effect import Effect, EffectParameter
+import numpy as np
+
+from pbrl_ppl.effects.effect import Effect, EffectParameter, is_unpivoted
 from pbrl_ppl.effects.stages import Force
+from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
+from pbrl_ppl.scene import Body, Scene
 from pbrl_ppl.state import Floats
 
 #: At the typical motion such a law is of the order of the typical force or torque.
@@ -50,6 +54,147 @@ angular_drag = Effect(
     "a torque against the rotation that grows with the angular speed",
     "viscous torque, tau = -c omega",
     Force(_angular),
+)
+
+
+def _quadratic_angular(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
+    wrench[2] -= parameters[0] * abs(state[5]) * state[5]
+
+
+quadratic_angular_drag = Effect(
+    "quadratic_angular_drag",
+    (EffectParameter("coefficient", "N m s^2", _TYPICAL, scale="torque/turn_rate^2"),),
+    "a torque against the rotation that grows with the square of the angular speed: a fan,"
+    " a stirrer",
+    "drag of a rotor, tau = -c |omega| omega",
+    Force(_quadratic_angular),
+)
+
+
+def _power(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
+    speed = math.sqrt(state[3] * state[3] + state[4] * state[4])
+    if speed > 0.0:
+        drag = parameters[0] * (speed / parameters[2]) ** parameters[1] / speed
+        wrench[0] -= drag * state[3]
+        wrench[1] -= drag * state[4]
+
+
+def _scan_exponents(scene: Scene, history: History, body: Body) -> Floats:
+    """Return exponents between and beyond the common ones; the derivative is taken by the size."""
+    return np.array([(np.nan, 1.5), (np.nan, 3.0)])
+
+
+_EXPONENT = EffectParameter(
+    "exponent", "1", Prior("truncated_normal", mu=2.0, sigma=0.7, lower=1.0, upper=3.0), null=2.0
+)
+
+power_drag = Effect(
+    "power_drag",
+    (EffectParameter("force", "N", _TYPICAL, scale="force"), _EXPONENT),
+    "a force against the motion that grows with a power of the speed, and has this size at the"
+    " typical speed",
+    "power law, F = -f (|v| / v0)^p, with a typical speed v0",
+    Force(_power),
+    scan=_scan_exponents,
+    constants=("speed",),
+    log_odds=-2.0,
+)
+
+
+def _angular_power(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
+    rate = abs(state[5])
+    if rate > 0.0:
+        wrench[2] -= parameters[0] * (rate / parameters[2]) ** parameters[1] * state[5] / rate
+
+
+power_angular_drag = Effect(
+    "power_angular_drag",
+    (EffectParameter("torque", "N m", _TYPICAL, scale="torque"), _EXPONENT),
+    "a torque against the rotation that grows with a power of the angular speed, and has this size"
+    " at the typical one",
+    "power law, tau = -t (|omega| / omega0)^p, with a typical angular speed omega0",
+    Force(_angular_power),
+    scan=_scan_exponents,
+    constants=("turn_rate",),
+    log_odds=-2.0,
+)
+
+
+def _linear_by_axis(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
+    c, s = math.cos(state[2]), math.sin(state[2])
+    x = -parameters[0] * (c * state[3] + s * state[4])
+    y = -parameters[1] * (c * state[4] - s * state[3])
+    wrench[0] += c * x - s * y
+    wrench[1] += s * x + c * y
+
+
+drag_by_axis = Effect(
+    "drag_by_axis",
+    (
+        EffectParameter("along", "kg/s", _TYPICAL, scale="force/speed"),
+        EffectParameter("across", "kg/s", _TYPICAL, scale="force/speed"),
+    ),
+    "a force against the motion that grows with the speed and is another along the body than across"
+    " it: a hull, a skid",
+    "linear drag with two coefficients in the body's frame (T. I. Fossen, 2011)",
+    Force(_linear_by_axis),
+    log_odds=-1.0,
+)
+
+
+def _quadratic_by_axis(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
+    c, s = math.cos(state[2]), math.sin(state[2])
+    x, y = c * state[3] + s * state[4], c * state[4] - s * state[3]
+    x, y = -parameters[0] * abs(x) * x, -parameters[1] * abs(y) * y
+    wrench[0] += c * x - s * y
+    wrench[1] += s * x + c * y
+
+
+quadratic_drag_by_axis = Effect(
+    "quadratic_drag_by_axis",
+    (
+        EffectParameter("along", "kg/m", _TYPICAL, scale="force/speed^2"),
+        EffectParameter("across", "kg/m", _TYPICAL, scale="force/speed^2"),
+    ),
+    "a force against the motion that grows with the square of the speed and is another along the"
+    " body than across it",
+    "cross-flow drag in the body's frame (T. I. Fossen, 2011)",
+    Force(_quadratic_by_axis),
+    applies=is_unpivoted,
+    log_odds=-1.0,
+)
+
+
+def _wind(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
+    x, y = state[3] - parameters[1], state[4] - parameters[2]
+    speed = math.sqrt(x * x + y * y)
+    wrench[0] -= parameters[0] * speed * x
+    wrench[1] -= parameters[0] * speed * y
+
+
+def _scan_winds(scene: Scene, history: History, body: Body) -> Floats:
+    """Return winds along the axes at the body's usual speed; the derivative is by the drag."""
+    velocity = history.dataset["start"].sel(body=body.name, state=["vx", "vy"]).to_numpy()
+    speed = np.sqrt(np.nanmean((velocity**2).sum(axis=-1))) if np.isfinite(velocity).any() else 0.0
+    winds = [(x * speed, y * speed) for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1))]
+    return np.array([(np.nan, *wind) for wind in winds if speed > 0.0]).reshape(-1, 3)
+
+
+_WIND = Prior("normal", sigma=1.0)
+
+wind = Effect(
+    "wind",
+    (
+        EffectParameter("coefficient", "kg/m", _TYPICAL, scale="force/speed^2"),
+        EffectParameter("wind_x", "m/s", _WIND, scale="speed"),
+        EffectParameter("wind_y", "m/s", _WIND, scale="speed"),
+    ),
+    "drag against air or water that moves itself: it grows with the square of the speed through it",
+    "Rayleigh's drag equation, F = -c |v - w| (v - w)",
+    Force(_wind),
+    applies=is_unpivoted,
+    scan=_scan_winds,
+    log_odds=-3.0,
 )
 
 

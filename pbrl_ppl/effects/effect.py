@@ -7,7 +7,7 @@ from dataclasses import InitVar, dataclass, replace
 
 import numpy as np
 
-from pbrl_ppl.effects.stages import STAGES, Command, Force, Law, Properties, Stage
+from pbrl_ppl.effects.stages import STAGES, Command, Force, Law, Properties, Sensor, Stage
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
@@ -54,6 +54,8 @@ class EffectParameter:
         of any size. SI units without it.
     origin : str
         ``x`` or ``y``: for places, which are counted from the body's mean position.
+    hinged : bool
+        Whether a body on a hinge has it: what is measured of it is its angle.
 
     Raises
     ------
@@ -76,6 +78,7 @@ class EffectParameter:
     null: float = 0.0
     scale: str = ""
     origin: str = ""
+    hinged: bool = True
 
     def __post_init__(self) -> None:
         """Check the scale."""
@@ -120,6 +123,10 @@ class Effect:
         ``applies(scene, body) -> bool``.
     scan : callable, optional
         Grid of parameters to try if the derivative at the null vanishes; see :data:`Scan`.
+    constants : tuple of str
+        Products of natural units of the body, as for a parameter's scale: the law finds their SI
+        values after its parameters, so that a shape that is no power of a unit suits a rig of any
+        size.
     log_odds : float
         Logarithm of the prior odds that a rig has this effect, beside common ones such as drag,
         friction or a constant force (nats, at most 0): part of the price of a law in a search.
@@ -155,6 +162,7 @@ class Effect:
     stage: Stage = None  # type: ignore[assignment]  # never None once made
     applies: Callable[[Scene, Body], bool] = always
     scan: Scan | None = None
+    constants: tuple[str | float, ...] = ()
     log_odds: float = 0.0
     force: InitVar[Law | None] = None
 
@@ -162,6 +170,9 @@ class Effect:
         """Check the fields."""
         if not self.name.isidentifier():
             raise EffectError(f"effect name {self.name!r} is not an identifier; use letters and _")
+        for constant in self.constants:
+            if isinstance(constant, str) and constant not in PLACES:
+                check_product(constant)
         if not self.parameters and not isinstance(self.stage, Command):
             raise EffectError(f"effect {self.name} has no parameters; give it at least one")
         if force is not None and self.stage is None:
@@ -192,7 +203,13 @@ class Effect:
     def in_si(self, units: Units) -> Effect:
         """Return the effect with its priors and null values in SI units."""
         parameters = tuple(parameter.in_si(units) for parameter in self.parameters)
-        return self if parameters == self.parameters else replace(self, parameters=parameters)
+        constants = tuple(
+            getattr(units, c) if c in PLACES else units.of(c) if isinstance(c, str) else c
+            for c in self.constants
+        )
+        if (parameters, constants) == (self.parameters, self.constants):
+            return self
+        return replace(self, parameters=parameters, constants=constants)
 
     @property
     def null(self) -> tuple[float, ...]:
@@ -212,8 +229,13 @@ class Attached:
     body: str
 
     def in_si(self, scene: Scene) -> Attached:
-        """Return the same with priors and null values in SI units; see :func:`units_of`."""
-        return Attached(self.effect.in_si(units_of(scene, self.body)), self.body)
+        """Return the same with what the body has of it in SI units; see :func:`units_of`."""
+        effect = self.effect
+        if not all(p.hinged for p in effect.parameters) and is_pivoted(
+            scene, scene.body(self.body)
+        ):
+            effect = replace(effect, parameters=tuple(p for p in effect.parameters if p.hinged))
+        return Attached(effect.in_si(units_of(scene, self.body)), self.body)
 
     @property
     def variables(self) -> tuple[str, ...]:
@@ -227,24 +249,33 @@ class Attached:
 
 
 def at_stage(effects: tuple[Attached, ...], stage: type) -> list[Attached]:
-    """Return the effects that act at a stage, in their order."""
-    return [attached for attached in effects if isinstance(attached.effect.stage, stage)]
+    """Return the effects that act at a stage, in their order; commands with a memory first."""
+    acting = [attached for attached in effects if isinstance(attached.effect.stage, stage)]
+    if stage is Command:  # what is late is late as it was sent, whatever is made of it
+        acting.sort(key=lambda one: -getattr(one.effect.stage, "memory", 0))
+    return acting
 
 
 def needs_inputs(effects: tuple[Attached, ...]) -> bool:
     """Return whether any effect needs the previous command or the clock."""
     stages = [attached.effect.stage for attached in effects]
     return any(
-        (isinstance(stage, Command) and stage.memory)
-        or (isinstance(stage, Properties) and stage.timed)
+        (isinstance(stage, Command) and stage.memory > 0)
+        or (isinstance(stage, Command | Force | Properties | Sensor) and stage.timed)
         for stage in stages
     )
 
 
 def is_pivoted(scene: Scene, body: Body) -> bool:
     """Return whether the body hangs in a hinge: the hinge's friction acts on this body."""
-    hinges = (joint for joint in scene.joints if joint.kind == "hinge" and joint.bodies)
+    hinges = (joint for joint in scene.joints if joint.traits.pins_anchors and joint.bodies)
     return any(hanging_body(scene, joint) == body.name for joint in hinges)
+
+
+def is_sliding(scene: Scene, body: Body) -> bool:
+    """Return whether the body slides on an axis: the slider's friction acts on this body."""
+    sliders = (joint for joint in scene.joints if joint.traits.slides)
+    return any(hanging_body(scene, joint) == body.name for joint in sliders)
 
 
 def is_unpivoted(scene: Scene, body: Body) -> bool:
@@ -252,18 +283,23 @@ def is_unpivoted(scene: Scene, body: Body) -> bool:
     return not is_pivoted(scene, body)
 
 
+def is_unjoined(scene: Scene, body: Body) -> bool:
+    """Return whether the body hangs in no hinge or slider: a rod would hold its one coordinate."""
+    return not (is_pivoted(scene, body) or is_sliding(scene, body))
+
+
 def hanging_body(scene: Scene, joint: Joint) -> str:
-    """Return the name of the body that hangs in a hinge: the farther from the world by hinges.
+    """Return the name of the body that hangs in a hinge or slider: the farther from the world.
 
     Raises
     ------
     EffectError
-        If it is not known which bodies the hinge joins.
+        If it is not known which bodies the joint joins.
     """
     if joint.bodies is None:
-        raise EffectError("which bodies the hinge joins is to be inferred; none hangs in it yet")
+        raise EffectError("which bodies the joint joins is to be inferred; none hangs in it yet")
     depth = {body.name: 0 for body in scene.bodies if body.static or body.kinematic} | {WORLD: 0}
-    pairs = [hinge.bodies for hinge in scene.joints if hinge.kind == "hinge" and hinge.bodies]
+    pairs = [each.bodies for each in scene.joints if each.traits.hangs and each.bodies]
     for _ in pairs:
         for pair in pairs:
             for near, far in (pair, pair[::-1]):

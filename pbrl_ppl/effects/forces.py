@@ -4,8 +4,9 @@ import math
 
 import numpy as np
 
-from pbrl_ppl.effects.effect import Effect, EffectParameter
+from pbrl_ppl.effects.effect import Effect, EffectParameter, is_unpivoted
 from pbrl_ppl.effects.stages import Clock, Force, Properties, Values
+from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene
 from pbrl_ppl.state import Floats
@@ -97,4 +98,135 @@ push_offset = Effect(
     "moment of a force about a point, tau = r x F",
     Force(_moment_of_push),
     log_odds=-1.0,
+)
+
+
+def _cogging(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
+    phase = math.floor(parameters[2] + 0.5) * state[2]  # a whole number: an angle has no turns
+    wrench[2] += parameters[0] * math.cos(phase) + parameters[1] * math.sin(phase)
+
+
+def _scan_counts(scene: Scene, history: History, body: Body) -> Floats:
+    """Return numbers of teeth of which the body passes some; the derivative is by the torques."""
+    theta = history.dataset["start"].sel(body=body.name, state="theta").to_numpy()
+    reach = float(np.nanmax(theta, initial=-np.inf) - np.nanmin(theta, initial=np.inf))
+    counts = [n for n in (2, 3, 4, 6, 8, 12) if 2.0 * np.pi < n * reach < 2.0 * np.pi * 12.0]
+    return np.array([(np.nan, np.nan, n) for n in counts]).reshape(-1, 3)
+
+
+_TORQUES = (
+    EffectParameter("cosine", "N m", _TYPICAL, scale="torque"),
+    EffectParameter("sine", "N m", _TYPICAL, scale="torque"),
+)
+
+cogging = Effect(
+    "cogging",
+    (*_TORQUES, EffectParameter("count", "1", Prior("log_normal", mu=1.5, sigma=1.0), null=2.0)),
+    "a torque that repeats several times in a turn: a motor's magnets, a bearing with flat spots",
+    "cogging torque, a cos(n theta) + b sin(n theta)",
+    Force(_cogging),
+    scan=_scan_counts,
+    log_odds=-3.0,
+)
+
+
+def _ripple(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
+    c, s = math.cos(parameters[3]), math.sin(parameters[3])
+    phase = 2.0 * math.pi * (c * state[0] + s * state[1]) / parameters[2]
+    force = parameters[0] * math.cos(phase) + parameters[1] * math.sin(phase)
+    wrench[0] += c * force
+    wrench[1] += s * force
+
+
+def _scan_waves(scene: Scene, history: History, body: Body) -> Floats:
+    """Return wavelengths along the axis of most motion; the derivative is taken by the forces."""
+    places = history.dataset["start"].sel(body=body.name, state=["x", "y"]).to_numpy()
+    reach = np.nanmax(places, axis=(0, 1), initial=-np.inf) - np.nanmin(
+        places, axis=(0, 1), initial=np.inf
+    )
+    axis = int(np.argmax(reach))
+    if not 0.0 < reach[axis] < np.inf:
+        return np.empty((0, 4))
+    return np.array([(np.nan, np.nan, reach[axis] / n, 0.5 * np.pi * axis) for n in (1.5, 3, 6)])
+
+
+ripple = Effect(
+    "ripple",
+    (
+        EffectParameter("cosine", "N", _TYPICAL, scale="force"),
+        EffectParameter("sine", "N", _TYPICAL, scale="force"),
+        EffectParameter(
+            "wavelength", "m", Prior("log_normal", mu=-1.0, sigma=1.0), null=0.4, scale="range"
+        ),
+        EffectParameter("direction", "rad", Prior("von_mises", mu=0.0, kappa=0.0)),
+    ),
+    "a force along a line that repeats with the place: a linear motor's magnets, a belt's teeth",
+    "force ripple, a cos(2 pi x / l) + b sin(2 pi x / l)",
+    Force(_ripple),
+    applies=is_unpivoted,
+    scan=_scan_waves,
+    log_odds=-5.0,
+)
+
+
+def _periodic(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
+    if command[9] < math.inf:  # after the recording nobody knows its phase
+        phase = 2.0 * math.pi * command[9] / parameters[2]
+        force = parameters[0] * math.cos(phase) + parameters[1] * math.sin(phase)
+        wrench[0] += math.cos(parameters[3]) * force
+        wrench[1] += math.sin(parameters[3]) * force
+
+
+def _periods(scene: Scene, history: History) -> list[float]:
+    """Return periods to try (s): whole trajectories to four intervals."""
+    longest = float(np.nanmax(history.dataset["clock"].to_numpy(), initial=0.0))
+    return [longest / n for n in (1, 2, 4, 8, 16) if longest / n > 4.0 * scene.time_step]
+
+
+def _scan_periods(scene: Scene, history: History, body: Body) -> Floats:
+    """Return periods and directions; the derivative is taken by the forces."""
+    pairs = [(period, turn) for period in _periods(scene, history) for turn in (0.0, 0.5 * np.pi)]
+    return np.array([(np.nan, np.nan, *pair) for pair in pairs]).reshape(-1, 4)
+
+
+_PERIOD = EffectParameter(
+    "period", "s", Prior("log_normal", mu=-1.5, sigma=1.0), null=0.2, scale="time"
+)
+
+periodic_force = Effect(
+    "periodic_force",
+    (
+        EffectParameter("cosine", "N", _TYPICAL, scale="force"),
+        EffectParameter("sine", "N", _TYPICAL, scale="force"),
+        _PERIOD,
+        EffectParameter("direction", "rad", Prior("von_mises", mu=0.0, kappa=0.0)),
+    ),
+    "a force along a line that repeats with the time since a trajectory began: a shaken table",
+    "harmonic force, a cos(2 pi t / T) + b sin(2 pi t / T)",
+    Force(_periodic, timed=True),
+    applies=is_unpivoted,
+    scan=_scan_periods,
+    log_odds=-6.0,
+)
+
+
+def _periodic_torque(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
+    if command[9] < math.inf:
+        phase = 2.0 * math.pi * command[9] / parameters[2]
+        wrench[2] += parameters[0] * math.cos(phase) + parameters[1] * math.sin(phase)
+
+
+def _scan_torque_periods(scene: Scene, history: History, body: Body) -> Floats:
+    """Return periods; the derivative is taken by the torques."""
+    return np.array([(np.nan, np.nan, t) for t in _periods(scene, history)]).reshape(-1, 3)
+
+
+periodic_torque = Effect(
+    "periodic_torque",
+    (*_TORQUES, _PERIOD),
+    "a torque that repeats with the time since a trajectory began",
+    "harmonic torque, a cos(2 pi t / T) + b sin(2 pi t / T)",
+    Force(_periodic_torque, timed=True),
+    scan=_scan_torque_periods,
+    log_odds=-6.0,
 )

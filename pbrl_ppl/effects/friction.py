@@ -1,17 +1,35 @@
-"""Friction in hinges, on the floor and of wheels; the engine solves it together with contacts."""
+"""Friction in joints, on the floor and of wheels; the engine solves it together with contacts."""
 
+import math
 from itertools import product
 
 import numpy as np
 
-from pbrl_ppl.effects.effect import Effect, EffectParameter, body_points, is_pivoted
-from pbrl_ppl.effects.stages import Clock, Properties, Values
+from pbrl_ppl.effects.effect import (
+    Effect,
+    EffectParameter,
+    body_points,
+    is_pivoted,
+    is_sliding,
+    is_unpivoted,
+)
+from pbrl_ppl.effects.stages import Clock, Force, Friction, Properties, Values
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene
 from pbrl_ppl.state import Floats
 
 _FRICTION = Prior("half_normal", sigma=0.5)
+_SHARE = Prior("half_normal", sigma=1.0)
+_DIFFERENCE = Prior("normal", sigma=0.5)
+
+
+def _speeds(history: History, body: Body, *columns: str) -> Floats:
+    """Return two speeds below the body's usual ones, shape (2,), rad/s or m/s; or none."""
+    start = history.dataset["start"].sel(body=body.name, state=list(columns)).to_numpy()
+    speed = np.linalg.norm(start, axis=-1)
+    speed = speed[speed > 0.0]  # not NaN either
+    return np.quantile(speed, [0.15, 0.45]) if len(speed) else np.empty(0)
 
 
 def _add_pivot_damping(properties: dict[str, Floats], parameters: Values, clock: Clock) -> None:
@@ -43,6 +61,134 @@ pivot_friction = Effect(
     "Coulomb's law of friction",
     Properties(_add_pivot_torque),
     applies=is_pivoted,
+)
+
+
+slider_damping = Effect(
+    "slider_damping",
+    (
+        EffectParameter(
+            "coefficient", "N s/m", Prior("half_normal", sigma=1.0), scale="force/speed"
+        ),
+    ),
+    "viscous friction in the slider: a force against the sliding that grows with its speed",
+    "viscous force on the relative velocity along the axis, F = -c v",
+    Properties(_add_pivot_damping),
+    applies=is_sliding,
+)
+
+
+def _add_slider_force(properties: dict[str, Floats], parameters: Values, clock: Clock) -> None:
+    properties["pivot_torque"] = properties["pivot_torque"] + parameters["force"]
+
+
+slider_friction = Effect(
+    "slider_friction",
+    (EffectParameter("force", "N", Prior("half_normal", sigma=1.0), scale="force"),),
+    "dry friction in the slider: a steady force against the sliding that can also hold it still",
+    "Coulomb's law of friction",
+    Properties(_add_slider_force),
+    applies=is_sliding,
+)
+
+
+def _fall_with_speed(state: Floats, load: Floats, parameters: Floats, most: Floats) -> None:
+    most[0] += parameters[0] * math.exp(-((load[2] / parameters[1]) ** 2))
+
+
+def _scan_turn_rates(scene: Scene, history: History, body: Body) -> Floats:
+    """Return speeds to try; the derivative is taken by the torque."""
+    return np.array([(np.nan, speed) for speed in _speeds(history, body, "omega")]).reshape(-1, 2)
+
+
+pivot_stribeck = Effect(
+    "pivot_stribeck",
+    (
+        EffectParameter("torque", "N m", _SHARE, scale="torque"),
+        EffectParameter(
+            "speed", "rad/s", Prior("log_normal", mu=-1.5, sigma=1.0), null=0.2, scale="turn_rate"
+        ),
+    ),
+    "dry friction in the hinge that is stronger near standstill than in motion: it sticks, then"
+    " slips",
+    "Stribeck's curve, tau = tau_s exp(-(omega/omega_s)^2) beside Coulomb's",
+    Friction(_fall_with_speed),
+    applies=is_pivoted,
+    scan=_scan_turn_rates,
+    log_odds=-2.0,
+)
+
+
+def _grow_with_load(state: Floats, load: Floats, parameters: Floats, most: Floats) -> None:
+    most[0] += parameters[0] * abs(load[0]) + parameters[1] * abs(load[1])
+
+
+pivot_load_friction = Effect(
+    "pivot_load_friction",
+    (EffectParameter("motor", "1", _SHARE), EffectParameter("load", "1", _SHARE)),
+    "dry friction in the hinge that grows with the torque of the motor and of the load: gears that"
+    " press harder rub harder",
+    "load-dependent friction, tau = a |motor| + b |load| (M. Duclusaud et al., arXiv 2410.08650)",
+    Friction(_grow_with_load),
+    applies=is_pivoted,
+    log_odds=-1.0,
+)
+
+
+def _vary_with_angle(state: Floats, load: Floats, parameters: Floats, most: Floats) -> None:
+    most[0] += parameters[0] * math.cos(state[2]) + parameters[1] * math.sin(state[2])
+
+
+pivot_angle_friction = Effect(
+    "pivot_angle_friction",
+    (
+        EffectParameter("cosine", "N m", _DIFFERENCE, scale="torque"),
+        EffectParameter("sine", "N m", _DIFFERENCE, scale="torque"),
+    ),
+    "dry friction in the hinge that is stronger at some angles: the bearing is bent or worn",
+    "Coulomb's law with a torque of the first harmonic of the angle",
+    Friction(_vary_with_angle),
+    applies=is_pivoted,
+    log_odds=-3.0,
+)
+
+
+def _damp_one_way(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
+    wrench[2] -= parameters[0] * abs(state[5])
+
+
+pivot_one_way_damping = Effect(
+    "pivot_one_way_damping",
+    (
+        EffectParameter(
+            "coefficient", "N m s", Prior("normal", sigma=1.0), scale="torque/turn_rate"
+        ),
+    ),
+    "viscous friction in the hinge that is stronger one way than the other",
+    "viscous torque by direction, tau = -c |omega| beside -c omega",
+    Force(_damp_one_way),
+    applies=is_pivoted,
+    log_odds=-3.0,
+)
+
+
+def _add_turn_torque(properties: dict[str, Floats], parameters: Values, clock: Clock) -> None:
+    properties["turn_torque"] = properties["turn_torque"] + parameters["torque"]
+
+
+def _lies_free(scene: Scene, body: Body) -> bool:
+    return scene.normal_gravity > 0 and is_unpivoted(scene, body)
+
+
+turning_friction = Effect(
+    "turning_friction",
+    (EffectParameter("torque", "N m", Prior("half_normal", sigma=1.0), scale="torque"),),
+    "dry friction against turning alone: a steady torque that can also hold it, and that sliding"
+    " does not weaken",
+    "Coulomb's law for the torque at a single foot",
+    Properties(_add_turn_torque),
+    applies=_lies_free,
+    log_odds=-1.0,
 )
 
 
@@ -81,6 +227,52 @@ sliding_friction = Effect(
     Properties(_add_patch),
     applies=_is_pressed,
     scan=_scan_radii,
+)
+
+
+def _fall_by_share(state: Floats, load: Floats, parameters: Floats, most: Floats) -> None:
+    most[0] *= 1.0 + parameters[0] * math.exp(-((load[2] / parameters[1]) ** 2))
+
+
+def _scan_speeds(scene: Scene, history: History, body: Body) -> Floats:
+    """Return speeds to try; the derivative is taken by the share."""
+    return np.array([(np.nan, speed) for speed in _speeds(history, body, "vx", "vy")]).reshape(
+        -1, 2
+    )
+
+
+sliding_stribeck = Effect(
+    "sliding_stribeck",
+    (
+        EffectParameter("share", "1", _SHARE),
+        EffectParameter(
+            "speed", "m/s", Prior("log_normal", mu=-1.5, sigma=1.0), null=0.2, scale="speed"
+        ),
+    ),
+    "dry friction on the floor that is stronger near standstill than in motion, by this share",
+    "Stribeck's curve, mu (1 + a exp(-(v/v_s)^2))",
+    Friction(_fall_by_share, under=True),
+    applies=_is_pressed,
+    scan=_scan_speeds,
+    log_odds=-2.0,
+)
+
+
+def _vary_with_place(state: Floats, load: Floats, parameters: Floats, most: Floats) -> None:
+    share = parameters[0] * (state[0] - parameters[2]) + parameters[1] * (state[1] - parameters[3])
+    most[0] *= 1.0 + share / parameters[4]
+
+
+friction_by_place = Effect(
+    "friction_by_place",
+    (EffectParameter("along_x", "1", _DIFFERENCE), EffectParameter("along_y", "1", _DIFFERENCE)),
+    "dry friction on the floor that is stronger at one end of the room, by this share at the"
+    " typical distance from the middle",
+    "Coulomb's law, mu (1 + a . (x - x0) / r0), with the mean place x0 and a typical range r0",
+    Friction(_vary_with_place, under=True),
+    applies=_is_pressed,
+    constants=("x", "y", "range"),
+    log_odds=-3.0,
 )
 
 

@@ -2,17 +2,19 @@
 
 import numpy as np
 
-from pbrl_ppl.effects.effect import Effect, EffectParameter
+from pbrl_ppl.effects.effect import Effect, EffectParameter, is_pivoted, is_unpivoted
 from pbrl_ppl.effects.stages import Noise, Sensor, Values
 from pbrl_ppl.parameters import Prior
-from pbrl_ppl.state import STATE, STATE_UNITS, Floats
+from pbrl_ppl.state import POSE, STATE, STATE_UNITS, Floats
 
 #: Natural units of a body's state; an angle has none.
 _SCALES = ("range", "range", "", "speed", "speed", "turn_rate")
 
 
 def _bias(parameters: Values) -> Floats:
-    return np.stack(np.broadcast_arrays(*(parameters[name] for name in STATE)), axis=-1)
+    nothing = np.zeros(())  # of what the effect does not have on a hinged body
+    given = (parameters.get(name, nothing) for name in STATE)
+    return np.stack(np.broadcast_arrays(*given), axis=-1)
 
 
 def _add_bias(state: Floats, parameters: Values) -> Floats:
@@ -26,7 +28,7 @@ def _subtract_bias(measured: Floats, parameters: Values) -> Floats:
 sensor_bias = Effect(
     "sensor_bias",
     tuple(
-        EffectParameter(name, unit, Prior("normal", sigma=0.1), scale=scale)
+        EffectParameter(name, unit, Prior("normal", sigma=0.1), scale=scale, hinged=name == "theta")
         for name, unit, scale in zip(STATE, STATE_UNITS, _SCALES, strict=True)
     ),
     "what is measured is off by a constant: a sensor is not zeroed, or not where it is thought",
@@ -37,7 +39,8 @@ sensor_bias = Effect(
 
 
 def _factors(parameters: Values) -> Floats:
-    length, angle = np.broadcast_arrays(parameters["length"], parameters["angle"])
+    nothing = np.ones(())  # a length, of a hinged body
+    length, angle = np.broadcast_arrays(parameters.get("length", nothing), parameters["angle"])
     return np.stack([length, length, angle, length, length, angle], axis=-1)
 
 
@@ -54,7 +57,7 @@ _SCALE = Prior("log_normal", mu=0.0, sigma=0.1)
 sensor_scale = Effect(
     "sensor_scale",
     (
-        EffectParameter("length", "1", _SCALE, null=1.0),
+        EffectParameter("length", "1", _SCALE, null=1.0, hinged=False),
         EffectParameter("angle", "1", _SCALE, null=1.0),
     ),
     "lengths or angles are measured too large or too small by a factor: a camera's or an encoder's"
@@ -88,6 +91,130 @@ frame_rotation = Effect(
     "rotation between two frames",
     Sensor(_turn, _turn_back),
     log_odds=-2.0,
+)
+
+
+def _seen_askew(state: Floats, parameters: Values) -> Floats:
+    x, y, theta, vx, vy, omega = np.moveaxis(state, -1, 0)
+    a, b = parameters["along_x"], parameters["along_y"]
+    depth, rate = 1.0 + a * x + b * y, a * vx + b * vy
+    parts = (
+        x / depth, y / depth, theta,
+        (vx - x * rate / depth) / depth, (vy - y * rate / depth) / depth, omega,
+    )  # fmt: skip
+    return np.stack(np.broadcast_arrays(*parts), axis=-1)
+
+
+def _set_straight(measured: Floats, parameters: Values) -> Floats:
+    opposite = {name: -value for name, value in parameters.items()}
+    return _seen_askew(measured, opposite)
+
+
+_TILT = Prior("normal", sigma=0.1)
+
+askew_camera = Effect(
+    "askew_camera",
+    (
+        EffectParameter("along_x", "1/m", _TILT, scale="/range"),
+        EffectParameter("along_y", "1/m", _TILT, scale="/range"),
+    ),
+    "places are measured too small at one end of the room and too large at the other: the camera"
+    " looks askew",
+    "perspective of a tilted plane, x / (1 + a x + b y)",
+    Sensor(_seen_askew, _set_straight),
+    applies=is_unpivoted,
+    log_odds=-3.0,
+)
+
+
+def _harmonic(state: Floats, parameters: Values, order: int) -> Floats:
+    phase = order * state[..., 2]
+    c, s = parameters["cosine"], parameters["sine"]
+    measured = np.array(np.broadcast_to(state, (*np.broadcast_shapes(phase.shape, c.shape), 6)))
+    measured[..., 2] += c * np.cos(phase) + s * np.sin(phase)
+    measured[..., 5] *= 1.0 + order * (s * np.cos(phase) - c * np.sin(phase))
+    return measured
+
+
+def _without_harmonic(measured: Floats, parameters: Values, order: int, tries: int = 30) -> Floats:
+    state = np.array(measured)
+    for _ in range(tries):  # a contraction where the measured angle grows with the angle
+        off = _harmonic(state, parameters, order) - state
+        state = np.where(np.arange(6) == 2, measured - off, np.broadcast_to(measured, off.shape))
+    slope = _harmonic(np.where(np.arange(6) == 5, 1.0, state), parameters, order)[..., 5]
+    state[..., 5] = measured[..., 5] / slope
+    return np.asarray(state)
+
+
+def _off_centre(state: Floats, parameters: Values) -> Floats:
+    return _harmonic(state, parameters, 1)
+
+
+def _without_off_centre(measured: Floats, parameters: Values) -> Floats:
+    return _without_harmonic(measured, parameters, 1)
+
+
+def _as_ellipse(state: Floats, parameters: Values) -> Floats:
+    return _harmonic(state, parameters, 2)
+
+
+def _without_ellipse(measured: Floats, parameters: Values) -> Floats:
+    return _without_harmonic(measured, parameters, 2)
+
+
+_PARTS = (EffectParameter("cosine", "rad", _TILT), EffectParameter("sine", "rad", _TILT))
+
+encoder_eccentricity = Effect(
+    "encoder_eccentricity",
+    _PARTS,
+    "the angle is measured too large on one side of the turn and too small on the other: the"
+    " encoder's disc is off its centre",
+    "first harmonic of an encoder's error, a cos(theta) + b sin(theta)",
+    Sensor(_off_centre, _without_off_centre),
+    applies=is_pivoted,
+    log_odds=-3.0,
+)
+
+askew_angle = Effect(
+    "askew_angle",
+    _PARTS,
+    "the angle is measured too large in two opposite quarters of the turn and too small in the"
+    " others: the camera looks askew at the plane of motion",
+    "second harmonic of a circle seen as an ellipse, a cos(2 theta) + b sin(2 theta)",
+    Sensor(_as_ellipse, _without_ellipse),
+    applies=is_pivoted,
+    log_odds=-3.0,
+)
+
+
+def _drift(state: Floats, parameters: Values) -> Floats:
+    time = np.where(np.isfinite(parameters["time"]), parameters["time"], 0.0)
+    nothing = np.zeros(())
+    rates = [parameters.get(name, nothing) for name in POSE]
+    shift = [rate * time for rate in rates] + rates
+    return np.asarray(state + np.stack(np.broadcast_arrays(*shift), axis=-1))
+
+
+def _without_drift(measured: Floats, parameters: Values) -> Floats:
+    opposite = {n: value if n == "time" else -value for n, value in parameters.items()}
+    return _drift(measured, opposite)
+
+
+sensor_drift = Effect(
+    "sensor_drift",
+    tuple(
+        EffectParameter(
+            name, f"{unit}/s", Prior("normal", sigma=0.1), scale=scale, hinged=name == "theta"
+        )
+        for name, unit, scale in zip(
+            POSE, STATE_UNITS[:3], ("range/time", "range/time", "/time"), strict=True
+        )
+    ),
+    "what is measured moves away steadily from the start of each trajectory on: a gyroscope's"
+    " integral, a tag that slips",
+    "sensor drift, x + a t",
+    Sensor(_drift, _without_drift, timed=True),
+    log_odds=-4.0,
 )
 
 

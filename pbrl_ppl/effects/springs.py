@@ -6,7 +6,7 @@ from math import floor, pi
 import numpy as np
 from scipy.optimize import least_squares
 
-from pbrl_ppl.effects.effect import Effect, EffectParameter, body_points, is_unpivoted
+from pbrl_ppl.effects.effect import Effect, EffectParameter, body_points, is_unjoined, is_unpivoted
 from pbrl_ppl.effects.stages import Force, Rod, Structure, Values
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
@@ -90,6 +90,151 @@ torsion_spring = Effect(
     Force(_torsion_spring),
     scan=_scan_angles,
     log_odds=-3.0,
+)
+
+
+def _cubic_spring(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
+    x, y = state[0] - parameters[1], state[1] - parameters[2]
+    pull = parameters[0] * (x * x + y * y)
+    wrench[0] -= pull * x
+    wrench[1] -= pull * y
+
+
+cubic_spring = Effect(
+    "cubic_spring",
+    (
+        EffectParameter("stiffness", "N/m^3", Prior("normal", sigma=1.0), scale="force/range^3"),
+        EffectParameter("anchor_x", "m", _PLACE, scale="range", origin="x"),
+        EffectParameter("anchor_y", "m", _PLACE, scale="range", origin="y"),
+    ),
+    "a pull towards a place that grows with the cube of the distance: a spring that hardens",
+    "Duffing's spring, F = -k r^3",
+    Force(_cubic_spring),
+    applies=is_unpivoted,
+    scan=_scan_anchors,
+    log_odds=-4.0,
+)
+
+
+def _cubic_torsion(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
+    off = state[2] - parameters[1]
+    off -= 2.0 * pi * floor((off + pi) / (2.0 * pi))
+    wrench[2] -= parameters[0] * off * off * off
+
+
+def _scan_middle(scene: Scene, history: History, body: Body) -> Floats:
+    """Return the middle and the ends of the range of the angle; the derivative is by the size."""
+    angles = _angles(history, body, 0.1, 0.5, 0.9)
+    return np.array([(np.nan, angle) for angle in angles]).reshape(-1, 2)
+
+
+def _angles(history: History, body: Body, *shares: float) -> list[float]:
+    """Return angles at shares of the range that was measured; none if it turns all the way."""
+    theta = history.dataset["start"].sel(body=body.name, state="theta").to_numpy().ravel()
+    theta = theta[np.isfinite(theta)]
+    if not len(theta) or not 0.0 < np.ptp(theta) < 2.0 * np.pi:
+        return []
+    return [float(theta.min() + share * np.ptp(theta)) for share in shares]
+
+
+_ANGLE = Prior("von_mises", mu=0.0, kappa=0.0)
+
+cubic_torsion_spring = Effect(
+    "cubic_torsion_spring",
+    (
+        EffectParameter("stiffness", "N m/rad^3", Prior("normal", sigma=1.0), scale="torque"),
+        EffectParameter("angle", "rad", _ANGLE),
+    ),
+    "a torque towards an angle that grows with the cube of the deflection: a spring that hardens",
+    "Duffing's spring, tau = -k theta^3",
+    Force(_cubic_torsion),
+    scan=_scan_middle,
+    log_odds=-3.0,
+)
+
+
+def _upper_stop(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
+    wrench[2] -= parameters[0] * max(0.0, state[2] - parameters[1])
+
+
+def _lower_stop(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
+    wrench[2] += parameters[0] * max(0.0, parameters[1] - state[2])
+
+
+def _scan_upper(scene: Scene, history: History, body: Body) -> Floats:
+    """Return angles near the upper end; the derivative is taken by the stiffness."""
+    return np.array([(np.nan, a) for a in _angles(history, body, 0.7, 0.9)]).reshape(-1, 2)
+
+
+def _scan_lower(scene: Scene, history: History, body: Body) -> Floats:
+    """Return angles near the lower end; the derivative is taken by the stiffness."""
+    return np.array([(np.nan, a) for a in _angles(history, body, 0.3, 0.1)]).reshape(-1, 2)
+
+
+_STOP = (
+    EffectParameter("stiffness", "N m/rad", Prior("half_normal", sigma=10.0), scale="torque"),
+    EffectParameter("angle", "rad", _ANGLE),
+)
+
+upper_stop = Effect(
+    "upper_stop",
+    _STOP,
+    "a springy stop above an angle: a bumper, a cable that gets tight",
+    "one-sided spring, tau = -k max(0, theta - theta0)",
+    Force(_upper_stop),
+    scan=_scan_upper,
+    log_odds=-4.0,
+)
+
+lower_stop = Effect(
+    "lower_stop",
+    _STOP,
+    "a springy stop below an angle: a bumper, a cable that gets tight",
+    "one-sided spring, tau = k max(0, theta0 - theta)",
+    Force(_lower_stop),
+    scan=_scan_lower,
+    log_odds=-4.0,
+)
+
+
+def _cable(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
+    x, y = state[0] - parameters[1], state[1] - parameters[2]
+    distance = (x * x + y * y) ** 0.5
+    if distance > parameters[3]:
+        pull = parameters[0] * (1.0 - parameters[3] / distance)
+        wrench[0] -= pull * x
+        wrench[1] -= pull * y
+
+
+def _scan_cables(scene: Scene, history: History, body: Body) -> Floats:
+    """Return cables from beyond each side, taut in a third of the poses; only stiffness is free."""
+    places = _poses(history, body, 2)
+    if not len(places):
+        return np.empty((0, 4))
+    middle, reach = places.mean(axis=0), places.max(axis=0) - places.min(axis=0)
+    rows = []
+    for side in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        if reach @ np.abs(side) > 0.0:
+            anchor = middle + reach * side
+            length = np.quantile(np.linalg.norm(places - anchor, axis=1), 0.67)
+            rows.append((np.nan, *anchor, length))
+    return np.array(rows).reshape(-1, 4)
+
+
+cable = Effect(
+    "cable",
+    (
+        EffectParameter("stiffness", "N/m", Prior("half_normal", sigma=3.0), scale="force/length"),
+        EffectParameter("anchor_x", "m", _PLACE, scale="range", origin="x"),
+        EffectParameter("anchor_y", "m", _PLACE, scale="range", origin="y"),
+        EffectParameter("length", "m", Prior("half_normal", sigma=1.0), null=1.0, scale="range"),
+    ),
+    "a pull towards a place that begins beyond a distance: a springy cable that gets taut",
+    "one-sided spring, F = -k max(0, r - l)",
+    Force(_cable),
+    applies=is_unpivoted,
+    scan=_scan_cables,
+    log_odds=-5.0,
 )
 
 
@@ -226,7 +371,7 @@ distance_joint = Effect(
     " distance from a place",
     "J_d of Scholz et al., ICML 2014, section 3.2, to the world",
     Structure(rod=_rod),
-    applies=is_unpivoted,
+    applies=is_unjoined,
     scan=_scan_rods,
     log_odds=-8.0,
 )

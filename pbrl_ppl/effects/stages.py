@@ -8,15 +8,21 @@ from typing import NamedTuple, final
 
 import numpy as np
 
+from pbrl_ppl.errors import EffectError
 from pbrl_ppl.state import Floats
 
 #: Values of an effect's parameters by name: arrays that broadcast, one entry per proposal.
 Values = Mapping[str, Floats]
 
 #: ``law(state, command, parameters, wrench)``, all arrays of floats: one body's state (6,), its
-#: command, the effect's parameters (q,), and the wrench (3,), which it changes in place. It runs
-#: inside the compiled substep loop: plain arithmetic and ``math`` only.
+#: command, the effect's parameters (q,) and then its constants, and the wrench (3,), which it
+#: changes in place. It runs inside the compiled substep loop: plain arithmetic and ``math`` only.
 Law = Callable[[Floats, Floats, Floats, Floats], None]
+#: Where a law finds, in ``command``, the time since the trajectory's start (s), infinite after the
+#: recording; the sampling interval (s); and its memory.
+TIME, INTERVAL, MEMORY = 9, 10, 12
+#: Numbers that a law may remember.
+MOST_MEMORY = 24
 
 
 @final
@@ -132,16 +138,44 @@ class Command:
     Parameters
     ----------
     law : callable
-        See :data:`Law`. ``command`` (8,) has the wrench of this interval, the wrench of the
-        previous interval (zero before the first), both as earlier effects changed them, and the
-        shares of the interval that have passed when the substep begins and ends. ``wrench`` (3,),
-        that of this interval, is to be changed.
-    memory : bool
-        Whether the law uses the previous wrench.
+        See :data:`Law`. ``command`` has the wrench of this interval as earlier effects changed it,
+        the wrench of the previous interval (zero before the first), the shares of the interval that
+        have passed when the substep begins and ends (6, 7), and :data:`TIME`, :data:`INTERVAL` and
+        :data:`MEMORY`. ``wrench`` (3,), that of this interval, is to be changed.
+    memory : int
+        How many past wrenches the law needs, or numbers of its own in threes, such as the wrench
+        that an actuator has reached: it acts before laws that need none. They begin as if the
+        previous wrench had lasted.
+    remember : callable, optional
+        ``remember(state, command, parameters, memory)`` changes them at the end of an interval.
+        Without it, the memory is the previous wrench alone.
+    alone : str
+        ``force_x``, ``force_y`` or ``torque`` for a law of one number: it is the first of each
+        three, and the others are zero.
+    timed : bool
+        Whether the law depends on the time.
+    jumps : bool
+        Whether the wrench may jump within an interval, as a late one does.
+
+    Raises
+    ------
+    EffectError
+        If the memory is too large.
     """
 
     law: Law
-    memory: bool = False
+    memory: int = 0
+    remember: Law | None = None
+    alone: str = ""
+    timed: bool = False
+    jumps: bool = False
+
+    def __post_init__(self) -> None:
+        """Check the memory."""
+        if not 0 <= 3 * self.memory <= MOST_MEMORY:
+            raise EffectError(
+                f"a law remembers {self.memory} wrenches, expected 0 to {MOST_MEMORY // 3}"
+            )
 
 
 @final
@@ -152,11 +186,33 @@ class Force:
     Parameters
     ----------
     law : callable
-        See :data:`Law`. ``command`` (3,) is the wrench after the command stage; ``wrench`` is the
-        sum so far.
+        See :data:`Law`. ``command`` (3,) is the wrench after the command stage, followed by
+        :data:`TIME` and :data:`INTERVAL`; ``wrench`` is the sum so far.
+    timed : bool
+        Whether the law depends on the time.
     """
 
     law: Law
+    timed: bool = False
+
+
+@final
+@dataclass(frozen=True)
+class Friction:
+    """Stage that changes the greatest force of dry friction: in a body's hinge, or under it.
+
+    Parameters
+    ----------
+    law : callable
+        See :data:`Law`. ``command`` has the torque that is commanded, the torque of all else about
+        the hinge (N m; both zero under a body), and the speed of sliding (rad/s, or m/s).
+        ``wrench`` (1,) is the greatest torque or force so far.
+    under : bool
+        Whether it is the friction under the body.
+    """
+
+    law: Law
+    under: bool = False
 
 
 @final
@@ -171,10 +227,14 @@ class Sensor:
         over the leading axes.
     invert : callable
         ``invert(measured, parameters) -> state``, its inverse.
+    timed : bool
+        Whether ``time`` is among the parameters: that since the trajectory's start (s), infinite
+        after the recording.
     """
 
     measure: Callable[[Floats, Values], Floats]
     invert: Callable[[Floats, Values], Floats]
+    timed: bool = False
 
 
 @final
@@ -192,5 +252,5 @@ class Noise:
     tail: Callable[[Values], Floats]
 
 
-Stage = Structure | Properties | Command | Force | Sensor | Noise
-STAGES: tuple[type, ...] = (Structure, Properties, Command, Force, Sensor, Noise)
+Stage = Structure | Properties | Command | Force | Friction | Sensor | Noise
+STAGES: tuple[type, ...] = (Structure, Properties, Command, Force, Friction, Sensor, Noise)

@@ -22,8 +22,8 @@ from .history import unseen as unseen
 from .history import with_paths as with_paths
 from .kinematics import column_noise as column_noise
 from .kinematics import estimate_rates as estimate_rates
-from .kinematics import fill_hinges as fill_hinges
-from .kinematics import hung_bodies as hung_bodies
+from .kinematics import fill_joints as fill_joints
+from .kinematics import joint_coordinates as joint_coordinates
 from .kinematics import lever as lever
 from .reading import read_recording as read_recording
 from .reading import read_scene as read_scene

@@ -1,4 +1,4 @@
-"""Kinematics of a history: angles, noise, recorded paths, hinges, and complete start states."""
+"""Kinematics of a history: angles, noise, recorded paths, joints, and complete start states."""
 
 from collections.abc import Iterable
 from math import comb
@@ -6,7 +6,7 @@ from math import comb
 import numpy as np
 from scipy.signal import savgol_filter
 
-from pbrl_ppl.scene import WORLD, Point, Scene
+from pbrl_ppl.scene import WORLD, Joint, Point, Scene
 from pbrl_ppl.state import THETA, Bools, Floats, wrapped
 
 #: Standard deviation of a Gaussian over the median of its absolute values.
@@ -129,16 +129,16 @@ def path_velocities(poses: Floats, time_step: float) -> Floats:
 def complete_start(state: Floats, scene: Scene) -> tuple[Floats, Bools]:
     """Return states completed for a simulation to start from, and their columns without data.
 
-    Measured values are kept. Hinges and paths give what follows from them; a position that was
-    never measured is that of the scene; velocities that were never measured are estimated.
+    Measured values are kept. Hinges, sliders and paths give what follows from them; a position that
+    was never measured is that of the scene; velocities that were never measured are estimated.
 
     Parameters
     ----------
     state : (trajectory, time, body, 6) array
         Measured states, NaN where missing (m, m, rad, m/s, m/s, rad/s).
     scene : Scene
-        Its known hinges give positions and velocities from angles; its kinematic bodies' positions
-        give their velocities.
+        Its known hinges give positions and velocities from angles, its known sliders from one
+        position; its kinematic bodies' positions give their velocities.
 
     Returns
     -------
@@ -155,18 +155,18 @@ def complete_start(state: Floats, scene: Scene) -> tuple[Floats, Bools]:
     ahead = np.concatenate([rate, rate[:, -1:]], axis=1)
     behind = np.concatenate([rate[:, :1], rate], axis=1)
     start[:, :, follows, 3:] = _filled(path[..., 3:], _filled(ahead, behind))
-    fill_hinges(start, scene)
+    fill_joints(start, scene)
     assumed: Bools = np.asarray(np.isnan(start).all(axis=(0, 1)))
-    hung = hung_bodies(scene)
+    given = joint_coordinates(scene)
     for i, body in enumerate(scene.moving):
         pose = body.pose or (0.0, 0.0, 0.0)
         for d in np.flatnonzero(assumed[i, :3]):
-            if d == THETA or body.name not in hung:
+            if d in (THETA, given.get(body.name, d)):
                 start[:, :, i, d] = pose[d]
     # The angular velocity first: hinges turn it into velocities.
     for columns in ((5,), (3, 4)):
         estimate_rates(start, scene.time_step, columns)
-        fill_hinges(start, scene)
+        fill_joints(start, scene)
     return start, assumed
 
 
@@ -174,13 +174,14 @@ def _filled(values: Floats, others: Floats) -> Floats:
     return np.where(np.isnan(values), others, values)
 
 
-def fill_hinges(start: Floats, scene: Scene) -> None:
-    """Fill missing coordinates of hinged bodies in place, breadth first from the world.
+def fill_joints(start: Floats, scene: Scene) -> None:
+    """Fill missing coordinates of bodies in hinges and sliders in place, from the world on.
 
-    Positions and their velocities follow from angles, and angles from positions.
+    In a hinge positions and their velocities follow from angles, and angles from positions. In a
+    slider the angle follows from the other body's, and positions from one of them.
     """
     position = {body.name: i for i, body in enumerate(scene.moving)}
-    for parent, child, at_parent, at_child in hinge_order(scene):
+    for parent, child, at_parent, at_child, joint in joint_order(scene):
         if child not in position:
             continue
         if parent in position:
@@ -190,6 +191,21 @@ def fill_hinges(start: Floats, scene: Scene) -> None:
             origin = np.broadcast_to(np.array([*pose, 0.0, 0.0, 0.0]), (*start.shape[:2], 6))
         body = start[:, :, position[child]]
         arm, arm_rate = lever(origin, at_parent)
+        if joint.traits.slides:
+            turn = scene.reference_angle(child) - scene.reference_angle(parent)
+            body[..., 2] = _filled(body[..., 2], origin[..., 2] + turn)
+            body[..., 5] = _filled(body[..., 5], origin[..., 5])
+            child_arm, child_rate = lever(body, at_child)
+            angle = origin[..., 2] + scene.direction(joint) - scene.reference_angle(parent)
+            along = np.stack([np.cos(angle), np.sin(angle)], -1)
+            across = np.stack([-along[..., 1], along[..., 0]], -1) * origin[..., 5:6]
+            base = origin[..., :2] + arm - child_arm
+            way = _along(body[..., :2] - base, along)
+            body[..., :2] = _filled(body[..., :2], base + way * along)
+            base = origin[..., 3:5] + arm_rate - child_rate + way * across
+            rate = _along(body[..., 3:5] - base, along)
+            body[..., 3:5] = _filled(body[..., 3:5], base + rate * along)
+            continue
         if np.any(at_child) and np.isnan(body[..., 2]).all():  # angles from places, then exact ones
             to = body[..., :2] - origin[..., :2] - arm
             turned = np.arctan2(to[..., 1], to[..., 0]) - np.arctan2(-at_child[1], -at_child[0])
@@ -200,16 +216,40 @@ def fill_hinges(start: Floats, scene: Scene) -> None:
         body[..., 3:5] = _filled(body[..., 3:5], origin[..., 3:5] + arm_rate - child_rate)
 
 
-def hung_bodies(scene: Scene) -> list[str]:
-    """Return the dynamic bodies that hinges tie to the world: positions follow from angles."""
+def _along(way: Floats, direction: Floats) -> Floats:
+    """Return how far ways (..., 2) with missing coordinates lead along unit vectors, (..., 1)."""
+    seen = np.where(np.isfinite(way), direction, 0.0)
+    square = (seen**2).sum(axis=-1, keepdims=True)
+    along = (np.nan_to_num(way) * seen).sum(axis=-1, keepdims=True)
+    return np.asarray(np.where(square > 1e-12, along / np.maximum(square, 1e-12), np.nan))
+
+
+def joint_coordinates(scene: Scene) -> dict[str, int]:
+    """Return the dynamic bodies that hinges and sliders tie to the world, with a column of each.
+
+    All else of a body's pose follows from that column: the angle in a hinge, x or y, which changes
+    more, in a slider. A slider on what turns has none.
+    """
     moving = [body.name for body in scene.dynamic]
     reached = {WORLD, *(body.name for body in scene.bodies if body.static)}
-    hung = []
-    for parent, child, *_ in hinge_order(scene):
-        if parent in reached and child in moving and child not in reached:
-            reached.add(child)
-            hung.append(child)
-    return hung
+    columns: dict[str, int] = {}
+    for parent, child, _, _, joint in joint_order(scene):
+        if parent not in reached or child not in moving or child in reached:
+            continue
+        if not joint.traits.slides:
+            columns[child] = THETA
+        elif columns.get(parent) != THETA:
+            angle = scene.direction(joint)
+            columns[child] = int(abs(np.sin(angle)) > abs(np.cos(angle)))
+        else:
+            continue
+        reached.add(child)
+    return columns
+
+
+def hung_bodies(scene: Scene) -> list[str]:
+    """Return the dynamic bodies that hinges tie to the world: positions follow from angles."""
+    return [name for name, column in joint_coordinates(scene).items() if column == THETA]
 
 
 def lever(state: Floats, anchor: Point) -> tuple[Floats, Floats]:
@@ -220,14 +260,14 @@ def lever(state: Floats, anchor: Point) -> tuple[Floats, Floats]:
     return np.stack([x, y], -1), np.stack([-y, x], -1) * state[..., 5:6]
 
 
-def hinge_order(scene: Scene) -> list[tuple[str, str, Point, Point]]:
-    """Return known hinges as (parent, child, anchors), breadth first from static bodies."""
+def joint_order(scene: Scene) -> list[tuple[str, str, Point, Point, Joint]]:
+    """Return known hinges and sliders as (parent, child, anchors, joint), from static bodies on."""
     edges = []
     for joint in scene.joints:
-        if joint.traits.pins_anchors and joint.known and joint.bodies:
+        if joint.traits.hangs and joint.known and joint.bodies:
             a, b = joint.bodies
             at_a, at_b = joint.anchor_a or (0.0, 0.0), joint.anchor_b or (0.0, 0.0)
-            edges += [(a, b, at_a, at_b), (b, a, at_b, at_a)]
+            edges += [(a, b, at_a, at_b, joint), (b, a, at_b, at_a, joint)]
     reached, order = [WORLD, *(body.name for body in scene.bodies if body.static)], []
     for parent in reached:  # the list grows while it is walked: that is the breadth-first queue
         for edge in edges:

@@ -203,10 +203,12 @@ def _joints(model: mujoco.MjModel, name: str, axes: Floats, reach: float) -> lis
         joints.append(_Joint(number, kind, axis, place, rate, reference, above))
     slides = [joint for joint in joints if joint.kind == SLIDE]
     turns = np.abs(np.asarray(body.quat)[1:]).max()
-    if len(slides) == 1 or (joints and joints[0].kind != FREE and turns > FLAT):
+    if (len(slides) == 1 and len(joints) > 1) or (
+        joints and joints[0].kind != FREE and turns > FLAT
+    ):
         raise HistoryError(
-            f'body "{name}": expected slides along both axes or none, and a body that is not'
-            " turned in the model; a free joint has all"
+            f'body "{name}": expected slides along both axes, one slide alone or none, and a body'
+            " that is not turned in the model; a free joint has all"
         )
     if slides and parent != 0:
         raise HistoryError(
@@ -227,6 +229,8 @@ def _fill(
     """Fill a body's states (trajectory, row, 6) in place; return whether it stays in the plane."""
     if any(joint.kind == SLIDE for joint in joints):
         state[..., :2], state[..., 3:5] = origin, 0.0
+        if len(joints) == 1:  # a slider, which does not turn
+            state[..., [2, 5]] = 0.0
     for joint in joints:
         at, rate = joint.position, joint.velocity
         moved = qpos[..., at] - joint.reference

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.history.kinematics import hinge_order
+from pbrl_ppl.history.kinematics import joint_order
 from pbrl_ppl.scene import Recording, Scene, nearest
 from pbrl_ppl.state import wrapped
 
@@ -36,7 +36,8 @@ def zero_angle(scene: Scene, body: str, zero: str) -> float:
             f"[recording]: zero of {body}'s theta is {zero!r}, expected a number or one of"
             f" {', '.join(ZEROS)}{nearest(zero, ZEROS)}"
         )
-    anchor = next((at for _, child, _, at in hinge_order(scene) if child == body), (0.0, 0.0))
+    held = (edge for edge in joint_order(scene) if edge[1] == body)
+    anchor = next((edge[3] for edge in held if edge[4].traits.pins_anchors), (0.0, 0.0))
     if not np.any(anchor):
         raise HistoryError(
             f'[recording]: zero of {body}\'s theta is "{zero}", and {body} hangs on no hinge beside'

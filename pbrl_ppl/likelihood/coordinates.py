@@ -10,7 +10,7 @@ from itertools import product
 import numpy as np
 
 from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.history import History, estimate_rates, fill_hinges, hung_bodies
+from pbrl_ppl.history import History, estimate_rates, fill_joints, joint_coordinates
 from pbrl_ppl.physics import touching
 from pbrl_ppl.scene import Scene, state_sizes
 from pbrl_ppl.state import STATE, THETA, VELOCITY, Bools, Floats, Ints, wrapped
@@ -106,16 +106,16 @@ class Coordinates:
         return np.asarray(values.reshape(*values.shape[:-2], -1)[..., self.places])
 
     def completed(self, scene: Scene, states: Floats) -> Floats:
-        """Place hinged bodies of states (..., body, 6) by their hinges, in place."""
+        """Place bodies of states (..., body, 6) by their hinges and sliders, in place."""
         if len(self.places) == 6 * len(scene.moving):  # none is hung
             return states
         free = np.zeros((len(scene.moving), 6), dtype=bool)
         free.reshape(-1)[self.places] = True
-        tied = hung_bodies(scene)
+        tied = joint_coordinates(scene)
         hung = np.array([body.name in tied for body in scene.moving])[:, None] & ~free
         if hung.any():
             states[..., hung] = np.nan
-            fill_hinges(states.reshape(-1, 1, *states.shape[-2:]), scene)
+            fill_joints(states.reshape(-1, 1, *states.shape[-2:]), scene)
         return states
 
     def slopes(
@@ -126,7 +126,7 @@ class Coordinates:
         Parameters
         ----------
         scene : Scene
-            Bodies; hinged ones follow the others.
+            Bodies; those in hinges and sliders follow the others.
         states : ndarray
             States before transitions, shape (transition, body, 6), SI units.
         steps : ndarray
@@ -221,9 +221,13 @@ def observed_coordinates(scene: Scene, history: History, *, exactness: float = 1
     still = measured & (high == low)
     still[:, VELOCITY:] |= still[:, :VELOCITY]
     free = np.array([[not body.kinematic] * len(STATE) for body in scene.moving])
+    tied = joint_coordinates(scene)
     for i, moving in enumerate(scene.moving):
-        if moving.name in hung_bodies(scene) and measured[i, THETA]:
-            free[i] = [d % VELOCITY == THETA for d in range(len(STATE))]
+        column = tied.get(moving.name)
+        if column in (0, 1) and not measured[i, column]:
+            column = 1 - column  # a slider's other position
+        if column is not None and measured[i, column]:
+            free[i] = [d % VELOCITY == column for d in range(len(STATE))]
     if _uncoupled(scene):  # what was not measured moves nothing that was
         seen = measured[:, :VELOCITY] | measured[:, VELOCITY:]
         free &= np.hstack([seen, seen])

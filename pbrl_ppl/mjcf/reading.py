@@ -30,6 +30,8 @@ _EFFECTS = (
     "com_offset",
     "pivot_damping",
     "pivot_friction",
+    "slider_damping",
+    "slider_friction",
     "linear_drag",
     "angular_drag",
 )
@@ -48,12 +50,13 @@ def scene_from_mjcf(
     """Return the planar scene of a MuJoCo model, in MJCF or URDF.
 
     Bodies keep their names. A body with a free joint, or with slides along both axes of the plane
-    and a hinge about its normal, is free; one with a hinge alone has a hinge to its parent or the
-    world. A hinge's damping and dry friction become the effects ``pivot_damping`` and
-    ``pivot_friction``, damping of equal slides ``linear_drag`` and of a free body's hinge
-    ``angular_drag``. An inertia or a centre of mass that differs from that of an even outline
-    becomes ``inertia_scale`` or ``com_offset``. The priors of these effects, and of the masses, are
-    about the model's values. Geoms of the world become walls (planes) and static bodies (others).
+    and a hinge about its normal, is free; one with a hinge or a slide alone has a hinge or slider
+    to its parent or the world. Their damping and dry friction become the effects ``pivot_damping``
+    and ``pivot_friction``, or ``slider_damping`` and ``slider_friction``, damping of equal slides
+    ``linear_drag`` and of a free body's hinge ``angular_drag``. An inertia or a centre of mass that
+    differs from that of an even outline becomes ``inertia_scale`` or ``com_offset``. The priors of
+    these effects, and of the masses, are about the model's values. Geoms of the world become walls
+    (planes) and static bodies (others).
 
     Parameters
     ----------
@@ -207,7 +210,7 @@ class _View:
 
         Bodies are asked for in their order, so that a parent comes before its children.
         """
-        name, hinge = self.name(i), self.hinge(i)
+        name, held = self.name(i), self.held(i)
         theta = self.angle(i)
         mass, centre, moment = self.inertia(i)
         shape, origin = self.outline(i, theta, centre)
@@ -221,9 +224,9 @@ class _View:
         if np.abs(offset).max() > _EVEN * size:
             for axis, value in zip("xy", offset, strict=True):
                 prior[f"com_offset_{axis}"] = {"mu": rounded(value), "sigma": rounded(size / 10)}
-        for label, value in self.friction(i, hinge is not None).items():
+        for label, value in self.friction(i, held is not None).items():
             prior[label] = {"mu": rounded(value), "sigma": rounded(value / 2)}
-        if hinge is None and np.abs(self.place(self.data.xpos[i]) - origin).max() > FLAT * size:
+        if held is None and np.abs(self.place(self.data.xpos[i]) - origin).max() > FLAT * size:
             self.left_out.append(
                 f'the frame of body "{name}", which is not at its outline\'s centroid: put it there'
                 " before from_mujoco reads rollouts"
@@ -236,14 +239,17 @@ class _View:
             effects=tuple(e for e in _EFFECTS if any(label.startswith(f"{e}_") for label in prior)),
             pose=(*pair(origin), rounded(theta)),
         )
-        if hinge is None:
+        if held is None:
             return body, None
-        parent, anchor = hinge
+        parent, anchor, way = held
         above, turn = self.poses.get(parent, (np.zeros(2), 0.0))
         other = self.name(parent) if parent else WORLD
         at_parent = pair(rotation(-turn) @ (anchor - above))
         at_child = pair(rotation(-theta) @ (anchor - origin))
-        return body, Joint("hinge", (other, name), at_parent, at_child)
+        if way is None:
+            return body, Joint("hinge", (other, name), at_parent, at_child)
+        along = pair(rotation(-turn) @ way)
+        return body, Joint("slider", (name, other), at_child, at_parent, axis=along)
 
     def angle(self, i: int) -> float:
         """Return a body's angle in the reference configuration.
@@ -263,19 +269,18 @@ class _View:
             )
         return math.atan2(frame[1, 0], frame[0, 0])
 
-    def hinge(self, i: int) -> tuple[int, Floats] | None:
-        """Return the parent (0 is the world) and the place (2,) of a hinge; None if it is free."""
+    def held(self, i: int) -> tuple[int, Floats, Floats | None] | None:
+        """Return parent (0 is the world), place (2,) and a slider's axis (2,); None if free."""
         model = self.model
         parent = int(model.body_weldid[model.body_parentid[i]])
         first, count = int(model.body_jntadr[i]), int(model.body_jntnum[i])
         kinds = [int(kind) for kind in model.jnt_type[first : first + count]]
         across = [self.axes @ self.data.xaxis[j] for j in range(first, first + count)]
-        hinges = [n for n, kind in enumerate(kinds) if kind == HINGE]
         slides = [n for n, kind in enumerate(kinds) if kind == SLIDE]
         where = f'body "{self.name(i)}"'
         expected = (
-            "expected a free joint, two slides in the plane and a hinge about its normal, or such a"
-            " hinge alone"
+            "expected a free joint, two slides in the plane and a hinge about its normal, or one"
+            " slide or hinge alone"
         )
         planar = all(
             abs(axis[2]) > 1 - FLAT if kind == HINGE else abs(axis[2]) < FLAT
@@ -296,7 +301,9 @@ class _View:
             if abs(a[0] * b[1] - a[1] * b[0]) > FLAT:
                 return None
         if kinds == [HINGE]:
-            return parent, self.place(self.data.xanchor[first + hinges[0]])
+            return parent, self.place(self.data.xanchor[first]), None
+        if kinds == [SLIDE]:
+            return parent, self.place(self.data.xanchor[first]), across[0][:2]
         names = ", ".join(_JOINTS[kind] for kind in kinds)
         above = f'on body "{self.name(parent)}"' if parent else "in the world"
         raise SceneError(f"{where}: it has {names} {above}; {expected}. Change its joints in MJCF")
@@ -313,7 +320,7 @@ class _View:
             if there:
                 self.left_out.append(f'the {what} of joint "{name}"')
 
-    def friction(self, i: int, hinged: bool) -> dict[str, float]:
+    def friction(self, i: int, held: bool) -> dict[str, float]:
         """Return the coefficients of effects that the joints' damping and dry friction are."""
         model = self.model
         first, count = int(model.body_dofadr[i]), int(model.body_dofnum[i])
@@ -322,11 +329,11 @@ class _View:
         joints = range(int(model.body_jntadr[i]), int(model.body_jntadr[i] + model.body_jntnum[i]))
         kinds = np.array([model.jnt_type[j] for j in joints])
         parameters: dict[str, float] = {}
-        if hinged:
-            parameters["pivot_damping_coefficient"], parameters["pivot_friction_torque"] = (
-                damping[0],
-                dry[0],
-            )
+        if held:
+            use, dry_use = "pivot", "pivot_friction_torque"
+            if kinds[0] == SLIDE:
+                use, dry_use = "slider", "slider_friction_force"
+            parameters[f"{use}_damping_coefficient"], parameters[dry_use] = damping[0], dry[0]
         else:
             if FREE in kinds:  # one coefficient for all
                 slide, turn = damping[:3], damping[3:]

@@ -31,8 +31,10 @@ def mjcf_ranges(
     The model has each body at its posterior mean: mass, moment of inertia and centre of mass,
     friction in contacts (MuJoCo takes the larger one of two geoms, the scene their product), and
     the damping and dry friction of its joints (``pivot_damping``, ``pivot_friction``,
-    ``linear_drag``, ``angular_drag``). In its reference configuration all angles are zero, so that
-    positions of its hinges are the scene's angles, those of a chain relative to the body above.
+    ``slider_damping``, ``slider_friction``, ``linear_drag``, ``angular_drag``). In its
+    reference configuration all angles are zero (a slider's as in the poses), so that positions of
+    its hinges are the scene's angles, those of a chain relative to the body above, and positions of
+    sliders the distances of their anchors along the axis.
 
     Parameters
     ----------
@@ -67,7 +69,7 @@ def mjcf_ranges(
     -----
     ConversionWarning
         Lists what MJCF leaves out: effects other than those above, wheels, joints that are no known
-        hinges. Restitution is in the ranges alone, since MuJoCo has none.
+        hinges or sliders. Restitution is in the ranges alone, since MuJoCo has none.
 
     Examples
     --------
@@ -165,13 +167,15 @@ class _Writer:
         return ET.tostring(self.root, encoding="unicode") + "\n", self.left_out
 
     def hinges(self) -> list[Joint]:
-        """Return the known hinges; list other joints as left out."""
+        """Return the known hinges and sliders; list other joints as left out."""
         kept = []
         for name, joint in zip(self.scene.joint_names, self.scene.joints, strict=True):
-            if joint.kind == "hinge" and joint.known:
+            if joint.traits.hangs and joint.known:
                 kept.append(joint)
             else:
-                self.left_out.append(f'joint "{name}", which is not a hinge with known anchors')
+                self.left_out.append(
+                    f'joint "{name}", which is not a hinge or slider with known anchors'
+                )
         return kept
 
     def release(self, body: Body) -> None:
@@ -187,34 +191,47 @@ class _Writer:
         self.list_effects(body, {"linear_drag", "angular_drag"})
 
     def hang(self, joint: Joint, parent: str, name: str) -> None:
-        """Add a body that hangs in a hinge on another."""
+        """Add a body that hangs in a hinge or slider on another."""
         body, values = self.scene.body(name), self.values[name]
         above, below = joint.anchor_a or (0.0, 0.0), joint.anchor_b or (0.0, 0.0)
         if joint.bodies == (name, parent):
             above, below = below, above
+        slides = joint.traits.slides
         turn = -self.angles[parent]
+        if slides:
+            turn = self.scene.reference_angle(name) - self.scene.reference_angle(parent)
         place = np.asarray(above) - rotation(turn) @ below
         element = self.add(body, self.elements[parent], self.placed(place, turn))
-        damping, known = values.get("pivot_damping_coefficient", 0.0), {"pivot_friction"}
+        self.angles[name] = self.angles[parent] + turn
+        axis, use, drag, dry = self.axes[2], "pivot", "angular_drag", "pivot_friction_torque"
+        if slides:
+            angle = self.scene.direction(joint) - self.scene.reference_angle(name)
+            axis = self.axes[:2].T @ (math.cos(angle), math.sin(angle))
+            use, drag, dry = "slider", "linear_drag", "slider_friction_force"
+        damping = values.get(f"{use}_damping_coefficient", 0.0)
+        known = {f"{use}_damping", f"{use}_friction"}
         if not self.moves(parent):
-            damping += values.get("angular_drag_coefficient", 0.0)
-            known |= {"angular_drag"}
-        hinge = {
-            "name": f"{name}_theta",
-            "type": "hinge",
-            "axis": _text(self.axes[2]),
+            damping += values.get(f"{drag}_coefficient", 0.0)
+            known |= {drag}
+        attributes = {
+            "name": f"{name}_slide" if slides else f"{name}_theta",
+            "type": "slide" if slides else "hinge",
+            "axis": _text(axis),
             "pos": _text(self.axes[:2].T @ below),
             "damping": f"{damping:.9g}",
-            "frictionloss": f"{values.get('pivot_friction_torque', 0.0):.9g}",
+            "frictionloss": f"{values.get(dry, 0.0):.9g}",
         }
-        element.insert(0, ET.Element("joint", hinge))
-        self.list_effects(body, {"pivot_damping", *known})
+        element.insert(0, ET.Element("joint", attributes))
+        self.list_effects(body, known)
 
     def moves(self, name: str) -> bool:
         return any(body.name == name for body in self.scene.moving)
 
     def connect(self, joint: Joint) -> None:
         """Close a loop of hinges."""
+        if joint.traits.slides:
+            self.left_out.append(f"the slider of {joint.bodies}, which closes a loop")
+            return
         a, b = joint.bodies or ("", "")
         first, anchor = (a, joint.anchor_a) if a != WORLD else (b, joint.anchor_b)
         second = {"body2": b} if first == a and b != WORLD else {}

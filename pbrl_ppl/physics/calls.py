@@ -44,7 +44,12 @@ Functions = namedtuple(
 #: C functions that set properties of constraints.
 SETTERS = sorted(
     {s.function for kind in JOINT_KINDS.values() for s in kind.settings}
-    | {s.function for kinds in BODY_CONSTRAINTS.values() for kind in kinds for s in kind.settings}
+    | {
+        s.function
+        for kinds in BODY_CONSTRAINTS.values()
+        for kind in kinds
+        for s in (*kind.settings, *kind.joint_settings)
+    }
 )
 _PLACE, _DOUBLE = ir.IntType(64), ir.DoubleType()
 
@@ -165,7 +170,9 @@ class Pointers(NamedTuple):
     iterations: int
     chained: NDArray[np.bool_]
     padding: int
-    normal_gravity: float  # m/s^2
+    gravity_x: float  # m/s^2
+    gravity_y: float
+    normal_gravity: float
     size: float  # m
     fastest: float  # m/s
     far: float  # m
@@ -179,6 +186,7 @@ class Pointers(NamedTuple):
     limited: NDArray[np.int64]
     body_settings: NDArray[np.void]  # of dtype SETTING, as the others
     strengths: NDArray[np.void]
+    pivots: NDArray[np.int64]  # (hinge, 3): body, joint, column of its anchor on the body
     joint_settings: NDArray[np.void]
     discs: NDArray[np.int64]
     patches: NDArray[np.int64]  # (2, patch, point of the ring): what holds it, the rod
@@ -219,6 +227,8 @@ def pointers(world: World) -> Pointers:
         iterations=world.iterations,
         chained=world.chained,
         padding=world.padding,
+        gravity_x=world.scene.gravity[0],
+        gravity_y=world.scene.gravity[1],
         normal_gravity=world.scene.normal_gravity,
         size=world.size,
         fastest=world.fastest,
@@ -234,6 +244,7 @@ def pointers(world: World) -> Pointers:
         body_settings=table(p for p in world.body_settings if p.setting.attribute != "max_force"),
         strengths=table(p for p in world.body_settings if p.setting.attribute == "max_force"),
         joint_settings=table(world.joint_settings),
+        pivots=whole(*chain(*world.pivots)).reshape(-1, 3),
         discs=at(*(disc._shape for disc in world.discs)),
         patches=constraints(*(p.first for p in patches), *(p.second for p in patches)).reshape(
             2, -1, len(RING)

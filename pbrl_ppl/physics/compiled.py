@@ -9,8 +9,19 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.physics.calls import call1, call2, call_int, call_law, call_pointer, get1, get2
+from pbrl_ppl.physics.calls import call1, call2, call_int, call_pointer, get1, get2
 from pbrl_ppl.physics.compilation import compiled, copy
+from pbrl_ppl.physics.laws import (
+    ACTED,
+    COMMAND,
+    LATE,
+    MORE,
+    WRENCHES,
+    act,
+    bound,
+    laws_of,
+    set_memory,
+)
 from pbrl_ppl.physics.properties import COLUMN
 from pbrl_ppl.physics.setters import (
     arm,
@@ -34,7 +45,9 @@ class Scratch(NamedTuple):
 
     state: NDArray[np.float64]  # (body, 6)
     axes: NDArray[np.float64]  # (wheel, 2): cos and sin of the wheel's angle on the body
-    acted: NDArray[np.float64]  # (body + 1, 9), see `act`
+    acted: NDArray[np.float64]  # (body + 4, 12), see `act`
+    memory: NDArray[np.float64]  # (2, slot), see `set_memory`
+    at: NDArray[np.int64]  # (2,), the same
 
 
 @numba.njit(inline="always")
@@ -68,48 +81,28 @@ def _forget(fn, world, bodies, batch, touched):  # type: ignore[no-untyped-def]
     set_strengths(fn, world, bodies, True)
 
 
-#: Columns of what acts on a body: its command, the one of the interval before, and the wrench.
-COMMAND, PREVIOUS, WRENCHES = 0, 3, 6
-
-
 @compiled
-def act(  # type: ignore[no-untyped-def]
-    state, interval, commands, command_parameters, forces, force_parameters, begin, end, acted
-):  # fmt: skip
-    """Compute the wrench on each body in a substep: the command stage, then the force stage.
-
-    ``state`` is (body, 6) and ``interval`` the inputs of the interval, (body, 3 or 9); ``begin``
-    and ``end`` of the substep are shares of the interval. ``acted`` (body + 1, 9) becomes command,
-    command before and wrench of each body; the last row is what a command law sees. Laws are rows
-    of address, body, first parameter and memory.
-    """
-    k, known, data = len(interval), interval.shape[1] > 3, acted.ctypes.data
-    signal_at = data + 72 * k
-    for i in range(k):
-        for w in range(3):
-            acted[i, COMMAND + w] = interval[i, w]
-            acted[i, PREVIOUS + w] = interval[i, 3 + w] if known else 0.0
-    acted[k, 6], acted[k, 7] = begin, end
-    for e in range(len(commands)):
-        address, i, first, memory = (commands[e, 0], commands[e, 1], commands[e, 2], commands[e, 3])
-        state_at = state.ctypes.data + 48 * i
-        parameters_at = command_parameters.ctypes.data + 8 * first
-        for w in range(6):
-            acted[k, w] = acted[i, w]
-        call_law(address, state_at, signal_at, parameters_at, data + 72 * i)
-        if known and not memory:
-            for w in range(3):
-                acted[k, w] = acted[i, PREVIOUS + w]
-            call_law(address, state_at, signal_at, parameters_at, data + 72 * i + 8 * PREVIOUS)
-    for i in range(k):
-        for w in range(3):
-            acted[i, WRENCHES + w] = acted[i, COMMAND + w]
-    for e in range(len(forces)):
-        address, i, first = forces[e, 0], forces[e, 1], forces[e, 2]
-        call_law(
-            address, state.ctypes.data + 48 * i, data + 72 * i,
-            force_parameters.ctypes.data + 8 * first, data + 72 * i + 8 * WRENCHES,
-        )  # fmt: skip
+def set_brakes(world, laws, bodies, joints, state, acted):  # type: ignore[no-untyped-def]
+    """Set the greatest torque of friction in hinges where laws change it."""
+    for j in range(len(world.strengths)):
+        setting = world.strengths[j]
+        i = setting.row
+        if setting.column != COLUMN.pivot_torque:
+            continue
+        row, rest = bodies[i], 0.0
+        for hinge in world.pivots:
+            if hinge[0] == i:  # body, joint, column of the anchor on the body
+                x, y = row[COLUMN.com_x], row[COLUMN.com_y]
+                x -= joints[hinge[1], hinge[2]]
+                y -= joints[hinge[1], hinge[2] + 1]
+                c, s = math.cos(state[i, 2]), math.sin(state[i, 2])
+                x, y = c * x - s * y, s * x + c * y
+                weight_x = world.gravity_x + row[COLUMN.extra_gravity_x]
+                weight_y = world.gravity_y + row[COLUMN.extra_gravity_y]
+                rest = row[COLUMN.mass] * (x * weight_y - y * weight_x)
+        torque, speed = acted[i, COMMAND + 2], abs(state[i, 5])
+        most = bound(row[COLUMN.pivot_torque], laws, i, 0, state, torque, rest, speed, acted)
+        call1(setting.function, setting.constraint, most)
 
 
 @compiled
@@ -122,7 +115,7 @@ def intervals(bodies, p, t, horizon):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always")  # a call costs as much as a substep: the world is many arrays
 def _transition(  # type: ignore[no-untyped-def]
-    fn, world, batch, p, t, substeps, scratch, first, begin, whole, out
+    fn, world, batch, laws, p, t, substeps, scratch, first, begin, whole, out
 ):
     """Step one transition into ``out`` (H, body, 6), from the states ``first`` on.
 
@@ -131,9 +124,7 @@ def _transition(  # type: ignore[no-untyped-def]
     """
     k = len(world.bodies)
     step = batch.time_step / substeps
-    state, axes, acted = scratch
-    commands, forces = batch.commands, batch.forces
-    command_parameters, force_parameters = batch.given[3][p], batch.given[4][p]
+    state, axes, acted, memory, at = scratch
     inputs, end = batch.inputs[t], begin
     properties, joints = intervals(batch.given[0], p, t, len(inputs)), batch.given[1][p]
     copy(first, state)
@@ -143,10 +134,12 @@ def _transition(  # type: ignore[no-untyped-def]
         axes[j, 0], axes[j, 1] = math.cos(turn), math.sin(turn)
     touched, near = _FREE, False
     driven = world.kinematic.any()
-    acting = len(batch.commands) + len(batch.forces) > 0
+    acting = len(laws.commands) + len(laws.forces) > 0
     sliding = len(world.patch_body) > 0
+    braked = len(laws.frictions) > 0
     watch = len(world.obstacles) > 0 or k > 1
     place_bodies(fn, world, bodies, state)
+    set_memory(batch, laws, p, t, begin, first, acted, memory, at)
     while end < len(inputs) and (whole or near or end == begin):
         h = end
         if h > begin and len(properties) > 1:
@@ -160,14 +153,13 @@ def _transition(  # type: ignore[no-untyped-def]
             drive(fn, world, state, inputs[h])
         for i in range(k):
             for w in range(3):
-                acted[i, WRENCHES + w] = inputs[h, i, w]
+                acted[i, COMMAND + w] = acted[i, WRENCHES + w] = inputs[h, i, w]
         for s in range(substeps):
             near = False
             if acting:
-                act(
-                    state, inputs[h], commands, command_parameters, forces, force_parameters,
-                    s / substeps, (s + 1) / substeps, acted,
-                )  # fmt: skip
+                act(state, inputs[h], laws, s / substeps, (s + 1) / substeps, acted, memory[1])
+            if braked:
+                set_brakes(world, laws, bodies, joints, state, acted)
             for i in range(k):
                 if driven and world.kinematic[i]:
                     continue
@@ -180,7 +172,7 @@ def _transition(  # type: ignore[no-untyped-def]
                 call1(fn.cpBodySetTorque, world.bodies[i], torque)
             place_wheels(fn, world, bodies, state, axes, step)
             if sliding:
-                place_patches(fn, world, bodies, state, step)
+                place_patches(fn, world, laws, bodies, state, step, acted)
             call1(fn.cpSpaceStep, world.space, step)
             for i in range(k):
                 body = world.bodies[i]
@@ -197,6 +189,8 @@ def _transition(  # type: ignore[no-untyped-def]
                 near = near_contact(state, world.radii, world.obstacles, world.can_touch)
                 touched = _TOUCHED if near else touched
         copy(state, out[h])
+        if memory.shape[1] > 0:
+            act(state, inputs[h], laws, LATE, 1.0, acted, memory[1], True)
         end += 1
     return touched, end
 
@@ -217,20 +211,21 @@ def rollout(fn, world, batch, items, begins, whole, out):  # type: ignore[no-unt
     Returns the place among the items at which the engine diverged (its world must then be
     replaced), or the number of items.
     """
-    bodies, joints, discs, _, _ = batch.given
+    bodies, joints, discs = batch.given[:3]
     n, horizon = len(batch.inputs), batch.inputs.shape[1]
     states = np.empty((horizon, batch.inputs.shape[2], 6))
     total = np.empty_like(states)
     timed = bodies.shape[1] > 1
     k = len(world.bodies)
     axes = np.empty((len(world.wheel_body), 2))
-    scratch = Scratch(np.empty((k, 6)), axes, np.empty((k + 1, 9)))
+    acted, memory = np.zeros((k + MORE, ACTED)), np.zeros((2, batch.slots))
+    scratch = Scratch(np.empty((k, 6)), axes, acted, memory, np.full(2, -1))
     proposal, finer = -1, 1
     start, outcome = batch.start, _TOUCHED  # an earlier call may have left contacts
     for place in range(len(items)):
         item = items[place]
         p, t = item // n, item % n
-        begin = begins[place]
+        begin, laws = begins[place], laws_of(batch, p)
         first = intervals(bodies, p, t, horizon)[begin if timed else 0]
         states_before = start[p if len(start) > 1 else 0, t]
         if begin > 0:
@@ -246,8 +241,9 @@ def rollout(fn, world, batch, items, begins, whole, out):  # type: ignore[no-unt
             _forget(fn, world, first, batch, _TOUCHED)
             substeps = batch.counts[0] * finer
             outcome, end = _transition(
-                fn, world, batch, p, t, substeps, scratch, states_before, begin, whole, out[item]
-            )
+                fn, world, batch, laws, p, t, substeps, scratch, states_before, begin, whole,
+                out[item],
+            )  # fmt: skip
             if outcome == _LOST:
                 return place
             begins[place] = end
@@ -261,8 +257,9 @@ def rollout(fn, world, batch, items, begins, whole, out):  # type: ignore[no-unt
                     set_properties(fn, world, first, joints[p])
                 _forget(fn, world, first, batch, before)
                 outcome, _ = _transition(
-                    fn, world, batch, p, t, substeps, scratch, states_before, begin, whole, states
-                )
+                    fn, world, batch, laws, p, t, substeps, scratch, states_before, begin, whole,
+                    states,
+                )  # fmt: skip
                 if substeps > batch.counts[level] and outcome == _FREE:
                     outcome = _TOUCHED  # the first run touched: a refined one is not extrapolated
                 fine = substeps == batch.counts[level] * finer

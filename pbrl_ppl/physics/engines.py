@@ -29,6 +29,10 @@ class Batch(NamedTuple):
     given: tuple[Floats, ...]
     commands: Ints
     forces: Ints
+    frictions: Ints
+    slots: int
+    late: bool
+    follows: NDArray[np.bool_]
     start: Floats
     inputs: Floats
     time_step: float
@@ -115,6 +119,8 @@ class Engine:
                     f"engine 'contact-free': {len(items)} of {last - first} transitions have"
                     " contacts, or joints that the fast path lacks; use 'auto' or 'chipmunk'"
                 )
+            if len(items):
+                self.world.check_steps()
             done = 0
             while done < len(items):
                 done += compiled.rollout(

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pbrl_ppl.physics.compilation import compiled
-from pbrl_ppl.physics.compiled import COMMAND, WRENCHES, act
+from pbrl_ppl.physics.laws import COMMAND, LATE, WRENCHES, Laws, act, laws_of, set_memory
 from pbrl_ppl.physics.motion import (
     BIAS,
     BOUND,
@@ -36,6 +36,7 @@ from pbrl_ppl.physics.motion import (
     Q,
     U,
     row_speed,
+    set_bounds,
     set_coordinates,
     set_first_slide,
     set_forces,
@@ -46,8 +47,8 @@ from pbrl_ppl.physics.motion import (
     strain,
 )
 from pbrl_ppl.physics.solids import near_contact
-from pbrl_ppl.physics.tree import ALONG
-from pbrl_ppl.state import Floats, Ints
+from pbrl_ppl.physics.tree import ALONG, FIRST, TURNING
+from pbrl_ppl.state import Floats
 
 #: Times of the stages, weights of earlier slopes, and those of the error estimate.
 _TIMES = np.array([0.0, 0.2, 0.3, 0.8, 8 / 9, 1.0, 1.0])
@@ -81,14 +82,19 @@ def _slope(work, laws, u, a, inputs, share, low, high):  # type: ignore[no-untyp
 
     ``low`` and ``high`` are the ends of the piece, as shares of the interval.
     """
+    _load(work, laws, u, inputs, share, low, high)
+    solve(work, u, a, False)
+
+
+@compiled
+def _load(work, flow, u, inputs, share, low, high):  # type: ignore[no-untyped-def]
+    """Set what acts there: wrenches, forces, and rows of friction."""
+    laws = flow.laws
     if len(laws.commands) + len(laws.forces) > 0:
         begin = min(max(low + _SHORTEST, share), high - _WINDOW)  # past a jump that is no switch
-        act(
-            work.states, inputs, laws.commands, laws.command_parameters, laws.forces,
-            laws.force_parameters, begin, begin + _WINDOW, work.acted,
-        )  # fmt: skip
+        act(work.states, inputs, laws, begin, begin + _WINDOW, work.acted, flow.memory[1])
     set_forces(work, u)
-    solve(work, u, a, False)
+    set_bounds(work, laws, u)
 
 
 @compiled
@@ -102,10 +108,7 @@ def _switch(work, laws, inputs, low):  # type: ignore[no-untyped-def]
     for tries in range(52):
         share = low if tries == 0 else 1.0 if tries == 1 else 0.5 * (begin + end)
         share = min(max(low + _SHORTEST, share), 1.0 - _WINDOW)
-        act(
-            work.states, inputs, laws.commands, laws.command_parameters, laws.forces,
-            laws.force_parameters, share, share + _WINDOW, work.acted,
-        )  # fmt: skip
+        act(work.states, inputs, laws.laws, share, share + _WINDOW, work.acted, laws.memory[1])
         same = True
         for i in range(k):
             for w in range(3):
@@ -130,10 +133,18 @@ def _slowest(work, laws, r):  # type: ignore[no-untyped-def]
 
 
 @compiled
+def _size(work, laws, r):  # type: ignore[no-untyped-def]
+    """Return the natural size of a row's way: of a wheel's in m, or of its joint's coordinate."""
+    if work.kinds[r, 0] >= ALONG:
+        return laws.length
+    return work.motion[SIZE, work.tree[work.kinds[r, 1], FIRST]]
+
+
+@compiled
 def _set_wheel(work, r, mode):  # type: ignore[no-untyped-def]
-    """Set the mode of the rows of a wheel that is under the body of a ring, whose place is r."""
+    """Set the mode of rows of a wheel, or against turning, under the body of a ring at place r."""
     for row in range(work.n_rows):
-        under = work.kinds[row, 1] == work.kinds[r, 1] and work.kinds[row, 0] >= ALONG
+        under = work.kinds[row, 1] == work.kinds[r, 1] and work.kinds[row, 0] >= TURNING
         if under and work.rows[row, BOUND] > 0.0:
             work.kinds[row, 2], work.kinds[row, 3] = mode, 2
 
@@ -148,7 +159,7 @@ def _decide(work, laws, inputs, share, low, high):  # type: ignore[no-untyped-de
     motion, kinds, rows, rings = work.motion, work.kinds, work.rows, work.rings
     count, n, moves = work.n_rows, work.n, False
     set_places(work, Q, U)
-    set_forces(work, U)  # for the rows
+    _load(work, laws, U, inputs, share, low, high)  # for the rows
     for r in range(work.n_kinds):
         # what stuck before moves by the error of steps alone
         still = 100.0 * laws.tolerance if kinds[r, 2] == STICK else _STILL
@@ -158,7 +169,7 @@ def _decide(work, laws, inputs, share, low, high):  # type: ignore[no-untyped-de
             continue
         if r < count:
             speed = row_speed(work, r, U)
-            size = laws.length if kinds[r, 0] >= ALONG else 1.0
+            size = _size(work, laws, r)
             if abs(speed) * laws.time_step > still * size:
                 kinds[r, 2] = 1 if speed > 0.0 else -1
             moved = speed != 0.0
@@ -180,7 +191,7 @@ def _decide(work, laws, inputs, share, low, high):  # type: ignore[no-untyped-de
         worst, back, most = -1, -1, 1.0 - _STILL
         for r in range(count):
             if kinds[r, 3] == 0 and kinds[r, 2] == STICK:
-                pull = abs(rows[r, FORCE]) / rows[r, BOUND]
+                pull = abs(rows[r, FORCE]) / max(rows[r, BOUND], 1e-300)
                 if pull > most:
                     worst, most = r, pull
             elif kinds[r, 3] == 0:
@@ -231,9 +242,10 @@ def _margin(work, laws, u):  # type: ignore[no-untyped-def]
     for r in range(work.n_rows):
         mode = work.kinds[r, 2]
         if mode == STICK:
-            least = min(least, 1.0 - abs(work.rows[r, FORCE]) / work.rows[r, BOUND])
+            bound = max(work.rows[r, BOUND], 1e-300)
+            least = min(least, 1.0 - abs(work.rows[r, FORCE]) / bound)
         elif mode != SMOOTH:
-            size = laws.length if work.kinds[r, 0] >= ALONG else 1.0
+            size = _size(work, laws, r)
             least = min(least, mode * row_speed(work, r, u) * laws.time_step / size)
     return least
 
@@ -378,13 +390,11 @@ def _way(work, laws, still):  # type: ignore[no-untyped-def]
     return max(_SHORTEST, 0.5 * still.length / (fastest * laws.time_step))
 
 
-class Laws(NamedTuple):
-    """Laws of a proposal, and what steps are measured by."""
+class Flow(NamedTuple):
+    """Laws of a proposal, what they remember, and what steps are measured by."""
 
-    commands: Ints  # see `compiled.act`
-    command_parameters: Floats
-    forces: Ints
-    force_parameters: Floats
+    laws: Laws
+    memory: Floats  # (2, slot), see `laws.set_memory`
     time_step: float  # s
     tolerance: float  # error of a step, as a share of natural sizes
     length: float  # natural size of a way (m)
@@ -398,19 +408,16 @@ def rollout(works, still, batch, items, begins, out):  # type: ignore[no-untyped
     near an obstacle, H where none does. Those that diverge, or take more than ``MOST_STEPS`` steps
     of an interval, are NaN from there on.
     """
-    rows, joints, discs, _, _ = batch.given
+    rows, joints, discs = batch.given[:3]
     work = works[0]
     n, horizon, proposal, bodies = len(batch.inputs), batch.inputs.shape[1], -1, work.n_bodies
-    timed, remembers, fixed = rows.shape[1] > 1, False, len(still.obstacles) - discs.shape[1]
-    for e in range(len(batch.commands)):
-        remembers |= batch.commands[e, 3] > 0
+    timed, fixed = rows.shape[1] > 1, len(still.obstacles) - discs.shape[1]
+    memory, at = np.zeros((2, batch.slots)), np.full(2, -1)
     for place in range(len(items)):
         item = items[place]
         p, t = item // n, item % n
-        laws = Laws(
-            batch.commands, batch.given[3][p], batch.forces, batch.given[4][p], batch.time_step,
-            batch.tolerance, still.length,
-        )  # fmt: skip
+        laws = laws_of(batch, p)
+        flow = Flow(laws, memory, batch.time_step, batch.tolerance, still.length)
         if p != proposal:
             proposal = p
             for j in range(discs.shape[1]):
@@ -435,18 +442,21 @@ def rollout(works, still, batch, items, begins, out):  # type: ignore[no-untyped
                 for k in range(bodies):
                     for d in range(6):
                         work.states[k, d] = begin[k, d]
+                set_memory(batch, laws, p, t, h, work.states, work.acted, memory, at)
             inputs, budget, low, high = batch.inputs[t, h], MOST_STEPS, 0.0, 0.0
             for k in range(bodies):
                 for w in range(3):
-                    work.acted[k, WRENCHES + w] = inputs[k, w]
+                    work.acted[k, COMMAND + w] = work.acted[k, WRENCHES + w] = inputs[k, w]
                     if work.bodies[k] < 0:
                         work.states[k, 3 + w] = inputs[k, w]
             while high < 1.0 and budget > 0:
                 low, high = high, 1.0
-                if remembers:
+                if batch.late:
                     set_places(work, Q, U)
-                    high = _switch(work, laws, inputs, low)
-                budget, wanted = _advance(work, laws, still, inputs, low, high, budget, wanted)
+                    high = _switch(work, flow, inputs, low)
+                budget, wanted = _advance(work, flow, still, inputs, low, high, budget, wanted)
+            if batch.slots > 0:
+                act(work.states, inputs, laws, LATE, 1.0, work.acted, memory[1], True)
             if budget < 0:
                 begins[place] = h
                 break

@@ -13,11 +13,14 @@ from numpy.typing import NDArray
 from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.parameters import JOINT_ANCHORS, JOINT_INDICES
 from pbrl_ppl.scene import WORLD, Scene, smallest_radius
-from pbrl_ppl.state import Floats
+from pbrl_ppl.state import Bools, Floats
 
-#: Columns of a joint's numbers: its anchors and its length (m).
-JOINT_COLUMNS = (*JOINT_ANCHORS, "length")
-A_X, A_Y, B_X, B_Y, LENGTH = range(len(JOINT_COLUMNS))
+#: Columns of a joint's numbers: its anchors and its length; of a slider, the ends of its line in
+#: the first body's frame (m).
+JOINT_COLUMNS = (*JOINT_ANCHORS, "length", "low_x", "low_y", "high_x", "high_y")
+A_X, A_Y, B_X, B_Y, LENGTH, LOW_X, LOW_Y, HIGH_X, HIGH_Y = range(len(JOINT_COLUMNS))
+#: Half the length of a slider's line, in radii of the smallest body: no body reaches an end.
+_LINE = 1e6
 
 
 class Setting(NamedTuple):
@@ -48,8 +51,8 @@ class JointKind:
         Properties of the constraint, in the order in which they are set.
     gap : callable
         Distance of the anchors from that in the reference poses (m).
-    friction : bool
-        Whether the effects of friction and damping in a hinge act in it.
+    friction : str
+        The body's constraints by which friction and damping act in it: see `world`. None without.
     contact_free : bool
         Whether the contact-free fast path has its arithmetic.
     """
@@ -57,7 +60,7 @@ class JointKind:
     constraint: Callable[[pymunk.Body, pymunk.Body], pymunk.Constraint]
     settings: tuple[Setting, ...]
     gap: Callable[[float], float]
-    friction: bool = False
+    friction: str = ""
     contact_free: bool = False
 
 
@@ -68,7 +71,7 @@ HINGE = JointKind(
         Setting("anchor_b", "cpPivotJointSetAnchorB", (B_X, B_Y)),
     ),
     gap=lambda distance: 0.0,
-    friction=True,
+    friction="pivot",
     contact_free=True,
 )
 ROD = JointKind(
@@ -81,8 +84,33 @@ ROD = JointKind(
     gap=lambda distance: distance,
     contact_free=True,
 )
+#: Right for bodies that never turn alone: see `never_turning`.
+SLIDER = JointKind(
+    constraint=lambda a, b: pymunk.GrooveJoint(a, b, (-1, 0), (1, 0), (0, 0)),
+    settings=(
+        Setting("groove_a", "cpGrooveJointSetGrooveA", (LOW_X, LOW_Y)),
+        Setting("groove_b", "cpGrooveJointSetGrooveB", (HIGH_X, HIGH_Y)),
+        Setting("anchor_b", "cpGrooveJointSetAnchorB", (B_X, B_Y)),
+    ),
+    gap=lambda distance: 0.0,
+    friction="rail",
+    contact_free=True,
+)
 #: Every kind that a scene can declare.
-JOINT_KINDS = {"hinge": HINGE, "distance": ROD}
+JOINT_KINDS = {"hinge": HINGE, "slider": SLIDER, "distance": ROD}
+
+
+def never_turning(scene: Scene) -> Bools:
+    """Return the moving bodies that sliders alone tie to what is fixed, shape (body,).
+
+    They keep their reference angles: their moments of inertia do not matter.
+    """
+    reached = {WORLD, *(body.name for body in scene.bodies if body.static)}
+    pairs = [set(joint.bodies or ()) for joint in scene.joints if joint.traits.slides]
+    for _ in pairs:
+        for pair in pairs:
+            reached |= pair if pair & reached else set()
+    return np.array([body.name in reached and not body.kinematic for body in scene.moving])
 
 
 class SceneJoints:
@@ -117,6 +145,13 @@ class SceneJoints:
                 free.append((j, *(places[f"{name}[{owner}]"] for name in JOINT_INDICES)))
         self._moved_anchors = np.array(moved, dtype=int).reshape(-1, 3).T
         self._free = np.array(free, dtype=int).reshape(-1, 3)
+        #: Ends of the sliders' lines from the first body's anchor, zero of other joints.
+        self._ends = np.zeros((len(scene.joints), 4))
+        for j, joint in enumerate(scene.joints):
+            if joint.traits.slides and joint.bodies:
+                turn = scene.direction(joint) - scene.reference_angle(joint.bodies[0])
+                along = _LINE * smallest_radius(scene) * np.array([np.cos(turn), np.sin(turn)])
+                self._ends[j] = *-along, *along
         lengths = self._lengths(self._anchors, self._held)
         #: Kind of each joint in the engine.
         self.kinds = tuple(
@@ -146,7 +181,7 @@ class SceneJoints:
         Returns
         -------
         joints : ndarray
-            Shape (proposal, joint, 5), columns as in :data:`JOINT_COLUMNS`, m.
+            Shape (proposal, joint, 9), columns as in :data:`JOINT_COLUMNS`, m.
         indices : ndarray
             Indices into ``scene.joinable`` of an inferred joint's bodies, shape (proposal, free
             joint, 2).
@@ -163,6 +198,7 @@ class SceneJoints:
         joints[..., :4] = self._anchors
         place, joint, column = self._moved_anchors
         joints[:, joint, column] = phi[:, place]
+        joints[..., LOW_X:] = self._ends + np.tile(joints[..., :B_X], 2)
         indices = phi[:, self._free[:, 1:]]
         choices = len(self._scene.joinable)
         wrong = (indices != np.floor(indices)) | (indices < 0) | (indices >= choices)

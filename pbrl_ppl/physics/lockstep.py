@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.physics.compilation import compiled
-from pbrl_ppl.physics.compiled import act
+from pbrl_ppl.physics.laws import ACTED, LATE, MORE, act, laws_of, set_memory
 from pbrl_ppl.physics.lockstep_bodies import (
     BLOCK,
     BODY,
@@ -44,7 +44,7 @@ class Wheels(NamedTuple):
 
 def free_wheels(world: World) -> Wheels | None:
     """Return a world's wheels; None where a body follows a path, is joined, or is on friction."""
-    if world.kinematic.any() or world.links or world.patches:
+    if world.kinematic.any() or world.links or world.patches or world.turners:
         return None
     wheels = [wheel.body for wheel in world.wheels]
     return Wheels(np.isin(np.arange(len(world.bodies)), wheels), world.iterations)
@@ -69,17 +69,18 @@ def rollout(wheels, still, batch, items, begins, out):  # type: ignore[no-untype
     ``begins``, shape (item,), are their first intervals; they become those in which a body comes
     near an obstacle or diverges, H where none does.
     """
-    rows, _, discs, command_parameters, force_parameters = batch.given
+    rows, discs = batch.given[0], batch.given[2]
     start, inputs = batch.start, batch.inputs
     n, horizon, moving = len(inputs), inputs.shape[1], len(still.radii)
     timed = rows.shape[1] > 1
-    commands, forces = batch.commands, batch.forces
-    acting = len(commands) + len(forces) > 0
+    acting = len(batch.commands) + len(batch.forces) > 0
     bodies = np.zeros((moving, BLOCK * len(BODY)))
     own_discs = np.zeros((BLOCK, discs.shape[1], 3))
     touched = np.zeros(BLOCK, dtype=np.bool_)
     proposal, transition, first, until = np.zeros((4, BLOCK), dtype=np.int64)
-    states, acted = np.empty((moving, 6)), np.empty((moving + 1, 9))
+    states, acted = np.empty((moving, 6)), np.zeros((moving + MORE, ACTED))
+    memory, at = np.zeros((2, batch.slots)), np.full(2, -1)
+    remembered = np.zeros((BLOCK, batch.slots))
     for begin in range(0, len(items), BLOCK):
         width = min(BLOCK, len(items) - begin)
         longest = 0
@@ -117,6 +118,12 @@ def rollout(wheels, still, batch, items, begins, out):  # type: ignore[no-untype
                             align(body, i)
                         force_x, force_y = inputs[t, h, k, 0], inputs[t, h, k, 1]
                         set_wrench(body, i, force_x, force_y, inputs[t, h, k, 2])
+                for i in range(width if ahead == 0 and batch.slots > 0 else 0):
+                    p, t = proposal[i], transition[i]
+                    for k in range(moving):
+                        get_state(bodies[k], i, states, k)
+                    set_memory(batch, laws_of(batch, p), p, t, first[i], states, acted, memory, at)
+                    remembered[i] = memory[1]
                 for s in range(substeps):
                     if acting:
                         for i in range(width):
@@ -124,8 +131,8 @@ def rollout(wheels, still, batch, items, begins, out):  # type: ignore[no-untype
                             for k in range(moving):
                                 get_state(bodies[k], i, states, k)
                             act(
-                                states, inputs[t, h], commands, command_parameters[p], forces,
-                                force_parameters[p], s / substeps, (s + 1) / substeps, acted,
+                                states, inputs[t, h], laws_of(batch, p), s / substeps,
+                                (s + 1) / substeps, acted, remembered[i],
                             )  # fmt: skip
                             for k in range(moving):
                                 set_wrench(bodies[k], i, acted[k, 6], acted[k, 7], acted[k, 8])
@@ -137,6 +144,12 @@ def rollout(wheels, still, batch, items, begins, out):  # type: ignore[no-untype
                         lose(bodies[k], still, touched)
                     if still.watched:
                         watch(bodies, still, own_discs, touched)
+                for i in range(width if batch.slots > 0 else 0):
+                    p, t, h = proposal[i], transition[i], min(first[i] + ahead, horizon - 1)
+                    for k in range(moving):
+                        get_state(bodies[k], i, states, k)
+                    laws = laws_of(batch, p)
+                    act(states, inputs[t, h], laws, LATE, 1.0, acted, remembered[i], True)
                 for i in range(width):
                     item, h = items[begin + i], first[i] + ahead
                     if touched[i]:

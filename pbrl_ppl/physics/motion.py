@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.physics.compilation import compiled
 from pbrl_ppl.physics.joints import LENGTH
+from pbrl_ppl.physics.laws import ACTED, COMMAND, MORE, bound
 from pbrl_ppl.physics.properties import COLUMN
 from pbrl_ppl.physics.tree import (
     ACROSS,
@@ -24,6 +25,7 @@ from pbrl_ppl.physics.tree import (
     FAR,
     FIRST,
     FREE,
+    HINGE,
     JOINT,
     KIND,
     MOST,
@@ -31,7 +33,9 @@ from pbrl_ppl.physics.tree import (
     OWNER,
     PARENT,
     PIVOT,
+    RAIL,
     TURN,
+    TURNING,
     UNDER,
     Tree,
 )
@@ -45,14 +49,18 @@ from pbrl_ppl.physics.world import RING
     COS, SIN, X, Y, V_X, V_Y, B_X, B_Y,
 ) = range(19)  # fmt: skip
 #: Columns of a row's numbers: its greatest force and the one with which it sticks, its acceleration
-#: without that of the speeds, a wheel's place from the joint's and direction; then G.
-BOUND, FORCE, BIAS, W_X, W_Y, W_COS, W_SIN, G = range(8)
+#: without that of the speeds, a wheel's place from the joint's and direction, its greatest force
+#: but for laws that change it; then G.
+BOUND, FORCE, BIAS, W_X, W_Y, W_COS, W_SIN, BASE, G = range(9)
 #: Rows of what each coordinate has: coordinates and speeds now and at the end of a step, natural
 #: sizes, forces Q; then seven slopes (speed, acceleration), and M.
 Q, U, END_Q, END_U, SIZE, LOAD, SLOPES, M = 0, 1, 2, 3, 4, 5, 6, 20
 #: Rows of a ring's numbers: greatest force of a point and reaction on a ring that holds; twist
-#: where a step begins, and at its end; then its points, from the joint's place.
-GRIP, TWIST, TWIST_END, POINTS = range(4)
+#: where a step begins (and the greatest force but for laws), at its end, and now; then its points,
+#: from the joint's place.
+GRIP, TWIST, TWIST_END, TWIST_NOW, POINTS = range(5)
+#: Columns of a link's pose: heading and slider's direction, less the coordinate of its angle.
+HEADING, AXIS = 4, 5
 #: Modes of a row beside slipping in its positive (1) or negative direction: it sticks, or has no
 #: friction. A ring slides or sticks.
 STICK, SMOOTH, SLIDE = 0, 2, 1
@@ -71,7 +79,7 @@ WORK = np.dtype(
         ("tree", np.int64, (MOST, 9)),
         ("kinds", np.int64, (MOST, 4)),  # of rows, then rings (-1): link, mode, if that is settled
         ("bodies", np.int64, (MOST,)),  # their links
-        ("poses", np.float64, (MOST, 4)),
+        ("poses", np.float64, (MOST, 6)),
         ("links", np.float64, (MOST, B_Y + 1)),
         ("slope", np.float64, (MOST, MOST, 2)),  # derivative of a link's place by each coordinate
         ("rows", np.float64, (MOST, G + MOST)),
@@ -79,7 +87,7 @@ WORK = np.dtype(
         ("motion", np.float64, (M + MOST, MOST)),
         ("system", np.float64, (4 * MOST, 4 * MOST + 1)),
         ("states", np.float64, (MOST, 6)),
-        ("acted", np.float64, (MOST + 1, 9)),  # see `compiled.act`
+        ("acted", np.float64, (MOST + MORE, ACTED)),  # see `laws.act`
     ],
     align=True,
 )
@@ -100,14 +108,14 @@ def work_of(tree: Tree, length: float) -> NDArray[np.void]:
     )
     work["motion"][0, SIZE] = 1.0
     for kind, first in tree.links[:, [KIND, FIRST]]:
-        if kind == FREE:
-            work["motion"][0, SIZE, first : first + 2] = length
+        if kind in (FREE, RAIL):
+            work["motion"][0, SIZE, first : first + 1 + (kind == FREE)] = length
     return work
 
 
 @compiled
 def set_numbers(work, gravity, normal_gravity, ring, bodies, joints):  # type: ignore[no-untyped-def]
-    """Set what depends on parameters alone: of ``bodies`` (body, column), ``joints`` (joint, 5)."""
+    """Set what depends on parameters alone: of ``bodies`` (body, column), ``joints`` (joint, 9)."""
     for i in range(work.n_links):
         fields, link, joint = work.tree[i], work.links[i], work.tree[i, JOINT]
         parent, near, far = fields[PARENT], fields[NEAR], fields[FAR]
@@ -118,7 +126,7 @@ def set_numbers(work, gravity, normal_gravity, ring, bodies, joints):  # type: i
         if near >= 0:
             x, y = joints[joint, near], joints[joint, near + 1]
         if parent < 0:
-            at_x, at_y, c, s = work.poses[i]
+            at_x, at_y, c, s, _, _ = work.poses[i]
             x, y = at_x + c * x - s * y, at_y + s * x + c * y
         elif work.tree[parent, KIND] == BAR:
             x = joints[joint, LENGTH]
@@ -146,13 +154,17 @@ def set_numbers(work, gravity, normal_gravity, ring, bodies, joints):  # type: i
                 point = work.rings[r - work.n_rows, POINTS + j]
                 point[0], point[1] = x, y
         if kind < 0:
-            work.rings[r - work.n_rows, GRIP, 0] = row[COLUMN.patch_mu] * load / len(ring)
+            grip = row[COLUMN.patch_mu] * load / len(ring)
+            work.rings[r - work.n_rows, GRIP, 0] = work.rings[r - work.n_rows, TWIST, 3] = grip
             continue
         numbers = work.rows[r]
         if kind == PIVOT:
             numbers[BOUND] = bodies[work.tree[i, OWNER], COLUMN.pivot_torque]
         elif kind == UNDER:
+            lever = 1.0 if work.tree[i, KIND] == RAIL else lever
             numbers[BOUND] = row[COLUMN.patch_mu] * load * lever
+        elif kind == TURNING:
+            numbers[BOUND] = row[COLUMN.turn_torque]
         else:
             angle = row[COLUMN.w_theta] + (0.5 * math.pi if kind == ACROSS else 0.0)
             numbers[BOUND] = load * (row[COLUMN.mu_x] if kind == ALONG else row[COLUMN.mu_y])
@@ -161,6 +173,7 @@ def set_numbers(work, gravity, normal_gravity, ring, bodies, joints):  # type: i
                 row[COLUMN.w_y] - link[OWN_Y],
             )
             numbers[W_COS], numbers[W_SIN] = math.cos(angle), math.sin(angle)
+        numbers[BASE] = numbers[BOUND]
 
 
 @compiled
@@ -172,18 +185,24 @@ def set_coordinates(work, states):  # type: ignore[no-untyped-def]
         if tree[i, KIND] == FREE:
             for d in range(3):
                 motion[Q, j + d], motion[U, j + d] = states[body, d], states[body, 3 + d]
-        elif tree[i, KIND] != BAR:
+        elif tree[i, KIND] == HINGE:
             motion[Q, j], motion[U, j] = states[body, 2], states[body, 5]
-        else:  # from the rod's end on its parent to the one on its body
+        else:  # from the joint's place on its parent to the one on its body, or the rod's
             x, y, v_x, v_y = work.links[i, AT_X], work.links[i, AT_Y], 0.0, 0.0
             if parent >= 0:
                 x += work.links[parent, OWN_X]
                 y += work.links[parent, OWN_Y]
                 x, y, v_x, v_y = _seen(states[tree[parent, BODY]], x, y)
-            end = work.links[i + 1]
-            far = _seen(states[tree[i + 1, BODY]], end[OWN_X], end[OWN_Y])
+            last = i + 1 if tree[i, KIND] == BAR else i
+            end = work.links[last]
+            far = _seen(states[tree[last, BODY]], end[OWN_X], end[OWN_Y])
             x, y, v_x, v_y = far[0] - x, far[1] - y, far[2] - v_x, far[3] - v_y
-            motion[Q, j], motion[U, j] = math.atan2(y, x), (x * v_y - y * v_x) / (x * x + y * y)
+            if tree[i, KIND] == BAR:
+                motion[Q, j], motion[U, j] = math.atan2(y, x), (x * v_y - y * v_x) / (x * x + y * y)
+                continue
+            angle = motion[Q, tree[i, TURN]] + work.poses[i, AXIS]
+            c, s = math.cos(angle), math.sin(angle)
+            motion[Q, j], motion[U, j] = c * x + s * y, c * v_x + s * v_y
 
 
 @compiled
@@ -224,6 +243,18 @@ def set_places(work, q, u):  # type: ignore[no-untyped-def]
             slope[i, j, 1] += x
             x, y = links[parent, X] + x, links[parent, Y] + y
         angle, omega = motion[q, turn], motion[u, turn]
+        if tree[i, KIND] == RAIL:
+            j = tree[i, FIRST]
+            along, rate = motion[q, j], motion[u, j]
+            c, s = math.cos(angle + work.poses[i, AXIS]), math.sin(angle + work.poses[i, AXIS])
+            x, y = x + c * along, y + s * along
+            v_x, v_y = v_x + c * rate - s * along * omega, v_y + s * rate + c * along * omega
+            b_x -= omega * (2.0 * s * rate + c * along * omega)
+            b_y += omega * (2.0 * c * rate - s * along * omega)
+            slope[i, j, 0], slope[i, j, 1] = c, s
+            slope[i, turn, 0] -= s * along
+            slope[i, turn, 1] += c * along
+            angle += work.poses[i, HEADING]
         c, s = math.cos(angle), math.sin(angle)
         links[i, COS], links[i, SIN], links[i, X], links[i, Y] = c, s, x, y
         links[i, V_X], links[i, V_Y], links[i, B_X], links[i, B_Y] = v_x, v_y, b_x, b_y
@@ -270,10 +301,11 @@ def set_forces(work, u):  # type: ignore[no-untyped-def]
         slope[i, turn, 1] -= x
         motion[M + turn, turn] += links[i, MOMENT]
         if links[i, DAMPING] > 0.0:
-            if tree[i, PARENT] >= 0:
-                omega -= motion[u, tree[tree[i, PARENT], TURN]]
-                motion[LOAD, tree[tree[i, PARENT], TURN]] += links[i, DAMPING] * omega
-            motion[LOAD, turn] -= links[i, DAMPING] * omega
+            rate, j = motion[u, tree[i, FIRST]], tree[i, FIRST]
+            if tree[i, KIND] == HINGE and tree[i, PARENT] >= 0:
+                rate -= motion[u, tree[tree[i, PARENT], TURN]]
+                motion[LOAD, tree[tree[i, PARENT], TURN]] += links[i, DAMPING] * rate
+            motion[LOAD, j] -= links[i, DAMPING] * rate
     for j in range(n):
         for k in range(j):
             motion[M + k, j] = motion[M + j, k]
@@ -282,9 +314,9 @@ def set_forces(work, u):  # type: ignore[no-untyped-def]
         turn = tree[i, TURN]
         for j in range(n):
             rows[r, G + j] = 0.0
-        if kind in (PIVOT, UNDER):
-            rows[r, G + turn] = 1.0
-            if kind == PIVOT and tree[i, PARENT] >= 0:
+        if kind in (PIVOT, UNDER, TURNING):
+            rows[r, G + tree[i, FIRST if kind != TURNING else TURN]] = 1.0
+            if kind == PIVOT and tree[i, KIND] == HINGE and tree[i, PARENT] >= 0:
                 rows[r, G + tree[tree[i, PARENT], TURN]] = -1.0
             continue
         c, s, omega = links[i, COS], links[i, SIN], motion[u, turn]
@@ -298,6 +330,39 @@ def set_forces(work, u):  # type: ignore[no-untyped-def]
         v_x, v_y = links[i, V_X] - omega * y, links[i, V_Y] + omega * x
         b_x, b_y = links[i, B_X] - omega * omega * x, links[i, B_Y] - omega * omega * y
         rows[r, BIAS] = omega * (n_x * v_y - n_y * v_x) + n_x * b_x + n_y * b_y
+
+
+@compiled
+def set_bounds(work, laws, u):  # type: ignore[no-untyped-def]
+    """Set the greatest forces of dry friction that laws change, where forces and rows are set."""
+    if len(laws.frictions) == 0:
+        return
+    tree, motion, acted, states = work.tree, work.motion, work.acted, work.states
+    for r in range(work.n_kinds):
+        kind, i = work.kinds[r, 0], work.kinds[r, 1]
+        turn, body = tree[i, TURN], tree[i, BODY]
+        if kind == PIVOT:
+            owner, torque = tree[i, OWNER], acted[body, COMMAND + 2]
+            first, speed = tree[i, FIRST], row_speed(work, r, u)
+            if tree[i, KIND] == RAIL:
+                torque = work.slope[i, first, 0] * acted[body, COMMAND]
+                torque += work.slope[i, first, 1] * acted[body, COMMAND + 1]
+            rest = motion[LOAD, first] + work.links[i, DAMPING] * speed - torque
+            work.rows[r, BOUND] = bound(
+                work.rows[r, BASE], laws, owner, 0, states, torque, rest, abs(speed), acted
+            )
+        elif kind == UNDER:
+            x, y = work.links[i, OWN_X], work.links[i, OWN_Y]
+            speed = abs(motion[u, turn]) * math.sqrt(x * x + y * y)
+            work.rows[r, BOUND] = bound(
+                work.rows[r, BASE], laws, body, 1, states, 0.0, 0.0, speed, acted
+            )
+        elif kind < 0:
+            ring = r - work.n_rows
+            points, base = work.rings.shape[1] - POINTS, work.rings[ring, TWIST, 3]
+            speed = math.sqrt(set_twist(work, ring, i, u, TWIST_NOW))
+            most = bound(points * base, laws, body, 1, states, 0.0, 0.0, speed, acted)
+            work.rings[ring, GRIP, 0] = most / points
 
 
 @compiled
@@ -514,7 +579,7 @@ def set_twist(work, ring, i, u, field):  # type: ignore[no-untyped-def]
 def strain(work, ring, i, tries=40):  # type: ignore[no-untyped-def]
     """Return by how much the reaction on a ring that holds exceeds what it can hold, as a share.
 
-    With a wheel under the same body, which holds with it.
+    With a wheel under the same body, or friction against turning, which hold with it.
 
     The greatest power of the reaction over that of friction, less one (S. Goyal, A. Ruina and
     J. Papadopoulos, Wear 143, 1991), by reweighted least squares.
@@ -547,13 +612,15 @@ def strain(work, ring, i, tries=40):  # type: ignore[no-untyped-def]
             system[0, 2] -= weight * y
             system[1, 2] += weight * x
             system[2, 2] += weight * (x * x + y * y)
-        for r in range(work.n_rows):  # of a wheel on the same body
-            if work.kinds[r, 1] == i and work.kinds[r, 0] >= ALONG:
+        for r in range(work.n_rows):  # of a wheel, or against turning, on the same body
+            if work.kinds[r, 1] == i and work.kinds[r, 0] >= TURNING:
                 row = work.rows[r]
-                n_x = c * row[W_COS] - s * row[W_SIN]
-                n_y = s * row[W_COS] + c * row[W_SIN]
-                x, y = c * row[W_X] - s * row[W_Y], s * row[W_X] + c * row[W_Y]
-                lever = n_y * x - n_x * y
+                n_x, n_y, lever = 0.0, 0.0, 1.0
+                if work.kinds[r, 0] >= ALONG:
+                    n_x = c * row[W_COS] - s * row[W_SIN]
+                    n_y = s * row[W_COS] + c * row[W_SIN]
+                    x, y = c * row[W_X] - s * row[W_Y], s * row[W_X] + c * row[W_Y]
+                    lever = n_y * x - n_x * y
                 along = n_x * t_x + n_y * t_y + lever * rate
                 speed = math.sqrt(along * along + _SLOW * _SLOW)
                 lost += row[BOUND] * speed

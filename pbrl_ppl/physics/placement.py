@@ -11,7 +11,7 @@ from pbrl_ppl.history import History, Segments
 from pbrl_ppl.physics.joints import JOINT_KINDS
 from pbrl_ppl.physics.solids import Pairs, circles, depth, put, scenery
 from pbrl_ppl.scene import WORLD, Joint, Scene
-from pbrl_ppl.state import Floats
+from pbrl_ppl.state import Floats, wrapped
 
 #: Violation that noise and resting contact may explain, as a share of the smaller body's size.
 ALLOWED = 0.25
@@ -42,8 +42,9 @@ def check_placement(scene: Scene, start: Floats, where: Callable[[int], str] | N
     SimulationError
         If two shapes overlap by more than a quarter of the width of the smaller one (a wall has
         none, a concave polygon that of its widest convex part), or the anchors of a known joint are
-        off by more than a quarter of the bounding radius of the smaller moving body. The first such
-        transition is named. Also if ``start`` has the wrong shape.
+        off by more than a quarter of the bounding radius of the smaller moving body, or a known
+        slider's bodies turned by more than a quarter radian. The first such transition is named.
+        Also if ``start`` has the wrong shape.
 
     Examples
     --------
@@ -136,8 +137,8 @@ def _apart(scene: Scene, poses: Floats) -> Iterator[tuple[int, str]]:
             poses[:, moving[name]] if name in moving else pose
             for name, pose in zip(joint.bodies, fixed, strict=True)
         ]
-        length = JOINT_KINDS[joint.kind].gap(_anchor_distance(joint, fixed)[0])
-        distance = _anchor_distance(joint, now)
+        length = JOINT_KINDS[joint.kind].gap(_anchor_distance(scene, joint, fixed)[0])
+        distance = _anchor_distance(scene, joint, now)
         smaller = min(scene.body(n).shape.bounding_radius for n in joint.bodies if n in moving)
         off = np.flatnonzero(np.abs(distance - length) > ALLOWED * smaller)
         if len(off):
@@ -148,12 +149,27 @@ def _apart(scene: Scene, poses: Floats) -> Iterator[tuple[int, str]]:
                 f" apart, expected {length:.3g} m to within {ALLOWED * smaller:.3g} m (a quarter of"
                 " the smaller moving body's bounding radius); correct the poses or the anchors",
             )
+        turned = wrapped(now[0][:, 2] - now[1][:, 2] - fixed[0][:, 2] + fixed[1][:, 2])
+        off = np.flatnonzero(np.abs(turned) > ALLOWED)
+        if joint.traits.slides and len(off):
+            yield (
+                int(off[0]),
+                f"{joint.bodies[0]} is turned by {turned[off[0]]:.3g} rad against"
+                f" {joint.bodies[1]} from their reference poses, whose angle the slider keeps,"
+                f" expected 0 to within {ALLOWED} rad; correct theta in the bodies' pose",
+            )
 
 
-def _anchor_distance(joint: Joint, poses: list[Floats]) -> Floats:
+def _anchor_distance(scene: Scene, joint: Joint, poses: list[Floats]) -> Floats:
+    """Return the distance of a joint's anchors, of a slider across its axis, shape (n,)."""
     anchors = (joint.anchor_a or (0.0, 0.0), joint.anchor_b or (0.0, 0.0))
     a, b = (put(np.array([at]), pose) for at, pose in zip(anchors, poses, strict=True))
-    return np.asarray(np.hypot(*np.moveaxis(a - b, -1, 0))[:, 0])
+    x, y = np.moveaxis(a - b, -1, 0)[..., 0]
+    if joint.traits.slides and joint.bodies:
+        second = joint.bodies[1]
+        angle = poses[1][:, 2] + scene.direction(joint) - scene.reference_angle(second)
+        return np.asarray(np.abs(np.cos(angle) * y - np.sin(angle) * x))
+    return np.asarray(np.hypot(x, y))
 
 
 def _colliding(scene: Scene) -> Pairs:

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pymunk
 
-from pbrl_ppl.effects import Attached, Command, Force, at_stage
+from pbrl_ppl.effects import Attached, Command, Force, Friction, at_stage
+from pbrl_ppl.effects.stages import INTERVAL, MEMORY, MOST_MEMORY, TIME
+from pbrl_ppl.physics.laws import LATE
 from pbrl_ppl.physics.properties import COLUMN, EngineInput
 from pbrl_ppl.physics.setters import glide, iterations, patch_point, wheel_ends
 from pbrl_ppl.physics.solids import near_contact
 from pbrl_ppl.physics.world import RING, World
-from pbrl_ppl.state import Floats
+from pbrl_ppl.state import WRENCH, Floats
 
 _EXTRA = [COLUMN.extra_gravity_x, COLUMN.extra_gravity_y]
 
@@ -27,6 +29,7 @@ def rollout(
     item: int,
     start: Floats,
     inputs: Floats,
+    earlier: Floats,
     substeps: int,
 ) -> tuple[Floats, bool]:
     """Step one transition of horizon H through a new world.
@@ -46,6 +49,9 @@ def rollout(
     inputs : ndarray
         Inputs of each interval, shape (H, body, 3 or 9): wrenches in N and N m (of a kinematic
         body, velocities in m/s and rad/s), and the rest as in :data:`pbrl_ppl.state.INPUT`.
+    earlier : ndarray
+        Inputs of the intervals of the recording that lead up to the first one and it, shape
+        (interval, body, 3 or more).
     substeps : int
         Engine steps in an interval.
 
@@ -56,6 +62,7 @@ def rollout(
     touched : bool
         Whether shapes came into contact.
     """
+    world.check_steps()
     properties, joints = numbers.bodies[proposal], numbers.joints[proposal]
     timed = len(properties) > 1
     bodies = properties[item * len(inputs) if timed else 0]
@@ -63,8 +70,7 @@ def rollout(
     set_discs(world, numbers.discs[proposal])
     _place_bodies(world, start)
     names = [body.name for body in world.scene.moving]
-    commands = list(_laws(effects, Command, numbers.commands[proposal], names))
-    forces = list(_laws(effects, Force, numbers.forces[proposal], names))
+    acting = Acting(effects, numbers, proposal, names, world.scene.time_step, earlier, start)
     step = world.scene.time_step / substeps
     states = np.empty((len(inputs), len(names), 6))
     touched, nearness = False, (world.radii, world.obstacles, world.can_touch)
@@ -78,18 +84,7 @@ def rollout(
                 body.velocity, body.angular_velocity = tuple(interval[i, :2]), interval[i, 2]
         now = _states(world)
         for s in range(substeps):
-            command = interval[:, :3].copy()
-            previous = interval[:, 3:6].copy() if interval.shape[1] > 3 else None
-            phase = s / substeps, (s + 1) / substeps
-            for i, stage, parameters in commands:
-                before = np.zeros(3) if previous is None else previous[i]
-                stage.law(now[i], np.array([*command[i], *before, *phase]), parameters, command[i])
-                if previous is not None and not stage.memory:
-                    signal = np.array([*before, *before, *phase])
-                    stage.law(now[i], signal, parameters, previous[i])
-            wrench = command.copy()
-            for i, stage, parameters in forces:
-                stage.law(now[i], command[i], parameters, wrench[i])
+            wrench = acting(now, interval, s / substeps, (s + 1) / substeps)
             for i, body in enumerate(world.bodies):
                 if world.kinematic[i]:
                     continue
@@ -97,7 +92,7 @@ def rollout(
                 x, y = _arm(body)
                 body.force = tuple(wrench[i, :2] + weight)
                 body.torque = wrench[i, 2] - (x * wrench[i, 1] - y * wrench[i, 0])
-            _place_constraints(world, bodies, now, step)
+            _place_constraints(world, acting, bodies, joints, now, step)
             world.space.step(step)
             now = _states(world)
             touched = touched or bool(near_contact(now, *nearness))
@@ -106,18 +101,115 @@ def rollout(
                 states[:] = np.nan
                 return states, True
         states[h] = now
+        acting.remember(now, interval)
     return states, touched
 
 
-def _laws(
-    effects: tuple[Attached, ...], kind: type, parameters: Floats, names: list[str]
-) -> Iterator[tuple[int, Any, Floats]]:
-    """Yield body, stage and parameters of each law of a kind of stage."""
-    first = 0
-    for attached in at_stage(effects, kind):
-        last = first + len(attached.effect.parameters)
-        yield names.index(attached.body), attached.effect.stage, parameters[first:last]
-        first = last
+class Acting:
+    """Laws of a proposal, and what they remember in one trajectory.
+
+    Parameters
+    ----------
+    effects : tuple of Attached
+        Effects; those with laws act.
+    numbers : EngineInput
+        The engine's numbers of all proposals.
+    proposal : int
+        Index of the proposal.
+    names : list of str
+        The moving bodies.
+    time_step : float
+        Sampling interval (s).
+    earlier : ndarray
+        Inputs of the intervals of the recording that lead to the first one, (interval, body, 3 or
+        more).
+    start : ndarray
+        Start state, shape (body, 6).
+    """
+
+    def __init__(
+        self,
+        effects: tuple[Attached, ...],
+        numbers: EngineInput,
+        proposal: int,
+        names: list[str],
+        time_step: float,
+        earlier: Floats,
+        start: Floats,
+    ) -> None:
+        def laws(kind: type, parameters: Floats) -> list[tuple[int, Any, Floats]]:
+            first, rows = 0, []
+            for attached in at_stage(effects, kind):
+                effect = attached.effect
+                last = first + len(effect.parameters) + len(effect.constants)
+                rows.append((names.index(attached.body), effect.stage, parameters[first:last]))
+                first = last
+            return rows
+
+        self._commands = laws(Command, numbers.commands[proposal])
+        self._forces = laws(Force, numbers.forces[proposal])
+        self._frictions = laws(Friction, numbers.frictions[proposal])
+        self._time_step, self.command = time_step, np.zeros((len(names), 3))
+        wide = earlier.shape[-1]
+        older = [np.arange(j, j + 3) for j in range(9, wide, 3)]
+        past = earlier[0][:, [np.arange(3, 6), *older][-1]] if wide > 3 else self.command
+        self._memory = [
+            np.tile(_alone(past[i], stage), stage.memory) for i, stage, _ in self._commands
+        ]
+        for before, now in pairwise([np.arange(3, 6), *older][::-1]):
+            self.remember(start, np.hstack([earlier[0][:, now], earlier[0][:, before], 0 * past]))
+        for interval in earlier[:-1]:
+            self.remember(start, interval)
+
+    def __call__(
+        self, states: Floats, interval: Floats, begin: float, end: float, after: bool = False
+    ) -> Floats:
+        """Return the wrench on each body in a substep, shape (body, 3); see `laws.act`."""
+        known = interval.shape[1] > 3
+        self.command = interval[:, :3].copy()
+        signals = np.zeros((len(interval), MEMORY + MOST_MEMORY))
+        signals[:, [TIME, INTERVAL]] = np.inf, self._time_step
+        if known:
+            signals[:, TIME] = interval[:, 7] + begin * self._time_step
+        for (i, stage, parameters), memory in zip(self._commands, self._memory, strict=True):
+            signal, wrench = signals[i].copy(), _alone(self.command[i], stage)
+            signal[:3] = wrench
+            signal[3:6] = _alone(interval[i, 3:6] if known else np.zeros(3), stage)
+            signal[6:8] = begin, end
+            signal[MEMORY : MEMORY + len(memory)] = memory
+            stage.law(states[i], signal, parameters, wrench)
+            if stage.alone:
+                self.command[i, WRENCH.index(stage.alone)] = wrench[0]
+            else:
+                self.command[i] = wrench
+            if after and stage.remember is not None:
+                stage.remember(states[i], signal, parameters, memory)
+        total = self.command.copy()
+        signals[:, :3] = self.command
+        for i, stage, parameters in self._forces:
+            stage.law(states[i], signals[i], parameters, total[i])
+        return total
+
+    def remember(self, states: Floats, interval: Floats) -> None:
+        """Bring what laws remember up to date at the end of an interval."""
+        if any(stage.remember is not None for _, stage, _ in self._commands):
+            self(states, interval, LATE, 1.0, after=True)
+
+    def bound(self, base: float, i: int, states: Floats, under: bool, *signal: float) -> float:
+        """Return the greatest force of dry friction in a body's hinge or under it; see `laws`."""
+        most = np.array([base])
+        for body, stage, parameters in self._frictions:
+            if body == i and stage.under == under:
+                stage.law(states[i], np.array(signal), parameters, most)
+                most = np.maximum(most, 0.0)
+        return float(most[0])
+
+
+def _alone(wrench: Floats, stage: Any) -> Floats:
+    """Return what a command law sees of a wrench."""
+    if not stage.alone:
+        return wrench.copy()
+    return np.array([wrench[WRENCH.index(stage.alone)], 0.0, 0.0])
 
 
 def _place_bodies(world: World, states: Floats) -> None:
@@ -186,16 +278,33 @@ def set_properties(world: World, bodies: Floats, joints: Floats) -> None:
                 setattr(constraint, setting.attribute, value[0] * load)
 
 
-def _place_constraints(world: World, bodies: Floats, states: Floats, step: float) -> None:
-    """Put the far ends of rods where the substep is predicted to end; split a patch's friction."""
+def _place_constraints(
+    world: World, acting: Acting, bodies: Floats, joints: Floats, states: Floats, step: float
+) -> None:
+    """Put the far ends of rods where the substep is predicted to end; set greatest forces."""
+    for constraint, setting, i, _ in world.body_settings:
+        if setting.attribute == "max_force" and setting.columns == (COLUMN.pivot_torque,):
+            row, rest = bodies[i], 0.0
+            for body, joint, column in world.pivots:
+                if body == i:
+                    arm = row[[COLUMN.com_x, COLUMN.com_y]] - joints[joint, column : column + 2]
+                    c, s = math.cos(states[i, 2]), math.sin(states[i, 2])
+                    x, y = c * arm[0] - s * arm[1], s * arm[0] + c * arm[1]
+                    weight = row[COLUMN.mass] * (np.array(world.scene.gravity) + row[_EXTRA])
+                    rest = x * weight[1] - y * weight[0]
+            signal = acting.command[i, 2], rest, abs(states[i, 5])
+            base = row[COLUMN.pivot_torque]
+            constraint.max_force = acting.bound(base, i, states, False, *signal)
     for i, (along_x,), (along_y,) in world.wheels:
         after, turn = glide(bodies[i], states[i], step), bodies[i, COLUMN.w_theta]
         x_1, y_1, x_2, y_2 = wheel_ends(bodies[i], after, math.cos(turn), math.sin(turn))
         along_x.anchor_b, along_y.anchor_b = (x_1, y_1), (x_2, y_2)
     for i, holds, rods in world.patches:
         row, after = bodies[i], glide(bodies[i], states[i], step)
-        slowing = row[COLUMN.patch_mu] * world.scene.normal_gravity
-        most = slowing * row[COLUMN.mass] / len(RING)
+        speed = math.hypot(*states[i, 3:5], states[i, 5] * row[COLUMN.patch_radius])
+        most = row[COLUMN.patch_mu] * row[COLUMN.mass] * world.scene.normal_gravity
+        most = acting.bound(most, i, states, True, 0.0, 0.0, speed)
+        slowing, most = most / row[COLUMN.mass], most / len(RING)
         for point, hold, rod in zip(RING, holds, rods, strict=True):
             x, y, share = patch_point(row, after, states[i, 5], point, step, slowing)
             rod.anchor_b = x, y

@@ -13,6 +13,7 @@ from pbrl_ppl.effects import (
     Clock,
     Command,
     Force,
+    Friction,
     Properties,
     Sensor,
     Structure,
@@ -21,19 +22,22 @@ from pbrl_ppl.effects import (
 )
 from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.parameters import BODY_PARAMETERS, Layout
-from pbrl_ppl.physics.joints import JOINT_COLUMNS, SceneJoints
+from pbrl_ppl.physics.joints import JOINT_COLUMNS, LENGTH, SceneJoints, never_turning
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats
 
 #: Columns of a body's properties. ``moment`` is about the centre of mass (kg m^2), which is at
 #: ``com_x`` and ``com_y`` of the body's frame (m); ``pivot_torque`` (N m) and ``pivot_damping``
-#: (N m s) act in the body's hinge, ``patch_mu`` (1) and ``patch_radius`` (m) describe the friction
-#: under it, ``extra_gravity_x`` and ``extra_gravity_y`` (m/s^2) are added to the scene's gravity.
+#: (N m s) act in the body's hinge (along its slider: N and N s/m), ``turn_torque`` (N m) against any
+#: turning of a free one; ``patch_mu`` (1) and ``patch_radius`` (m) describe the friction under it,
+#: ``extra_gravity_x`` and
+#: ``extra_gravity_y`` (m/s^2) are added to the scene's gravity.
 COLUMNS = (
     *BODY_PARAMETERS,
     "moment",
     "pivot_torque",
     "pivot_damping",
+    "turn_torque",
     "patch_mu",
     "patch_radius",
     "extra_gravity_x",
@@ -44,8 +48,8 @@ COLUMNS = (
 #: Index of each column, by name.
 COLUMN: Any = namedtuple("COLUMN", COLUMNS)(*range(len(COLUMNS)))
 _POSITIVE = ("mass", "moment")
-#: Columns of the friction coefficients of a ring under a body, and of a wheel.
-_PATCH, _WHEEL = ("patch_mu",), ("mu_x", "mu_y")
+#: Columns of friction of a ring under a body, of a wheel, and against turning.
+_PATCH, _WHEEL, _TURN = ("patch_mu",), ("mu_x", "mu_y"), ("turn_torque",)
 _ANY_SIGN = ("w_x", "w_y", "w_theta", "extra_gravity_x", "extra_gravity_y", "com_x", "com_y")
 #: Names that effects see in place of a column: moment per mass and the whole gravity.
 SEEN = {
@@ -69,11 +73,11 @@ class EngineInput(NamedTuple):
         Shape (proposal, 1, body, column), columns as in :data:`COLUMNS`, SI units; or (proposal,
         interval, body, column) where they depend on the time.
     joints : ndarray
-        Shape (proposal, joint, 5), columns as in :data:`JOINT_COLUMNS`, m.
+        Shape (proposal, joint, 9), columns as in :data:`JOINT_COLUMNS`, m.
     discs : ndarray
         x, y and radius of hidden discs, shape (proposal, disc, 3), m.
-    commands, forces : ndarray
-        Parameters of the command and of the force laws, one after the other, shape (proposal, q).
+    commands, forces, frictions : ndarray
+        Parameters of the laws of each stage, one after the other, shape (proposal, q).
     indices : ndarray
         Indices into ``scene.joinable`` of an inferred joint's bodies, shape (proposal, free
         joint, 2).
@@ -84,6 +88,7 @@ class EngineInput(NamedTuple):
     discs: Floats
     commands: Floats
     forces: Floats
+    frictions: Floats
     indices: NDArray[np.int64]
 
 
@@ -128,9 +133,12 @@ class EngineProperties:
         self._moved = np.array(moved, dtype=int).reshape(-1, 3).T
         self._unit_moment = np.array([body.shape.unit_moment for body in scene.moving])
         self._places = places
-        stages = (Structure, Properties, Command, Force, Sensor)
+        stages = (Structure, Properties, Command, Force, Friction, Sensor)
         self._acting: dict[type, list[Attached]] = {s: at_stage(effects, s) for s in stages}
         self._bodies = bodies
+        #: Which bodies never turn, and all reference angles.
+        self.upright = never_turning(scene)
+        self.angles = np.array([scene.reference_angle(name) for name in bodies])
         #: Whether a body's numbers depend on time.
         self.timed = any(
             isinstance(attached.effect.stage, Properties) and attached.effect.stage.timed
@@ -143,8 +151,8 @@ class EngineProperties:
         ]
         #: Number of discs that the structure stage adds.
         self.n_discs = self._discs(np.zeros((1, layout.size))).shape[1]
-        #: Bodies under which effects put a ring of friction, and a wheel.
-        self.under = (self._changed(effects, _PATCH), self._changed(effects, _WHEEL))
+        #: Bodies under which effects put a ring of friction, a wheel, and friction against turning.
+        self.under = tuple(self._changed(effects, names) for names in (_PATCH, _WHEEL, _TURN))
         #: Body and row among all joints of each rod that an effect adds.
         self.tied = tuple(
             (bodies.index(attached.body), len(scene.joints) + j)
@@ -205,11 +213,15 @@ class EngineProperties:
         bodies[:, body, column] = phi[:, place]
         bodies = self._modified(bodies, phi, clock)
         self._check(bodies)
+        bodies[..., self.upright, COLUMN.moment] = np.inf
         joints, indices = self.joints(phi)
         if self._tying:
             joints = np.concatenate([joints, self._rods(phi)], axis=1)
-        commands, forces = (self._law_parameters(phi, stage) for stage in (Command, Force))
-        return EngineInput(bodies, joints, self._discs(phi), commands, forces, indices)
+        commands, forces, frictions = (
+            self._law_parameters(phi, stage) for stage in (Command, Force, Friction)
+        )
+        discs = self._discs(phi)
+        return EngineInput(bodies, joints, discs, commands, forces, frictions, indices)
 
     def _modified(self, bodies: Floats, phi: Floats, clock: Clock | None) -> Floats:
         """Return properties after the properties stage, with the moments of inertia."""
@@ -241,9 +253,15 @@ class EngineProperties:
         return result
 
     def _law_parameters(self, phi: Floats, stage: type) -> Floats:
-        """Return the parameters of the laws of a stage, one after another, shape (proposal, q)."""
-        laws = self._acting[stage]
-        columns = [column for law in laws for column in self.values(law, phi).values()]
+        """Return parameters and constants of a stage's laws, one after another, (proposal, q)."""
+        columns = [
+            column
+            for law in self._acting[stage]
+            for column in (
+                *self.values(law, phi).values(),
+                *(np.full(len(phi), constant) for constant in law.effect.constants),
+            )
+        ]
         return np.stack(columns, axis=1) if columns else np.empty((len(phi), 0))
 
     def _discs(self, phi: Floats) -> Floats:
@@ -265,12 +283,12 @@ class EngineProperties:
         return discs
 
     def _rods(self, phi: Floats) -> Floats:
-        """Return the structure stage's rods, shape (proposal, rod, 5)."""
-        rods = np.empty((len(phi), len(self._tying), len(JOINT_COLUMNS)))
+        """Return the structure stage's rods, shape (proposal, rod, 9)."""
+        rods = np.zeros((len(phi), len(self._tying), len(JOINT_COLUMNS)))
         for j, (attached, rod) in enumerate(self._tying):
             ends = rod(self.values(attached, phi))
-            rods[:, j] = np.stack(np.broadcast_arrays(*ends), axis=-1)
-        if not (np.isfinite(rods).all() and (rods[..., 4] >= 0).all()):
+            rods[:, j, : LENGTH + 1] = np.stack(np.broadcast_arrays(*ends), axis=-1)
+        if not (np.isfinite(rods).all() and (rods[..., LENGTH] >= 0).all()):
             raise ParameterError(
                 "a rod that an effect adds has an end or a length that is not finite, or a length"
                 " below 0; give finite numbers, and 0 for no rod"

@@ -8,6 +8,7 @@ import numpy as np
 
 from pbrl_ppl.physics.calls import call1, call2, call_pointer
 from pbrl_ppl.physics.compilation import compiled
+from pbrl_ppl.physics.laws import bound
 from pbrl_ppl.physics.properties import COLUMN
 from pbrl_ppl.physics.world import STICKING
 
@@ -169,12 +170,16 @@ def place_wheels(fn, world, bodies, state, axes, step):  # type: ignore[no-untyp
 
 
 @compiled
-def place_patches(fn, world, bodies, state, step):  # type: ignore[no-untyped-def]
+def place_patches(fn, world, laws, bodies, state, step, acted):  # type: ignore[no-untyped-def]
     """Put each point's rod along its velocity; split its friction with the pivot joint."""
     for j in range(len(world.patch_body)):
-        row, body = bodies[world.patch_body[j]], state[world.patch_body[j]]
-        slowing, after = row[COLUMN.patch_mu] * world.normal_gravity, glide(row, body, step)
-        most = slowing * row[COLUMN.mass] / len(world.ring)
+        k = world.patch_body[j]
+        row, body = bodies[k], state[k]
+        turned, after = body[5] * row[COLUMN.patch_radius], glide(row, body, step)
+        speed = math.sqrt(body[3] ** 2 + body[4] ** 2 + turned**2)
+        most = row[COLUMN.patch_mu] * row[COLUMN.mass] * world.normal_gravity
+        most = bound(most, laws, k, 1, state, 0.0, 0.0, speed, acted)
+        slowing, most = most / row[COLUMN.mass], most / len(world.ring)
         for i in range(len(world.ring)):
             x, y, share = patch_point(row, after, body[5], world.ring[i], step, slowing)
             call2(fn.cpPinJointSetAnchorB, world.patches[1, j, i], x, y)

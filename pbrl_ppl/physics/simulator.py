@@ -13,17 +13,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.effects import Clock, Command, Force, at_stage, needs_inputs
+from pbrl_ppl.effects import Clock, Command, Force, Friction, at_stage, needs_inputs
 from pbrl_ppl.errors import SimulationError
-from pbrl_ppl.history import fill_hinges, hung_bodies
+from pbrl_ppl.history import fill_joints, joint_coordinates
 from pbrl_ppl.parameters import Layout, differentiate
 from pbrl_ppl.physics import calls, plain
 from pbrl_ppl.physics.engines import Batch, Engine, share_out
-from pbrl_ppl.physics.joints import on_rod
+from pbrl_ppl.physics.joints import LENGTH, on_rod
 from pbrl_ppl.physics.properties import EngineInput, EngineProperties
 from pbrl_ppl.physics.world import FINER, World
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import INPUT, Floats, Ints
+from pbrl_ppl.state import INPUT, STATE, THETA, VELOCITY, WRENCH, Floats, Ints
 
 if TYPE_CHECKING:
     from pbrl_ppl.physics.physics import Physics
@@ -118,8 +118,13 @@ class Simulator:
         proposals = np.atleast_2d(phi)
         inputs, clock = self._inputs(actions)
         numbers = self._properties(proposals, clock)
-        starts = self._on_rods(self._states(proposals, start), numbers.joints)
         n, horizon, k = actions.shape[:3]
+        begin = None if clock is None else clock.begin.reshape(1, n, horizon)[..., 0]
+        starts = self._on_rods(self._states(proposals, start, begin), numbers.joints)
+        if (upright := self._properties.upright).any():
+            starts = starts.copy()
+            starts[..., upright, THETA] = self._properties.angles[upright]
+            starts[..., upright, THETA + VELOCITY] = 0.0
         out = np.full((len(proposals), n, horizon, k, 6), np.nan)
         plain = self.physics.engine == "python" or not calls.AVAILABLE
         run = self._run_plain if plain else self._run_compiled
@@ -133,6 +138,8 @@ class Simulator:
                 run(choice, EngineInput(*(array[rows] for array in numbers)), begin, inputs, part)
                 out[rows] = part.reshape(count, n, horizon, k, 6)
         for i, sensor, values in self._properties.sensors(proposals):
+            if sensor.timed and clock is not None:
+                values = {**values, "time": clock.end.reshape(1, n, horizon)}
             out[..., i, :] = sensor.measure(out[..., i, :], values)
         return out if phi.ndim == 2 else out[0]
 
@@ -143,7 +150,7 @@ class Simulator:
         Friction under bodies does not, where its coefficient is zero: a derivative there is not to
         see the difference of two solvers.
         """
-        tied = numbers.joints[:, len(self.physics.scene.joints) :, -1] > 0
+        tied = numbers.joints[:, len(self.physics.scene.joints) :, LENGTH] > 0
         proposals, joints, _ = numbers.indices.shape
         indices = numbers.indices.reshape(proposals, 2 * joints)
         keys = np.column_stack([tied, indices])
@@ -161,11 +168,14 @@ class Simulator:
             previous = np.zeros_like(actions)
             previous[:, 1:] = actions[:, :-1]
             actions = after_recording(actions, previous)
-        when = actions[:, :, 0, 6:].reshape(1, -1, 3)
+        when = actions[:, :, 0, 6:9].reshape(1, -1, 3)
         return actions, Clock(*np.moveaxis(when, -1, 0))
 
-    def _states(self, phi: Floats, measured: Floats) -> Floats:
-        """True states by the sensors' inverses, shape (1 or proposal, transition, body, 6)."""
+    def _states(self, phi: Floats, measured: Floats, begin: Floats | None) -> Floats:
+        """True states by the sensors' inverses, shape (1 or proposal, transition, body, 6).
+
+        ``begin`` are the times at which transitions begin, shape (1, transition), s.
+        """
         sensors = self._properties.sensors(phi)
         measured = measured if measured.ndim == 4 else measured[None]
         if not sensors:
@@ -173,12 +183,15 @@ class Simulator:
         states = _each(measured, len(phi))
         for i, sensor, values in reversed(sensors):
             flat = {name: value[..., 0] for name, value in values.items()}
+            if sensor.timed and begin is not None:
+                flat["time"] = begin
             states[:, :, i] = sensor.invert(states[:, :, i], flat)
-        # a hinged body's place follows from its angle
+        # of a body in joints all follows from one coordinate
         names = [body.name for body in self.physics.scene.moving]
-        hung = [names.index(name) for name in hung_bodies(self.physics.scene)]
-        states[:, :, hung, 0:2] = states[:, :, hung, 3:5] = np.nan
-        fill_hinges(states, self.physics.scene)
+        for name, column in joint_coordinates(self.physics.scene).items():
+            others = [d for d in range(len(STATE)) if d % VELOCITY != column]
+            states[:, :, names.index(name), others] = np.nan
+        fill_joints(states, self.physics.scene)
         return states
 
     def _on_rods(self, states: Floats, joints: Floats) -> Floats:
@@ -187,7 +200,7 @@ class Simulator:
             states = _each(states, len(joints))
         for i, position in self._properties.tied:
             moment = self.physics.scene.moving[i].shape.unit_moment
-            states[:, :, i] = on_rod(states[:, :, i], joints[:, position], moment)
+            states[:, :, i] = on_rod(states[:, :, i], joints[:, position, : LENGTH + 1], moment)
         return states
 
     def jacobian(self, phi: Floats, start: Floats, actions: Floats, step: float = 1e-5) -> Floats:
@@ -235,44 +248,57 @@ class Simulator:
         return np.array(counts, dtype=np.int64), np.array(weights, dtype=float)
 
     @cached_property
-    def _commands(self) -> Ints:
-        """Address, body, first parameter and memory of each command law, shape (law, 4)."""
-        return self._laws(Command)
+    def _laws(self) -> tuple[Ints, Ints, Ints, int, bool]:
+        """Rows of the laws of commands, forces and friction as in `laws`, numbers remembered.
 
-    @cached_property
-    def _forces(self) -> Ints:
-        """The same of each force law."""
-        return self._laws(Force)
-
-    def _laws(self, kind: type) -> Ints:
-        names, first, rows = [body.name for body in self.physics.scene.moving], 0, []
-        for attached in at_stage(self.physics.effects, kind):
-            stage = attached.effect.stage
-            if isinstance(stage, Command | Force):
-                memory = isinstance(stage, Command) and stage.memory
-                body = names.index(attached.body)
-                rows.append((calls.law_address(stage.law), body, first, int(memory)))
-            first += len(attached.effect.parameters)
-        return np.array(rows, dtype=np.int64).reshape(-1, 4)
+        And whether commands may jump within an interval.
+        """
+        names, slots = [body.name for body in self.physics.scene.moving], 0
+        tables = []
+        for kind in (Command, Force, Friction):
+            first, rows = 0, []
+            for attached in at_stage(self.physics.effects, kind):
+                stage: Any = attached.effect.stage
+                remember, count, alone = getattr(stage, "remember", None), 0, -1
+                if remember is not None:
+                    count, remember = 3 * stage.memory, calls.law_address(remember)
+                if getattr(stage, "alone", ""):
+                    alone = WRENCH.index(stage.alone)
+                rows.append((
+                    calls.law_address(stage.law), names.index(attached.body), first, remember or 0,
+                    slots, count, alone, int(getattr(stage, "under", False)),
+                ))  # fmt: skip
+                first += len(attached.effect.parameters) + len(attached.effect.constants)
+                slots += count
+            tables.append(np.array(rows, dtype=np.int64).reshape(-1, 8))
+        commands, forces, frictions = tables
+        late = any(one.effect.stage.jumps for one in at_stage(self.physics.effects, Command))  # type: ignore[union-attr]
+        return commands, forces, frictions, slots, late
 
     def _new_world(self, choice: Choice) -> World:
         joined, there = choice
         properties = self._properties
-        patches, wheels = properties.under
         rods = tuple(compress(properties.tied, there))
         scene, kinds = self.physics.scene, properties.joints.kinds
-        return World(scene, kinds, joined, properties.n_discs, patches, wheels, rods)
+        patches, wheels, turners = properties.under
+        discs = properties.n_discs
+        return World(scene, kinds, joined, discs, patches, wheels, turners, rods)
 
     def _run_plain(
         self, choice: Choice, numbers: EngineInput, starts: Floats, inputs: Floats, out: Floats
     ) -> None:
+        follows = _following(inputs)
         for item in range(len(out)):
             p, t = divmod(item, len(inputs))
             start = starts[p if len(starts) > 1 else 0, t]
             total = np.zeros_like(out[item])
+            first = t
+            while follows[first]:
+                first -= 1
+            earlier = np.concatenate([*inputs[first:t], inputs[t, :1]])
             stepped = partial(
                 plain.rollout, effects=self.physics.effects, numbers=numbers, proposal=p, item=t,
-                start=start, inputs=inputs[t],
+                start=start, inputs=inputs[t], earlier=earlier,
             )  # fmt: skip
             for level, (count, weight) in enumerate(zip(*self.levels, strict=True)):
                 states, touched = stepped(self._new_world(choice), substeps=int(count))
@@ -304,7 +330,7 @@ class Simulator:
         So many engine steps are worth a thread of their own.
         """
         batch = Batch(
-            tuple(numbers[:-1]), self._commands, self._forces, starts, inputs,
+            tuple(numbers[:-1]), *self._laws, _following(inputs), starts, inputs,
             self.physics.scene.time_step, *self.levels, self.physics.tolerance,
         )  # fmt: skip
         steps = len(out) * inputs.shape[1] * int(self.levels[0].sum())
@@ -327,20 +353,33 @@ def _each(states: Floats, proposals: int) -> Floats:
     return np.array(np.broadcast_to(states, (proposals, *states.shape[1:])), order="C")
 
 
-def after_recording(wrenches: Floats, previous: Floats) -> Floats:
+def _following(inputs: Floats) -> NDArray[np.bool_]:
+    """Return which transitions begin where the one before ends in the recording, (transition,)."""
+    follows = np.zeros(len(inputs), dtype=bool)
+    if inputs.shape[-1] > len(WRENCH):
+        number, begin, end = np.moveaxis(inputs[:, :, 0, 6:9], -1, 0)
+        follows[1:] = (number[1:, 0] == number[:-1, -1]) & (begin[1:, 0] == end[:-1, -1])
+        follows[1:] &= np.isfinite(begin[1:, 0])
+    return follows
+
+
+def after_recording(wrenches: Floats, *past: Floats) -> Floats:
     """Inputs of intervals that begin when the recording has ended.
 
     Parameters
     ----------
-    wrenches, previous : ndarray
-        Wrenches of each interval and of the one before, shape (..., 3) each.
+    wrenches : ndarray
+        Wrenches of each interval, shape (..., 3).
+    *past : ndarray
+        Those of the interval before, of that before it, and so on, same shape.
 
     Returns
     -------
     ndarray
-        Shape (..., 9), as in :data:`pbrl_ppl.state.INPUT`.
+        Shape (..., 9), as in :data:`pbrl_ppl.state.INPUT`, or more: the older wrenches come last.
     """
-    return np.concatenate([wrenches, previous, np.full_like(wrenches, np.inf)], axis=-1)
+    when = np.full_like(wrenches, np.inf)
+    return np.concatenate([wrenches, past[0], when, *past[1:]], axis=-1)
 
 
 def check_shapes(scene: Scene, layout: Layout, phi: Floats, start: Floats, actions: Floats) -> None:
@@ -370,9 +409,9 @@ def check_shapes(scene: Scene, layout: Layout, phi: Floats, start: Floats, actio
             f"start has shape {start.shape}, expected (transition, {k}, 6), or with as many"
             " proposals first as phi has, in the order x, y, theta, vx, vy, omega"
         )
-    widths = (3, len(INPUT))
     shaped = actions.ndim == 4 and actions.shape[0] == start.shape[-3] and actions.shape[2] == k
-    if not shaped or actions.shape[3] not in widths:
+    width = actions.shape[-1]
+    if not shaped or not (width == 3 or (width >= len(INPUT) and width % 3 == 0)):
         raise SimulationError(
             f"actions have shape {actions.shape}, expected ({start.shape[-3]}, H, {k}, 3)"
             f" in the order force_x, force_y, torque, or {len(INPUT)} in place of 3:"

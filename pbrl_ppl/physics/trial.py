@@ -14,11 +14,13 @@ from pbrl_ppl.effects import (
     Command,
     Effect,
     Force,
+    Friction,
     Noise,
     Properties,
     Sensor,
     Structure,
 )
+from pbrl_ppl.effects.stages import INTERVAL, MEMORY, MOST_MEMORY, TIME
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.history import History
 from pbrl_ppl.physics.physics import Physics
@@ -191,13 +193,17 @@ def _applied(effect: Effect, state: Floats, parameters: Floats, body: Body, unit
     """Return the results of an effect's functions at a state and parameters, as one array."""
     stage: Any = effect.stage
     named = _named(effect, parameters)
-    if isinstance(stage, Force | Command):
+    if isinstance(stage, Force | Command | Friction):
         wrench = np.array([1.0, -0.5, 0.2]) * (units.force, units.force, units.torque)
-        command = wrench.copy()
-        if isinstance(stage, Command):
-            command = np.concatenate([wrench, 0.5 * wrench, [0.4, 0.5]])
-        stage.law(state.copy(), command, parameters.copy(), wrench)
-        return wrench
+        command = np.zeros(MEMORY + MOST_MEMORY)
+        command[:9] = *wrench, *(0.5 * wrench), 0.4, 0.5, 0.0
+        command[[TIME, INTERVAL]] = 1.0, 0.1
+        numbers = np.array([*parameters, *effect.in_si(units).constants], dtype=float)
+        stage.law(state.copy(), command, numbers, wrench)
+        remembered = command[MEMORY:].copy()
+        if isinstance(stage, Command) and stage.remember is not None:
+            stage.remember(state.copy(), command, numbers, remembered)
+        return np.concatenate([wrench, remembered])
     if isinstance(stage, Properties):
         values = {name: np.ones((1, 1)) for name in (*COLUMNS, *SEEN)}
         values["mass"] = np.full((1, 1), units.mass)
@@ -206,7 +212,7 @@ def _applied(effect: Effect, state: Floats, parameters: Floats, body: Body, unit
         stage.modify(values, named, clock)
         return np.concatenate([np.ravel(value) for value in values.values()])
     if isinstance(stage, Sensor):
-        flat = {name: value[0] for name, value in named.items()}
+        flat = {name: value[0] for name, value in named.items()} | {"time": np.ones(1)}
         measured = stage.measure(state[None].copy(), flat)
         return np.concatenate([np.ravel(measured), np.ravel(stage.invert(measured, flat))])
     if isinstance(stage, Structure):

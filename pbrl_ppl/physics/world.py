@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +12,20 @@ import pymunk
 from pymunk import autogeometry
 
 from pbrl_ppl.effects import hanging_body
-from pbrl_ppl.physics.joints import HINGE, JOINT_KINDS, ROD, JointKind, Setting
+from pbrl_ppl.errors import SimulationError
+from pbrl_ppl.physics.joints import (
+    A_X,
+    B_X,
+    B_Y,
+    HIGH_X,
+    HIGH_Y,
+    HINGE,
+    JOINT_KINDS,
+    ROD,
+    JointKind,
+    Setting,
+    never_turning,
+)
 from pbrl_ppl.physics.properties import COLUMN
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene, smallest_radius
 
@@ -32,11 +46,23 @@ FINER = 8
 
 
 class ConstraintKind(NamedTuple):
-    """What a constraint on a body is in the engine: a maker, properties, a limit of its force."""
+    """What a constraint on a body is in the engine: a maker, properties, a limit of its force.
+
+    ``joint_settings`` are those properties that are numbers of the joint in which it acts.
+    """
 
     constraint: Callable[[pymunk.Body, pymunk.Body], pymunk.Constraint]
     settings: tuple[Setting, ...]
     limited: bool = True
+    joint_settings: tuple[Setting, ...] = ()
+
+
+def _on_line(name: str) -> tuple[Setting, ...]:
+    """Return the settings of a constraint along a slider's line, to an end that is far away."""
+    return (
+        Setting("anchor_a", f"{name}SetAnchorA", (HIGH_X, HIGH_Y)),
+        Setting("anchor_b", f"{name}SetAnchorB", (B_X, B_Y)),
+    )
 
 
 #: Beside joints, two kinds of constraints on a body for each use, with their settings.
@@ -46,7 +72,10 @@ class ConstraintKind(NamedTuple):
 #: resists motion along a line and leaves motion across it alone. (Off-centre, its groove joint
 #: turns motion along the groove into a force across it.)
 #:
-#: ``pivot`` is friction and damping in a hinge, with the parameters of the hanging body.
+#: ``pivot`` is friction and damping in a hinge, with the parameters of the hanging body, and
+#: ``turning`` friction against the turning of a free one.
+#:
+#: ``rail`` is the same in a slider: a rod with limited force, and a damper, along its line.
 #:
 #: ``patch`` is Coulomb friction under a body, at points of a ring that share its weight. A pivot
 #: joint to the ground, whose force is limited as a vector, holds a point if it rests; a rod along
@@ -75,6 +104,25 @@ BODY_CONSTRAINTS = {
             limited=False,
         ),
     ),
+    "turning": (
+        ConstraintKind(
+            lambda a, b: pymunk.SimpleMotor(a, b, 0.0),
+            (Setting("max_force", "cpConstraintSetMaxForce", (COLUMN.turn_torque,)),),
+        ),
+    ),
+    "rail": (
+        ConstraintKind(
+            ROD.constraint,
+            (Setting("max_force", "cpConstraintSetMaxForce", (COLUMN.pivot_torque,)),),
+            joint_settings=_on_line("cpPinJoint"),
+        ),
+        ConstraintKind(
+            lambda a, b: pymunk.DampedSpring(a, b, (0, 0), (0, 0), 0.0, 0.0, 0.0),
+            (Setting("damping", "cpDampedSpringSetDamping", (COLUMN.pivot_damping,)),),
+            limited=False,
+            joint_settings=_on_line("cpDampedSpring"),
+        ),
+    ),
     "patch": tuple(
         ConstraintKind(
             kind.constraint, (Setting("anchor_a", function, 2 * (COLUMN.patch_radius,)),)
@@ -94,23 +142,25 @@ class Placed(NamedTuple):
 
 
 class OnBody(NamedTuple):
-    """The two kinds of constraints on a body: one each of a wheel, one a point of a patch."""
+    """The kinds of constraints on a body: one each of a wheel, one a point of a patch."""
 
     body: int
     first: tuple[pymunk.Constraint, ...]
-    second: tuple[pymunk.Constraint, ...]
+    second: tuple[pymunk.Constraint, ...] = ()
 
 
 class Link(NamedTuple):
     """Joint constraint J_d, its kind and its row among all joints.
 
-    ``pivot`` is the body whose friction acts in it, -1 for none.
+    ``pivot`` is the body whose friction acts in it, -1 for none; ``axis`` the direction of a slider
+    in the bodies' reference poses (rad).
     """
 
     joint: int
     kind: JointKind
     constraint: pymunk.Constraint
     pivot: int
+    axis: float = 0.0
 
 
 class World:
@@ -129,8 +179,8 @@ class World:
         Number of hidden static discs; their places and sizes are properties.
     patches : tuple of int
         Bodies with friction under them.
-    wheels : tuple of int
-        Bodies with a wheel that an effect adds.
+    wheels, turners : tuple of int
+        Bodies with a wheel that an effect adds, and with friction against turning.
     rods : tuple of (int, int)
         Body and row among all joints of each rod that an effect adds.
     """
@@ -143,6 +193,7 @@ class World:
         discs: int = 0,
         patches: tuple[int, ...] = (),
         wheels: tuple[int, ...] = (),
+        turners: tuple[int, ...] = (),
         rods: tuple[tuple[int, int], ...] = (),
     ) -> None:
         self.scene = scene
@@ -163,6 +214,8 @@ class World:
         self.shapes: list[tuple[int, pymunk.Shape]] = []
         self.wheels: list[OnBody] = []
         self.links: list[Link] = []
+        #: Body whose friction acts in a hinge, the joint, and the column of its anchor on the body.
+        self.pivots: list[tuple[int, int, int]] = []
         #: Constraints whose force is limited and others, and the settings of all of them by the
         #: bodies' and the joints' numbers.
         self.limited: list[pymunk.Constraint] = []
@@ -198,6 +251,9 @@ class World:
             self._constrain("patch", i, self.bodies[i], self.space.static_body, RING)
             for i in patches
         ]
+        self.turners = [
+            self._constrain("turning", i, self.bodies[i], self.space.static_body) for i in turners
+        ]
         #: Which dynamic bodies are joined to other moving ones.
         self.chained = np.logical_not(self.can_touch.all(axis=1)) & ~self.kinematic
         alone = len(scene.bodies) == 1 and not scene.walls and not (discs or patches)
@@ -215,6 +271,25 @@ class World:
         ]
         fixed += [(-self.far, -self.far, -self.far, -self.far, 0.0)] * discs  # the last ones
         self.obstacles = np.array(fixed, dtype=float).reshape(-1, 5)
+
+    def check_steps(self) -> None:
+        """Refuse sliders on what turns, for which the engine has no right joint.
+
+        Raises
+        ------
+        SimulationError
+            If there is one.
+        """
+        moving = [body.name for body in self.scene.moving]
+        upright = set(compress(moving, never_turning(self.scene)))
+        for joint in self.scene.joints:
+            if joint.traits.slides and not upright.intersection(joint.bodies or ()):
+                a, b = joint.bodies or ("", "")
+                raise SimulationError(
+                    f"the slider of {a} and {b} turns, and Chipmunk, which steps contacts and"
+                    " closed chains, has no such joint; expected a slider to the world, or to one"
+                    " that slides on it. Use engine 'auto', and keep other bodies and walls away"
+                )
 
     def _add_shapes(self) -> None:
         """Add the moving shapes so that contacts have one order, whatever was simulated before.
@@ -261,6 +336,7 @@ class World:
         a: pymunk.Body,
         b: pymunk.Body,
         points: tuple[tuple[float, float], ...] = ((1.0, 1.0),),
+        joint: int = -1,
     ) -> OnBody:
         """Add the constraints of a use, which resist motion but do not correct drift."""
         made = []
@@ -271,6 +347,7 @@ class World:
                     constraint.max_bias = constraint.max_force = 0.0
                 self._add_constraint(constraint, kind.limited)
                 self.body_settings += [Placed(constraint, s, row, point) for s in kind.settings]
+                self.joint_settings += [Placed(constraint, s, joint) for s in kind.joint_settings]
         return OnBody(row, *made)
 
     def _add_constraint(self, constraint: pymunk.Constraint, limited: bool) -> None:
@@ -310,8 +387,12 @@ class World:
         pivot = -1
         if joint is not None and joint.bodies is not None and JOINT_KINDS[joint.kind].friction:
             pivot = self.bodies.index(self._by_name[hanging_body(self.scene, joint)])
-            self._constrain("pivot", pivot, a, b)
-        self.links.append(Link(position, kind, link, pivot))
+            self._constrain(kind.friction, pivot, a, b, joint=position)
+            if kind is HINGE:
+                column = A_X if a is self.bodies[pivot] else B_X
+                self.pivots.append((pivot, position, column))
+        axis = self.scene.direction(joint) if joint is not None and joint.axis else 0.0
+        self.links.append(Link(position, kind, link, pivot, axis))
         self.joint_settings += [Placed(link, setting, position) for setting in kind.settings]
 
 

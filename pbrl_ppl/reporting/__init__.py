@@ -5,6 +5,7 @@ from pbrl_ppl.reporting.error_plots import plot_errors as plot_errors
 from pbrl_ppl.reporting.error_plots import plot_rollout as plot_rollout
 from pbrl_ppl.reporting.logs import Log as Log
 from pbrl_ppl.reporting.logs import read_manifest as read_manifest
+from pbrl_ppl.reporting.loop_report import in_brief as in_brief
 from pbrl_ppl.reporting.loop_report import render as render
 from pbrl_ppl.reporting.loop_report import report as report
 from pbrl_ppl.reporting.many import ManyLoops as ManyLoops
@@ -22,4 +23,3 @@ from pbrl_ppl.reporting.scene_plots import draw_goal as draw_goal
 from pbrl_ppl.reporting.scene_plots import draw_motion as draw_motion
 from pbrl_ppl.reporting.scene_plots import draw_scene as draw_scene
 from pbrl_ppl.reporting.style import png as png
-from pbrl_ppl.reporting.words import in_brief as in_brief

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Literal, TypeVar
 
 import numpy as np
+from cycler import cycler
 from matplotlib.artist import Artist
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -18,14 +18,19 @@ from pbrl_ppl.reporting.style import (
     AFTER,
     BAND,
     BEFORE,
+    BOX,
+    LINES,
     PLAIN,
     UNITS,
     WIDE,
+    bars,
     blank_figure,
     label,
     legend,
+    name_axes,
+    zero_line,
 )
-from pbrl_ppl.state import Floats, Ints
+from pbrl_ppl.state import Floats
 
 T = TypeVar("T")
 
@@ -40,28 +45,28 @@ def _models(loop: Loop, before: T, after: T) -> list[tuple[str, T, str]]:
 def plot_residuals(loop: Loop, width: float = WIDE) -> Figure:
     """Plot held-out residuals of each state dimension in units of noise, before and after."""
     names = list(loop.residuals_before)
-    figure, (axes,) = blank_figure(width, 3.6, 1, 1)
+    figure, (axes,) = blank_figure(width, 3.6)
     edge = float(norm.ppf(0.5 + HDI_PROB / 2))
     axes.axhspan(-edge, edge, color=BAND, zorder=0)
-    axes.axhline(0.0, color="black", linewidth=0.8, zorder=1)
+    zero_line(axes)
     models = _models(loop, loop.residuals_before, loop.residuals_after)
     largest = 0.0
     for i, (_, residuals, colour) in enumerate(models):
-        shift = 0.36 * (i - (len(models) - 1) / 2)
-        for place, name in enumerate(names):
+        for where, name in enumerate(names):
+            place = where + 0.36 * (i - (len(models) - 1) / 2)
             values = np.asarray(residuals[name], dtype=float)
             values = values[np.isfinite(values)]
             if values.size < len(residuals[name]):
-                label(axes, "diverged", (place + shift, 0.0), color=colour)
+                label(axes, "diverged", (place, 0.0), color=colour)
             if not values.size:
                 continue
             largest = max(largest, float(np.abs(values).max()))
             some = values[:: max(1, values.size // 300)]
             # spread sideways by a sequence that is even and the same on every run
             aside = (np.arange(some.size) * 0.618 % 1 - 0.5) * 0.24
-            axes.plot(place + shift + aside, some, ".", color=colour, alpha=0.25, markersize=3)
-            low, high = np.quantile(values, [0.5 - HDI_PROB / 2, 0.5 + HDI_PROB / 2])
-            axes.plot([place + shift] * 2, [low, high], color=colour, linewidth=3)
+            axes.plot(place + aside, some, ".", color=colour, alpha=0.25, markersize=3)
+            ends = np.quantile(values, [0.5 - HDI_PROB / 2, 0.5 + HDI_PROB / 2])
+            axes.plot([place] * 2, ends, color=colour, linewidth=3)
     if largest > 12:
         axes.set_yscale("asinh", linear_width=4.0)
         ticks = [tick for tick in (3, 10, 30, 100, 300, 1000) if tick <= largest]
@@ -84,7 +89,7 @@ def plot_errors(loop: Loop, width: float = WIDE) -> Figure:
     }
     kinds = [kind for kind in titles if getattr(loop.before, kind)]
     height = 1.2 + 0.42 * max((len(getattr(loop.before, kind)) for kind in kinds), default=1)
-    figure, panels = blank_figure(width, height, 1, max(len(kinds), 1), grid="x")
+    figure, panels = blank_figure(width, height, max(len(kinds), 1), max(len(kinds), 1), "x")
     for axes, kind in zip(panels, kinds, strict=False):
         before, after, floor = (
             getattr(e, kind) for e in (loop.before, loop.after, loop.noise_floor)
@@ -93,23 +98,19 @@ def plot_errors(loop: Loop, width: float = WIDE) -> Figure:
         scale = floor if has_floor else {d: e if np.isfinite(e) else 1.0 for d, e in before.items()}
         models = _models(loop, before, after)
         for i, (_, values, colour) in enumerate(models):
-            for place, dim in enumerate(before):
-                value = values.get(dim, np.nan)
-                if np.isnan(value) or not scale[dim] > 0:
-                    continue
-                at = (value / scale[dim], place + 0.38 * (i - (len(models) - 1) / 2))
-                text = f"{value:.3g} {UNITS.get(dim, '')}"
-                if np.isinf(value):
-                    at, text = (0.0, at[1]), "diverged"
-                axes.barh(at[1], at[0], height=0.36, color=colour)
-                label(axes, text, at, xytext=(3, 0), va="center", fontsize=7.5)
+            found = {d: values.get(d, np.nan) for d in before}
+            shown = [np.nan_to_num(v / (scale[d] or np.nan), posinf=0.0) for d, v in found.items()]
+            texts = [
+                "diverged" if np.isinf(v) else f"{v:.3g} {UNITS.get(d, '')}" * bool(np.isfinite(v))
+                for d, v in found.items()
+            ]
+            shift = 0.38 * (i - (len(models) - 1) / 2)
+            bars(axes, list(before), shown, colour, texts, shift=shift, height=0.36)
         axes.axvline(1.0, color="black", linewidth=1.0, linestyle=":")
-        axes.set_yticks(range(len(before)), list(before))
-        axes.invert_yaxis()
         axes.margins(x=0.3)
         axes.set_xlim(left=0.0)
-        axes.set_title(titles[kind], fontsize=10)
-        axes.set_xlabel("error / noise floor" if has_floor else "error / error before")
+        scaled_by = "noise floor" if has_floor else "error before"
+        name_axes(axes, titles[kind], f"error / {scaled_by}")
     legend(figure, [Patch(color=colour, label=name) for name, _, colour in _models(loop, 0, 0)])
     return figure
 
@@ -118,42 +119,45 @@ def plot_rollout(loop: Loop, width: float = WIDE) -> Figure:
     """Plot one held-out trajectory: measured, and predicted before and after."""
     rollout = loop.rollout
     count = len(rollout.names)
-    columns = 1 if count == 1 else 2
-    rows = -(-count // columns)
-    figure, panels = blank_figure(width, 0.8 + 1.9 * rows, rows, columns, count=count)
+    columns = min(count, 2)
+    figure, panels = blank_figure(width, 1.9, count, columns, spare=0.8)
     models = _models(loop, rollout.before, rollout.after)
     both: tuple[Literal["--", "-"], ...] = ("--", "-")
     styles = both[-len(models) :]
     for place, (name, unit) in enumerate(zip(rollout.names, rollout.units, strict=True)):
-        axes = panels[place]
-        measured = rollout.measured[:, place]
+        axes, measured = panels[place], rollout.measured[:, place]
         if unit == "rad":
             measured = unwrap(measured)
         axes.plot(rollout.time, measured, "o", color="black", markersize=2.5)
         notes = [("black", _measured_until(rollout.time, measured))]
         shown = [measured]
-        for (which, values, colour), style in zip(models, styles, strict=True):
+        for (which, values, colour), dashes in zip(models, styles, strict=True):
             line = values[:, place]
             if unit == "rad":
                 line = _beside(unwrap(line), measured)
-            axes.plot(rollout.time, line, linestyle=style, color=colour, linewidth=1.6)
+            axes.plot(rollout.time, line, linestyle=dashes, color=colour, linewidth=1.6)
             end = diverged_after(rollout.time, values)
             if end is None:
                 shown.append(line)
             else:
                 notes.append((colour, f"{which}: diverged after {end:.3g} s"))
-        if len(shown) <= len(models):
-            _fit_to(axes, np.concatenate(shown))
-        _write(axes, notes)
+        seen = np.concatenate(shown)
+        seen = seen[np.isfinite(seen)]
+        if len(shown) <= len(models) and seen.size:  # a line that diverges leaves the panel
+            spare = 0.5 * float(np.ptp(seen)) or 1.0
+            axes.set_ylim(float(seen.min()) - spare, float(seen.max()) + spare)
+        for i, (colour, text) in enumerate(note for note in notes if note[1]):
+            axes.text(
+                0.98, 0.97 - 0.11 * i, text, color=colour, transform=axes.transAxes, ha="right",
+                va="top", fontsize=8, bbox=BOX,
+            )  # fmt: skip
         axes.set_ylabel(f"{name} ({unit})")
         if place >= count - columns:
             axes.set_xlabel("time (s)")
-    handles = [
-        Line2D([], [], color="black", label="measured", marker="o", linestyle="", markersize=3)
-    ]
+    handles = [Line2D([], [], color="black", label="measured", marker="o", ls="", markersize=3)]
     handles += [
-        Line2D([], [], color=colour, linestyle=style, label=name)
-        for (name, _, colour), style in zip(models, styles, strict=True)
+        Line2D([], [], color=colour, linestyle=dashes, label=name)
+        for (name, _, colour), dashes in zip(models, styles, strict=True)
     ]
     legend(figure, handles)
     return figure
@@ -166,23 +170,6 @@ def _measured_until(time: Floats, measured: Floats) -> str:
         return "not measured"
     last = seen[-1]
     return "" if last + 1 == len(time) else f"not measured after {time[last]:.3g} s"
-
-
-def _fit_to(axes: Axes, values: Floats) -> None:
-    """Show some values: others, of a prediction that diverges, leave the panel."""
-    seen = values[np.isfinite(values)]
-    if seen.size:
-        spare = 0.5 * float(np.ptp(seen)) or 1.0
-        axes.set_ylim(float(seen.min()) - spare, float(seen.max()) + spare)
-
-
-def _write(axes: Axes, notes: list[tuple[str, str]]) -> None:
-    """Write notes in their colours at the top of a panel."""
-    for i, (colour, text) in enumerate(note for note in notes if note[1]):
-        axes.text(
-            0.98, 0.97 - 0.11 * i, text, color=colour, transform=axes.transAxes, ha="right",
-            va="top", fontsize=8, bbox={"color": "white", "alpha": 0.7, "pad": 1.0},
-        )  # fmt: skip
 
 
 def unwrap(angle: Floats) -> Floats:
@@ -202,68 +189,54 @@ def _beside(line: Floats, measured: Floats) -> Floats:
     return np.asarray(line + 2 * np.pi * turns)
 
 
-def plot_correlations(loop: Loop, width: float = WIDE) -> Figure:
-    """Plot correlations of errors with earlier errors and with commands."""
-    own, driven, pairs = loop.correlations.own, loop.correlations.driven, loop.correlations.pairs
-    cells, commands = loop.correlations.cells, loop.correlations.commands
-    figure, panels = blank_figure(width, 3.2, 1, 2 if commands else 1)
-    panels[0].set_title("with itself", fontsize="medium")
-    panels[0].set_ylabel("correlation of errors")
-    fewest = pairs[pairs > 1].min(initial=pairs.max(initial=1))  # some cells were not measured
-    _plot_correlations(panels[0], np.arange(1, len(own) + 1), own, fewest, list(cells))
-    for axes in panels[1:]:
-        axes.set_title("with commands", fontsize="medium")
-        names = [f"{cell}, {command.replace('_', ' ')}" for command in commands for cell in cells]
-        values = driven.reshape(len(driven), -1)
-        _plot_correlations(axes, np.arange(len(driven)), values, pairs.max(initial=1), names)
-    return figure
-
-
-def _plot_correlations(
-    axes: Axes, lags: Ints, values: Floats, pairs: float, names: list[str], most: int = 4
-) -> None:
-    """Draw correlations over lags; name the largest that leave the band of noise alone.
+def plot_correlations(loop: Loop, width: float = WIDE, most: int = 4) -> Figure:
+    """Plot correlations of errors with earlier errors and with commands; name the largest.
 
     Noise alone puts any curve of a panel outside the band once in 100 times.
     """
-    edge = norm.isf(0.01 / 2 / max(values.size, 1)) / np.sqrt(max(pairs, 1))
-    axes.axhspan(-edge, edge, color=BAND, zorder=0)
-    axes.axhline(0.0, color="black", linewidth=0.8, zorder=1)
-    largest = np.abs(values).max(axis=0)
-    outside = [i for i in np.argsort(-largest) if largest[i] > edge]
-    for i in range(values.shape[1]):
-        if i not in outside[:most]:
+    found = loop.correlations
+    pairs = found.pairs[found.pairs > 1].min(initial=found.pairs.max(initial=1))  # the fewest
+    panels_of = {"with itself": (found.own, 1, pairs, list(found.cells))}
+    if found.commands:
+        names = [f"{c}, {u.replace('_', ' ')}" for u in found.commands for c in found.cells]
+        driven = found.driven.reshape(len(found.driven), -1)
+        panels_of["with commands"] = (driven, 0, found.pairs.max(initial=1), names)
+    figure, panels = blank_figure(width, 3.2, len(panels_of), len(panels_of))
+    for axes, (title, (values, first, size, names)) in zip(panels, panels_of.items(), strict=True):
+        edge = norm.isf(0.01 / 2 / max(values.size, 1)) / np.sqrt(max(size, 1))
+        axes.axhspan(-edge, edge, color=BAND, zorder=0)
+        zero_line(axes)
+        largest, lags = np.abs(values).max(axis=0), np.arange(first, len(values) + first)
+        shown = [i for i in np.argsort(-largest) if largest[i] > edge][:most]
+        for i in (i for i in range(values.shape[1]) if i not in shown):
             axes.plot(lags, values[:, i], ".-", color=PLAIN, linewidth=0.7, markersize=4)
-    for i in outside[:most]:
-        axes.plot(lags, values[:, i], ".-", linewidth=1.6, markersize=7, label=names[i])
-    if outside:
-        axes.legend(frameon=False, fontsize="small")
-    axes.set_ylim(-max(1.3 * edge, 1.1 * largest.max()), max(1.3 * edge, 1.1 * largest.max()))
-    axes.set_xticks(lags)
-    axes.set_xlabel("intervals before")
+        for i in shown:
+            axes.plot(lags, values[:, i], ".-", linewidth=1.6, markersize=7, label=names[i])
+        if shown:
+            axes.legend(frameon=False, fontsize="small")
+        top = max(1.3 * edge, 1.1 * largest.max())
+        axes.set(ylim=(-top, top), xticks=lags)
+        name_axes(axes, title, "intervals before", "correlation of errors" * (axes is panels[0]))
+    return figure
 
 
 def plot_growth(loop: Loop, width: float = WIDE) -> Figure:
     """Plot errors of forecasts over their length, as multiples of the error from noise alone."""
     growth = loop.growth
-    names = [name for name in growth.floor[-1] if growth.floor[-1][name] > 0]
-    figure, (axes,) = blank_figure(width, 3.2, 1, 1)
+    figure, (axes,) = blank_figure(width, 3.2)
     axes.axhline(1.0, color="black", linewidth=0.8)
-    for i, name in enumerate(names):
+    axes.set_prop_cycle(LINES + cycler(marker=list("ooss^^")))
+    for name in (name for name, size in growth.floor[-1].items() if size > 0):
         ratio = [
-            error.get(name, np.nan) / floor[name] if floor.get(name) else np.nan
+            error.get(name, np.nan) / (floor.get(name) or np.nan)
             for error, floor in zip(growth.error, growth.floor, strict=True)
         ]
-        colour = AFTER if i % 2 else BEFORE
-        ended = np.flatnonzero(~np.isfinite(ratio))
-        why = ""
+        ended, why = np.flatnonzero(~np.isfinite(ratio)), ""
         if ended.size:
             said = "diverged" if np.isinf(ratio[ended[0]]) else "not measured"
             why = f" ({said} at {growth.seconds[ended[0]]:.3g} s)"
-        style = ["o-", "s--", "^:"][i // 2 % 3]
-        axes.plot(growth.seconds, ratio, style, color=colour, label=f"{name}{why}")
-    axes.set_xlabel("length of the forecast (s)")
-    axes.set_ylabel("error / noise alone")
+        axes.plot(growth.seconds, ratio, label=f"{name}{why}")
+    axes.set(xlabel="length of the forecast (s)", ylabel="error / noise alone")
     top = axes.get_ylim()[1]
     if top > 10:
         axes.set_yscale("log")

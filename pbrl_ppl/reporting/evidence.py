@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -63,18 +64,6 @@ class Evidence:
         sums = zip(self.names, self.nats.sum(axis=0).tolist(), strict=True)
         return dict(sorted(sums, key=lambda item: -item[1]))
 
-    def in_words(self) -> str:
-        """Return a sentence on where the gain is largest."""
-        total, sums = float(self.nats.sum()), self.by_cell
-        first = next(iter(sums))
-        carriers = len(self.carriers())
-        sentence = (
-            f"The revised model makes the recording that was fitted {total:,.0f} nats likelier."
-            f" The largest share is in {first} ({100 * sums[first] / total:.0f} %), and {carriers}"
-            f" of {len(self.nats)} transitions hold 80 % of the gains."
-        )
-        return sentence if total > 0 else "The recording that was fitted is no likelier."
-
     def carriers(self, share: float = 0.8) -> Ints:
         """Return the fewest transitions that hold this share of the gains, largest first."""
         gains = self.by_transition
@@ -131,8 +120,7 @@ def _log_density(mode: Mode) -> Floats:
     return np.where(noise.seen, cells + rest, 0.0)
 
 
-@dataclass(frozen=True, eq=False)
-class Bins:
+class Bins(NamedTuple):
     """Means of y in bins of x that hold about as many values each.
 
     Parameters
@@ -163,8 +151,7 @@ def bin_means(x: Floats, y: Floats, most: int = 10, least: int = 8) -> Bins:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class ResidualForce:
+class ResidualForce(NamedTuple):
     """Force, torque or acceleration of a body that the model lacks.
 
     Parameters
@@ -183,8 +170,7 @@ class ResidualForce:
     unit: str
 
 
-@dataclass(frozen=True, eq=False)
-class Curve:
+class Curve(NamedTuple):
     """A simple curve: its formula, its values at the sorted x, the share of variance explained."""
 
     form: str
@@ -192,8 +178,7 @@ class Curve:
     share: float
 
 
-@dataclass(frozen=True, eq=False)
-class Law:
+class Law(NamedTuple):
     """Residual force of a body against a quantity that it depends on.
 
     Parameters
@@ -204,8 +189,6 @@ class Law:
         The quantity that it depends on.
     x : ndarray
         That quantity at each transition, shape (transition,).
-    bins : Bins
-        Means of the residual in bins of x.
     curve : Curve
         The simplest curve that follows the residual.
     """
@@ -214,7 +197,6 @@ class Law:
     quantity: str
     unit: str
     x: Floats
-    bins: Bins
     curve: Curve
 
 
@@ -237,7 +219,7 @@ def find_laws(loop: Loop, most: int = 3, least: float = 0.02) -> list[Law]:
     if residual is None:
         return []
     laws = [
-        _law(residual, quantity, unit, x)
+        Law(residual, quantity, unit, x, _simplest(x, residual.values))
         for (quantity, unit), x in zip(
             QUANTITIES.items(), recorded_quantities(problem, body).T, strict=True
         )
@@ -276,12 +258,6 @@ def _residual_force(
         moment = float(mass) * moving.shape.unit_moment
         return ResidualForce(dimension, moment * values, "residual torque", "N m")
     return ResidualForce(dimension, float(mass) * values, "residual force", "N")
-
-
-def _law(residual: ResidualForce, quantity: str, unit: str, x: Floats) -> Law:
-    """Return the means in bins of a quantity, and the simplest curve that follows them."""
-    y = residual.values
-    return Law(residual, quantity, unit, x, bin_means(x, y), _simplest(x, y))
 
 
 def _simplest(x: Floats, y: Floats) -> Curve:

@@ -80,59 +80,56 @@ def read_manifest(path: str | Path) -> tuple[Log, ...]:
     where = f"manifest {path}"
     try:
         text = path.read_text(encoding="utf-8-sig")
+        table = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines())]
     except FileNotFoundError:
         raise ManifestError(f"{where}: there is no such file; check the path") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ManifestError(f"{where}: cannot be read: {error}") from None
-    try:
-        table = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines())]
     except csv.Error as error:
         raise ManifestError(f"{where}: no CSV table: {error}") from None
-    if not any(map(any, table)):
-        raise ManifestError(f"{where}: it is empty; expected {', '.join(_NEEDED)} and rows")
+    columns = ", ".join(_NEEDED)
+    _check(any(map(any, table)), f"{where}: it is empty; expected {columns} and rows")
     head, known = table[0], (*_NEEDED, *_OPTIONAL)
     for name in head:
-        if name not in known:
-            raise ManifestError(
-                f'{where}: unknown column "{name}"{nearest(name, known)} Expected'
-                f" {', '.join(known)} (the last two are optional)"
-            )
-    if lacking := [name for name in _NEEDED if name not in head]:
-        raise ManifestError(f"{where}: missing column(s) {', '.join(lacking)}")
-    if len(set(head)) < len(head):
-        raise ManifestError(f"{where}: a column is there twice; drop one")
+        hint = f"{nearest(name, known)} Expected {', '.join(known)} (the last two are optional)"
+        _check(name in known, f'{where}: unknown column "{name}"{hint}')
+    lacking = ", ".join(name for name in _NEEDED if name not in head)
+    _check(not lacking, f"{where}: missing column(s) {lacking}")
+    _check(len(set(head)) == len(head), f"{where}: a column is there twice; drop one")
     logs = [
         _log(head, row, f"{where}, row {number}", path.parent.absolute())
         for number, row in enumerate(table[1:], start=2)
         if any(row)
     ]
-    if not logs:
-        raise ManifestError(f"{where}: it has no rows; expected one a log")
+    _check(bool(logs), f"{where}: it has no rows; expected one a log")
     seen: set[str] = set()
-    for log in logs:
+    for name in (log.name for log in logs):
         # some file systems ignore case
-        if log.name.lower() in seen:
-            raise ManifestError(f'{where}: the name "{log.name}" is there twice; expected one each')
-        seen.add(log.name.lower())
+        twice = f'{where}: the name "{name}" is there twice; expected one each'
+        _check(name.lower() not in seen, twice)
+        seen.add(name.lower())
     return tuple(logs)
+
+
+def _check(fine: bool, message: str) -> None:
+    """Raise an error with a message unless all is fine."""
+    if not fine:
+        raise ManifestError(message)
 
 
 def _log(head: list[str], cells: list[str], where: str, folder: Path) -> Log:
     """Return the log of one row; its paths are relative to the folder."""
-    if len(cells) != len(head):
-        raise ManifestError(f"{where}: {len(cells)} cells, expected {len(head)} as in the header")
-    row = dict(zip(head, cells, strict=True))
+    count = f"{len(cells)} cells, expected {len(head)} as in the header"
+    _check(len(cells) == len(head), f"{where}: {count}")
+    row = dict.fromkeys(_OPTIONAL, "") | dict(zip(head, cells, strict=True))
     for name in _NEEDED:
-        if not row[name]:
-            raise ManifestError(f"{where}: {name} is empty; fill it in")
+        _check(bool(row[name]), f"{where}: {name} is empty; fill it in")
+    expected = 'expected letters, digits, "_" and "-", for it names a file'
     for name in ("name", "kind"):
-        if row.get(name) and not _NAME.fullmatch(row[name]):
-            raise ManifestError(
-                f'{where}: {name} is "{row[name]}"; expected letters, digits, "_" and "-", for it'
-                " names a file"
-            )
-    test = folder / row["test"] if row.get("test") else None
-    return Log(row["name"], folder / row["scene"], folder / row["train"], test, row.get("kind", ""))
+        fine = not row[name] or bool(_NAME.fullmatch(row[name]))
+        _check(fine, f'{where}: {name} is "{row[name]}"; {expected}')
+    test = folder / row["test"] if row["test"] else None
+    return Log(row["name"], folder / row["scene"], folder / row["train"], test, row["kind"])
 
 
 #: The file that marks a finished log, written last; the file that a failed log leaves.
@@ -219,9 +216,7 @@ def inputs_sha256(log: Log, settings: Settings) -> str:
     """Return the hash of a log's inputs: its files, the settings, the package's version."""
     digest = hashlib.sha256()
     for path in (log.scene, log.train, log.test):
-        content = b""
-        if path is not None and path.is_file():
-            content = path.read_bytes()
+        content = path.read_bytes() if path and path.is_file() else b""
         digest.update(hashlib.sha256(content).digest() if path else b"none")
     contents = [settings.to_dict(), __version__]
     digest.update(json.dumps(contents, sort_keys=True, default=dict).encode())

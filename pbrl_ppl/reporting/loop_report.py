@@ -8,7 +8,7 @@ from typing import Any
 from pbrl_ppl.criticism import Loop
 from pbrl_ppl.files import write_text
 from pbrl_ppl.reporting.motion import held_out_motions
-from pbrl_ppl.reporting.page import Section, Source, render_page
+from pbrl_ppl.reporting.page import Section, Source, render_page, templates
 from pbrl_ppl.reporting.posterior_report import render_posterior
 from pbrl_ppl.reporting.posterior_summary import Parameters, recorded_poses
 from pbrl_ppl.reporting.words import plain
@@ -95,3 +95,20 @@ def render(loop: Loop, source: Source | None = None) -> str:
         why_unknown="",
         unfolded=False,
     )
+
+
+def in_brief(loop: Loop, folder: str | Path, remainder: str = "") -> list[str]:
+    """Return a summary of a closed loop in about ten lines.
+
+    Parameters
+    ----------
+    loop : Loop
+        Result of :func:`pbrl_ppl.close_loop`.
+    folder : str or pathlib.Path
+        Folder of the results, to name in commands.
+    remainder : str
+        What a learned remainder does, or why there is none; empty if none was requested.
+    """
+    brief = templates().get_template("brief.txt.jinja")
+    text = brief.render(result=loop, folder=Path(folder), remainder=remainder)
+    return [line.rstrip() for line in text.splitlines() if line.strip()]

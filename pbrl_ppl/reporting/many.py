@@ -235,22 +235,19 @@ def _pooled(
     logs: Iterable[Log], rows: Mapping[str, Row], folder: Path
 ) -> tuple[dict[str, Pooled], dict[str, str]]:
     """Return the hyper-parameters of each kind with at least two adequate models."""
-    kinds: dict[str, list[str]] = {}
+    kinds: dict[str, list[str]] = {log.kind: [] for log in logs if log.kind}
     for log in logs:
-        usable = kinds.setdefault(log.kind, [])
-        row = rows[log.name]
-        if row["status"] == "done" and row["verdict"] not in (UNEXPLAINED, NOT_CONVERGED):
-            usable.append(log.name)
-    kinds.pop("", None)
+        verdict = rows[log.name].get("verdict", NOT_CONVERGED)
+        if log.kind and verdict not in (UNEXPLAINED, NOT_CONVERGED):
+            kinds[log.kind].append(log.name)
     pooled, reasons = {}, {}
     for kind, names in kinds.items():
         if len(names) < 2:
             reasons[kind] = f"{len(names)} adequate model(s), expected at least 2"
             continue
+        posteriors = {name: folder / name / "after.nc" for name in names}
         try:
-            pooled[kind] = pool(
-                {name: load_posterior(folder / name / "after.nc") for name in names}
-            )
+            pooled[kind] = pool({name: load_posterior(file) for name, file in posteriors.items()})
         except PbrlError as error:
             reasons[kind] = str(error)
     return pooled, reasons

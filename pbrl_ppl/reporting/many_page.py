@@ -95,19 +95,16 @@ def page(
 
 def _logs(rows: Iterable[Row]) -> Table:
     """Tabulate the logs, one row each."""
-    cells: list[list[Cell]] = []
-    marks = []
+    cells, marks = [], []
     for row in rows:
-        status = row["status"]
         words, numbers = row.get("message", ""), ["", "", "", ""]
-        if status == "done":
+        if row["status"] == "done":
             words = joined(map(_named, row["effects"])) or words
             numbers = [number(row["error_before"]), number(row["error_after"]),
                        str(len(row["warnings"]) or ""), number(row["seconds"])]  # fmt: skip
-        verdict = _verdict(row.get("verdict", status))
-        cells.append([(_link(row), row["kind"]), verdict, words, *numbers])
-        bad = status == "failed" or row.get("verdict") == NOT_CONVERGED
-        marks.append("bad" if bad else "")
+        verdict = row.get("verdict", row["status"])
+        cells.append([(_link(row), row["kind"]), _verdict(verdict), words, *numbers])
+        marks.append("bad" * (verdict in ("failed", NOT_CONVERGED)))
     heads = ("Log", "Verdict", "Effects, or what went wrong", "Error before", "Error after",
              "Warnings", "Time (s)")  # fmt: skip
     return Table("All logs", heads, cells, (1, 2), marks)
@@ -115,13 +112,10 @@ def _logs(rows: Iterable[Row]) -> Table:
 
 def _effects(rows: Iterable[Row], pairs: Sequence[tuple[str, str]]) -> Table:
     """Tabulate the effects, one row a finished log, one column an effect."""
-    cells: list[list[Cell]] = [
-        [_link(row), *(_cell(row, *pair) for pair in pairs)]
-        for row in rows
-        if row["status"] == "done"
-    ]
+    done = [row for row in rows if row["status"] == "done"]
+    cells = [[_link(row), *(_cell(row, *pair) for pair in pairs)] for row in done]
     heads = ["Log", *(_title(*pair) for pair in pairs)]
-    return Table("Effects found, by log", heads, cells, tuple(range(1, len(heads))))
+    return Table("Effects found, by log", heads, cells, range(1, len(heads)))
 
 
 def _pooled(pooled: Pooled, kind: str) -> Table:
@@ -131,7 +125,7 @@ def _pooled(pooled: Pooled, kind: str) -> Table:
         low, high = number(row[f"{name}_low"]), number(row[f"{name}_high"])
         return number(row[middle]), f"{low} to {high}"
 
-    cells: list[list[Cell]] = [
+    cells = [
         [
             (row["parameter"], row["scale"]),
             interval(row, "mean", "mean"),

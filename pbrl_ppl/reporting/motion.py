@@ -62,29 +62,20 @@ def held_out_motions(loop: Loop, most: int = 6, most_rows: int = 3000) -> list[M
     moves = np.nanmax([np.ptp(states, axis=0) for states in paths], axis=0)[:, :2]
     if (moves[unmeasured[:, :2]] > 1e-6).any():
         return []  # a place that moves, and that nobody measured
-    labels = [str(label) for label in dataset["trajectory"].to_numpy()]
-    motions = [
-        Motion(
-            labels[trajectory],
-            np.arange(len(first), dtype=float) * loop.scene.time_step,
-            known[trajectory, : len(first)],
-            first,
-            after[trajectory],
-            unmeasured,
-        )
-        for trajectory, first in before.items()
-    ]
-    shown: list[Motion] = []
+    labels = dataset["trajectory"].to_numpy().astype(str)
+    motions = []
+    for i, first in before.items():
+        time = np.arange(len(first), dtype=float) * loop.scene.time_step
+        seen = known[i, : len(first)]
+        motions.append(Motion(str(labels[i]), time, seen, first, after[i], unmeasured))
 
     def worst(motion: Motion) -> tuple[bool, float]:
         first, last = (distance(loop.scene, motion, p) for p in (motion.before, motion.after))
         return not np.isposinf(last), -float(np.nan_to_num(first))
 
-    for motion in sorted(motions, key=worst):
-        if shown and sum(len(other.time) for other in [*shown, motion]) > most_rows:
-            break
-        shown.append(motion)
-    return shown[:most]
+    motions = sorted(motions, key=worst)[:most]
+    rows = np.cumsum([len(motion.time) for motion in motions])
+    return motions[: max(1, int((rows <= most_rows).sum()))]
 
 
 def distance(scene: Scene, motion: Motion, predicted: Floats) -> float:

@@ -74,6 +74,23 @@ class Section(NamedTuple):
     link: str = ""
 
 
+def templates() -> jinja2.Environment:
+    """Return the templates, with the public names of this room's modules."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("pbrl_ppl.reporting"),
+        autoescape=jinja2.select_autoescape(["html.jinja"]),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    names = ChainMap(*map(vars, _MODULES))
+    public = {name: value for name, value in names.items() if not name.startswith("_")}
+    environment.globals |= public
+    environment.filters = public | environment.filters
+    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
+    return environment
+
+
 def render_page(title: str, header: str, sections: Sequence[Section], **context: object) -> str:
     """Return a page of HTML; pictures are drawn twice, for a page and for a telephone.
 
@@ -88,14 +105,7 @@ def render_page(title: str, header: str, sections: Sequence[Section], **context:
     **context
         Values that the templates show, by name.
     """
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("pbrl_ppl.reporting"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
+    environment = templates()
     draws: list[Callable[..., Figure]] = []
 
     def draw(plot: Callable[..., Figure], *data: object) -> Mapping[str, str]:
@@ -103,13 +113,8 @@ def render_page(title: str, header: str, sections: Sequence[Section], **context:
         draws.append(partial(plot, *data))
         return {width: f"\0{len(draws) - 1} {width}\0" for width in ("wide", "narrow")}
 
-    names = ChainMap(*map(vars, _MODULES))
-    public = {name: value for name, value in names.items() if not name.startswith("_")}
-    environment.globals.update(public, draw=draw)
-    environment.filters = public | environment.filters
-
     def rendered(name: str) -> Markup:
-        return Markup(environment.get_template(f"{name}.html.jinja").render(context))
+        return Markup(environment.get_template(f"{name}.html.jinja").render(context, draw=draw))
 
     shown = [
         (section, environment.from_string(section.title).render(context), body)

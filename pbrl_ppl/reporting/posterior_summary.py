@@ -234,20 +234,24 @@ def rank_correlations(draws: xr.Dataset, names: Sequence[str]) -> Floats:
     return np.asarray(table.corr("spearman"))
 
 
+def pit_values(posterior: Idata) -> dict[str, Floats]:
+    """Return where measurements lie in leave-one-out predictions (0 to 1), by state dimension."""
+    pit = loo_pit(posterior)
+    every = {str(name): pit.sel(state=name).to_numpy().ravel() for name in pit["state"].values}
+    seen = {name: values[np.isfinite(values)] for name, values in every.items()}
+    return {name: values for name, values in seen.items() if values.size}
+
+
 def coverage(posterior: Idata) -> dict[str, tuple[float, float, int]]:
     """Return how leave-one-out predictions cover the measurements, by state dimension.
 
     Shares of measurements in the central 50 % and 94 % of predictions, and their number.
     """
-    pit = loo_pit(posterior)
-    result = {}
-    for name in (str(state) for state in pit["state"].values):
-        values = pit.sel(state=name).to_numpy()
-        values = values[np.isfinite(values)]
-        if values.size:
-            off = np.abs(values - 0.5)
-            result[name] = float((off < 0.25).mean()), float((off < 0.47).mean()), values.size
-    return result
+    off = {name: np.abs(values - 0.5) for name, values in pit_values(posterior).items()}
+    return {
+        name: (float((each < 0.25).mean()), float((each < 0.47).mean()), each.size)
+        for name, each in off.items()
+    }
 
 
 def pareto_k(posterior: Idata) -> tuple[Floats, float, str]:

@@ -97,7 +97,7 @@ def plot_recording(
     width : float
         Of the figure (inches).
     """
-    figure, (axes,) = blank_figure(width, 0.62 * width if width > NARROW else width, 1, 1)
+    figure, (axes,) = blank_figure(width, 0.62 * width if width > NARROW else width)
     for paths, style, alpha in ((poses, "-", 0.8), (held_out, ":", 1.0)):
         for states in () if paths is None else paths:
             for i in range(states.shape[1]):

@@ -1,4 +1,4 @@
-"""Style shared by all pictures: colours, panels, units, and their rendering as PNG."""
+"""What all pictures share: colours, panels, bars, densities, bands, and their rendering as PNG."""
 
 from __future__ import annotations
 
@@ -6,12 +6,15 @@ import io
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
+import numpy as np
+from cycler import cycler
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
+from scipy.stats import gaussian_kde
 
-from pbrl_ppl.state import STATE, STATE_UNITS
+from pbrl_ppl.state import STATE, STATE_UNITS, Floats
 
 #: Unit of each state dimension.
 UNITS: Mapping[str, str] = dict(zip(STATE, STATE_UNITS, strict=True))
@@ -24,6 +27,10 @@ def acceleration_unit(velocity: str) -> str:
 
 # Okabe and Ito's colours: distinct for colour-blind readers and in grey print
 BEFORE, AFTER, PLAIN, BAND = "#D55E00", "#0072B2", "#999999", "#e9e9e9"
+#: Lines of up to six state dimensions.
+LINES = cycler(color=[BEFORE, AFTER] * 3, linestyle=["-", "-", "--", "--", ":", ":"])
+#: Box behind a text, through which a line can be seen.
+BOX = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.5}
 #: Widths of pictures (inches): of a page, and of a telephone, where panels are in one column.
 WIDE, NARROW = 8.0, 4.2
 
@@ -31,11 +38,11 @@ WIDE, NARROW = 8.0, 4.2
 def blank_figure(
     width: float,
     height: float,
-    rows: int,
-    columns: int,
+    count: int = 1,
+    columns: int = 1,
     grid: Literal["x", "y"] | None = "y",
     *,
-    count: int | None = None,
+    spare: float = 0.0,
     stack: bool = True,
 ) -> tuple[Figure, list[Axes]]:
     """Return a figure outside pyplot, and its panels row by row.
@@ -43,27 +50,37 @@ def blank_figure(
     Parameters
     ----------
     width, height : float
-        Size in inches. On a narrow figure all panels are stacked in one column, and the height
-        grows with them, unless ``stack`` is false.
-    rows, columns : int
-        Panels.
+        Width of the figure and height of each row of panels (inches). On a narrow figure all panels
+        are stacked in one column, and the height grows with them, unless ``stack`` is false.
+    count, columns : int
+        Panels that are shown, and panels side by side.
     grid : str, optional
         Axis of the grid lines.
-    count : int, optional
-        Panels that are shown, if fewer than there are.
+    spare : float
+        Height of the figure beside the rows (inches).
     """
+    rows = -(-count // columns)
+    height = spare + height * rows
     if stack and width <= NARROW and columns > 1:
         height, rows, columns = height * columns * 0.95, rows * columns, 1
     figure = Figure(figsize=(width, height), layout="constrained")
     panels = list(figure.subplots(rows, columns, squeeze=False).ravel())
-    for axes in panels:
+    for i, axes in enumerate(panels):
         axes.spines[["top", "right"]].set_visible(False)
         axes.set_axisbelow(True)
+        axes.set_visible(i < count)
         if grid:
             axes.grid(axis=grid, color="#dddddd", linewidth=0.6)
-    for axes in panels[count:] if count is not None else ():
-        axes.set_visible(False)
     return figure, panels
+
+
+def name_axes(
+    axes: Axes, title: str = "", x: str = "", y: str = "", *, small: bool = False
+) -> None:
+    """Write the title and the labels of a panel, in small type if there are many."""
+    axes.set_title(title, fontsize=9 if small else 10)
+    axes.set_xlabel(x, fontsize=8 if small else 10)
+    axes.set_ylabel(y, fontsize=8 if small else 10)
 
 
 def legend(figure: Figure, handles: Sequence[Artist]) -> None:
@@ -79,6 +96,101 @@ def label(axes: Axes, text: str, at: tuple[float, float], **options: Any) -> Non
     """Write a label beside a point of the data, by default 4 points to its right."""
     how: dict[str, Any] = {"xytext": (4, 0), "textcoords": "offset points", "fontsize": 8}
     axes.annotate(text, at, **how | options)
+
+
+def zero_line(axes: Axes) -> None:
+    """Draw a line at zero."""
+    axes.axhline(0.0, color="black", linewidth=0.8, zorder=1)
+
+
+def bars(
+    axes: Axes,
+    names: Sequence[str],
+    values: Sequence[float],
+    colours: str | Sequence[str],
+    texts: Sequence[str] = (),
+    *,
+    shift: float = 0.0,
+    **options: Any,
+) -> None:
+    """Draw horizontal bars from the top down, with their names, and a text beside each.
+
+    Parameters
+    ----------
+    axes : Axes
+        Axes to draw on.
+    names, values, colours, texts : sequence
+        One a bar.
+    shift : float
+        Places by which the bars are lower than their names.
+    **options
+        Of the bars.
+    """
+    places = np.arange(len(names)) + shift
+    axes.barh(places, values, color=colours, **options)
+    for at in zip(values, places, strict=True):
+        text = texts[round(at[1] - shift)] if texts else ""
+        label(axes, text, at, xytext=(3, 0), va="center", bbox=BOX)
+    axes.set_yticks(range(len(names)), names)
+    axes.yaxis.set_inverted(True)
+
+
+def density(
+    axes: Axes,
+    values: Floats,
+    colour: str,
+    shown: tuple[float, float],
+    filled: tuple[float, float],
+) -> None:
+    """Draw a density of height one, and fill a part of it; nothing if all values are equal.
+
+    Parameters
+    ----------
+    axes : Axes
+        Axes to draw on.
+    values : ndarray
+        Draws, shape (draw,).
+    colour : str
+        Of the line and the filling.
+    shown, filled : tuple of float
+        Ends of the two intervals.
+    """
+    if np.ptp(values) > 0:
+        # as many points where the density is narrow
+        grid = np.r_[np.linspace(*shown, 200), np.quantile(values, np.linspace(0, 1, 100)), filled]
+        grid = np.unique(np.clip(grid, *shown))
+        height = gaussian_kde(values)(grid)
+        height /= height.max()
+        inside = (grid >= filled[0]) & (grid <= filled[1])
+        axes.plot(grid, height, color=colour, linewidth=1.2)
+        axes.fill_between(grid, height, where=inside, color=colour, alpha=0.3, linewidth=0)
+
+
+def shares_below(axes: Axes, samples: Mapping[str, Floats], size: float) -> tuple[float, float]:
+    """Plot the share of values below each quantile, less what an even spread gives.
+
+    Parameters
+    ----------
+    axes : Axes
+        Axes to draw on.
+    samples : mapping of str to ndarray
+        Values between 0 and 1 of each curve, by its name.
+    size : float
+        Independent values a curve: even ones stay in the band 99 times of 100.
+
+    Returns
+    -------
+    tuple of float
+        Half the band's width, and the largest difference.
+    """
+    # Kolmogorov's distance times the root of the size, at 1 %
+    edge, largest, grid = 1.63 / float(np.sqrt(max(size, 1.0))), 0.0, np.linspace(0.0, 1.0, 201)
+    axes.axhspan(-edge, edge, color=BAND, zorder=0)
+    for name, values in samples.items():
+        off = np.searchsorted(np.sort(values), grid, side="right") / max(len(values), 1) - grid
+        axes.plot(grid, off, linewidth=1.3, label=name)
+        largest = max(largest, float(np.abs(off).max()))
+    return edge, largest
 
 
 def png(figure: Figure, colours: int = 96) -> bytes:

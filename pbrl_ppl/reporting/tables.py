@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import NamedTuple
 
 import numpy as np
+import xarray as xr
 
 from pbrl_ppl.criticism import Candidate, Loop
 from pbrl_ppl.effects import Sensor
@@ -19,10 +20,12 @@ from pbrl_ppl.reporting.words import (
     chance,
     digits_of,
     error,
+    model_of,
     number,
     percent,
     plain,
     quantity,
+    seconds_ahead,
     share,
 )
 from pbrl_ppl.scene import units_of
@@ -82,16 +85,10 @@ def limits_in_words(candidate: Candidate, loop: Loop) -> str:
             continue
         size, unit = candidate.detectable[name], candidate.units[name]
         null = priors[name].null if name in priors else 0.0
-        if not np.isfinite(size) or (
-            name in priors and not _plausible(priors[name].prior, null, size, candidate.caps)
-        ):
-            limits[name] = ""
-        elif candidate.caps:
-            limits[name] = f"{plain(name)} up to {quantity(size, unit)}"
-        elif null:
-            limits[name] = f"{plain(name)} {number(null)} ± {quantity(size, unit)}"
-        else:
-            limits[name] = f"{plain(name)} {quantity(size, unit)}"
+        shown = name not in priors or _plausible(priors[name].prior, null, size, candidate.caps)
+        how = "up to " if candidate.caps else f"{number(null)} ± " if null else ""
+        known = f"{plain(name)} {how}{quantity(size, unit)}"
+        limits[name] = known if shown and np.isfinite(size) else ""
     if not any(limits.values()):
         return "no plausible size" if limits else ""
     return ", ".join(text or f"{plain(name)} no plausible size" for name, text in limits.items())
@@ -114,46 +111,32 @@ def _draws(prior: Prior) -> Floats:
 
 def error_tables(loop: Loop) -> list[Table]:
     """Tabulate the held-out errors, one interval and a rollout ahead, and overall."""
-    tables, errors = [], (loop.before, loop.after, loop.noise_floor)
-    seconds = loop.rollout_horizon * loop.scene.time_step
-    kinds = [
-        ("one_step_rmse", f"One interval ahead, {loop.scene.time_step:g} s"),
-        ("rollout_rmse", f"{loop.rollout_horizon} intervals ahead, {number(seconds)} s"),
-        ("simulated_rmse", "Whole trajectories, simulated from start states fitted to them"),
-    ]
-    for kind, title in kinds:
+    errors = [loop.before, *[loop.after] * bool(loop.added), loop.noise_floor]
+    heads, intervals = (*models_of(loop), "Noise floor"), loop.rollout_horizon
+    titles = {
+        "one_step_rmse": f"One interval ahead, {loop.scene.time_step:g} s",
+        "rollout_rmse": f"{intervals} intervals ahead, {number(seconds_ahead(loop))} s",
+        "simulated_rmse": "Whole trajectories, simulated from start states fitted to them",
+    }
+    tables = []
+    for kind, title in titles.items():
         sizes = [getattr(each, kind) for each in errors]
-        if sizes[0]:
-            rows = [_row(loop, d, [size.get(d) for size in sizes], UNITS[d]) for d in sizes[0]]
+        rows = [(d, *(error(size.get(d)) for size in sizes), UNITS[d]) for d in sizes[0]]
+        columns = ("State dimension", *heads, "Unit")
+        if rows:
             caption = f"{title} (root mean square error)"
-            tables.append(_before_after(loop, caption, "State dimension", rows, "Unit"))
-    nrmse, elpd = [each.normalised_rmse for each in errors], [each.elpd for each in errors]
-    rows = [
-        _row(loop, "Error in units of the noise", nrmse),
-        _row(loop, "Log predictive density in nats (more is better)", elpd, digits=4),
+            tables.append(Table(caption, columns, rows, words=(len(heads) + 1,)))
+    elpd = "Log predictive density in nats (more is better)"
+    overall = [
+        ("Error in units of the noise", *(error(each.normalised_rmse) for each in errors)),
+        (elpd, *(error(each.elpd, 4) for each in errors)),
     ]
-    tables.append(_before_after(loop, "Overall", "Measure", rows))
-    return tables
-
-
-def _row(
-    loop: Loop, name: str, errors: Sequence[float | None], *unit: str, digits: int = 3
-) -> tuple[str, ...]:
-    """Return the row of an error before, after and of the noise; without after if none is added."""
-    shown = errors if loop.added else (errors[0], errors[2])
-    return (name, *(error(value, digits) for value in shown), *unit)
+    return [*tables, Table("Overall", ("Measure", *heads), overall)]
 
 
 def models_of(loop: Loop) -> tuple[str, ...]:
     """Return the heads of the columns of one model, or of two."""
     return ("Before", "After") if loop.added else ("Declared model",)
-
-
-def _before_after(
-    loop: Loop, caption: str, name: str, rows: list[tuple[str, ...]], *last: str
-) -> Table:
-    columns = (name, *models_of(loop), "Noise floor", *last)
-    return Table(caption, columns, rows, words=(len(columns) - 1,) if last else ())
 
 
 def loo_table(loo: Comparison, columns: Sequence[str]) -> Table:
@@ -167,90 +150,79 @@ def loo_table(loo: Comparison, columns: Sequence[str]) -> Table:
         Heads of the columns: one for the model before alone, or two.
     """
     models = (loo.before, loo.after)[: len(columns)]
+    high = f"How many have a Pareto k above {number(loo.before.good_k, 2)}"
     rows = [
-        ("elpd_loo (nats; more is better)", *(number(model.elpd_loo, 4) for model in models)),
-        ("Standard error", *(number(model.se) for model in models)),
-        ("p_loo, the effective number of parameters", *(number(m.p_loo) for m in models)),
-        (
-            f"How many have a Pareto k above {number(loo.before.good_k, 2)}",
-            *(str(model.high_pareto_k) for model in models),
-        ),
+        ("elpd_loo (nats; more is better)", *(number(each.elpd_loo, 4) for each in models)),
+        ("Standard error", *(number(each.se) for each in models)),
+        ("p_loo, the effective number of parameters", *(number(each.p_loo) for each in models)),
+        (high, *(str(each.high_pareto_k) for each in models)),
     ]
     return Table(f"{loo.method} (az.loo)", ("Measure", *columns), rows)
 
 
 def acceleration_table(loop: Loop) -> Table:
     """Tabulate the unexplained acceleration and its share of the bodies' acceleration."""
-    left, models = loop.acceleration, models_of(loop)
-    shown = [(left.before, left.relative_before), (left.after, left.relative_after)]
-    shown = shown[-len(models) :]
-    shares = ("Before, share", "After, share") if loop.added else ("Share",)
+    left, models, both = loop.acceleration, models_of(loop), bool(loop.added)
+    sizes = [left.before, left.after][not both :]
+    shares = [left.relative_before, left.relative_after][not both :]
+    rows = [
+        (
+            name,
+            *(number(each[name]) for each in sizes),
+            *(share(each[name]) for each in shares),
+            acceleration_unit(name),
+            "yes" if left.certain_after.get(name) else "no",
+        )
+        for name in left.before
+    ]
+    heads = ("Before, share", "After, share") if both else ("Share",)
     return Table(
         "Unexplained acceleration (standard deviation in an interval)",
-        ("Velocity", *models, *shares, "Unit", "Significant"),
-        [
-            (
-                name,
-                *(number(sizes[name]) for sizes, _ in shown),
-                *(share(relative[name]) for _, relative in shown),
-                acceleration_unit(name),
-                "yes" if left.certain_after.get(name) else "no",
-            )
-            for name in left.before
-        ],
+        ("Velocity", *models, *heads, "Unit", "Significant"),
+        rows,
         words=(1 + 2 * len(models), 2 + 2 * len(models)),
     )
 
 
 def residual_test_table(loop: Loop) -> Table:
     """Tabulate the tests of the model's residual."""
-    which = "revised" if loop.added else "declared"
-    return Table(
-        f"Tests of the {which} model's residual, on the recordings that it was fitted to",
-        ("Test", "Result", "p", "Passed"),
-        [
-            (
-                test.name,
-                test.sentence,
-                chance(test.p_value),
-                ("yes" if test.passed else "no") if test.tested else "not tested",
-            )
-            for test in loop.tests
-        ],
-        words=(1, 3),
-        marks=["" if test.passed else "bad" for test in loop.tests],
-    )
+    caption = f"Tests of the {model_of(loop)} model's residual, on the recordings that it was"
+    passed = [("yes" if t.passed else "no") if t.tested else "not tested" for t in loop.tests]
+    rows = [
+        (test.name, test.sentence, chance(test.p_value), said)
+        for test, said in zip(loop.tests, passed, strict=True)
+    ]
+    marks = ["" if test.passed else "bad" for test in loop.tests]
+    return Table(f"{caption} fitted to", ("Test", "Result", "p", "Passed"), rows, (1, 3), marks)
 
 
 def candidate_table(loop: Loop) -> Table:
     """Tabulate the candidates: scores, the search's regression for each alone, the decision."""
     added = {(effect.effect, effect.body) for effect in loop.added}
-    return Table(
-        "All candidates, those of the largest score first",
-        ("Effect", "Score", "Degrees of freedom", "p (corrected)", "First estimate",
-         "Identifiable", "Alone: share of simulation error", "Alone: evidence (nats)",
-         "Detection limit", "Decision"),
-        [
-            (
-                (plain(candidate.effect), candidate.body),
-                number(candidate.statistic),
-                str(candidate.dof),
-                chance(candidate.p_value),
-                _estimates(candidate, measured_parameters(candidate, loop)),
-                percent(candidate.identifiable),
-                percent(candidate.simulated_share),
-                number(candidate.simulated_nats),
-                limits_in_words(candidate, loop) or "–",
-                candidate.why or "–",
-            )
-            for candidate in loop.candidates
-        ],
-        words=(4, 8, 9),
-        marks=[
-            "added" if (candidate.effect, candidate.body) in added else ""
-            for candidate in loop.candidates
-        ],
-    )  # fmt: skip
+    rows = [
+        (
+            (plain(one.effect), one.body),
+            number(one.statistic),
+            str(one.dof),
+            chance(one.p_value),
+            ", ".join(
+                f"{plain(name)} {quantity(one.estimate[name], one.units[name])}"
+                for name in measured_parameters(one, loop)
+                if name in one.estimate
+            ),
+            percent(one.identifiable),
+            percent(one.simulated_share),
+            number(one.simulated_nats),
+            limits_in_words(one, loop) or "–",
+            one.why or "–",
+        )
+        for one in loop.candidates
+    ]
+    marks = ["added" * ((one.effect, one.body) in added) for one in loop.candidates]
+    heads = ("Effect", "Score", "Degrees of freedom", "p (corrected)", "First estimate",
+             "Identifiable", "Alone: share of simulation error", "Alone: evidence (nats)",
+             "Detection limit", "Decision")  # fmt: skip
+    return Table("All candidates, those of the largest score first", heads, rows, (4, 8, 9), marks)
 
 
 def search_tables(loop: Loop) -> list[Table]:
@@ -269,36 +241,24 @@ def search_tables(loop: Loop) -> list[Table]:
     ]
 
 
-def _estimates(candidate: Candidate, names: Iterable[str]) -> str:
-    return ", ".join(
-        f"{plain(name)} {quantity(candidate.estimate[name], candidate.units[name])}"
-        for name in names
-        if name in candidate.estimate
-    )
-
-
 def carrier_table(evidence: Evidence, most: int = 8) -> Table:
     """Tabulate the transitions that carry most of the evidence."""
     gains = evidence.by_transition
-    shown = np.argsort(-gains, kind="stable")[:most]
-    return Table(
-        f"The {len(shown)} transitions with most evidence",
-        ("Trajectory", "Time (s)", "Gain (nats)", "Mostly in", "Speed (m/s)",
-         "Force x (N)", "Force y (N)", "Torque (N m)", "Touching"),
-        [
-            (
-                str(evidence.trajectory[i]),
-                f"{evidence.time[i]:.4g}",
-                number(float(gains[i])),
-                evidence.names[int(np.argmax(evidence.nats[i]))],
-                number(float(evidence.speed[i])),
-                *(number(float(value)) for value in evidence.wrench[i]),
-                "yes" if evidence.touching[i] else "no",
-            )
-            for i in shown
-        ],
-        words=(3, 8),
-    )  # fmt: skip
+    heads = ("Trajectory", "Time (s)", "Gain (nats)", "Mostly in", "Speed (m/s)", "Force x (N)",
+             "Force y (N)", "Torque (N m)", "Touching")  # fmt: skip
+    rows = [
+        (
+            str(evidence.trajectory[i]),
+            f"{evidence.time[i]:.4g}",
+            number(gains[i]),
+            evidence.names[int(np.argmax(evidence.nats[i]))],
+            number(evidence.speed[i]),
+            *map(number, evidence.wrench[i]),
+            "yes" if evidence.touching[i] else "no",
+        )
+        for i in np.argsort(-gains, kind="stable")[:most]
+    ]
+    return Table(f"The {len(rows)} transitions with most evidence", heads, rows, (3, 8))
 
 
 def parameter_table(parameters: Parameters) -> Table:
@@ -333,33 +293,28 @@ def _span(low: float, high: float) -> str:
 def width_table(known: Identifiability, parameters: Parameters) -> Table:
     """Tabulate the intervals of each parameter before and after the data."""
     both = [draws(parameters.posterior) for draws in (prior_draws, scalars)]
-    units = parameters.summary["unit"]
-    data = {
-        "informed": "inform it",
-        "weak": "inform it weakly",
-        "prior only": "say nothing beyond the prior",
-    }
+    units, bad = parameters.summary["unit"], "say nothing beyond the prior"
+    data = {"informed": "inform it", "weak": "inform it weakly", "prior only": bad}
+
+    def span(draws: xr.Dataset, name: str) -> str:
+        return _span(*interval(draws[name].to_numpy())) if name in draws else "–"
+
     rows = [
         (
-            width.parameter,
-            *(
-                _span(*interval(draws[width.parameter].to_numpy()))
-                if width.parameter in draws
-                else "–"
-                for draws in both
-            ),
-            units.get(width.parameter, ""),
-            f"{100 * width.ratio:.3g} %",
-            data[width.verdict],
+            one.parameter,
+            *(span(draws, one.parameter) for draws in both),
+            units.get(one.parameter, ""),
+            f"{100 * one.ratio:.3g} %",
+            data[one.verdict],
         )
-        for width in known.parameters
+        for one in known.parameters
     ]
     return Table(
         "What was believed, and what is known now (94 % intervals)",
         ("Parameter", "Before the data", "After", "Unit", "Width left", "The data"),
         rows,
         words=(3, 5),
-        marks=["bad" if width.verdict == "prior only" else "" for width in known.parameters],
+        marks=["bad" if row[-1] == bad else "" for row in rows],
     )
 
 

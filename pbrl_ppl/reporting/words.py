@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from pbrl_ppl.criticism import (
     ONE_TRAJECTORY,
     UNEXPLAINED,
     Added,
+    Candidate,
     Estimate,
     Loop,
     acceleration_in_words,
@@ -53,7 +53,10 @@ def _found(loop: Loop) -> str:
         return f"Nothing{matters} was found missing"
     first, *more = main_laws(loop)
     sentence = _listed([_named(one) for one in (first, *more)], "and")
-    return f"{sentence[0].upper()}{sentence[1:]}{'' if more else _size(first)}"
+    if not more and has_size(first):
+        (size,) = first.parameters.values()
+        sentence += f", {with_interval(size)}"
+    return f"{sentence[0].upper()}{sentence[1:]}"
 
 
 def main_laws(loop: Loop) -> tuple[Added, ...]:
@@ -74,15 +77,7 @@ def has_size(added: Added) -> bool:
     return len(added.parameters) == 1 and not added.not_separable_from
 
 
-def _size(added: Added) -> str:
-    """Write the size of an effect with one parameter and its interval; empty for others."""
-    if not has_size(added):
-        return ""
-    (size,) = added.parameters.values()
-    return f", {_with_interval(size, '94 %')}"
-
-
-def _with_interval(size: Estimate, name: str) -> str:
+def with_interval(size: Estimate, name: str = "94 %") -> str:
     """Write an estimate and its interval, with the digits that tell the ends apart."""
     digits = digits_of(*size.hdi)
     low, high = (number(end, digits) for end in size.hdi)
@@ -242,44 +237,20 @@ def error_in_words(loop: Loop) -> str:
     return ""
 
 
-def held_out_in_words(loop: Loop) -> str:
-    """Return the held-out errors of one model, or of both and their change."""
-    before, after = loop.before.normalised_rmse, loop.after.normalised_rmse
-    fell = 1 - after / before if before > 0 else np.nan
-    if not loop.added:
-        text = f"the error of the declared model is {error(before)} times the noise"
-    elif np.isposinf(after):
-        text = (
-            f"the revised model diverges; the error of the declared one is {error(before)} times"
-            " the noise"
-        )
-    else:
-        changed = f"{'fell' if fell > 0 else 'rose'} by {abs(fell) * 100:.0f} %"
-        if not np.isfinite(fell) or abs(fell) < 0.005:
-            changed = "did not change"
-        text = (
-            f"the prediction error {changed}, from {error(before)} to {number(after)} times the"
-            " noise"
-        )
-    floor = number(loop.noise_floor.normalised_rmse)
-    return f"On held-out recordings {text}; noise alone gives {floor}."
-
-
 def caution_in_words(loop: Loop) -> str:
     """Return what to know of added effects of a recording of one trajectory; empty otherwise."""
     single = bool(loop.added) and loop.provenance.get("trajectories") == 1
     return f"{ONE_TRAJECTORY[0].upper()}{ONE_TRAJECTORY[1:]}." if single else ""
 
 
-def rejected_in_words(loop: Loop) -> str:
-    """Return why the leading significant candidates were not added."""
+def rejected(loop: Loop) -> list[Candidate]:
+    """Return the leading significant candidates that were not added."""
     present = {(added.effect, added.body) for added in loop.added}
-    reasons = [
-        f"{plain(one.effect)} on the {plain(one.body)} ({one.why})"
+    return [
+        one
         for one in loop.candidates
         if one.why and one.p_value < loop.criteria.try_p and (one.effect, one.body) not in present
-    ]
-    return f"Not added: {'; '.join(reasons[:_LISTED])}." if reasons else ""
+    ][:_LISTED]
 
 
 def left_out_in_words(loop: Loop) -> str:
@@ -289,107 +260,16 @@ def left_out_in_words(loop: Loop) -> str:
     return f"{'; '.join(first)}{rest}." if first else ""
 
 
-def in_brief(loop: Loop, folder: str | Path, remainder: str = "") -> list[str]:
-    """Return a summary of a closed loop in about ten lines.
-
-    Parameters
-    ----------
-    loop : Loop
-        Result of :func:`pbrl_ppl.close_loop`.
-    folder : str or pathlib.Path
-        Folder of the results, to name in commands.
-    remainder : str
-        What a learned remainder does, or why there is none; empty if none was requested.
-    """
-    folder = Path(folder)
-    lines = [f"Verdict: {loop.verdict}. {verdict_in_words(loop)}"]
-    lines += [_sizes(added) for added in accepted(loop)]
-    lines += [caution] if (caution := caution_in_words(loop)) else []
-    lines += _worst_error(loop)
-    lines += [f"  {remains}"] if (remains := remains_in_words(loop)) else []
-    lines += [f"Left out: {words}"] if (words := left_out_in_words(loop)) else []
-    lines += [f"Remainder: {remainder}"] if remainder else []
-    lines.append(f"Next: {_next_step(loop, folder, bool(remainder))}")
-    lines.append(f"Report: {folder / 'report.html'}; posteriors before.nc and after.nc beside it.")
-    return lines
-
-
-def _sizes(added: Added) -> str:
-    """Write the sizes of an effect with their intervals, and the effects confounded with it."""
-    sizes = [
-        f"{plain(name)} {_with_interval(size, '94 % interval')}"
-        for name, size in added.parameters.items()
-    ]
-    name = f"{plain(added.effect)} on the {plain(added.body)}"
-    name = name if added.main else f"small correction, {name}"
-    text = f"  {name} ({added.sentence.rstrip('.')}): {', '.join(sizes)}"
-    if added.not_separable_from:
-        others = joined((plain(name) for name in added.not_separable_from), "or")
-        text += f"; these data cannot tell it from {others}"
-    return text
-
-
-def _worst_error(loop: Loop) -> list[str]:
-    """Write the held-out error far ahead that is worst, before and after if something was added."""
-    every = (loop.before, loop.after, loop.noise_floor)
-    ahead = f" {number(seconds_ahead(loop))} s ahead"
-    before, after, floor = (errors.rollout_rmse for errors in every)
-    if loop.after.simulated_rmse and loop.held_out is not None:
-        before, after, floor = (errors.simulated_rmse for errors in every)
-        before = {name: error for name, error in before.items() if name in floor}
-        steps = int(loop.held_out.dataset["n_rows"].max()) - 1
-        ahead = f", {number(steps * loop.scene.time_step)} s from fitted starts"
+def worst_ahead(loop: Loop, kind: str) -> str:
+    """Return the state dimension with the worst error of a kind, over the noise floor, or none."""
+    before, after, floor = (getattr(e, kind) for e in (loop.before, loop.after, loop.noise_floor))
 
     def times_floor(name: str) -> float:
-        if np.isposinf(after.get(name, 0.0)):
-            return float("inf")
-        return before[name] / (floor.get(name, 0.0) or np.inf)
+        far = after.get(name, 0.0)
+        return float(far if np.isposinf(far) else before[name] / (floor.get(name) or np.inf))
 
-    lines = []
-    if before:
-        name = max(before, key=times_floor)
-        errors = (before[name], after.get(name, np.nan)) if loop.added else (before[name],)
-        unit = f" {UNITS[name]}" * bool(np.isfinite(errors[-1]))
-        lines.append(
-            f"Held-out error of {name}{ahead}:"
-            f" {' -> '.join(map(error, errors))}{unit}{_floor(loop, floor, name)}."
-        )
-    return [*lines, *([f"  {note}"] if (note := error_in_words(loop)) else [])]
-
-
-def _floor(loop: Loop, floor: Mapping[str, float], name: str) -> str:
-    """Return the noise floor of an error in brackets, unless it is larger than the motion."""
-    size = floor.get(name, np.inf)
-    if loop.held_out is not None:
-        measured = loop.held_out.dataset["observed"].sel(state=name)
-        if not size < float(measured.max() - measured.min()):
-            return ""
-    return f" (noise floor {number(size)} {UNITS[name]})"
-
-
-def _next_step(loop: Loop, folder: Path, tried: bool) -> str:
-    """Return what to do next."""
-    left = loop.unexplained
-    if loop.verdict == NOT_CONVERGED:
-        return "close the loop again with more --draws, or with tighter priors in the scene."
-    if diverges(loop):
-        return "open the report, which shows where forecasts diverge; do not plan with this model."
-    if left is not None and depends_on_records(loop):
-        learn = loop.verdict == UNEXPLAINED and not tried
-        return (
-            f"open the report, which plots the residual against {left.depends_on}; write an effect"
-            f" for it{', or close the loop again with --learn-remainder' if learn else ''}."
-        )
-    if loop.verdict == UNEXPLAINED:
-        return "open the report; record more quantities, or longer."
-    if any(added.not_separable_from for added in loop.added):
-        return (
-            f"pbrl-ppl suggest {folder / 'after.nc'} -o next.csv: a recording that tells these"
-            " effects apart."
-        )
-    if loop.verdict == ADEQUATE:
-        return "open the report for the detection limit of each effect."
-    return "open the report; plan and update with the posterior after.nc."
+    names = before if kind == "rollout_rmse" else [name for name in before if name in floor]
+    return max(names, key=times_floor, default="")
 
 
 def plain(name: str) -> str:

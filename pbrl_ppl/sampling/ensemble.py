@@ -9,7 +9,7 @@ their effective sample size sets.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import permutations
 from typing import Any, NamedTuple, Protocol
@@ -80,10 +80,8 @@ class Path:
 
     def look(self, q: Floats) -> tuple[Any, Any]:
         """Return what both are, at particles (n, d); nothing of one without a share."""
-        return (
-            self.start.look(q) if self.beta < 1 else None,
-            self.end.look(q) if self.beta > 0 else None,
-        )
+        start = self.start.look(q) if self.beta < 1 else None
+        return start, self.end.look(q) if self.beta > 0 else None
 
     def columns(self, q: Floats, look: tuple[Any, Any]) -> Floats:
         """Return the weighted mean of both, shape (n, part + 1)."""
@@ -158,13 +156,10 @@ class Block:
         densities = [mode.log_density(x) for mode in self.modes]
         return np.asarray(logsumexp(densities, axis=0) - np.log(len(densities)))
 
-    def kind(self, rng: np.random.Generator, *, jumps: float = 0.25) -> str:
-        """Return which move is made next.
-
-        ``jumps``: share of moves that jump between modes, where there are several.
-        """
+    def kind(self, rng: np.random.Generator) -> str:
+        """Return which move is made next: a quarter are jumps where there are several modes."""
         if len(self.modes) > 1:
-            return "jump" if rng.uniform() < jumps else "walk"
+            return "jump" if rng.uniform() < 0.25 else "walk"
         return "walk" if rng.uniform() < 0.5 else "draw"
 
     def propose(self, x: Floats, kind: str, rng: np.random.Generator) -> tuple[Floats, Floats]:
@@ -245,24 +240,19 @@ class Reference:
 
         ``cheap`` is the space of fewer engine steps, which tells how far off densities fall.
         """
-        gaussians = []
-        for one in (mode, *mode.others):
-            mean, covariance = space.laplace(one)
-            gaussians.append((mean, _WIDER * (cheap or space).widened(mean, covariance)))
+        near = cheap or space
+        gaussians = [space.laplace(one) for one in (mode, *mode.others)]
+        gaussians = [(mean, _WIDER * near.widened(mean, spread)) for mean, spread in gaussians]
 
         def block(places: Ints) -> Block:
             modes: list[_Gaussian] = []
             for mean, covariance in gaussians:
-                gaussian = _gaussian(mean[places], covariance[np.ix_(places, places)])
-                apart = [
-                    np.abs(old.standardised(gaussian.mean[None])).max(initial=0.0) for old in modes
-                ]
-                if all(distance > 1.0 for distance in apart):
-                    modes.append(gaussian)
+                one = _gaussian(mean[places], covariance[np.ix_(places, places)])
+                if all((np.abs(old.standardised(one.mean[None])) > 1.0).any() for old in modes):
+                    modes.append(one)
             return Block(places, tuple(modes))
 
-        parts = [block(part.places) for part in space.parts]
-        return cls(space, gaussians[0][0], parts, [block(places) for places in space.noise_blocks])
+        return cls._of_blocks(space, gaussians[0][0], block)
 
     @classmethod
     def of_draws(cls, space: Space, q: Floats) -> Reference:
@@ -270,11 +260,15 @@ class Reference:
         middle = q.mean(axis=0)
 
         def block(places: Ints) -> Block:
-            gaussian = _gaussian(middle[places], _WIDER * np.cov(q[:, places], rowvar=False))
-            return Block(places, (gaussian,))
+            covariance = _WIDER * np.cov(q[:, places], rowvar=False)
+            return Block(places, (_gaussian(middle[places], covariance),))
 
+        return cls._of_blocks(space, middle, block)
+
+    @classmethod
+    def _of_blocks(cls, space: Space, origin: Floats, block: Callable[[Ints], Block]) -> Reference:
         parts = [block(part.places) for part in space.parts]
-        return cls(space, middle, parts, [block(places) for places in space.noise_blocks])
+        return cls(space, origin, parts, [block(places) for places in space.noise_blocks])
 
     def draw(self, n: int, rng: np.random.Generator) -> Floats:
         """Draw n particles, silent parameters from their prior, shape (n, d)."""
@@ -336,17 +330,12 @@ class Ensemble:
             block.learn(self.q[:, block.places])
 
     def move(
-        self,
-        target: Target,
-        sweeps: int,
-        cheap: Target | None = None,
-        *,
-        adapt: bool = True,
-        noise: bool = True,
-        noise_moves: int = 5,
-        noise_along: int = 1,
+        self, target: Target, sweeps: int, cheap: Target | None = None, *, adapt: bool = True
     ) -> float:
         """Move all particles by Metropolis sweeps; return the share of accepted moves.
+
+        After each sweep the noise moves several times, fewer along trajectories, where each move
+        runs the filter.
 
         Parameters
         ----------
@@ -359,49 +348,32 @@ class Ensemble:
             which frees particles from where it is far too low.
         adapt : bool
             Whether step sizes follow acceptance rates.
-        noise : bool
-            Whether the noise moves too.
-        noise_moves : int
-            Moves of the noise for each of the parameters.
-        noise_along : int
-            The same along trajectories, where each runs the filter.
         """
         rates = []
-        along = not self.space.problem.likelihood.independent
-        moves = 0 if not noise else noise_along if along else noise_moves
+        noise = self.noise * (5 if self.space.problem.likelihood.independent else 1)
         for chosen in groups(self.space, len(self.q)):
-            self.q[chosen], rate = self._moved(self.q[chosen], target, sweeps, cheap, adapt, moves)
-            rates.append(rate)
+            q, of_sweeps = self.q[chosen], []
+            look = target.look(q)
+            here = target.columns(q, look)
+            for i in range(self._sweeps, self._sweeps + sweeps):
+                ahead = cheap if i % 2 == 0 else None
+                y, gain, kinds = (
+                    self._proposed(q) if ahead is None else self._ahead(q, ahead, adapt)
+                )
+                seen = target.look(y)
+                there = target.columns(y, seen)
+                accepted, rate = self._accepted(there[:, :-1], here[:, :-1], gain)
+                if adapt:
+                    self._adapt(kinds, rate)
+                q, look = self._chosen(accepted, y, q), self._merged(accepted, seen, look)
+                here[:, :-1] = np.where(accepted, there[:, :-1], here[:, :-1])
+                of_sweeps.append(rate.mean() if len(rate) else 1.0)
+                for block in noise:
+                    q, here = self._of_noise(block, q, here, target, look, adapt)
+            self.q[chosen] = q
+            rates.append(np.mean(of_sweeps))
         self._sweeps += sweeps
         return float(np.mean(rates))
-
-    def _moved(
-        self,
-        q: Floats,
-        target: Target,
-        sweeps: int,
-        cheap: Target | None,
-        adapt: bool,
-        of_noise: int,
-    ) -> tuple[Floats, float]:
-        look = target.look(q)
-        here, rates = target.columns(q, look), []
-        first = self._sweeps
-        for i in range(sweeps):
-            ahead = cheap if (first + i) % 2 == 0 else None
-            y, gain, kinds = self._proposed(q) if ahead is None else self._ahead(q, ahead, adapt)
-            seen = target.look(y)
-            there = target.columns(y, seen)
-            accepted, rate = self._accepted(there[:, :-1], here[:, :-1], gain)
-            if adapt:
-                self._adapt(kinds, rate)
-            q, look = self._chosen(accepted, y, q), self._merged(accepted, seen, look)
-            here[:, :-1] = np.where(accepted, there[:, :-1], here[:, :-1])
-            rates.append(rate.mean() if len(rate) else 1.0)
-            for _ in range(of_noise):
-                for block in self.noise:
-                    q, here = self._of_noise(block, q, here, target, look, adapt)
-        return q, float(np.mean(rates))
 
     def _proposed(self, q: Floats) -> tuple[Floats, Floats, list[str]]:
         """Return a proposal, the log Hastings ratio of each part, and the kinds of move."""
@@ -487,19 +459,9 @@ class Ensemble:
         return np.where(accepted[:, None], y, q), np.where(accepted[:, None], there, here)
 
     def settle(
-        self,
-        target: Target,
-        cheap: Target | None = None,
-        looks: int = _LOOKS,
-        *,
-        n_sweeps: int = 3,
-        forgotten: float = 0.5,
+        self, target: Target, cheap: Target | None = None, looks: int = _LOOKS
     ) -> tuple[float, float]:
         """Move until particles have decorrelated from where they were, ``looks`` times at most.
-
-        ``n_sweeps``: sweeps between two tests whether particles have forgotten where they were.
-
-        ``forgotten``: the largest correlation with it then.
 
         Returns
         -------
@@ -510,11 +472,11 @@ class Ensemble:
         """
         begin, rates = self.q.copy(), []
         places = np.concatenate([block.places for block in self.blocks])
-        sweeps = 1 if cheap is not None else n_sweeps
+        sweeps = 1 if cheap is not None else 3
         for _ in range(looks):
             rates.append(self.move(target, sweeps, cheap))
             correlation = _correlation(begin[:, places], self.q[:, places])
-            if correlation < forgotten:
+            if correlation < 0.5:
                 break
             self.learn()
         return float(np.mean(rates)), correlation

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -142,19 +142,11 @@ class SamplerRun:
         starts = self.starts()
         try:
             trace: Idata = pm.sample(
-                draws=self.draws * steps_a_draw,
-                tune=self.tune,
-                chains=len(starts),
-                cores=min(self.cores, len(starts)),
-                step=step,
-                initvals=starts,
-                random_seed=self.seed,
-                progressbar=self.progress,
-                quiet=not self.progress,
-                compute_convergence_checks=False,
-                discard_tuned_samples=True,
-                model=self.model,
-            )
+                draws=self.draws * steps_a_draw, tune=self.tune, chains=len(starts),
+                cores=min(self.cores, len(starts)), step=step, initvals=starts,
+                random_seed=self.seed, progressbar=self.progress, quiet=not self.progress,
+                compute_convergence_checks=False, discard_tuned_samples=True, model=self.model,
+            )  # fmt: skip
         except ValueError as error:
             if "Not enough samples" in str(error):  # PyMC's answer to an early interrupt
                 raise KeyboardInterrupt from error
@@ -257,18 +249,15 @@ def _paper(job: SamplerRun) -> Idata:
     return job.sample(steps, job.thin)
 
 
-def _demetropolisz(job: SamplerRun) -> Idata:
-    """Run differential evolution from each chain's past (ter Braak and Vrugt, 2008)."""
+def _pymc(step: str, job: SamplerRun) -> Idata:
+    """Run a step method of PyMC on all parameters together.
+
+    ``DEMetropolisZ`` is differential evolution from each chain's past (ter Braak and Vrugt, 2008);
+    ``NUTS`` takes the finite-difference gradient: where nothing slides to a stop or collides.
+    """
     import pymc as pm
 
-    return job.sample(pm.DEMetropolisZ(job.model.free_RVs, model=job.model), job.thin)
-
-
-def _nuts(job: SamplerRun) -> Idata:
-    """Run NUTS on the finite-difference gradient: where nothing slides to a stop or collides."""
-    import pymc as pm
-
-    return job.sample(pm.NUTS(job.model.free_RVs, model=job.model), job.thin)
+    return job.sample(getattr(pm, step)(job.model.free_RVs, model=job.model), job.thin)
 
 
 def _smc(job: SamplerRun) -> Idata:
@@ -276,14 +265,9 @@ def _smc(job: SamplerRun) -> Idata:
     import pymc as pm
 
     trace: Idata = pm.sample_smc(
-        draws=job.draws,
-        chains=job.chains,
-        cores=job.cores,
-        random_seed=job.seed,
-        progressbar=job.progress,
-        compute_convergence_checks=False,
-        model=job.model,
-    )
+        draws=job.draws, chains=job.chains, cores=job.cores, random_seed=job.seed,
+        progressbar=job.progress, compute_convergence_checks=False, model=job.model,
+    )  # fmt: skip
     return trace
 
 
@@ -359,9 +343,9 @@ METHODS: Mapping[str, Method] = {
     "importance": Method(_importance, draws=250, tune=0, thin=1),
     "metropolis": Method(_metropolis, draws=800, tune=500, thin=4),
     "paper": Method(_paper, draws=1900, tune=1000, thin=10, chains=30),
-    "demetropolisz": Method(_demetropolisz, draws=1000, tune=2000, thin=10),
+    "demetropolisz": Method(partial(_pymc, "DEMetropolisZ"), draws=1000, tune=2000, thin=10),
     "smc": Method(_smc, draws=1000, tune=0, thin=1),
-    "nuts": Method(_nuts, draws=500, tune=500, thin=1),
+    "nuts": Method(partial(_pymc, "NUTS"), draws=500, tune=500, thin=1),
     "laplace": Method(_laplace, draws=250, tune=0, thin=1),
     "map": Method(_map, draws=1, tune=0, thin=1),
 }

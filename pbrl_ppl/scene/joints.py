@@ -1,5 +1,6 @@
 """Joints of a scene, and the table of their kinds."""
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
@@ -18,6 +19,8 @@ class JointKind:
     ----------
     pins_anchors : bool
         Whether the anchors coincide, so that positions follow from angles and anchors.
+    slides : bool
+        Whether one body slides along an axis of the other and does not turn against it.
     needs_reference_poses : bool
         Whether it keeps what the anchors' distance is in the bodies' reference poses.
     stops_bodies : bool
@@ -25,13 +28,20 @@ class JointKind:
     """
 
     pins_anchors: bool = False
+    slides: bool = False
     needs_reference_poses: bool = False
     stops_bodies: bool = False
+
+    @property
+    def hangs(self) -> bool:
+        """Whether one body hangs in it with one coordinate, in which friction may act."""
+        return self.pins_anchors or self.slides
 
 
 #: The kinds of joints by name. A new kind needs an entry here and one in `pbrl_ppl.physics`.
 JOINT_KINDS: Mapping[str, JointKind] = {
     "hinge": JointKind(pins_anchors=True),
+    "slider": JointKind(slides=True),
     "distance": JointKind(needs_reference_poses=True, stops_bodies=True),
 }
 
@@ -44,7 +54,9 @@ class Joint:
     ----------
     kind : str
         ``"distance"``, which keeps the distance that the anchors have in the bodies' reference
-        poses (zero is a hinge), or ``"hinge"``.
+        poses (zero is a hinge), ``"hinge"``, or ``"slider"``: the first body slides along the line
+        through the second's anchor, and keeps the angle against it that their reference poses have
+        (`Body.pose`; 0 without one). Friction in a hinge or slider is an effect.
     bodies : tuple of str, optional
         Two names; ``"world"`` is the ground. None to infer which bodies it joins (the indices
         ``i_a`` and ``i_b`` of Table 1).
@@ -59,6 +71,8 @@ class Joint:
         Of a joint of unknown bodies: probabilities of the indices by name, such as
         ``{"i_a": {"cart": 0.7, "world": 0.3}}``, scaled to add up to one; a mapping of mappings is
         accepted. Names left out have none; all are equally probable for an index left out.
+    axis : tuple of float, optional
+        Direction of a slider in the second body's frame (the world's own), of any length.
 
     Raises
     ------
@@ -78,6 +92,7 @@ class Joint:
     known: bool = True
     name: str | None = None
     prior: tuple[tuple[str, Named], ...] = ()
+    axis: Point | None = None
 
     def __post_init__(self) -> None:
         if self.name is not None:
@@ -111,6 +126,29 @@ class Joint:
                 )
             if anchor is not None:
                 object.__setattr__(self, key, vector(anchor, 2, f"{where}: {key}"))
+        if self.axis is not None or self.traits.slides:
+            self._check_axis(where)
+
+    def _check_axis(self, where: str) -> None:
+        """Refuse a slider without a direction or bodies, and an axis of another joint."""
+        if not self.traits.slides:
+            raise SceneError(
+                f"{where}: it is a {self.kind} and has an axis, which only a slider has; drop axis,"
+                ' or set kind = "slider"'
+            )
+        if self.bodies is None:
+            raise SceneError(f"{where}: it is a slider without bodies; name the two that it joins")
+        if self.axis is None:
+            raise SceneError(
+                f"{where}: it is a slider without an axis; add axis = [x, y], a direction in the"
+                f" frame of {self.bodies[1]}"
+            )
+        object.__setattr__(self, "axis", vector(self.axis, 2, f"{where}: axis"))
+        if not math.hypot(*self.axis) > 0:
+            raise SceneError(
+                f"{where}: axis is {list(self.axis)}, expected a direction; give two numbers that"
+                " are not both 0"
+            )
 
     @property
     def traits(self) -> JointKind:

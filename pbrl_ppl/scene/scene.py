@@ -7,6 +7,7 @@ from a TOML file or from Python.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,7 +56,7 @@ class Scene:
     walls : tuple of Wall
         Immovable segments.
     joints : tuple of Joint
-        Hinges and distance joints.
+        Hinges, sliders and distance joints.
     noise : tuple of (str, float)
         Standard deviation of measuring a state dimension where it is known (m, rad, m/s, rad/s),
         for the likelihood of whole trajectories, which infers the others; a dict will do.
@@ -292,6 +293,16 @@ class Scene:
                 return body
         names = [body.name for body in self.bodies]
         raise SceneError(f'scene: there is no body "{name}"{nearest(name, names)}')
+
+    def reference_angle(self, name: str) -> float:
+        """Return the angle in a body's reference pose (rad): 0 without one, and of the world."""
+        pose = None if name == WORLD else self.body(name).pose
+        return pose[2] if pose else 0.0
+
+    def direction(self, slider: Joint) -> float:
+        """Return the direction of a slider's axis where its bodies are in their poses (rad)."""
+        (x, y), (_, second) = slider.axis or (0.0, 0.0), slider.bodies or ("", WORLD)
+        return self.reference_angle(second) + math.atan2(y, x)
 
     def replace(self, **changes: Any) -> Scene:
         """Return a scene with these attributes changed, checked again."""

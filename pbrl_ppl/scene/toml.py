@@ -26,7 +26,7 @@ KEYS: dict[str, tuple[str, str]] = {
     ),
     "shape": ("kind", "size radius vertices"),
     "wall": ("from to", ""),
-    "joint": ("kind", "bodies anchor_a anchor_b known name prior"),
+    "joint": ("kind", "bodies anchor_a anchor_b axis known name prior"),
 }
 
 

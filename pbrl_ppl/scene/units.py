@@ -47,6 +47,8 @@ class Units:
         Root mean square angular speed (rad/s).
     range : float
         Largest distance of a position from their mean (m).
+    interval : float
+        Sampling interval (s).
     x, y : float
         Mean position (m).
 
@@ -67,6 +69,7 @@ class Units:
     speed: float
     turn_rate: float
     range: float
+    interval: float
     x: float = 0.0
     y: float = 0.0
 
@@ -149,6 +152,7 @@ def units_of(scene: Scene, name: str) -> Units:
         speed=speed,
         turn_rate=speed / length,
         range=extent,
+        interval=scene.time_step,
         x=centre[0],
         y=centre[1],
     )

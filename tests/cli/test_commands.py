@@ -86,6 +86,13 @@ def test_every_help_has_an_example_that_parses() -> None:
         command.make_context(name, words[2:])  # raises on what it does not know
 
 
+def test_every_option_has_its_help() -> None:
+    """It stands in a docstring, where a name that is mistyped would lose it."""
+    for name, command in typer.main.get_command(app).commands.items():
+        for parameter in command.params:
+            assert parameter.help or parameter.hidden, (name, parameter.name)
+
+
 def test_options_are_alike() -> None:
     """All can be quiet and answer in JSON; what is random has a seed."""
     for name, command in typer.main.get_command(app).commands.items():

@@ -36,8 +36,14 @@ def free(time_step: float = 1.0, substeps: int = 200) -> Scene:
     return Scene(time_step=time_step, substeps=substeps, bodies=bodies)
 
 
-def full_scene() -> Scene:
-    """A wheeled cart with an arm hinged to it, between walls."""
+def full_scene(name: str = "") -> Scene:
+    """A wheeled cart with an arm hinged to it, between walls; or with the arm on a rail.
+
+    ``name`` is that of the effect that it is for.
+    """
+    joint = Joint("hinge", ("cart", "arm"), (0.5, 0.0), (0.0, 0.2))
+    if name.startswith("slider"):
+        joint = Joint("slider", ("arm", "world"), (0.0, 0.2), (0.5, 0.0), axis=(1.0, 0.2))
     cart = body("cart", BOX, wheel=True, mass=MASS, r=0.3, mu_c=0.3, mu_x=0.05, mu_y=0.4, w_x=-0.2)
     return Scene(
         time_step=0.1,
@@ -45,7 +51,7 @@ def full_scene() -> Scene:
         normal_gravity=G,
         bodies=(cart, body("arm", Shape.box(0.05, 0.4), mass=0.3)),
         walls=(Wall((-1.0, -2.0), (-1.0, 2.0)), Wall((1.0, -2.0), (1.0, 2.0))),
-        joints=(Joint("hinge", ("cart", "arm"), (0.5, 0.0), (0.0, 0.2)),),
+        joints=(joint,),
     )
 
 
@@ -77,7 +83,7 @@ def test_every_effect_says_what_it_is(effect) -> None:
 @PATHS
 @pytest.mark.parametrize("name", NAMES)
 def test_null_value_is_no_effect(name, path) -> None:
-    scene = full_scene()
+    scene = full_scene(name)
     rng = np.random.default_rng(8)
     start = rng.normal(0, 1, (15, 2, 6)) * [0.2, 0.2, 1, 2, 2, 2]
     actions = rng.normal(0, 5, (15, 2, 2, 3))

@@ -197,9 +197,10 @@ def test_only_it_puts_a_ring_under_a_body() -> None:
     others = tuple(each for each in catalogue if each.applies(scene, scene.bodies[0]))
     for effect in others:
         sim = simulator(scene, (effect,))
-        rings, wheels = sim._properties.under
+        rings, wheels, turners = sim._properties.under
         assert bool(rings) == (effect.name == "sliding_friction")
         assert bool(wheels) == (effect.name == "wheel")
+        assert bool(turners) == (effect.name == "turning_friction")
 
 
 @pytest.mark.slow

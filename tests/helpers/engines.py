@@ -15,7 +15,7 @@ PIVOT = [e for e in catalogue if e.name.startswith("pivot")]
 TILT = [e for e in catalogue if e.name == "gravity_tilt"]
 #: Without hinges there is no friction in them, without obstacles nothing to touch, a wheel is
 #: declared, and bodies that are anywhere are on no rod.
-_ELSEWHERE = ("pivot", "gravity", "hidden_obstacle", "wheel", "distance_joint")
+_ELSEWHERE = ("pivot", "slider", "gravity", "hidden_obstacle", "wheel", "distance_joint")
 OTHERS = [e for e in catalogue if not e.name.startswith(_ELSEWHERE)]
 
 

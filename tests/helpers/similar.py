@@ -16,7 +16,7 @@ _POWERS = {"m": (1, 0, 0), "kg": (0, 1, 0), "s": (0, 0, 1), "N": (1, 1, -2)}
 _POWERS |= {"1": (0, 0, 0), "rad": (0, 0, 0)}
 #: SI units of the natural units of a body.
 _TYPICAL = dict(mass="kg", length="m", time="s", force="N", torque="N m", speed="m/s")
-_TYPICAL |= dict(turn_rate="rad/s", range="m", x="m", y="m")
+_TYPICAL |= dict(turn_rate="rad/s", range="m", interval="s", x="m", y="m")
 
 
 def factor(unit: str, length: float, mass: float, time: float) -> float:

@@ -240,7 +240,7 @@ def test_masses_off_the_centre_and_welded_bodies() -> None:
     [
         ('axis="0 -1 0"/>', 'axis="1 0 0"/>', '"lower": a joint of it leads out of the plane'),
         ('type="hinge" axis="0 -1 0"/>', 'type="ball"/>', '"lower": it has a ball joint on body'),
-        ('type="hinge" axis="0 -1 0"/>', 'type="slide"/>', '"lower": .*a slide on body "upper"'),
+        ('type="hinge" axis="0 -1 0"/>', 'type="ball"/>', '"lower": .*a ball joint on body'),
         ('mass=".3"/>', 'mass=".3"/><geom name="tip" size=".1"/>', r'"lower" has 2 geoms .*tip'),
         ('<geom type="box" pos="0 0 -.15" size=".03 .02 .15" mass=".3"/>',
          '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>', '"lower" has no geom'),
@@ -395,3 +395,36 @@ def test_mjcf_ranges_refuses_bad_input() -> None:
     del idata.attrs["scene"]
     with pytest.raises(PosteriorError, match="holds no scene"):
         pp.mjcf_ranges(idata)
+
+
+def test_a_pendulum_on_a_cart_there_and_back() -> None:
+    """A slide on an inclined rail, read again from what was written, and its rollout."""
+    along = (0.8, 0.6)
+    bodies = (
+        Body("cart", Shape.box(0.2, 0.1), known={"mass": 1.5}, pose=(0.1, 0.2, 0.0),
+             effects=("slider_damping", "slider_friction")),
+        Body("pole", Shape.box(0.04, 0.6), known={"mass": 0.7}, pose=(0.1, -0.1, 0.0)),
+    )  # fmt: skip
+    joints = (
+        Joint("slider", ("cart", "world"), (0.0, 0.0), (0.1, 0.2), axis=along),
+        Joint("hinge", ("cart", "pole"), (0.0, 0.0), (0.0, 0.3)),
+    )
+    scene = Scene(time_step=0.02, gravity=(0.0, -9.81), bodies=bodies, joints=joints, substeps=40)
+    draws = {"slider_damping_coefficient": 0.4, "slider_friction_force": 0.0}
+    idata = posterior(scene, **{n: (np.full((5, 1), v), ["cart"]) for n, v in draws.items()})
+    text, _ = pp.mjcf_ranges(idata, plane="xz")
+    places, _ = motion(text, (0.3, 0.7), (0.5, 0.0), 0.3)
+    start = np.zeros((2, 6))
+    start[:, :2], start[1, 2] = places[0][:, [0, 2]], 0.7
+    start[:, 3:5] = 0.5 * np.array(along)
+    states = predicted(scene, start, 15, **draws)
+    np.testing.assert_allclose(states[..., :2], places[1:, :, [0, 2]], atol=2e-3)
+    again = quiet(text, plane="xz", time_step=0.02, known_mass=True)
+    assert [joint.kind for joint in again.joints] == ["slider", "hinge"]
+    np.testing.assert_allclose(again.joints[0].axis, along)
+    assert again.body("cart").effects == ("slider_damping",)
+    model = mujoco.MjModel.from_xml_string(text)
+    history = pp.from_mujoco(
+        model, again, [[0.3, 0.7]] * 2, [[0.5, 0.0]] * 2, plane="xz", time_step=0.02
+    )
+    np.testing.assert_allclose(history.dataset["start"].to_numpy()[0, 0], start, atol=1e-9)

@@ -11,18 +11,21 @@ from pbrl_ppl.criticism.results import Unexplained, diverged_after
 from pbrl_ppl.history import History
 from pbrl_ppl.modes import trajectory_mode
 from pbrl_ppl.posterior import Fit, compare
+from pbrl_ppl.reporting import render
 from pbrl_ppl.reporting.effect_plots import plot_evidence, plot_laws
 from pbrl_ppl.reporting.evidence import bin_means, find_evidence, find_laws
 from pbrl_ppl.reporting.motion import animation, distance, divergence_in_words, held_out_motions
 from pbrl_ppl.sampling import fit, physics_model
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.free_puck import DISC, Disc
+from tests.helpers.html import Page
 from tests.helpers.made_up import made_up
 from tests.helpers.revised import DRAG, diverging, recordings, revised, unexplained
 
 pytestmark = pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning")
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_evidence_adds_up_and_is_where_the_drag_is() -> None:
     findings = revised()
     evidence = find_evidence(findings)
@@ -39,7 +42,7 @@ def test_evidence_adds_up_and_is_where_the_drag_is() -> None:
     assert gains[carriers].sum() >= 0.8 * gains.sum() > gains[carriers[:-1]].sum()
     assert not evidence.touching.any()
     assert evidence.trajectory[12] == "1" and evidence.time[12] == 0.0
-    assert f"{evidence.nats.sum():,.0f} nats likelier" in evidence.in_words()
+    assert f"{evidence.nats.sum():,.0f} nats likelier" in Page(render(findings)).text
     assert len(plot_evidence(evidence).axes) == 7  # with the map's scale
 
 

@@ -245,7 +245,8 @@ def scenes(draw: st.DrawFn) -> Scene:
     ]
     bodies.append(Body("w" + max(movers), draw(shapes), static=True, pose=(*draw(pairs), 1)))
     walls = [Wall(a, b) for a, b in draw(st.lists(st.tuples(pairs, pairs))) if a != b]
-    kinds = st.sampled_from(sorted(JOINT_KINDS))
+    kinds = st.sampled_from(sorted({*JOINT_KINDS} - {"slider"}))
+    slider, ways = st.just("slider"), pairs.filter(any)
     weights = st.dictionaries(st.sampled_from(["world", *movers]), size, min_size=1)
     indices = st.fixed_dictionaries({}, optional={"i_a": weights, "i_b": weights})
     two, maybe = st.just(("world", movers[0])), st.none() | pairs
@@ -253,6 +254,7 @@ def scenes(draw: st.DrawFn) -> Scene:
         st.builds(Joint, kinds, two, pairs, pairs),
         st.builds(Joint, kinds, two, maybe, maybe, st.just(False)),
         st.builds(Joint, kinds, known=st.just(False), prior=indices),
+        st.builds(Joint, slider, two, maybe, maybe, axis=ways, known=st.just(False)),
     )
     return Scene(
         gravity=draw(pairs),

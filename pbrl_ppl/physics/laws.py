@@ -1,0 +1,166 @@
+"""Laws of effects in the compiled loops: what acts on bodies, and what laws remember."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbrl_ppl.physics.calls import call_law
+from pbrl_ppl.physics.compilation import compiled
+
+#: When an interval is nearly over, as a share of it.
+LATE = 1.0 - 1e-7
+#: Columns of what acts on a body: its command, the one of the interval before, the wrench, and when
+#: it is; see :data:`pbrl_ppl.effects.stages.TIME`.
+COMMAND, PREVIOUS, WRENCHES, TIME, INTERVAL, ACTED = 0, 3, 6, 9, 10, 12
+#: Further rows of what acts: a law's command and its memory, and the wrench of a law of one number.
+MORE = 4
+#: Columns of a law: its address, body, first parameter, the address of `remember`, its first number
+#: in the memory, how many, the component that is alone (-1: none), and whether it is under a body.
+LAW, ON, FIRST, REMEMBER, SLOT, SLOTS, ALONE, UNDER = range(8)
+
+
+class Laws(NamedTuple):
+    """Laws of a proposal: rows of integers, with columns as above, and their parameters."""
+
+    commands: NDArray[np.int64]
+    command_parameters: NDArray[np.float64]
+    forces: NDArray[np.int64]
+    force_parameters: NDArray[np.float64]
+    frictions: NDArray[np.int64]
+    friction_parameters: NDArray[np.float64]
+    time_step: float  # s
+
+
+@compiled
+def laws_of(batch, p):  # type: ignore[no-untyped-def]
+    """Return the laws of a proposal."""
+    given = batch.given
+    return Laws(
+        batch.commands, given[3][p], batch.forces, given[4][p], batch.frictions, given[5][p],
+        batch.time_step,
+    )  # fmt: skip
+
+
+@compiled
+def act(state, interval, laws, begin, end, acted, memory, after=False):  # type: ignore[no-untyped-def]
+    """Compute the wrench on each body in a substep: the command stage, then the force stage.
+
+    ``state`` is (body, 6) and ``interval`` the inputs of the interval, (body, 3 or more); ``begin``
+    and ``end`` of the substep are shares of the interval. ``acted`` (body + 4, 12) becomes command,
+    command before and wrench of each body; of the other rows a command law sees the first three.
+    ``memory`` is that of all laws when the interval begins; ``after`` it, it is brought up to date.
+    """
+    k, known, data = len(interval), interval.shape[1] > 3, acted.ctypes.data
+    wide = 8 * ACTED
+    for i in range(k):
+        for w in range(3):
+            acted[i, COMMAND + w] = interval[i, w]
+            acted[i, PREVIOUS + w] = interval[i, 3 + w] if known else 0.0
+        acted[i, TIME] = np.inf
+        if known:
+            acted[i, TIME] = interval[i, 7] + begin * laws.time_step
+        acted[i, INTERVAL] = laws.time_step
+    for e in range(len(laws.commands)):
+        law = laws.commands[e]
+        i, alone, state_at = law[ON], law[ALONE], state.ctypes.data + 48 * law[ON]
+        parameters_at = laws.command_parameters.ctypes.data + 8 * law[FIRST]
+        for w in range(ACTED):
+            acted[k, w] = acted[i, w]
+        acted[k, 6], acted[k, 7] = begin, end
+        for s in range(law[SLOTS]):
+            acted[k + 1 + s // ACTED, s % ACTED] = memory[law[SLOT] + s]
+        wrench_at = data + wide * i
+        if alone >= 0:
+            wrench_at = data + wide * (k + 3)
+            for w in range(3):
+                acted[k, w] = acted[i, alone] if w == 0 else 0.0
+                acted[k, PREVIOUS + w] = acted[i, PREVIOUS + alone] if w == 0 else 0.0
+                acted[k + 3, w] = acted[k, w]
+        call_law(law[LAW], state_at, data + wide * k, parameters_at, wrench_at)
+        if alone >= 0:
+            acted[i, alone] = acted[k + 3, 0]
+        if after and law[SLOTS] > 0:
+            at = memory.ctypes.data + 8 * law[SLOT]
+            call_law(law[REMEMBER], state_at, data + wide * k, parameters_at, at)
+    for i in range(k):
+        for w in range(3):
+            acted[i, WRENCHES + w] = acted[i, COMMAND + w]
+    for e in range(len(laws.forces)):
+        law = laws.forces[e]
+        at = data + wide * law[ON]
+        call_law(
+            law[LAW], state.ctypes.data + 48 * law[ON], at,
+            laws.force_parameters.ctypes.data + 8 * law[FIRST], at + 8 * WRENCHES,
+        )  # fmt: skip
+
+
+@compiled
+def set_memory(batch, laws, p, t, begin, start, acted, memory, at):  # type: ignore[no-untyped-def]
+    """Set ``memory[1]``, shape (slot,), to what the laws of a proposal ``p`` remember.
+
+    That is before the interval ``begin`` of the transition ``t``. Commands alone decide it: those
+    of all intervals that follow each other in the recording up to this one, at the state ``start``
+    (body, 6). ``memory[0]`` is that before the first interval of the transition ``at[1]`` of the
+    proposal ``at[0]``.
+    """
+    slots = memory.shape[1]
+    if slots == 0:
+        return
+    inputs, first = batch.inputs, t
+    while batch.follows[first] and not (at[0] == p and at[1] == first):
+        first -= 1
+    if not (at[0] == p and at[1] == first):
+        _begin_memory(laws, inputs[first, 0], start, acted, memory[0])
+    for earlier in range(first, t):
+        for h in range(inputs.shape[1]):
+            act(start, inputs[earlier, h], laws, LATE, 1.0, acted, memory[0], True)
+    at[0], at[1] = p, t
+    for s in range(slots):
+        memory[1, s] = memory[0, s]
+    for h in range(begin):
+        act(start, inputs[t, h], laws, LATE, 1.0, acted, memory[1], True)
+
+
+@compiled
+def _begin_memory(laws, interval, start, acted, memory):  # type: ignore[no-untyped-def]
+    """Set what laws remember where nothing but the inputs (body, 9 or more) is known.
+
+    As if the oldest wrench had lasted: the previous one, or the last of those before it.
+    """
+    older = (interval.shape[1] - 9) // 3
+    oldest = PREVIOUS if older == 0 else 6 + 3 * older
+    for e in range(len(laws.commands)):
+        law = laws.commands[e]
+        for s in range(law[SLOTS]):
+            w = s % 3 if law[ALONE] < 0 else law[ALONE]
+            there = law[ALONE] < 0 or s % 3 == 0
+            memory[law[SLOT] + s] = interval[law[ON], oldest + w] if there else 0.0
+    past = np.zeros((len(interval), 9))
+    for age in range(older - 1, -1, -1):
+        now, before = PREVIOUS if age == 0 else 6 + 3 * age, 9 + 3 * age
+        for i in range(len(past)):
+            for w in range(3):
+                past[i, w] = interval[i, now + w]
+                past[i, PREVIOUS + w] = interval[i, before + w]
+        act(start, past, laws, LATE, 1.0, acted, memory, True)
+
+
+@compiled
+def bound(base, laws, i, under, state, torque, rest, speed, acted):  # type: ignore[no-untyped-def]
+    """Return the greatest force of dry friction in the hinge of body ``i``, or under it."""
+    k, data = len(acted) - MORE, acted.ctypes.data
+    for e in range(len(laws.frictions)):
+        law = laws.frictions[e]
+        if law[ON] == i and law[UNDER] == under:
+            acted[k, 0], acted[k, 1], acted[k, 2] = torque, rest, speed
+            acted[k + 3, 0] = base
+            call_law(
+                law[LAW], state.ctypes.data + 48 * i, data + 8 * ACTED * k,
+                laws.friction_parameters.ctypes.data + 8 * law[FIRST],
+                data + 8 * ACTED * (k + 3),
+            )  # fmt: skip
+            base = max(acted[k + 3, 0], 0.0)
+    return base
