@@ -13,9 +13,11 @@ from .criticism import Attribution as Attribution
 from .criticism import Criteria as Criteria
 from .criticism import Loop as Loop
 from .criticism import PriorCheck as PriorCheck
+from .criticism import Rehearsal as Rehearsal
 from .criticism import attribute as attribute
 from .criticism import close_loop as close_loop
 from .criticism import prior_predictive_check as prior_predictive_check
+from .criticism import rehearse as rehearse
 from .effects import Attached as Attached
 from .effects import Effect as Effect
 from .effects import EffectParameter as EffectParameter

@@ -12,7 +12,7 @@ import typer
 from pbrl_ppl.cli import options
 from pbrl_ppl.cli.options import command
 from pbrl_ppl.cli.terminal import check_file, interruptible, print_result, stages
-from pbrl_ppl.errors import HistoryError, ParameterError, PosteriorError, SimulationError
+from pbrl_ppl.errors import ParameterError, PosteriorError
 from pbrl_ppl.state import STATE, Floats
 
 if TYPE_CHECKING:
@@ -63,7 +63,9 @@ def simulate(
         scene.replace(noise=errors)  # raises where the noise is invalid
         recorded = reading.recording(history, scene)
         progress("simulating")
-        simulated = _simulated(physics, phi, recorded)
+        from pbrl_ppl.physics import simulated_recording
+
+        simulated = simulated_recording(physics, phi, recorded)
         result = _history(recorded, simulated, errors, seed, labelled=draws is not None)
         result.save(output)
     print_result(
@@ -129,43 +131,6 @@ def _set(layout: Layout, phi: Floats, values: Mapping[str, float]) -> None:
 
 def _bare(label: str) -> str:
     return label.partition("[")[0]
-
-
-def _simulated(physics: Physics, phi: Floats, recorded: History) -> list[Floats]:
-    """Return simulated states, shape (trajectory, time, body, 6), for each draw."""
-    from pbrl_ppl.physics import check_history
-
-    # one segment a trajectory, up to its end
-    segments = recorded.segments(int(recorded.dataset["n_rows"].max()) - 1)
-    lost = set(range(recorded.n_trajectories)) - set(segments.trajectory.tolist())
-    if lost:
-        label = recorded.dataset["trajectory"].to_numpy()[min(lost)]
-        raise HistoryError(
-            f"history: trajectory {label} has no complete state to start from; measure one, drop it"
-            " or pass --estimate-velocities"
-        )
-    check_history(physics.scene, recorded, segments)
-    predicted = physics.predict(phi, segments.start, segments.inputs)
-    follows = recorded.dataset["kinematic"].to_numpy()
-    n_rows = recorded.dataset["n_rows"].to_numpy()
-    result = []
-    for drawn in predicted:
-        states = np.full(recorded.dataset["observed"].shape, np.nan)
-        states[:, :, follows] = recorded.dataset["start"].to_numpy()[:, :, follows]
-        for i, (trajectory, step) in enumerate(
-            zip(segments.trajectory, segments.step, strict=True)
-        ):
-            rows = np.arange(step + 1, n_rows[trajectory])
-            after = drawn[i, : len(rows)][:, ~follows]
-            if not np.isfinite(after).all():
-                raise SimulationError(
-                    "simulate: the engine diverged under these parameters; check them and their"
-                    " units, or use more substeps in the scene"
-                )
-            states[np.ix_([trajectory], [step], ~follows)] = segments.start[i][~follows]
-            states[np.ix_([trajectory], rows, ~follows)] = after
-        result.append(states)
-    return result
 
 
 def _history(

@@ -23,6 +23,9 @@ from .prior_check import prior_predictive_check as prior_predictive_check
 from .prior_check import telling_horizon as telling_horizon
 from .ranking import Ranking as Ranking
 from .ranking import criticise as criticise
+from .rehearsal import Rehearsal as Rehearsal
+from .rehearsal import RehearsedLaw as RehearsedLaw
+from .rehearsal import rehearse as rehearse
 from .remainder import check_scikit_learn as check_scikit_learn
 from .remainder import learn_remainder as learn_remainder
 from .results import ONE_TRAJECTORY as ONE_TRAJECTORY

@@ -129,15 +129,7 @@ def score_candidates(
         Smallest p-value first; of equal ones, the earlier in the catalogue. Effects of the noise
         stage come last.
     """
-    smooth = [one for one in candidates if one.effect.scan is None and not _of_noise(one)]
-    residual, jacobian, signatures = _signatures(mode, smooth)
-    scale = 1.0 / np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
-    q, r = np.linalg.qr(jacobian * scale)
-    # a parameter that neither the data nor the prior inform has no direction
-    informed = np.abs(np.diag(r)) > 1e-10 * np.abs(np.diag(r)).max(initial=0.0)
-    back, q = scale[:, None] * np.linalg.pinv(r)[:, informed], q[:, informed]
-    test = _Test(q, back, residual - q @ (q.T @ residual), len(candidates), criteria)
-    derived = dict(zip(smooth, signatures, strict=True))
+    test, derived = _test(mode, candidates, criteria)
 
     def score(attached: Attached) -> Signature:
         if _of_noise(attached):
@@ -156,6 +148,45 @@ def score_candidates(
         return _of_noise(signature.attached), round(signature.log_p, 3)
 
     return test.residual, sorted(in_parallel(score, candidates), key=order)
+
+
+def linearised(
+    mode: Mode, candidates: Sequence[Attached], criteria: Criteria = DEFAULT
+) -> tuple[ScoreTest, dict[Attached, tuple[Linearisation, ...]]]:
+    """Return the score tests at a mode, and candidates linearised at every grid point.
+
+    Those without a scan are linearised at the null value, those of the noise not at all. Candidates
+    that the declared parameters absorb have no linearisation.
+    """
+    test, derived = _test(mode, candidates, criteria)
+
+    def points(attached: Attached) -> list[GridPoint]:
+        if attached not in derived:
+            return grid_points(mode, attached)
+        null = np.array(attached.effect.null, dtype=float)
+        return [GridPoint(null, derived[attached], tuple(range(len(null))))]
+
+    def every(attached: Attached) -> tuple[Linearisation, ...]:
+        tried = [] if _of_noise(attached) else points(attached)
+        seen = [test.at(point, attached).about(point.values, point.columns) for point in tried]
+        return tuple(one for one in seen if one.basis.shape[1])
+
+    return test, dict(zip(candidates, in_parallel(every, candidates), strict=True))
+
+
+def _test(
+    mode: Mode, candidates: Sequence[Attached], criteria: Criteria
+) -> tuple[ScoreTest, dict[Attached, Floats]]:
+    """Return the score tests at a mode, and the signatures of candidates that are not scanned."""
+    smooth = [one for one in candidates if one.effect.scan is None and not _of_noise(one)]
+    residual, jacobian, signatures = _signatures(mode, smooth)
+    scale = 1.0 / np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
+    q, r = np.linalg.qr(jacobian * scale)
+    # a parameter that neither the data nor the prior inform has no direction
+    informed = np.abs(np.diag(r)) > 1e-10 * np.abs(np.diag(r)).max(initial=0.0)
+    back, q = scale[:, None] * np.linalg.pinv(r)[:, informed], q[:, informed]
+    test = ScoreTest(q, back, residual - q @ (q.T @ residual), len(candidates), criteria)
+    return test, dict(zip(smooth, signatures, strict=True))
 
 
 def _signatures(mode: Mode, candidates: Sequence[Attached]) -> tuple[Floats, Floats, list[Floats]]:
@@ -232,7 +263,7 @@ def _none(n: int, p: int) -> _Evidence:
 
 
 @dataclass(frozen=True, eq=False)
-class _Test:
+class ScoreTest:
     """Score tests of candidates at one mode.
 
     Parameters
@@ -255,6 +286,18 @@ class _Test:
     candidates: int
     criteria: Criteria
 
+    def left(self, rows: Floats) -> Floats:
+        """Return whitened rows, shape (n, ...), without what the declared parameters absorb."""
+        return np.asarray(rows - self.q @ (self.q.T @ rows))
+
+    def at(self, point: GridPoint, attached: Attached) -> _Evidence:
+        """Return the score test of a candidate at a grid point."""
+        missing = len(self.residual) - len(point.signature)
+        rows, columns = np.pad(point.signature, ((0, missing), (0, 0))), list(point.columns)
+        sides = null_sides(attached)[columns] if columns else np.ones(1, dtype=np.intp)
+        scales = _scales(attached)[columns] if columns else np.ones(1)
+        return self.evidence(rows, sides, scales)
+
     def evidence(self, signature: Floats, sides: Ints, scales: Floats) -> _Evidence:
         """Return the score test of a signature.
 
@@ -268,7 +311,7 @@ class _Test:
             Typical sizes, shape (columns,): directions that are invisible at these are left out.
         """
         signature = signature * scales
-        projected = signature - self.q @ (self.q.T @ signature)
+        projected = self.left(signature)
         total = (signature**2).sum()
         share = float((projected**2).sum() / total) if total > 0 else 0.0
         n, columns = signature.shape
@@ -315,7 +358,7 @@ def _signature(
     evidence: _Evidence,
     values: Floats,
     n_points: int,
-    test: _Test,
+    test: ScoreTest,
     linear: tuple[Linearisation, ...] = (),
 ) -> Signature:
     """Return a candidate's signature, its p-value corrected for grid points and candidates."""
@@ -343,22 +386,14 @@ def _signature(
     )
 
 
-def _best_grid_point(mode: Mode, attached: Attached, test: _Test, again: int = 4) -> Signature:
+def _best_grid_point(mode: Mode, attached: Attached, test: ScoreTest, again: int = 4) -> Signature:
     """Return the signature of the grid point that explains most; a whole change has one sign.
 
     The ``again`` leading ones are simulated again with more engine steps.
     """
     effect, n = attached.effect, len(test.residual)
-
-    def evidence(point: GridPoint) -> _Evidence:
-        rows = np.pad(point.signature, ((0, n - len(point.signature)), (0, 0)))
-        columns = list(point.columns)
-        sides = null_sides(attached)[columns] if columns else np.ones(1, dtype=np.intp)
-        scales = _scales(attached)[columns] if columns else np.ones(1)
-        return test.evidence(rows, sides, scales)
-
     tried = grid_points(mode, attached)
-    scores = [evidence(point) for point in tried]
+    scores = [test.at(point, attached) for point in tried]
     units = [score.unit for score in scores]
     best, values = _none(n, len(test.back)), np.array(effect.null)
     leading = sorted(range(len(tried)), key=lambda i: scores[i].log_p)[:again]
@@ -367,7 +402,9 @@ def _best_grid_point(mode: Mode, attached: Attached, test: _Test, again: int = 4
         finer = grid_points(mode, attached, np.array([tried[i].proposed for i in leading]))
     linear: tuple[Linearisation, ...] = ()
     if finer:  # with more engine steps a body may pass by
-        judged = sorted(((evidence(trial), trial) for trial in finer), key=lambda x: x[0].log_p)
+        judged = sorted(
+            ((test.at(trial, attached), trial) for trial in finer), key=lambda x: x[0].log_p
+        )
         linear = tuple(one.about(at.values, at.columns) for one, at in judged if one.statistic > 0)
         best, point = judged[0]
         values = point.values.copy()
@@ -389,7 +426,7 @@ def _of_noise(attached: Attached) -> bool:
     return isinstance(attached.effect.stage, Noise)
 
 
-def _tail_score(mode: Mode, attached: Attached, test: _Test) -> Signature:
+def _tail_score(mode: Mode, attached: Attached, test: ScoreTest) -> Signature:
     """Return the score test of the noise's tail: the kurtosis, with sigma's score projected out.
 
     The derivative of Student-t's log-density by the reciprocal of its degrees of freedom at zero is

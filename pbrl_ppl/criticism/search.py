@@ -41,6 +41,8 @@ from pbrl_ppl.scene import state_sizes
 from pbrl_ppl.state import Bools, Floats
 from pbrl_ppl.threads import in_parallel
 
+#: A refit takes a share of the error away if the regression says this of it.
+LIKELY = 0.7
 #: Share of the joint sizes from which refits begin a second time.
 _SHORTER = 0.3
 
@@ -670,13 +672,10 @@ def _carried(mode: Mode, length: int) -> Mode:
 
 
 def _proposals(
-    regression: Regression, refits: int, singles: int, least_share: float, likely: float = 0.7
+    regression: Regression, refits: int, singles: int, least_share: float
 ) -> list[Subset]:
-    """Return the subsets to refit: the best, and single laws, of those that may be accepted.
-
-    ``likely``: a refit takes a share of ``least_share`` away if the regression says this of it.
-    """
-    least = 1.0 - (1.0 - likely * least_share) ** 2
+    """Return the subsets to refit: the best, and single laws, of those that may be accepted."""
+    least = 1.0 - (1.0 - LIKELY * least_share) ** 2
     subsets = [one for one in regression.subsets if one.nats > 0]
     # structures cost contact in the engine: they are refitted where they lead
     first = _structures(subsets[0]) if subsets else set()
@@ -811,16 +810,31 @@ def _alone(regression: Regression) -> dict[Attached, Evidence]:
     return alone
 
 
-def _is_lost(shorter: Mode, mode: Mode, *, far: float = 0.2, more: float = 3.0) -> bool:
+def _is_lost(shorter: Mode, mode: Mode) -> bool:
     """Return whether pieces are too long to tell a law from.
 
     Their starts are magnified, or the error nears the motion's size, where it is out of phase.
     """
-    if growth(mode.problem) > MOST_GROWTH:
-        return True
     values = mode.problem.observations.values
+    return growth(mode.problem) > MOST_GROWTH or is_out_of_phase(mode.sigma, shorter.sigma, values)
+
+
+def is_out_of_phase(
+    error: Floats, shorter: Floats, values: Floats, *, far: float = 0.2, more: float = 3.0
+) -> bool:
+    """Return whether a simulation error nears the size of the motion.
+
+    Parameters
+    ----------
+    error, shorter : ndarray
+        Errors on pieces and on shorter ones, shape (state,), SI units.
+    values : ndarray
+        Measurements, shape (piece, H, body, state), SI units.
+    far, more : float
+        Share of the motion, and multiple of the shorter pieces' error, from which it does.
+    """
     motion = np.nanstd(values, axis=(0, 1, 2))
-    return bool(((mode.sigma > far * motion) & (mode.sigma > more * shorter.sigma)).any())
+    return bool(((error > far * motion) & (error > more * shorter)).any())
 
 
 def _error(mode: Mode) -> dict[str, float]:

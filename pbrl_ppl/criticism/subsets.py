@@ -58,6 +58,11 @@ class Subset:
         return tuple(self.sizes)
 
 
+def worth(share: float, columns: int, n: float) -> float:
+    """Return the log-evidence (nats) of columns that take a share of n squared residuals away."""
+    return float(-0.5 * n * np.log(1.0 - share) - 0.5 * columns * np.log(n))
+
+
 @dataclass(frozen=True, eq=False)
 class Regression:
     """Subsets of a model's candidates, best first.
@@ -88,19 +93,19 @@ class Regression:
         """Return subsets that differ by one law and are worth as much, prior odds aside."""
         rest = set(subset.laws) - {law}
 
-        def worth(one: Subset) -> float:
+        def evidence(one: Subset) -> float:
             return one.nats - sum(member.effect.log_odds for member in one.laws)
 
         return [
             other for other in self.subsets
             if len(other.laws) == len(subset.laws)
             and law not in other.laws and rest < set(other.laws)
-            and worth(other) > worth(subset) - within
+            and evidence(other) > evidence(subset) - within
         ]  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
-class _Term:
+class Term:
     """A law linearised at one point, and its columns in the regression."""
 
     law: Attached
@@ -166,14 +171,14 @@ def best_subsets(
     if not distinct or total <= 0.0:
         return Regression((), same, tuple(signatures))
     leading = _leading(distinct, residual, leaders, beside)
-    terms: list[_Term] = []
+    terms: list[Term] = []
     width = 0
     for signature in leading:
         law = signature.attached
         price = np.log(len(distinct) * signature.candidate.looks) - law.effect.log_odds
         for linear in signature.linear[:_MOST_POINTS]:
             columns = np.arange(width, width + linear.basis.shape[1])
-            terms.append(_Term(law, linear, columns, float(price)))
+            terms.append(Term(law, linear, columns, float(price)))
             width += len(columns)
     basis = np.hstack([term.linear.basis for term in terms])
     gram, towards = basis.T @ basis, basis.T @ residual
@@ -195,8 +200,7 @@ def best_subsets(
             sizes[term.law], begin = size, end
         share = min(float(coordinates @ towards[columns]) / total, 1.0 - 1e-12)
         prices = {terms[i].law: terms[i].price for i in chosen}
-        worth = -0.5 * n * np.log(1.0 - share) - 0.5 * len(columns) * np.log(n)
-        return Subset(sizes, float(worth) - sum(prices.values()), share, prices)
+        return Subset(sizes, worth(share, len(columns), n) - sum(prices.values()), share, prices)
 
     order = {law: place for place, law in enumerate(candidates)}
     level: dict[tuple[int, ...], Subset] = {

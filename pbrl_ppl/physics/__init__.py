@@ -11,6 +11,7 @@ from .physics import Physics as Physics
 from .placement import check_history as check_history
 from .placement import check_placement as check_placement
 from .placement import overlap as overlap
+from .recording import simulated_recording as simulated_recording
 from .simulator import Simulator as Simulator
 from .simulator import after_recording as after_recording
 from .solids import Scenery as Scenery

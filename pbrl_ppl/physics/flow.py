@@ -102,7 +102,7 @@ def _load(work, flow, u, inputs, share, low, high):  # type: ignore[no-untyped-d
     """Set what acts there: wrenches, forces, and rows of friction."""
     laws = flow.laws
     if len(laws.commands) + len(laws.forces) > 0:
-        begin = max(low, min(share, high - _WINDOW))
+        begin = min(max(low + _SHORTEST, share), high - _WINDOW)  # past a jump that is no switch
         act(work.states, inputs, laws, begin, begin + _WINDOW, work.acted, flow.memory[1])
     set_forces(work, u)
     set_bounds(work, laws, u)

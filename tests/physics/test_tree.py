@@ -122,6 +122,17 @@ def test_single_bodies(what) -> None:
     assert 0.9 < convergence(sim, phi, start, inputs)[0] < 1.1
 
 
+def test_a_delay_too_short_to_split_an_interval_is_none() -> None:
+    """A step that began with the command before would be off by the tolerance."""
+    sim, phi, start, inputs = case(chain("h"), ("actuator_delay",), seed=3, n=20)
+    inputs[:, 0, :, 3:6] = -inputs[:, 0, :, :3]
+    phi = np.tile(phi[:1], (3, 1))
+    phi[:, sim.physics.layout.labels.index("actuator_delay_share[b0]")] = 0.0, 5e-7, 1e-3
+    none, short, long = sim(phi, start, inputs)
+    np.testing.assert_array_equal(short, none)
+    assert np.abs(long - none).max() > 1e-5
+
+
 def test_energy_and_momentum_are_kept() -> None:
     """Of links whose mass is anywhere, to the tolerance; and better with a smaller one."""
     offs, masses = np.array([(0.03, -0.05), (-0.02, 0.04), (0.01, 0.06)]), np.array([0.5, 0.9, 0.3])

@@ -1,0 +1,142 @@
+"""Rehearsals of recordings, against recordings with the law that are searched in earnest."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pbrl_ppl.criticism import Rehearsal, RehearsedLaw, attribute, rehearse
+from pbrl_ppl.effects import attach, catalogue
+from pbrl_ppl.errors import HistoryError, ParameterError
+from pbrl_ppl.history import History
+from pbrl_ppl.physics import Physics, simulated_recording
+from pbrl_ppl.scene import WORLD, Body, Joint, Scene, Shape
+from pbrl_ppl.state import STATE
+
+pytestmark = pytest.mark.one_stack
+ARM = Body("arm", Shape.box(0.03, 0.4), known={"mass": 0.5, "r": 0.2, "mu_c": 0.2})
+PENDULUM = Scene(
+    time_step=0.02, gravity=(0.0, -9.81), bodies=(ARM,), noise={"theta": 1e-3},
+    joints=(Joint("hinge", ("arm", WORLD), (0.0, 0.18), (0.0, 0.0)),),
+)  # fmt: skip
+PUCK = Scene(
+    time_step=0.1, normal_gravity=9.81, noise={"x": 2e-3, "y": 2e-3, "theta": 2e-3},
+    bodies=(Body("puck", Shape.box(0.5, 0.3), known={"mass": 4.0, "r": 0.2, "mu_c": 0.2}),),
+)  # fmt: skip
+OFFERED = {
+    PENDULUM: (
+        "pivot_damping", "pivot_friction", "quadratic_drag", "angular_drag", "torque_gain",
+        "constant_torque",
+    ),
+    PUCK: ("linear_drag", "sliding_friction", "force_gain", "constant_force", "push_offset"),
+}  # fmt: skip
+
+
+def offered(scene: Scene) -> list:
+    return [effect for effect in catalogue if effect.name in OFFERED[scene]]
+
+
+@pytest.fixture(scope="module", params=[PENDULUM, PUCK], ids=["pendulum", "puck"])
+def rehearsed(request) -> tuple[Scene, Rehearsal]:
+    return request.param, rehearse(request.param, catalogue=offered(request.param), seed=1)
+
+
+def law_of(rehearsal: Rehearsal, effect: str) -> RehearsedLaw:
+    return next(law for law in rehearsal.laws if law.effect == effect)
+
+
+def recorded(scene: Scene, rehearsal: Rehearsal, law: RehearsedLaw, times: float) -> History:
+    """A recording of the rehearsed commands with a law of some times the stated size."""
+    (name, size), *_ = law.sizes.items()
+    values = law.null | {name: law.null[name] + times * size}
+    if law.effect == "sliding_friction":
+        values["radius"] = 0.2
+    effects = attach(
+        scene, [effect.on(law.body) for effect in catalogue if effect.name == law.effect]
+    )
+    physics = Physics(scene, effects)
+    known = rehearsal.parameters | {f"{law.effect}_{k}[{law.body}]": v for k, v in values.items()}
+    phi = np.array([[known[label] for label in physics.layout.labels]])
+    (states,) = simulated_recording(physics, phi, rehearsal.history)
+    sd = [rehearsal.noise.get(name, np.nan) for name in STATE]  # NaN: not measured
+    states += sd * np.random.default_rng(7).standard_normal(states.shape)
+    return History.of_arrays(states, scene, rehearsal.history.dataset["action"].to_numpy())
+
+
+def found(scene: Scene, history: History) -> dict:
+    return {law.effect: law for law in attribute(scene, history, catalogue=offered(scene)).laws}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("place", range(4))
+def test_a_law_is_named_from_the_stated_size_on(rehearsed, place) -> None:
+    """Alone at three times that size, under the stated name; nothing at a fifth of it."""
+    scene, rehearsal = rehearsed
+    law = law_of(rehearsal, OFFERED[scene][place])
+    assert set(found(scene, recorded(scene, rehearsal, law, 3.0))) == {law.named}
+    assert not found(scene, recorded(scene, rehearsal, law, 0.2))
+
+
+@pytest.mark.slow
+def test_confounded_laws_are_worth_as_much() -> None:
+    """Two dampings of one pendulum: each explains the recording, alone in the catalogue."""
+    rehearsal = rehearse(PENDULUM, catalogue=offered(PENDULUM), seed=1)
+    law = law_of(rehearsal, "angular_drag")
+    assert law.named == "pivot_damping" and "pivot_damping" in law.confounded
+    assert "angular_drag" in law_of(rehearsal, "pivot_damping").confounded
+    history = recorded(PENDULUM, rehearsal, law, 3.0)
+    assert "angular_drag" in found(PENDULUM, history)["pivot_damping"].confounded
+    worth = [
+        attribute(PENDULUM, history, catalogue=[effect]).laws[0].nats
+        for effect in catalogue
+        if effect.name in ("pivot_damping", "angular_drag")
+    ]
+    assert abs(worth[0] - worth[1]) < 3.0
+
+
+def test_what_is_seen_best_comes_first(rehearsed) -> None:
+    scene, rehearsal = rehearsed
+    shares = [law.share for law in rehearsal.laws]
+    assert shares == sorted(shares)
+    assert rehearsal.noise == dict(scene.noise)
+    measured = np.isfinite(rehearsal.history.dataset["observed"]).any(
+        ("trajectory", "time", "body")
+    )
+    seen = [name for name, there in zip(STATE, measured, strict=True) if there]
+    assert seen == list(dict(scene.noise))
+
+
+def test_a_law_that_changes_nothing_is_unseen() -> None:
+    """A pendulum that torques turn shows no gain of forces."""
+    gains = [effect for effect in catalogue if effect.name in ("force_gain", "torque_gain")]
+    seen, unseen = rehearse(PENDULUM, catalogue=gains).laws
+    assert (seen.effect, unseen.effect) == ("torque_gain", "force_gain")
+    assert unseen.named == "" and not unseen.sizes and not np.isfinite(unseen.share)
+
+
+def test_twice_the_noise_hides_twice_as_much_and_one_trajectory_more() -> None:
+    drag = [effect for effect in catalogue if effect.name == "pivot_damping"]
+    (law,) = rehearse(PENDULUM, catalogue=drag).laws
+    (noisy,) = rehearse(PENDULUM.replace(noise={"theta": 2e-3}), catalogue=drag).laws
+    assert noisy.sizes["coefficient"] == pytest.approx(2 * law.sizes["coefficient"], rel=0.35)
+    commands = rehearse(PENDULUM, catalogue=drag).history
+    single = History(commands.dataset.isel(trajectory=[0]))
+    (alone,) = rehearse(PENDULUM, single, catalogue=drag).laws
+    assert alone.sizes["coefficient"] > 3 * law.sizes["coefficient"]
+
+
+def test_parameters_are_by_label_or_name() -> None:
+    scene = PUCK.replace(bodies=(replace(PUCK.bodies[0], known=()),))
+    drag = [effect for effect in catalogue if effect.name == "linear_drag"]
+    for name in ("mass", "mass[puck]"):
+        assert (
+            rehearse(scene, parameters={name: 3.0}, catalogue=drag).parameters["mass[puck]"] == 3.0
+        )
+    with pytest.raises(ParameterError, match='no parameter "mas"'):
+        rehearse(scene, parameters={"mas": 3.0})
+
+
+def test_a_body_on_a_path_needs_commands() -> None:
+    finger = Body("finger", Shape.circle(0.05), kinematic=True)
+    with pytest.raises(HistoryError, match="give a file of commands"):
+        rehearse(PUCK.replace(bodies=(*PUCK.bodies, finger)))
