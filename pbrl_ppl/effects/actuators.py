@@ -159,16 +159,23 @@ def _remember_lag(state: Floats, command: Floats, parameters: Floats, memory: Fl
 
 def _scan_lags(scene: Scene, history: History, body: Body) -> Floats:
     """Return the null value, where the derivative is taken, and time constants (s)."""
-    return np.array([[np.nan], *([scene.time_step * share] for share in (1.0, 3.0, 10.0))])
+    times = [scene.time_step * share for share in (1.0, 3.0, 8.0)]
+    return np.array([(np.nan, 0.0), *((time, begin) for begin in (0.0, 1.0) for time in times)])
+
+
+_BEGIN = EffectParameter(
+    "begin", "1", Prior("truncated_normal", mu=0.0, sigma=1.0, lower=0.0, upper=1.0)
+)
 
 
 first_order_lag = Effect(
     "first_order_lag",
-    (EffectParameter("time", "s", Prior("half_normal", sigma=5.0), scale="interval"),),
+    (EffectParameter("time", "s", Prior("half_normal", sigma=5.0), scale="interval"), _BEGIN),
     "the push follows the command slowly, as a motor or a fan that has to spin up: after this time"
-    " two thirds of a change have arrived",
+    " two thirds of a change have arrived, and this share of the first command had when a recording"
+    " began",
     "first-order lag, T df/dt = u - f",
-    Command(_lag, memory=1, remember=_remember_lag),
+    Command(_lag, memory=1, remember=_remember_lag, begins=True),
     scan=_scan_lags,
     family="late command",
 )

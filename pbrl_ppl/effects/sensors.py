@@ -123,7 +123,7 @@ askew_camera = Effect(
     "perspective of a tilted plane, x / (1 + a x + b y)",
     Sensor(_seen_askew, _set_straight),
     applies=is_unpivoted,
-    log_odds=-3.0,
+    log_odds=-6.0,
 )
 
 
@@ -172,7 +172,7 @@ encoder_eccentricity = Effect(
     "first harmonic of an encoder's error, a cos(theta) + b sin(theta)",
     Sensor(_off_centre, _without_off_centre),
     applies=is_pivoted,
-    log_odds=-3.0,
+    log_odds=-6.0,
 )
 
 askew_angle = Effect(
@@ -183,7 +183,7 @@ askew_angle = Effect(
     "second harmonic of a circle seen as an ellipse, a cos(2 theta) + b sin(2 theta)",
     Sensor(_as_ellipse, _without_ellipse),
     applies=is_pivoted,
-    log_odds=-3.0,
+    log_odds=-6.0,
 )
 
 

@@ -152,6 +152,9 @@ class Command:
     alone : str
         ``force_x``, ``force_y`` or ``torque`` for a law of one number: it is the first of each
         three, and the others are zero.
+    begins : bool
+        Whether the last parameter is the share of the first command that a memory begins with where
+        a recording begins, 0 to 1: an actuator may have been at work before.
     timed : bool
         Whether the law depends on the time.
     jumps : bool
@@ -168,6 +171,7 @@ class Command:
     memory: int = 0
     remember: Law | None = None
     alone: str = ""
+    begins: bool = False
     timed: bool = False
     jumps: bool = False
 

@@ -18,9 +18,10 @@ COMMAND, PREVIOUS, WRENCHES, TIME, INTERVAL, ACTED = 0, 3, 6, 9, 10, 12
 #: Further rows of what acts: a law's command and its memory, and the wrench of a law of one number.
 MORE = 4
 #: Columns of a law: its address, body, first parameter, the address of `remember`, its first number
-#: in the memory, how many, the component that is alone (-1: none), whether it is under a body, and
-#: whether the command jumps in an interval, at the fractional part of the first parameter.
-LAW, ON, FIRST, REMEMBER, SLOT, SLOTS, ALONE, UNDER, JUMPS = range(9)
+#: in the memory, how many, the component that is alone (-1: none), whether it is under a body,
+#: whether the command jumps in an interval, at the fractional part of the first parameter, and the
+#: parameter that is the share of the first command that the memory begins with (-1: none).
+LAW, ON, FIRST, REMEMBER, SLOT, SLOTS, ALONE, UNDER, JUMPS, BEGINS = range(10)
 
 
 class Laws(NamedTuple):
@@ -137,8 +138,11 @@ def _begin_memory(laws, interval, start, acted, memory):  # type: ignore[no-unty
         law = laws.commands[e]
         for s in range(law[SLOTS]):
             w = s % 3 if law[ALONE] < 0 else law[ALONE]
+            last, now = interval[law[ON], oldest + w], interval[law[ON], w]
+            if law[BEGINS] >= 0 and interval[0, 7] < np.inf:
+                last += laws.command_parameters[law[BEGINS]] * (now - last)
             there = law[ALONE] < 0 or s % 3 == 0
-            memory[law[SLOT] + s] = interval[law[ON], oldest + w] if there else 0.0
+            memory[law[SLOT] + s] = last if there else 0.0
     past = np.zeros((len(interval), 9))
     for age in range(older - 1, -1, -1):
         now, before = PREVIOUS if age == 0 else 6 + 3 * age, 9 + 3 * age

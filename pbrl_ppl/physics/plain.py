@@ -153,9 +153,12 @@ class Acting:
         wide = earlier.shape[-1]
         older = [np.arange(j, j + 3) for j in range(9, wide, 3)]
         past = earlier[0][:, [np.arange(3, 6), *older][-1]] if wide > 3 else self.command
-        self._memory = [
-            np.tile(_alone(past[i], stage), stage.memory) for i, stage, _ in self._commands
-        ]
+        self._memory = []
+        for i, stage, parameters in self._commands:
+            last = past[i].copy()
+            if stage.begins and earlier[0, 0, 7] < np.inf:
+                last += parameters[-1] * (earlier[0, i, :3] - last)
+            self._memory.append(np.tile(_alone(last, stage), stage.memory))
         for before, now in pairwise([np.arange(3, 6), *older][::-1]):
             self.remember(start, np.hstack([earlier[0][:, now], earlier[0][:, before], 0 * past]))
         for interval in earlier[:-1]:

@@ -259,16 +259,18 @@ class Simulator:
                 remember, count, alone = getattr(stage, "remember", None), 0, -1
                 if remember is not None:
                     count, remember = 3 * stage.memory, calls.law_address(remember)
+                begins = getattr(stage, "begins", False)
                 if getattr(stage, "alone", ""):
                     alone = WRENCH.index(stage.alone)
                 rows.append((
                     calls.law_address(stage.law), names.index(attached.body), first, remember or 0,
                     slots, count, alone, int(getattr(stage, "under", False)),
                     int(getattr(stage, "jumps", False)),
+                    first + len(attached.effect.parameters) - 1 if begins else -1,
                 ))  # fmt: skip
                 first += len(attached.effect.parameters) + len(attached.effect.constants)
                 slots += count
-            tables.append(np.array(rows, dtype=np.int64).reshape(-1, 9))
+            tables.append(np.array(rows, dtype=np.int64).reshape(-1, 10))
         commands, forces, frictions = tables
         return commands, forces, frictions, slots
 
