@@ -19,7 +19,7 @@ from scipy.stats import norm
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.results import Law, LawsOfSize, Rung
 from pbrl_ppl.criticism.score import named_beside, rank_candidates
-from pbrl_ppl.criticism.subsets import Regression, Subset, best_subsets
+from pbrl_ppl.criticism.subsets import Regression, Subset, best_subsets, simplicity
 from pbrl_ppl.effects import Attached, Noise, Structure
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem, in_pieces, output_error
@@ -413,18 +413,34 @@ class Search:
         return pruned if set(pruned.earlier) - set(model.earlier) else model
 
     def _best_of_family(
-        self, before: Mode, subset: Subset, fitted: Mode, regression: Regression, weight: Floats
+        self,
+        before: Mode,
+        subset: Subset,
+        fitted: Mode,
+        regression: Regression,
+        weight: Floats,
+        *,
+        most: int = 4,
     ) -> tuple[Subset, Mode]:
-        """Return the subset and its refit, with the laws of each one's family that do better."""
-        scored = {one.attached: one for one in regression.signatures if one.linear}
+        """Return the subset and its refit, with the laws of each one's family that do better.
+
+        ``most``: laws that are tried in the place of one, the simplest.
+        """
+        ranked = sorted(regression.signatures, key=lambda one: simplicity(one.attached))
+        scored = {one.attached: one for one in ranked if one.linear}
         for law in subset.laws:
             there = fitted.problem.physics.effects
             rivals = [
                 one for one in scored
                 if law.effect.family and one.effect.family == law.effect.family
                 and one.body == law.body and one not in there
-            ]  # fmt: skip
-            sizes = {one: np.array(list(scored[one].candidate.estimate.values())) for one in rivals}
+            ][:most]  # fmt: skip
+            sizes = {  # what a law is alone says little of it beside others
+                one: np.array(list(scored[one].candidate.estimate.values()))
+                if one.effect.scan
+                else np.array(one.effect.null)
+                for one in rivals
+            }
             swaps = in_parallel(partial(_swapped, fitted, law, sizes), rivals)
             nats = [
                 Evidence.of(before, mode, -one.effect.log_odds, weight).nats

@@ -228,6 +228,11 @@ def best_subsets(
     )
 
 
+def simplicity(law: Attached) -> float:
+    """Return the price of a law before anything is known: twice its parameters, less log odds."""
+    return 2 * len(law.labels) - law.effect.log_odds
+
+
 def _distinct(
     signatures: Sequence[Signature], candidates: Sequence[Attached]
 ) -> tuple[list[Signature], dict[Attached, tuple[Attached, ...]]]:
@@ -238,8 +243,7 @@ def _distinct(
     order = {law: place for place, law in enumerate(candidates)}
 
     def simple(signature: Signature) -> tuple[float, int]:
-        law = signature.attached
-        return 2 * len(law.labels) - law.effect.log_odds, order[law]
+        return simplicity(signature.attached), order[signature.attached]
 
     distinct: list[Signature] = []
     same: dict[Attached, tuple[Attached, ...]] = {}

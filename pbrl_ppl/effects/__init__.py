@@ -9,6 +9,7 @@ from .effect import Effect as Effect
 from .effect import EffectParameter as EffectParameter
 from .effect import at_stage as at_stage
 from .effect import hanging_body as hanging_body
+from .effect import holder as holder
 from .effect import is_pivoted as is_pivoted
 from .effect import needs_inputs as needs_inputs
 from .learned_remainder import LEARNED_REMAINDER as LEARNED_REMAINDER

@@ -100,6 +100,11 @@ anisotropic_gain = Effect(
 )
 
 
+def sends_wrenches(scene: Scene, body: Body) -> bool:
+    """Return whether a body's commands are forces and torques: it has no actuators."""
+    return not scene.actuators_of(body.name)
+
+
 def _delay(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
     # a delay that ends inside a substep is blended: the likelihood stays smooth in it
     begin, end = command[6], command[7]
@@ -226,6 +231,7 @@ rate_limit = Effect(
     scan=_scan_rates,
     log_odds=-2.0,
     family="late command",
+    applies=sends_wrenches,
 )
 
 
@@ -248,6 +254,7 @@ actuator_backlash = Effect(
     Command(_play, memory=1, remember=_remember_play),
     log_odds=-2.0,
     family="late command",
+    applies=sends_wrenches,
 )
 
 
@@ -284,6 +291,7 @@ dead_zone = Effect(
     scan=_scan_dead_zones,
     log_odds=-2.0,
     family="shape of the command",
+    applies=sends_wrenches,
 )
 
 
@@ -311,6 +319,7 @@ force_cutoff = Effect(
     scan=_scan_cutoffs,
     log_odds=-3.0,
     family="shape of the command",
+    applies=sends_wrenches,
 )
 
 
@@ -343,6 +352,7 @@ saturation = Effect(
     scan=_scan_limits,
     log_odds=-2.0,
     family="shape of the command",
+    applies=sends_wrenches,
 )
 
 
@@ -539,4 +549,5 @@ power_limit = Effect(
     scan=_scan_powers,
     log_odds=-3.0,
     family="shape of the command",
+    applies=sends_wrenches,
 )

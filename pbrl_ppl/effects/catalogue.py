@@ -6,6 +6,7 @@ import difflib
 from collections.abc import Iterable
 
 from pbrl_ppl.effects import actuators, drag, forces, friction, mass, obstacles, sensors, springs
+from pbrl_ppl.effects.actuation import actuation
 from pbrl_ppl.effects.effect import Attached, Effect
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.scene import Scene
@@ -97,7 +98,8 @@ def attach(
 ) -> tuple[Attached, ...]:
     """Return all effects of a model: those that the scene declares, then the extra ones.
 
-    Forces that its recording gives along the bodies' axes are turned by an effect, too.
+    What its actuators do is an effect, too, and the turning of forces that its recording gives
+    along the bodies' axes.
 
     Their priors are in SI units; see :func:`pbrl_ppl.scene.units_of`.
 
@@ -129,14 +131,15 @@ def attach(
     listed = [item.effect if isinstance(item, Attached) else item for item in extra]
     check_names((*effects, *listed))
     by_name = {effect.name: effect for effect in (*effects, *listed)}
-    turning = actuators.body_frame
-    by_name[turning.name] = turning
     result: list[Attached] = []
     along_bodies = scene.recording is not None and scene.recording.forces == "body"
-    given = {(item.effect, item.body) for item in extra if isinstance(item, Attached)}
+    given = {(item.effect.name, item.body) for item in extra if isinstance(item, Attached)}
     for body in scene.dynamic:
-        if along_bodies and turning.name not in body.effects and (turning, body.name) not in given:
-            result.append(turning.on(body.name))
+        acting = actuation(scene, body.name) or (actuators.body_frame if along_bodies else None)
+        if acting is not None:
+            by_name[acting.name] = acting
+            if acting.name not in body.effects and (acting.name, body.name) not in given:
+                result.append(acting.on(body.name))
         for name in body.effects:
             if name not in by_name:
                 near = difflib.get_close_matches(name, by_name, n=1)

@@ -56,6 +56,8 @@ class EffectParameter:
         ``x`` or ``y``: for places, which are counted from the body's mean position.
     hinged : bool
         Whether a body on a hinge has it: what is measured of it is its angle.
+    given : bool
+        Whether it is known, and has its null value.
 
     Raises
     ------
@@ -79,6 +81,7 @@ class EffectParameter:
     scale: str = ""
     origin: str = ""
     hinged: bool = True
+    given: bool = False
 
     def __post_init__(self) -> None:
         """Check the scale."""
@@ -244,7 +247,8 @@ class Attached:
     @property
     def variables(self) -> tuple[str, ...]:
         """Names of the random variables of its parameters in a model."""
-        return tuple(self.effect.variable(parameter) for parameter in self.effect.parameters)
+        free = (parameter for parameter in self.effect.parameters if not parameter.given)
+        return tuple(self.effect.variable(parameter) for parameter in free)
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -312,6 +316,16 @@ def hanging_body(scene: Scene, joint: Joint) -> str:
     # of two bodies that nothing ties to the world, the second hangs on the first
     first, second = joint.bodies
     return first if depth.get(first, 0) > depth.get(second, 1) else second
+
+
+def holder(scene: Scene, attached: Attached) -> int:
+    """Return the place among the moving bodies of what an effect's body hangs on, or -1."""
+    names = [body.name for body in scene.moving]
+    for joint in scene.joints:
+        if joint.kind == "hinge" and joint.bodies and hanging_body(scene, joint) == attached.body:
+            (other,) = set(joint.bodies) - {attached.body}
+            return names.index(other) if other in names else -1
+    return -1
 
 
 def body_points(body: Body) -> Floats:

@@ -35,6 +35,7 @@ gravity_tilt = Effect(
     "gravity turned by an angle",
     Properties(_tilt),
     applies=_has_gravity,
+    family="place and angle",
 )
 
 
@@ -49,6 +50,7 @@ constant_force = Effect(
     "a steady push in one direction of the room: the floor slopes, or a wind blows",
     "Newton's second law with a constant force",
     Force(_world_force),
+    family="place and angle",
 )
 
 
@@ -78,6 +80,7 @@ constant_torque = Effect(
     "a steady twist in one direction, such as a torque sensor that is off zero",
     "Euler's second law with a constant torque",
     Force(_torque),
+    family="place and angle",
 )
 
 
@@ -127,6 +130,7 @@ cogging = Effect(
     Force(_cogging),
     scan=_scan_counts,
     log_odds=-3.0,
+    family="place and angle",
 )
 
 
@@ -166,6 +170,7 @@ ripple = Effect(
     applies=is_unpivoted,
     scan=_scan_waves,
     log_odds=-5.0,
+    family="place and angle",
 )
 
 

@@ -124,6 +124,7 @@ askew_camera = Effect(
     Sensor(_seen_askew, _set_straight),
     applies=is_unpivoted,
     log_odds=-6.0,
+    family="place and angle",
 )
 
 
@@ -173,6 +174,7 @@ encoder_eccentricity = Effect(
     Sensor(_off_centre, _without_off_centre),
     applies=is_pivoted,
     log_odds=-6.0,
+    family="place and angle",
 )
 
 askew_angle = Effect(
@@ -184,6 +186,7 @@ askew_angle = Effect(
     Sensor(_as_ellipse, _without_ellipse),
     applies=is_pivoted,
     log_odds=-6.0,
+    family="place and angle",
 )
 
 

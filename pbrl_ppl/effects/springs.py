@@ -54,6 +54,7 @@ spring = Effect(
     applies=is_unpivoted,
     scan=_scan_anchors,
     log_odds=-3.0,
+    family="place and angle",
 )
 
 
@@ -90,6 +91,7 @@ torsion_spring = Effect(
     Force(_torsion_spring),
     scan=_scan_angles,
     log_odds=-3.0,
+    family="place and angle",
 )
 
 
@@ -113,6 +115,7 @@ cubic_spring = Effect(
     applies=is_unpivoted,
     scan=_scan_anchors,
     log_odds=-4.0,
+    family="place and angle",
 )
 
 
@@ -150,6 +153,7 @@ cubic_torsion_spring = Effect(
     Force(_cubic_torsion),
     scan=_scan_middle,
     log_odds=-3.0,
+    family="place and angle",
 )
 
 
@@ -184,6 +188,7 @@ upper_stop = Effect(
     Force(_upper_stop),
     scan=_scan_upper,
     log_odds=-4.0,
+    family="place and angle",
 )
 
 lower_stop = Effect(
@@ -194,6 +199,7 @@ lower_stop = Effect(
     Force(_lower_stop),
     scan=_scan_lower,
     log_odds=-4.0,
+    family="place and angle",
 )
 
 
@@ -235,6 +241,7 @@ cable = Effect(
     applies=is_unpivoted,
     scan=_scan_cables,
     log_odds=-5.0,
+    family="place and angle",
 )
 
 
@@ -286,6 +293,7 @@ point_attractor = Effect(
     applies=is_unpivoted,
     scan=_scan_places,
     log_odds=-8.0,
+    family="place and angle",
 )
 
 

@@ -152,6 +152,9 @@ class Command:
     alone : str
         ``force_x``, ``force_y`` or ``torque`` for a law of one number: it is the first of each
         three, and the others are zero.
+    reacts : bool
+        Whether the torque acts back on what the body hangs on, and the law sees angle and speed
+        relative to it.
     begins : bool
         Whether the last parameter is the share of the first command that a memory begins with where
         a recording begins, 0 to 1: an actuator may have been at work before.
@@ -172,6 +175,7 @@ class Command:
     remember: Law | None = None
     alone: str = ""
     begins: bool = False
+    reacts: bool = False
     timed: bool = False
     jumps: bool = False
 

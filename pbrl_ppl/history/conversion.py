@@ -81,14 +81,17 @@ def as_history(
         What was repaired or left out.
     """
     columns, units = reading.get("columns") or {}, reading.get("units") or {}
-    if layout is None and not columns:
+    frame = with_clean_names(frame, source)
+    frame, sent = with_commands(frame, scene)
+    if layout is None and not (columns or sent):
         return in_si(frame, units) if units else frame
+    columns = {**sent, **columns}
     layout = (layout or Recording()).with_entries(columns=columns, units=units)
     said: list[str] = list(frame.attrs.get("said", ()))
     say = said.append
     if is_history(frame):
-        return _repaired(with_clean_names(frame, source), scene, layout, source, said)
-    frame = with_derived(with_clean_names(frame, source), say)
+        return _repaired(frame, scene, layout, source, said)
+    frame = with_derived(frame, say)
     frame = on_one_clock(frame, layout, commands, source, say)
     columns = _numbered(frame, dict(layout.columns), source)
     if "time" in frame and "duration" not in columns:
@@ -99,6 +102,29 @@ def as_history(
     units = stated | {name: unit for name, unit in layout.units if name != "time"}
     named = with_zeros(in_si(named, units), scene, layout, source)
     return _repaired(named, scene, layout, source, said)
+
+
+def with_commands(frame: pd.DataFrame, scene: Scene) -> tuple[pd.DataFrame, dict[str, str]]:
+    """Return a table whose actuators' columns are those of wrenches, or which are to be so named.
+
+    An actuator of a body takes the place of ``force_x``, the second that of ``force_y``, the third
+    that of the torque; a history that was saved has them there already.
+    """
+    slots = {
+        (body.name, wrench): actuator.column or actuator.name
+        for body in scene.dynamic
+        for wrench, actuator in zip(WRENCH, scene.actuators_of(body.name), strict=False)
+    }
+    missing = [column for column in slots.values() if column not in frame]
+    if not slots or (missing and not {*WRENCH}.isdisjoint(frame)):
+        return frame, {}
+    if "body" not in frame or missing:
+        alone = len(scene.moving) == 1
+        return frame, {(w if alone else f"{b}.{w}"): c for (b, w), c in slots.items()}
+    frame = frame.assign(**{w: frame[w] if w in frame else 0.0 for w in WRENCH})
+    for (body, wrench), column in slots.items():
+        frame[wrench] = frame[wrench].where(frame["body"] != body, frame[column])
+    return frame.drop(columns=list(slots.values())), {}
 
 
 def renamed(

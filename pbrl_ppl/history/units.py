@@ -40,6 +40,8 @@ def with_units(scene: Scene, history: History) -> Scene:
         if body.name in dynamic:
             states = data["start"].sel(body=body.name).to_numpy()
             wrench = data["action"].sel(body=body.name).to_numpy()
+            if scene.actuators_of(body.name):  # commands are no forces
+                wrench = np.zeros_like(wrench)
             units = {**vars(units_of(scene, body.name)), "time": _duration(history, scene)}
             seen = _measured(units, states[..., :3], wrench, scene.time_step)
             typical = {**units, **seen, **dict(body.typical)}

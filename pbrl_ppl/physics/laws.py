@@ -19,9 +19,10 @@ COMMAND, PREVIOUS, WRENCHES, TIME, INTERVAL, ACTED = 0, 3, 6, 9, 10, 12
 MORE = 4
 #: Columns of a law: its address, body, first parameter, the address of `remember`, its first number
 #: in the memory, how many, the component that is alone (-1: none), whether it is under a body,
-#: whether the command jumps in an interval, at the fractional part of the first parameter, and the
-#: parameter that is the share of the first command that the memory begins with (-1: none).
-LAW, ON, FIRST, REMEMBER, SLOT, SLOTS, ALONE, UNDER, JUMPS, BEGINS = range(10)
+#: whether the command jumps in an interval, at the fractional part of the first parameter, the
+#: parameter that is the share of the first command that the memory begins with (-1: none), and the
+#: body that the torque acts back on, relative to which the law sees angle and speed (-1: none).
+LAW, ON, FIRST, REMEMBER, SLOT, SLOTS, ALONE, UNDER, JUMPS, BEGINS, OTHER = range(11)
 
 
 class Laws(NamedTuple):
@@ -81,6 +82,12 @@ def act(state, interval, laws, begin, end, acted, memory, after=False):  # type:
                 acted[k, w] = acted[i, alone] if w == 0 else 0.0
                 acted[k, PREVIOUS + w] = acted[i, PREVIOUS + alone] if w == 0 else 0.0
                 acted[k + 3, w] = acted[k, w]
+        if law[OTHER] >= 0:
+            for d in range(6):
+                acted[k + 3, 6 + d] = state[i, d]
+            acted[k + 3, 8] -= state[law[OTHER], 2]
+            acted[k + 3, 11] -= state[law[OTHER], 5]
+            state_at = data + wide * (k + 3) + 48
         call_law(law[LAW], state_at, data + wide * k, parameters_at, wrench_at)
         if alone >= 0:
             acted[i, alone] = acted[k + 3, 0]
@@ -90,6 +97,9 @@ def act(state, interval, laws, begin, end, acted, memory, after=False):  # type:
     for i in range(k):
         for w in range(3):
             acted[i, WRENCHES + w] = acted[i, COMMAND + w]
+    for e in range(len(laws.commands)):
+        if laws.commands[e, OTHER] >= 0:
+            acted[laws.commands[e, OTHER], WRENCHES + 2] -= acted[laws.commands[e, ON], COMMAND + 2]
     for e in range(len(laws.forces)):
         law = laws.forces[e]
         at = data + wide * law[ON]

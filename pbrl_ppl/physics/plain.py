@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pymunk
 
-from pbrl_ppl.effects import Attached, Command, Force, Friction, at_stage
+from pbrl_ppl.effects import Attached, Command, Force, Friction, at_stage, holder
 from pbrl_ppl.effects.stages import INTERVAL, MEMORY, MOST_MEMORY, TIME
 from pbrl_ppl.physics.laws import LATE
 from pbrl_ppl.physics.properties import COLUMN, EngineInput
@@ -70,7 +70,10 @@ def rollout(
     set_discs(world, numbers.discs[proposal])
     _place_bodies(world, start)
     names = [body.name for body in world.scene.moving]
-    acting = Acting(effects, numbers, proposal, names, world.scene.time_step, earlier, start)
+    others = {names.index(one.body): holder(world.scene, one) for one in effects}
+    acting = Acting(
+        effects, numbers, proposal, names, others, world.scene.time_step, earlier, start
+    )
     step = world.scene.time_step / substeps
     states = np.empty((len(inputs), len(names), 6))
     touched, nearness = False, (world.radii, world.obstacles, world.can_touch)
@@ -118,6 +121,8 @@ class Acting:
         Index of the proposal.
     names : list of str
         The moving bodies.
+    others : dict of int to int
+        What each body hangs on; -1 for nothing that moves.
     time_step : float
         Sampling interval (s).
     earlier : ndarray
@@ -133,6 +138,7 @@ class Acting:
         numbers: EngineInput,
         proposal: int,
         names: list[str],
+        others: dict[int, int],
         time_step: float,
         earlier: Floats,
         start: Floats,
@@ -149,6 +155,7 @@ class Acting:
         self._commands = laws(Command, numbers.commands[proposal])
         self._forces = laws(Force, numbers.forces[proposal])
         self._frictions = laws(Friction, numbers.frictions[proposal])
+        self._others = others
         self._time_step, self.command = time_step, np.zeros((len(names), 3))
         wide = earlier.shape[-1]
         older = [np.arange(j, j + 3) for j in range(9, wide, 3)]
@@ -180,7 +187,10 @@ class Acting:
             signal[3:6] = _alone(interval[i, 3:6] if known else np.zeros(3), stage)
             signal[6:8] = begin, end
             signal[MEMORY : MEMORY + len(memory)] = memory
-            stage.law(states[i], signal, parameters, wrench)
+            seen = states[i]
+            if (other := self._others.get(i, -1)) >= 0 and stage.reacts:
+                seen = seen - states[other] * np.isin(np.arange(6), (2, 5))
+            stage.law(seen, signal, parameters, wrench)
             if stage.alone:
                 self.command[i, WRENCH.index(stage.alone)] = wrench[0]
             else:
@@ -188,6 +198,9 @@ class Acting:
             if after and stage.remember is not None:
                 stage.remember(states[i], signal, parameters, memory)
         total = self.command.copy()
+        for i, stage, _ in self._commands:
+            if (other := self._others.get(i, -1)) >= 0 and stage.reacts:
+                total[other, 2] -= self.command[i, 2]
         signals[:, :3] = self.command
         for i, stage, parameters in self._forces:
             stage.law(states[i], signals[i], parameters, total[i])

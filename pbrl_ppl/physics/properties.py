@@ -170,7 +170,8 @@ class EngineProperties:
         A parameter that is not in phi has its null value.
         """
         result = {}
-        for parameter, label in zip(attached.effect.parameters, attached.labels, strict=True):
+        for parameter in attached.effect.parameters:
+            label = f"{attached.effect.variable(parameter)}[{attached.body}]"
             place = self._places.get(label)
             column = np.full(len(phi), parameter.null) if place is None else phi[:, place]
             result[parameter.name] = column.reshape(-1, *(1,) * axes)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.effects import Clock, Command, Force, Friction, at_stage, needs_inputs
+from pbrl_ppl.effects import Clock, Command, Force, Friction, at_stage, holder, needs_inputs
 from pbrl_ppl.errors import SimulationError
 from pbrl_ppl.history import fill_joints, joint_coordinates
 from pbrl_ppl.parameters import Layout, differentiate
@@ -259,7 +259,7 @@ class Simulator:
                 remember, count, alone = getattr(stage, "remember", None), 0, -1
                 if remember is not None:
                     count, remember = 3 * stage.memory, calls.law_address(remember)
-                begins = getattr(stage, "begins", False)
+                begins, reacts = (getattr(stage, x, False) for x in ("begins", "reacts"))
                 if getattr(stage, "alone", ""):
                     alone = WRENCH.index(stage.alone)
                 rows.append((
@@ -267,10 +267,11 @@ class Simulator:
                     slots, count, alone, int(getattr(stage, "under", False)),
                     int(getattr(stage, "jumps", False)),
                     first + len(attached.effect.parameters) - 1 if begins else -1,
+                    holder(self.physics.scene, attached) if reacts else -1,
                 ))  # fmt: skip
                 first += len(attached.effect.parameters) + len(attached.effect.constants)
                 slots += count
-            tables.append(np.array(rows, dtype=np.int64).reshape(-1, 10))
+            tables.append(np.array(rows, dtype=np.int64).reshape(-1, 11))
         commands, forces, frictions = tables
         return commands, forces, frictions, slots
 

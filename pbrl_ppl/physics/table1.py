@@ -240,7 +240,8 @@ def build_layout(scene: Scene, effects: tuple[Attached, ...] = ()) -> Layout:
         those = [attached.in_si(scene) for attached in effects if attached.effect.name == effect]
         by_name: dict[str, dict[str, EffectParameter]] = {}  # not every body has all
         for attached in those:
-            for name, parameter in zip(attached.variables, attached.effect.parameters, strict=True):
+            free = (one for one in attached.effect.parameters if not one.given)
+            for name, parameter in zip(attached.variables, free, strict=True):
                 by_name.setdefault(name, {})[attached.body] = parameter
         for name, alike in by_name.items():
             priors = tuple(

@@ -1,5 +1,7 @@
 """Scenes: shapes, bodies, walls and joints as declared; TOML to `Scene` and back."""
 
+from .actuators import NUMBERS as NUMBERS
+from .actuators import Actuator as Actuator
 from .bodies import Body as Body
 from .bodies import Wall as Wall
 from .checks import CONTACT_NAMES as CONTACT_NAMES

@@ -17,6 +17,7 @@ import numpy as np
 
 from pbrl_ppl.errors import SceneError
 from pbrl_ppl.scene import toml as scene_toml
+from pbrl_ppl.scene.actuators import Actuator, check_actuators
 from pbrl_ppl.scene.bodies import Body, Wall, check_classes
 from pbrl_ppl.scene.checks import (
     Named,
@@ -57,6 +58,9 @@ class Scene:
         Immovable segments.
     joints : tuple of Joint
         Hinges, sliders and distance joints.
+    actuators : tuple of Actuator
+        What the commands of bodies mean; those of a body without any are wrenches in the world's
+        frame.
     noise : tuple of (str, float)
         Standard deviation of measuring a state dimension where it is known (m, rad, m/s, rad/s),
         for the likelihood of whole trajectories, which infers the others; a dict will do.
@@ -85,6 +89,7 @@ class Scene:
     substeps: int = 10
     walls: tuple[Wall, ...] = ()
     joints: tuple[Joint, ...] = ()
+    actuators: tuple[Actuator, ...] = ()
     noise: Named = ()
     test_is_later: bool = True
     recording: Recording | None = None
@@ -104,7 +109,8 @@ class Scene:
             )
         object.__setattr__(self, "substeps", int(steps))
         flag(self.test_is_later, "[world]: test_is_later")
-        for key, kind in (("bodies", Body), ("walls", Wall), ("joints", Joint)):
+        kinds = {"bodies": Body, "walls": Wall, "joints": Joint, "actuators": Actuator}
+        for key, kind in kinds.items():
             parts = tuple(getattr(self, key))
             for part in parts:
                 if not isinstance(part, kind):
@@ -115,6 +121,7 @@ class Scene:
             raise SceneError(f"scene: recording is {self.recording!r}, expected a Recording")
         self._check_bodies()
         self._check_joints()
+        check_actuators(self.actuators, [body.name for body in self.dynamic])
 
     def _check_bodies(self) -> None:
         names = [body.name for body in self.bodies]
@@ -206,10 +213,15 @@ class Scene:
         for where, table in arrays["joint"]:
             with located(where):
                 joints.append(Joint(**table))
+        actuators = []
+        for where, table in arrays["actuator"]:
+            with located(where):
+                actuators.append(Actuator(**table))
         if (layout := world["recording"]) is not None:
             world["recording"] = Recording(**layout)
         any_joints = world.pop("joints", None) == "any"
-        scene = cls(bodies=tuple(bodies), walls=tuple(walls), joints=tuple(joints), **world)
+        world |= {"walls": tuple(walls), "joints": tuple(joints), "actuators": tuple(actuators)}
+        scene = cls(bodies=tuple(bodies), **world)
         return scene.with_any_joints() if any_joints else scene
 
     def to_toml(self) -> str:
@@ -233,6 +245,12 @@ class Scene:
         for joint in self.joints:
             indices = {index: dict(p) for index, p in joint.prior}
             sections.append(("[[joint]]", dict(vars(joint), prior=indices or None)))
+        for actuator in self.actuators:
+            prior = {name: dict(hyper) for name, hyper in actuator.prior}
+            table = dict(vars(actuator), known=dict(actuator.known) or None, prior=prior or None)
+            for name in ("column", "of"):
+                table[name] = table[name] or None
+            sections.append(("[[actuator]]", table))
         return scene_toml.write(sections)
 
     @property
@@ -280,6 +298,10 @@ class Scene:
         x, y = np.array(points).T
         return float(x.min()), float(x.max()), float(y.min()), float(y.max())
 
+    def actuators_of(self, body: str) -> tuple[Actuator, ...]:
+        """Return the actuators of a body, in order: those of its columns of commands."""
+        return tuple(one for one in self.actuators if one.body == body)
+
     def body(self, name: str) -> Body:
         """Return the body of this name.
 
@@ -324,7 +346,8 @@ class Scene:
             for name, joint in zip(self.joint_names, self.joints, strict=True)
             if joint.bodies is None or set(joint.bodies) <= there
         )
-        return self.replace(bodies=bodies, joints=joints)
+        actuators = tuple(one for one in self.actuators if one.body in kept)
+        return self.replace(bodies=bodies, joints=joints, actuators=actuators)
 
     def with_any_joints(self) -> Scene:
         """Return a scene in which any two bodies, or a body and the world, may be joined by a rod.

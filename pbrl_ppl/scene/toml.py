@@ -16,7 +16,7 @@ Table = dict[str, Any]
 
 #: Required and optional keys of each table.
 KEYS: dict[str, tuple[str, str]] = {
-    "the file": ("world", "noise recording body wall joint"),
+    "the file": ("world", "noise recording body wall joint actuator"),
     "[world]": ("time_step", "gravity normal_gravity substeps test_is_later joints"),
     "[noise]": ("", " ".join(STATE)),
     "[recording]": ("", " ".join(field.name for field in fields(Recording))),
@@ -27,6 +27,7 @@ KEYS: dict[str, tuple[str, str]] = {
     "shape": ("kind", "size radius vertices"),
     "wall": ("from to", ""),
     "joint": ("kind", "bodies anchor_a anchor_b axis known name prior"),
+    "actuator": ("name kind body", "column at of frame known prior"),
 }
 
 
@@ -56,7 +57,7 @@ def read(text: str) -> tuple[Table, dict[str, list[tuple[str, Table]]]]:
     if recording is not None:
         _check_keys(recording, "[recording]")
     arrays: dict[str, list[tuple[str, Table]]] = {}
-    for key in ("body", "wall", "joint"):
+    for key in ("body", "wall", "joint", "actuator"):
         arrays[key] = list(_tables(document, key))
         for where, table in arrays[key]:
             _check_keys(table, where, key)

@@ -1,0 +1,138 @@
+"""Wrenches of a scene's actuators, by the simulated pose of the body that they act on."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+from pbrl_ppl.effects.effect import Effect, EffectParameter, is_pivoted
+from pbrl_ppl.effects.stages import Command
+from pbrl_ppl.parameters import Prior
+from pbrl_ppl.scene import NUMBERS, Actuator, Scene
+from pbrl_ppl.state import WRENCH, Floats
+
+#: Name of the effect of actuators.
+ACTUATION = "actuators"
+#: What an actuator is to the law: nothing, a force in the body's or the world's frame, a torque, or
+#: a torque towards an angle or a speed.
+_NONE, _FORCE, _WORLD_FORCE, _TORQUE, _TO_ANGLE, _TO_SPEED = range(6)
+#: Numbers of each actuator, one after the other; its kind is among the constants.
+_SIZE = 5
+
+
+def _act(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
+    c, s = math.cos(state[2]), math.sin(state[2])
+    force_x, force_y, torque = 0.0, 0.0, 0.0
+    for a in range(3):
+        kind, at, u = int(parameters[15 + a]), 5 * a, command[a]
+        if kind in (1, 2):
+            angle = parameters[at + 2] + (state[2] if kind == 1 else 0.0)
+            x = c * parameters[at + 3] - s * parameters[at + 4]
+            y = s * parameters[at + 3] + c * parameters[at + 4]
+            d_x, d_y = math.cos(angle), math.sin(angle)
+            along = d_x * (state[3] - state[5] * y) + d_y * (state[4] + state[5] * x)
+            force = parameters[at] * u - parameters[at + 1] * along
+            force_x += force * d_x
+            force_y += force * d_y
+            torque += force * (x * d_y - y * d_x)
+        elif kind == 3:
+            torque += parameters[at] * u - parameters[at + 1] * state[5]
+        elif kind > 3:
+            off = u - state[5]
+            if kind == 4:
+                off = u - state[2]
+                off -= 2.0 * math.pi * math.floor((off + math.pi) / (2.0 * math.pi))
+            turn = parameters[at] * off
+            if kind == 4:
+                turn -= parameters[at + 1] * state[5]
+            if parameters[at + 2] > 0.0:
+                turn = min(max(turn, -parameters[at + 2]), parameters[at + 2])
+            torque += turn
+    wrench[0], wrench[1], wrench[2] = force_x, force_y, torque
+
+
+#: Prior and natural unit of each number that is inferred.
+_GAIN = Prior("log_normal", mu=0.0, sigma=2.0)
+_LOSS = Prior("half_normal", sigma=1.0)
+_PRIORS = {
+    "thruster": {
+        "gain": (_GAIN, "force"),
+        "loss": (_LOSS, "force/speed"),
+        "direction": (Prior("normal", sigma=0.3), ""),
+    },
+    "motor": {"gain": (_GAIN, "torque"), "loss": (_LOSS, "torque/turn_rate")},
+    "servo": {
+        "kp": (_GAIN, "torque"),
+        "kd": (_LOSS, "torque/turn_rate"),
+        "limit": (_GAIN, "torque"),
+    },
+    "wrench": {},
+}
+
+
+def _kind(actuator: Actuator) -> int:
+    """Return what an actuator is to the law."""
+    if actuator.kind == "servo":
+        return _TO_ANGLE if actuator.of == "angle" else _TO_SPEED
+    if actuator.kind == "motor" or actuator.of == "torque":
+        return _TORQUE
+    return _FORCE if actuator.frame == "body" else _WORLD_FORCE
+
+
+def _numbers(actuator: Actuator) -> list[EffectParameter]:
+    """Return an actuator's numbers in the order of the law, given ones at their values."""
+
+    def given(value: float) -> EffectParameter:
+        return EffectParameter("given", "1", Prior("normal", sigma=1.0), value, given=True)
+
+    parameters, prior = [], dict(actuator.prior)
+    for name, value in actuator.numbers.items():
+        if value is not None:
+            parameters.append(given(value))
+            continue
+        family, scale = _PRIORS[actuator.kind][name]
+        stated: dict[str, Any] = dict(prior.get(name, ()))
+        if stated:  # in SI units
+            family, scale = replace(family, **stated), ""
+        unit = NUMBERS[actuator.kind][name][0]
+        null = 1.0 if family.family == "log_normal" else 0.0
+        parameters.append(
+            EffectParameter(f"{actuator.name}_{name}", unit, family, null, scale=scale)
+        )
+    if actuator.kind == "wrench":
+        turn = 0.5 * math.pi if actuator.of == "force_y" else 0.0
+        parameters = [given(1.0), given(0.0), given(turn)]
+    places = actuator.at if _kind(actuator) in (_FORCE, _WORLD_FORCE) else (0.0, 0.0)
+    parameters += [given(0.0)] * (3 - len(parameters))
+    return parameters + [given(place) for place in places]
+
+
+def actuation(scene: Scene, body: str) -> Effect | None:
+    """Return the effect of a body's actuators, if it has any: commands become wrenches.
+
+    Parameters
+    ----------
+    scene : Scene
+        Its actuators.
+    body : str
+        Name of a dynamic body.
+    """
+    acting = scene.actuators_of(body)
+    if not acting:
+        return None
+    nothing = EffectParameter("given", "1", Prior("normal", sigma=1.0), given=True)
+    parameters: list[EffectParameter] = []
+    for actuator in acting:
+        parameters += _numbers(actuator)
+    parameters += [nothing] * (_SIZE * len(WRENCH) - len(parameters))
+    kinds = [float(_kind(actuator)) for actuator in acting]
+    return Effect(
+        ACTUATION,
+        tuple(
+            replace(one, name=f"given_{i}") if one.given else one
+            for i, one in enumerate(parameters)
+        ),
+        "commands act through " + ", ".join(f"{one.name} ({one.kind})" for one in acting),
+        "forces and torques of actuators in the body's frame",
+        Command(_act, reacts=is_pivoted(scene, scene.body(body))),
+        constants=(*kinds, *[float(_NONE)] * (len(WRENCH) - len(kinds))),
+    )
