@@ -25,7 +25,7 @@ def _act(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> 
     for a in range(3):
         kind, at, u = int(parameters[15 + a]), 5 * a, command[a]
         if kind in (1, 2):
-            angle = parameters[at + 2] + (state[2] if kind == 1 else 0.0)
+            angle = parameters[at + 2] + wrench[6 + a] + (state[2] if kind == 1 else 0.0)
             x = c * parameters[at + 3] - s * parameters[at + 4]
             y = s * parameters[at + 3] + c * parameters[at + 4]
             d_x, d_y = math.cos(angle), math.sin(angle)
@@ -48,6 +48,28 @@ def _act(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> 
                 turn = min(max(turn, -parameters[at + 2]), parameters[at + 2])
             torque += turn
     wrench[0], wrench[1], wrench[2] = force_x, force_y, torque
+
+
+def _scale(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
+    wrench[0] *= parameters[0]
+
+
+# where the law of actuators finds by how much each is turned
+
+
+def _turn_first(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
+    wrench[6] = parameters[0]
+
+
+def _turn_second(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
+    wrench[7] = parameters[0]
+
+
+def _turn_third(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
+    wrench[8] = parameters[0]
+
+
+_TURNS = (_turn_first, _turn_second, _turn_third)
 
 
 #: Prior and natural unit of each number that is inferred.
@@ -136,3 +158,40 @@ def actuation(scene: Scene, body: str) -> Effect | None:
         Command(_act, reacts=is_pivoted(scene, scene.body(body))),
         constants=(*kinds, *[float(_NONE)] * (len(WRENCH) - len(kinds))),
     )
+
+
+def laws_of_actuators(scene: Scene, body: str) -> tuple[Effect, ...]:
+    """Return what may be wrong with each actuator of a body that is declared as known.
+
+    Parameters
+    ----------
+    scene : Scene
+        Its actuators.
+    body : str
+        Name of a dynamic body.
+    """
+    laws = []
+    for slot, actuator in enumerate(scene.actuators_of(body)):
+        name, force = actuator.name, _kind(actuator) in (_FORCE, _WORLD_FORCE)
+        if actuator.kind == "wrench" or actuator.numbers.get("gain") is not None:
+            prior = Prior("log_normal", mu=0.0, sigma=0.5)
+            laws.append(
+                Effect(
+                    f"{name}_gain",
+                    (EffectParameter("factor", "1", prior, null=1.0),),
+                    f"{name} is stronger or weaker than declared by this factor",
+                    "gain of an actuator",
+                    Command(_scale, alone=WRENCH[slot]),
+                )
+            )
+        if force and not dict(actuator.prior).get("direction"):
+            laws.append(
+                Effect(
+                    f"{name}_direction",
+                    (EffectParameter("angle", "rad", Prior("normal", sigma=0.3)),),
+                    f"{name} points in another direction than declared: it is mounted askew",
+                    "rotation of a vector in the plane",
+                    Command(_TURNS[slot], acts=False),
+                )
+            )
+    return tuple(laws)

@@ -189,16 +189,18 @@ first_order_lag = Effect(
 def _ramp(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
     most = parameters[0] * 0.5 * (command[6] + command[7]) * command[10]
     off = math.hypot(command[0] - command[12], command[1] - command[13])
-    share = min(1.0, most / off) if off > 0.0 else 1.0
-    for i in range(2):
-        wrench[i] = command[12 + i] + share * (command[i] - command[12 + i])
+    if off > most:
+        for i in range(2):
+            wrench[i] = command[12 + i] + most / off * (command[i] - command[12 + i])
 
 
 def _remember_ramp(state: Floats, command: Floats, parameters: Floats, memory: Floats) -> None:
-    off = math.hypot(command[0] - memory[0], command[1] - memory[1])
-    share = min(1.0, parameters[0] * command[10] / off) if off > 0.0 else 1.0
+    off, most = (
+        math.hypot(command[0] - memory[0], command[1] - memory[1]),
+        command[10] * parameters[0],
+    )
     for i in range(2):
-        memory[i] += share * (command[i] - memory[i])
+        memory[i] += min(1.0, most / max(off, 1e-300)) * (command[i] - memory[i])
 
 
 def _scan_rates(scene: Scene, history: History, body: Body) -> Floats:

@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Iterable
 
 from pbrl_ppl.effects import actuators, drag, forces, friction, mass, obstacles, sensors, springs
-from pbrl_ppl.effects.actuation import actuation
+from pbrl_ppl.effects.actuation import actuation, laws_of_actuators
 from pbrl_ppl.effects.effect import Attached, Effect
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.scene import Scene
@@ -137,7 +137,8 @@ def attach(
     for body in scene.dynamic:
         acting = actuation(scene, body.name) or (actuators.body_frame if along_bodies else None)
         if acting is not None:
-            by_name[acting.name] = acting
+            own = laws_of_actuators(scene, body.name)
+            by_name |= {acting.name: acting} | {effect.name: effect for effect in own}
             if acting.name not in body.effects and (acting.name, body.name) not in given:
                 result.append(acting.on(body.name))
         for name in body.effects:
@@ -203,9 +204,12 @@ def candidates(
     Their priors are in SI units; see :func:`pbrl_ppl.scene.units_of`.
     """
     present = {(attached.effect.name, attached.body) for attached in declared}
+    everywhere = [(effect, body) for effect in effects for body in scene.dynamic]
+    own = [
+        (effect, body) for body in scene.dynamic for effect in laws_of_actuators(scene, body.name)
+    ]
     return tuple(
         effect.on(body.name).in_si(scene)
-        for effect in effects
-        for body in scene.dynamic
+        for effect, body in (*everywhere, *own)
         if (effect.name, body.name) not in present and effect.applies(scene, body)
     )

@@ -259,8 +259,8 @@ class Attached:
 def at_stage(effects: tuple[Attached, ...], stage: type) -> list[Attached]:
     """Return the effects that act at a stage, in their order; commands with a memory first."""
     acting = [attached for attached in effects if isinstance(attached.effect.stage, stage)]
-    if stage is Command:  # what is late is late as it was sent, whatever is made of it
-        acting.sort(key=lambda one: -getattr(one.effect.stage, "memory", 0))
+    if stage is Command:  # what is late is late as it was sent; wrenches of actuators come after
+        acting.sort(key=lambda one: getattr(one.effect.stage, "rank", 0))
     return acting
 
 

@@ -155,6 +155,8 @@ class Command:
     reacts : bool
         Whether the torque acts back on what the body hangs on, and the law sees angle and speed
         relative to it.
+    acts : bool
+        Whether the law changes the wrench; otherwise it changes how an actuator acts.
     begins : bool
         Whether the last parameter is the share of the first command that a memory begins with where
         a recording begins, 0 to 1: an actuator may have been at work before.
@@ -176,8 +178,14 @@ class Command:
     alone: str = ""
     begins: bool = False
     reacts: bool = False
+    acts: bool = True
     timed: bool = False
     jumps: bool = False
+
+    @property
+    def rank(self) -> int:
+        """Where the law is among others: those with most memory first, then of single numbers."""
+        return -2 * self.memory - bool(self.alone or not self.acts)
 
     def __post_init__(self) -> None:
         """Check the memory."""

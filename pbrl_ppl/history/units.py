@@ -43,7 +43,8 @@ def with_units(scene: Scene, history: History) -> Scene:
             if scene.actuators_of(body.name):  # commands are no forces
                 wrench = np.zeros_like(wrench)
             units = {**vars(units_of(scene, body.name)), "time": _duration(history, scene)}
-            seen = _measured(units, states[..., :3], wrench, scene.time_step)
+            moment = body.shape.unit_moment
+            seen = _measured(units, states[..., :3], wrench, moment, scene.time_step)
             typical = {**units, **seen, **dict(body.typical)}
             body = replace(body, typical=tuple(typical.items()))
         bodies.append(body)
@@ -56,18 +57,25 @@ def _duration(history: History, scene: Scene) -> float:
 
 
 def _measured(
-    units: dict[str, float], poses: Floats, wrench: Floats, dt: float
+    units: dict[str, float], poses: Floats, wrench: Floats, unit_moment: float, dt: float
 ) -> dict[str, float]:
-    """Return the natural units that poses (trajectory, time, 3) and wrenches show."""
+    """Return the natural units that poses (trajectory, time, 3) and wrenches show.
+
+    ``unit_moment`` is the body's moment of inertia for each unit of mass (m^2).
+    """
     places = poses[..., :2]
     centre = np.nanmean(places, axis=(0, 1)) if np.isfinite(places).any() else np.zeros(2)
     reach = float(np.nanmax(np.linalg.norm(places - centre, axis=-1), initial=0.0))
     speed, acceleration = _rates(places, dt)
-    turn_rate, _ = _rates(np.unwrap(np.nan_to_num(poses[..., THETA:]), axis=1), dt)
+    turn_rate, spin_up = _rates(np.unwrap(np.nan_to_num(poses[..., THETA:]), axis=1), dt)
     force = max(
         units["force"], units["mass"] * acceleration, _size(wrench[..., : WRENCH.index("torque")])
     )
-    torque = max(force * units["length"], _size(wrench[..., WRENCH.index("torque") :]))
+    torque = max(
+        force * units["length"],
+        units["mass"] * unit_moment * spin_up,
+        _size(wrench[..., WRENCH.index("torque") :]),
+    )
     rates = dict(speed=speed, turn_rate=turn_rate or speed / units["length"])
     return {
         "force": force,

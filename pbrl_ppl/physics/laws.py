@@ -62,6 +62,7 @@ def act(state, interval, laws, begin, end, acted, memory, after=False):  # type:
         for w in range(3):
             acted[i, COMMAND + w] = interval[i, w]
             acted[i, PREVIOUS + w] = interval[i, 3 + w] if known else 0.0
+            acted[i, WRENCHES + w] = 0.0  # by how much actuators are turned, for now
         acted[i, TIME] = np.inf
         if known:
             acted[i, TIME] = interval[i, 7] + begin * laws.time_step

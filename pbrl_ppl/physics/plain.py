@@ -176,14 +176,17 @@ class Acting:
     ) -> Floats:
         """Return the wrench on each body in a substep, shape (body, 3); see `laws.act`."""
         known = interval.shape[1] > 3
-        self.command = interval[:, :3].copy()
+        # and by how much actuators are turned
+        work = np.hstack([interval[:, :3], np.zeros((len(interval), 6))])
         signals = np.zeros((len(interval), MEMORY + MOST_MEMORY))
         signals[:, [TIME, INTERVAL]] = np.inf, self._time_step
         if known:
             signals[:, TIME] = interval[:, 7] + begin * self._time_step
         for (i, stage, parameters), memory in zip(self._commands, self._memory, strict=True):
-            signal, wrench = signals[i].copy(), _alone(self.command[i], stage)
-            signal[:3] = wrench
+            signal, wrench = signals[i].copy(), work[i]
+            if stage.alone:
+                wrench = _alone(work[i], stage)
+            signal[:3] = wrench[:3]
             signal[3:6] = _alone(interval[i, 3:6] if known else np.zeros(3), stage)
             signal[6:8] = begin, end
             signal[MEMORY : MEMORY + len(memory)] = memory
@@ -192,11 +195,10 @@ class Acting:
                 seen = seen - states[other] * np.isin(np.arange(6), (2, 5))
             stage.law(seen, signal, parameters, wrench)
             if stage.alone:
-                self.command[i, WRENCH.index(stage.alone)] = wrench[0]
-            else:
-                self.command[i] = wrench
+                work[i, WRENCH.index(stage.alone)] = wrench[0]
             if after and stage.remember is not None:
                 stage.remember(states[i], signal, parameters, memory)
+        self.command = work[:, :3].copy()
         total = self.command.copy()
         for i, stage, _ in self._commands:
             if (other := self._others.get(i, -1)) >= 0 and stage.reacts:
