@@ -14,7 +14,16 @@ from pbrl_ppl.agents.revision import Revision
 from pbrl_ppl.errors import GoalError
 from pbrl_ppl.oomdp import LWR, OOLWR
 from pbrl_ppl.physics import touching
-from pbrl_ppl.planning import ActionSet, Dynamics, Goal, TransitionModel, plan, rollout, start_state
+from pbrl_ppl.planning import (
+    ActionSet,
+    Dynamics,
+    Goal,
+    TransitionModel,
+    plan,
+    remembered,
+    rollout,
+    start_state,
+)
 from pbrl_ppl.posterior import Idata
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import THETA, Bools, Floats, wrapped
@@ -125,7 +134,9 @@ class Agent(ABC):
         self._options = {"nodes": nodes, **options}
         self._rng = np.random.default_rng([seed, 0])  # [seed, 1] is the world's
         self._ahead = np.empty((0, len(task.scene.moving), 3))
-        self._last = np.zeros((len(task.scene.moving), 3))  # for actuators with memory
+        self._last = np.zeros(
+            (len(task.scene.moving), 3 * 16)
+        )  # of 16 intervals: an actuator may remember
         self.planned = False
 
     @abstractmethod
@@ -177,8 +188,8 @@ class Agent(ABC):
             chosen = int(np.argmin((off**2).sum(axis=(1, 2))))
         else:
             chosen = int(self._rng.integers(len(wrenches)))
-        self._last = wrenches[chosen]
-        return self._last.copy()
+        self._last = remembered(wrenches[chosen], self._last)
+        return np.array(wrenches[chosen])
 
     def _planned(self, model: TransitionModel, state: Floats) -> Floats:
         """Return wrenches (time, body, 3): the last plan's if it reaches the goal."""

@@ -4,6 +4,7 @@ from .actions import Action as Action
 from .actions import ActionSet as ActionSet
 from .dynamics import Dynamics as Dynamics
 from .dynamics import TransitionModel as TransitionModel
+from .dynamics import remembered as remembered
 from .dynamics import rollout as rollout
 from .experiments import Suggestion as Suggestion
 from .experiments import suggest_actions as suggest_actions

@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import dijkstra
 from pbrl_ppl.errors import GoalError
 from pbrl_ppl.physics import overlap
 from pbrl_ppl.planning.actions import ActionSet
-from pbrl_ppl.planning.dynamics import TransitionModel
+from pbrl_ppl.planning.dynamics import TransitionModel, remembered
 from pbrl_ppl.planning.goals import Goal, Target
 from pbrl_ppl.planning.search import Found, Task, contact_cost, tail_mean
 from pbrl_ppl.scene import Body, Scene, Shape
@@ -196,14 +196,14 @@ class _Search:
         for interval in range(1, (only or self.counts[-1]) + 1):
             wrenches = self.actions.wrenches(self.scene, which, mean_angle(states[..., 2]))
             states = self.dynamics.step(states, wrenches, last)
-            last = wrenches
+            last = remembered(wrenches, last)
             if self.rng is not None:
                 states = self.dynamics.noisy(states, self.rng)
             self.generated += len(parents) * self.dynamics.draws
             cost = cost + self.scene.time_step * (1.0 + contact_cost(self.goal, self.scene, states))
             far = self._note(states, cost, parents, which, interval)
             if interval == only or (only is None and interval in self.counts):
-                self._add(states, wrenches, cost, far, parents, which, interval)
+                self._add(states, last, cost, far, parents, which, interval)
 
     def _note(
         self, states: Floats, cost: Floats, parents: Ints, which: Ints, interval: int
@@ -229,7 +229,7 @@ class _Search:
     def _add(
         self,
         states: Floats,
-        wrenches: Floats,
+        last: Floats,
         cost: Floats,
         far: Floats,
         parents: Ints,
@@ -250,7 +250,7 @@ class _Search:
         first, self.size = self.size, self.size + len(chosen)
         edges = np.stack([parents, which, np.full_like(parents, interval)], axis=1)
         for name, new in (
-            ("states", np.moveaxis(states, 0, 1)), ("last", wrenches), ("cost", cost),
+            ("states", np.moveaxis(states, 0, 1)), ("last", last), ("cost", cost),
             ("edges", edges),
         ):  # fmt: skip
             old = getattr(self, name)
@@ -304,11 +304,12 @@ def played(task: Task, steps: list[tuple[int, int]]) -> Floats:
     dynamics, start, actions = task.dynamics, task.start, task.actions
     scene, states = dynamics.scene, np.repeat(start[None, None], dynamics.draws, axis=0)
     wrenches = np.zeros((sum(intervals for _, intervals in steps), len(start), 3))
+    last = dynamics.before[None]
     sequence = [action for action, intervals in steps for _ in range(intervals)]
     for i, action in enumerate(sequence):
         wrenches[i] = actions.wrenches(scene, np.array([action]), mean_angle(states[..., 2]))[0]
-        last = wrenches[i - 1] if i else dynamics.before
-        states = dynamics.step(states, wrenches[i : i + 1], last[None])
+        states = dynamics.step(states, wrenches[i : i + 1], last)
+        last = remembered(wrenches[i : i + 1], last)
     return wrenches
 
 

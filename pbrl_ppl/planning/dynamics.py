@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 
-from pbrl_ppl.effects import Attached, Effect, attach, catalogue, needs_inputs
+from pbrl_ppl.effects import Attached, Command, Effect, attach, catalogue, needs_inputs
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.likelihood import Coordinates, degrees_of_freedom, next_state_random, tail_places
 from pbrl_ppl.physics import Physics, after_recording
@@ -34,7 +34,10 @@ class TransitionModel(Protocol):
 
     @property
     def before(self) -> Floats:
-        """Wrenches that acted before the start, shape (body, 3), N and N m."""
+        """Wrenches that acted before the start, shape (body, 3) or more, N and N m.
+
+        The last interval's first; three numbers more for each one before that a model remembers.
+        """
 
     @property
     def draws(self) -> int:
@@ -56,12 +59,25 @@ class TransitionModel(Protocol):
         ----------
         states : ndarray
             Shape (draw, n, body, 6), SI units.
-        wrenches, previous : ndarray
-            Now and in the interval before, shape (n, body, 3), world frame, N and N m.
+        wrenches : ndarray
+            Shape (n, body, 3), world frame, N and N m.
+        previous : ndarray, optional
+            Those before, shape (n, body, 3) or more: as :attr:`before`.
         """
 
     def noisy(self, states: Floats, rng: np.random.Generator) -> Floats:
         """Return states (draw, n, body, 6) with the noise of a step."""
+
+
+def remembered(wrenches: Floats, before: Floats) -> Floats:
+    """Return the wrenches before the next interval: these, and those before but for the oldest.
+
+    Examples
+    --------
+    >>> remembered(np.array([3.0, 0, 0]), np.array([2.0, 0, 0, 1.0, 0, 0]))
+    array([3., 0., 0., 2., 0., 0.])
+    """
+    return np.concatenate([wrenches, before[..., : -len(WRENCH)]], axis=-1)
 
 
 def rollout(
@@ -82,9 +98,9 @@ def rollout(
     lead, in_time = wrenches.shape[:-3], np.moveaxis(wrenches, -3, 0)
     in_time = in_time.reshape(len(in_time), math.prod(lead), *wrenches.shape[-2:])
     states = np.broadcast_to(start, (model.draws, in_time.shape[1], *start.shape))
-    path, last = [states], np.broadcast_to(model.before, in_time.shape[1:])
+    path, last = [states], np.broadcast_to(model.before, (in_time.shape[1], *model.before.shape))
     for wrench in in_time:
-        states, last = model.step(states, wrench, last), wrench
+        states, last = model.step(states, wrench, last), remembered(wrench, last)
         if rng is not None:
             states = model.noisy(states, rng)
         path.append(states)
@@ -159,6 +175,18 @@ class AccelerationNoise:
 StepNoise = StateNoise | AccelerationNoise
 
 
+#: Intervals that an actuator with a state of its own is followed back to.
+_PAST = 16
+
+
+def _memory(attached: Attached) -> int:
+    """Return how many past wrenches an effect needs."""
+    stage = attached.effect.stage
+    if not isinstance(stage, Command):
+        return 0
+    return stage.memory + (stage.remember is not None)
+
+
 class Dynamics:
     """Transition model under each of some parameter draws.
 
@@ -199,8 +227,10 @@ class Dynamics:
         self.scene, self.layout, self._noise = scene, self._physics.layout, noise
         self.phi = np.atleast_2d(np.asarray(phi, dtype=float))
         self._whole = needs_inputs(attached)
-        #: Wrenches that acted before the start, shape (body, 3); an actuator may remember them.
-        self.before = np.zeros((len(scene.moving), len(WRENCH)))
+        #: Wrenches that acted before the start, shape (body, 3); three more columns for each older
+        #: one that an actuator remembers.
+        past = _PAST if any(_memory(one) > 1 for one in attached) else 1
+        self.before = np.zeros((len(scene.moving), past * len(WRENCH)))
 
     @classmethod
     def known(
@@ -297,10 +327,18 @@ class Dynamics:
         return other
 
     def after(self, before: Floats) -> Dynamics:
-        """Return dynamics after these previous wrenches, shape (body, 3), N and N m."""
-        later = copy(self)
-        later.before = np.asarray(before, dtype=float).reshape(self.before.shape)
+        """Return dynamics after previous wrenches, N and N m, as in :attr:`before`.
+
+        Of shape (body, 3) they lasted.
+        """
+        later, given = copy(self), np.asarray(before, dtype=float)
+        later.before = self._lasting(given.reshape(len(self.before), -1))
         return later
+
+    def _lasting(self, before: Floats) -> Floats:
+        """Return wrenches before as many as are remembered, shape (..., 3 or more)."""
+        width = self.before.shape[-1]
+        return np.asarray(np.tile(before, width)[..., :width])
 
     def mass(self, body: str) -> Floats:
         """Return a body's mass under each draw, shape (draw,), kg."""
@@ -328,7 +366,7 @@ class Dynamics:
         wrenches : ndarray
             Shape (n, body, 3), world frame, N and N m; the same under each draw.
         previous : ndarray, optional
-            Wrenches of the interval before, same shape; :attr:`before` without them.
+            Wrenches before, shape (n, body, 3) or more as in :attr:`before`, which is the default.
 
         Returns
         -------
@@ -337,8 +375,10 @@ class Dynamics:
         """
         actions = wrenches[:, None]
         if self._whole:  # the time is after the recording
-            last = np.broadcast_to(self.before if previous is None else previous, wrenches.shape)
-            actions = after_recording(wrenches, last)[:, None]
+            before = self.before if previous is None else self._lasting(previous)
+            last = np.broadcast_to(before, (len(wrenches), *self.before.shape))
+            each = np.split(last, last.shape[-1] // len(WRENCH), axis=-1)
+            actions = after_recording(wrenches, *each)[:, None]
         # the engine refuses states that had diverged: they stay NaN
         lost = np.asarray(~np.isfinite(states).all(axis=(-2, -1)))
         begin = np.where(lost[..., None, None], 0.0, states) if lost.any() else states

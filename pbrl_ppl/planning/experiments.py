@@ -20,7 +20,7 @@ from pbrl_ppl.history import from_segments
 from pbrl_ppl.parameters import differentiate
 from pbrl_ppl.physics import touching
 from pbrl_ppl.planning.actions import ActionSet, Allowed, Bounds, allowed_wrenches
-from pbrl_ppl.planning.dynamics import Dynamics, rollout
+from pbrl_ppl.planning.dynamics import Dynamics, remembered, rollout
 from pbrl_ppl.planning.planner import start_state
 from pbrl_ppl.scene import Scene, body_sizes
 from pbrl_ppl.state import WRENCH, WRENCH_UNITS, Bools, Floats
@@ -58,13 +58,17 @@ class _Paths:
         states = rollout(dynamics, start, wrenches)
         lost = np.asarray(~np.isfinite(states).all(axis=(2, 3, 4)))
         states[lost] = start
-        first = np.broadcast_to(dynamics.before, wrenches[:, :1].shape)
-        before = np.concatenate([first, wrenches[:, :-1]], axis=1)
+        last = np.broadcast_to(dynamics.before, (len(wrenches), *dynamics.before.shape))
+        past = []
+        for wrench in np.moveaxis(wrenches, 1, 0):
+            past.append(last)
+            last = remembered(wrench, last)
+        before = np.stack(past, axis=1)
         return cls(
             states[:, :, :-1].reshape(-1, *start.shape),
             states[:, :, 1:].reshape(-1, *start.shape),
             np.tile(wrenches, (dynamics.draws, 1, 1, 1)).reshape(-1, *wrenches.shape[2:]),
-            np.tile(before, (dynamics.draws, 1, 1, 1)).reshape(-1, *wrenches.shape[2:]),
+            np.tile(before, (dynamics.draws, 1, 1, 1)).reshape(-1, *before.shape[2:]),
             wrenches.shape[1],
             lost.ravel(),
         )

@@ -7,6 +7,7 @@ import time
 import numpy as np
 
 from pbrl_ppl.errors import GoalError
+from pbrl_ppl.planning.dynamics import remembered
 from pbrl_ppl.planning.search import Found, Task, contact_cost, tail_mean
 from pbrl_ppl.state import Floats
 
@@ -108,9 +109,10 @@ class Horizon:
         scene, goal = task.dynamics.scene, task.goal
         states = np.repeat(start[:, None], len(tried), axis=1)
         cost = np.zeros(len(tried))
+        last = np.broadcast_to(before, (len(tried), *before.shape))
         for t in range(horizon):
-            last = tried[:, t - 1] if t else np.broadcast_to(before, tried[:, 0].shape)
             states = task.dynamics.step(states, tried[:, t], last)
+            last = remembered(tried[:, t], last)
             if task.noise:
                 states = task.dynamics.noisy(states, self.rng)
             self.generated += len(tried) * task.dynamics.draws
@@ -159,7 +161,7 @@ def mppi(
     rng = task.rng or np.random.default_rng(0)
     ahead = Horizon(task, horizon, samples, iterations, rng)
     states = np.repeat(start[None, None], dynamics.draws, axis=0)
-    wrenches: list[Floats] = []
+    wrenches, last = list[Floats](), dynamics.before
     nearest, best, stopped = np.inf, 0, "exhausted"
 
     try:
@@ -176,10 +178,10 @@ def mppi(
                 stopped = "nodes" if ahead.generated >= nodes else "time"
                 break
             task.progress(f"interval {len(wrenches)}, {far:.3g} m from the goal")
-            last = wrenches[-1] if wrenches else dynamics.before
             ahead.improve(states[:, 0], last)
             wrenches.append(ahead.advance())
             states = dynamics.step(states, wrenches[-1][None], last[None])
+            last = remembered(wrenches[-1], last)
     except KeyboardInterrupt:
         stopped = "interrupted"
     chosen = np.array(wrenches[:best]).reshape(-1, len(start), 3)
