@@ -7,7 +7,7 @@ import shutil
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -21,7 +21,7 @@ from pbrl_ppl.cli.options import command
 from pbrl_ppl.cli.terminal import check_file, interruptible, print_json
 from pbrl_ppl.errors import HistoryError, LayoutError, OutputError, RecordingWarning, SceneError
 from pbrl_ppl.files import write_text
-from pbrl_ppl.scene import WORLD, Body, Joint, Recording, Scene, Shape, nearest
+from pbrl_ppl.scene import WORLD, Actuator, Body, Joint, Recording, Scene, Shape, nearest
 from pbrl_ppl.scene import toml as scene_toml
 from pbrl_ppl.state import Floats
 
@@ -52,6 +52,8 @@ class Recorded:
         Bodies of which angles alone were measured, which must be hinged.
     circles : dict of str to (float, float, float)
         Centre and radius (m) of bodies that swing on a circle, and whose angle was not measured.
+    actuators : callable
+        Takes the outline of the one body; returns actuators that columns' names give away.
     """
 
     names: tuple[str, ...]
@@ -60,6 +62,7 @@ class Recorded:
     said: list[str]
     angles: tuple[str, ...]
     circles: dict[str, tuple[float, float, float]]
+    actuators: Callable[[Shape], tuple[Actuator, ...]] = lambda shape: ()
 
 
 def recorded(
@@ -91,6 +94,7 @@ def recorded(
 
     from pbrl_ppl.history import (
         as_history,
+        guessed_actuators,
         is_history,
         propose,
         read_commands,
@@ -158,10 +162,17 @@ def recorded(
         shown.append(
             f"{name} swings on a circle of {radius:g} m about ({x:g}, {y:g}): hung on a hinge there"
         )
-    if not plain and (unused := unused_columns(frame, proposed)):
+    acting: Callable[[Shape], tuple[Actuator, ...]] = Recorded.actuators
+    if not plain and len(names) == 1:
+        acting = partial(guessed_actuators, frame, proposed, hung=bool(hung or circles))
+    sent = [one.column or one.name for one in acting(Shape.circle(1.0))]
+    if sent:
+        shown.append(f"commands by their names: {', '.join(sent)}; correct [[actuator]]")
+    unused = [] if plain else [n for n in unused_columns(frame, proposed) if n not in sent]
+    if unused:
         shown.append(f"columns that are not used: {', '.join(unused)}")
-    as_is = plain and not shown
-    return Recorded(tuple(names), step, None if as_is else proposed, [*said, *shown], hung, circles)
+    layout_found = None if plain and not shown else proposed
+    return Recorded(tuple(names), step, layout_found, [*said, *shown], hung, circles, acting)
 
 
 def _read_with_cures(
@@ -452,13 +463,15 @@ def scene_text(answers: Answers, found: Recorded | None = None) -> str:
         above, end = name, (0.0, low)
     for name, (x, y, radius) in (found.circles if found else {}).items():
         joints.append(Joint("hinge", (name, WORLD), (0.0, radius), (x, y)))
+    name, shape = next(iter(answers.shapes.items()))
+    actuators = [replace(one, body=name) for one in (found.actuators(shape) if found else ())]
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("pbrl_ppl", "cli"), undefined=jinja2.StrictUndefined,
         trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
     )  # fmt: skip
     return environment.get_template("scene.toml.jinja").render(
         shapes={name: vars(shape) for name, shape in answers.shapes.items()},
-        side=answers.side, time_step=answers.time_step, joints=joints,
+        side=answers.side, time_step=answers.time_step, joints=joints, actuators=actuators,
         recording=found and found.layout, said=found.said if found else (),
         entry=lambda key, value: scene_toml.write([("", {key: value})]).strip(),
     )  # fmt: skip

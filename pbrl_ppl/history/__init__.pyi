@@ -11,6 +11,7 @@ from .ends import trimmed as trimmed
 from .files import read_commands as read_commands
 from .files import read_table as read_table
 from .files import table_of_arrays as table_of_arrays
+from .guesses import guessed_actuators as guessed_actuators
 from .guesses import unused_columns as unused_columns
 from .guesses import with_guesses as with_guesses
 from .history import History as History

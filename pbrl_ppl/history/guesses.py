@@ -12,7 +12,10 @@ from pbrl_ppl.history.clocks import TIMES, Say
 from pbrl_ppl.history.derived import derived_columns, with_derived
 from pbrl_ppl.history.files import COLUMNS
 from pbrl_ppl.history.text import unit_in_name
-from pbrl_ppl.scene import Recording, column_of
+from pbrl_ppl.scene import Actuator, Recording, Shape, column_of
+from pbrl_ppl.state import WRENCH
+
+Actuators = tuple[Actuator, ...]
 
 #: Names, in lower case, of each column of a history: of a message's field the last two parts.
 _GUESSES = {
@@ -78,6 +81,55 @@ def unused_columns(frame: pd.DataFrame, layout: Recording) -> list[str]:
         used |= {*parts} if name in used else set()
     left = [str(name) for name in frame.columns if not {name, unit_in_name(str(name))[0]} & used]
     return [name for name in left if frame[name].nunique() > 1]
+
+
+#: Words in names of columns of commands, by the kind of actuator.
+_ACTUATORS = {
+    "thruster": r"fan|thrust|prop|rotor|jet|rocket|engine",
+    "servo": r"goal|target|setpoint|servo|desired",
+    "motor": r"motor|duty|pwm|volt|throttle|current",
+}
+
+
+def guessed_actuators(
+    frame: pd.DataFrame, layout: Recording, shape: Shape, hung: bool
+) -> Actuators:
+    """Return actuators of the one body that unused columns' names give away.
+
+    None where the layout has wrenches, or they are more than three.
+
+    Parameters
+    ----------
+    frame : pandas.DataFrame
+        The table of the recording.
+    layout : Recording
+        What is known.
+    shape : Shape
+        Outline of the body: a fan on the left or right is at its edge.
+    hung : bool
+        Whether it hangs on a hinge, which a motor or a servo needs.
+    """
+    if any(name in WRENCH for name in (*dict(layout.columns), *frame.columns)):
+        return ()
+    found = []
+    for column in unused_columns(frame, layout):
+        text = column.lower()
+        kind = next((k for k, words in _ACTUATORS.items() if re.search(words, text)), None)
+        if kind is None or not (hung or kind != "servo"):
+            continue
+        side = float("left" in text) - float("right" in text)
+        *_, low, high = shape.bounds
+        place = (0.0, round(side * 0.4 * (high - low), 6))
+        name = re.sub(r"\W+", "_", column).strip("_") or "command"
+        kind = "thruster" if kind == "motor" and not hung else kind
+        found.append(
+            Actuator(
+                name=name if name.isidentifier() else f"command_{name}",
+                kind=kind, body="body", column="" if name == column else column,
+                at=place if kind == "thruster" else (0.0, 0.0),
+            )
+        )  # fmt: skip
+    return tuple(found) if len(found) <= len(WRENCH) else ()
 
 
 def _plain(name: str) -> str:

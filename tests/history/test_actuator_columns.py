@@ -1,0 +1,90 @@
+"""Commands of actuators: read from columns of their names, and guessed for a new scene."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pbrl_ppl.cli import main
+from pbrl_ppl.errors import HistoryError
+from pbrl_ppl.history import History
+from pbrl_ppl.scene import Actuator, Body, Recording, Scene, Shape
+
+pytestmark = pytest.mark.one_stack
+
+
+def craft(*names: str) -> Scene:
+    fans = tuple(
+        Actuator(name=name, kind="thruster", body="craft", known={"gain": 0.5})
+        for name in names or ("left_fan", "right_fan")
+    )
+    return Scene(time_step=0.1, bodies=(Body("craft", Shape.circle(0.1)),), actuators=fans)
+
+
+def log(n: int = 12) -> pd.DataFrame:
+    time = 0.1 * np.arange(n)
+    table = pd.DataFrame({"time": time, "x": time, "y": 0.0, "theta": 0.1 * time})
+    return table.assign(left_fan=np.arange(n) % 2, right_fan=1.0)
+
+
+def commands(history: History) -> np.ndarray:
+    return history.dataset["action"].to_numpy()[0, :-1, 0]
+
+
+def test_columns_of_actuators_are_read(tmp_path: Path) -> None:
+    log().to_csv(tmp_path / "log.csv", index=False)
+    read = commands(History.load(tmp_path / "log.csv", craft()))
+    np.testing.assert_array_equal(read[:, 0], np.arange(11) % 2)
+    np.testing.assert_array_equal(read[:, 1:], np.tile([1.0, 0.0], (11, 1)))
+
+
+def test_a_saved_history_is_read_again(tmp_path: Path) -> None:
+    scene = craft()
+    history = History.from_dataframe(log(), scene, layout=Recording())
+    history.save(tmp_path / "saved.csv")
+    again = History.load(tmp_path / "saved.csv", scene)
+    assert again.data_sha256 == history.data_sha256
+
+
+def test_one_row_a_body() -> None:
+    """Of two bodies one has an actuator; the column is read on its rows."""
+    scene = craft("fan")
+    scene = scene.replace(bodies=(*scene.bodies, Body("puck", Shape.circle(0.1))))
+    rows = [log().drop(columns=["left_fan", "right_fan"]).assign(body=b) for b in ("craft", "puck")]
+    table = pd.concat(rows).assign(fan=3.0, trajectory=0, force_x=7.0, force_y=0.0, torque=0.0)
+    table = table.assign(vx=np.nan, vy=np.nan, omega=np.nan).sort_values("time", kind="stable")
+    action = History.from_dataframe(table, scene).dataset["action"].to_numpy()[0, :-1]
+    assert (action[:, 0, 0] == 3.0).all()
+    assert (action[:, 1, 0] == 7.0).all()
+
+
+def test_a_missing_column_is_named() -> None:
+    with pytest.raises(HistoryError, match='no column "right_fan"'):
+        History.from_dataframe(log().drop(columns="right_fan"), craft(), layout=Recording())
+
+
+@pytest.mark.parametrize(
+    ("column", "shape", "kind"),
+    [
+        ("left fan [%]", "craft=circle:0.1", "thruster"),
+        ("motor_pwm", "arm=box:0.02x0.2", "motor"),
+        ("goal position", "arm=box:0.02x0.2", "servo"),
+    ],
+)
+def test_new_proposes_actuators(tmp_path: Path, column: str, shape: str, kind: str) -> None:
+    """From a log of a free body, or of an angle alone; the log is read with what it proposes."""
+    hung = shape.startswith("arm")
+    table = log().drop(columns=["left_fan", "right_fan"]).assign(**{column: np.arange(12) % 3})
+    if hung:
+        table = table.drop(columns=["x", "y"])
+    path, scene_path = tmp_path / "log.csv", tmp_path / "scene.toml"
+    table.to_csv(path, index=False)
+    given = ["--side" if hung else "--top", "--quiet"]
+    assert main(["new", str(scene_path), "--history", str(path), "--body", shape, *given]) == 0
+    scene = Scene.load(scene_path)
+    (actuator,) = scene.actuators
+    assert actuator.kind == kind
+    if kind == "thruster":
+        assert actuator.at[1] > 0.0
+    np.testing.assert_array_equal(commands(History.load(path, scene))[:, 0], np.arange(11) % 3)
