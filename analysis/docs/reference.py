@@ -3,6 +3,8 @@
 import ast
 import inspect
 import re
+import sys
+from collections.abc import Collection
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -22,7 +24,7 @@ FORMULAS = {
     "pivot_damping": "torque = −coefficient · ω, ω relative to the other body of the hinge",
     "pivot_friction": "torque = −torque · sign(ω); at rest, any torque up to it",
     "pivot_load_friction": "|torque| ≤ motor · |commanded torque| + load · |torque of "
-        "all else about the hinge|, beside other friction",
+    "all else about the hinge|, beside other friction",
     "pivot_stribeck": "|torque| ≤ torque · exp(−(ω / speed)²), beside other friction",
     "slider_damping": "F = −coefficient · v along the axis, v relative to the other body",
     "slider_friction": "F = −force · sign(v) along the axis; at rest, any force up to it",
@@ -34,7 +36,7 @@ FORMULAS = {
     "quadratic_drag_by_axis": "F = −R(θ) (along · |v_x′| v_x′, across · |v_y′| v_y′), v′ = R(−θ) v",
     "power_drag": "F = −force · (|v| / v₀)^exponent · v / |v|, v₀ the typical speed",
     "power_angular_drag": "torque = −torque · (|ω| / ω₀)^exponent · sign(ω), ω₀ the "
-        "typical angular speed",
+    "typical angular speed",
     "gravity_tilt": "g → R(angle) g",
     "constant_force": "F = (force_x, force_y) in the world's frame",
     "body_force": "F = R(θ) (force_x, force_y): turns with the body",
@@ -50,7 +52,7 @@ FORMULAS = {
     "command_power": "u → u (|u| / u₀)^(exponent − 1), u₀ a typical force or torque",
     "gain_by_speed": "u → u (1 − share · v_u / v₀), v_u the speed along u, v₀ the typical one",
     "gain_by_place": "u → u (1 + (along_x, along_y) · (x − x₀) / r₀), x₀ the mean "
-        "place, r₀ the typical range",
+    "place, r₀ the typical range",
     "fading_gain": "u → u exp(−rate · t), t since the trajectory's start",
     "sliding_friction": "|F| ≤ mu m g against sliding, |torque| ≤ radius · mu m g against turning",
     "turning_friction": "|torque| ≤ torque against turning",
@@ -81,10 +83,10 @@ FORMULAS = {
     "lower_stop": "torque = stiffness · max(0, angle − θ)",
     "cogging": "torque = cosine · cos(count θ) + sine · sin(count θ)",
     "ripple": "F = cosine · cos(2π s / wavelength) + sine · sin(2π s / wavelength) along the "
-        "direction, s the place along it",
+    "direction, s the place along it",
     "cable": "F = −stiffness · max(0, |d| − length) d / |d|, d from the anchor to the body",
     "periodic_force": "F = cosine · cos(2π t / period) + sine · sin(2π t / period) along the "
-        "direction",
+    "direction",
     "periodic_torque": "torque = cosine · cos(2π t / period) + sine · sin(2π t / period)",
     "point_attractor": "F = strength · d / (|d|² + depth²)^1.5, d from the body to (x, y)",
     "mass_change": "m → factor · m from that time on, in that trajectory and later ones",
@@ -159,6 +161,17 @@ LOOK_ALIKES = (
     (("constant_torque", "periodic_torque"), "in short trajectories"),
     (("sensor_scale", "askew_camera"), "if the body stays at a place"),
 )  # fmt: skip
+#: Measured rigs on which an effect was named; see the page on hardware.
+FOUND = {
+    "pivot_damping": "a hobby servo that turns a weight, a propeller on an arm",
+    "pivot_friction": "a propeller on an arm, a double pendulum, a pole that swings",
+    "pivot_load_friction": "a hobby servo that turns a weight",
+    "pivot_stribeck": "a hobby servo that turns a weight",
+    "quadratic_drag": "a table-tennis ball on a string, a swinging pole",
+    "linear_drag": "a linear carriage",
+    "first_order_lag": "a propeller on an arm",
+    "turning_friction": "a puck that slides and turns",
+}
 #: Which bodies an effect suits, by the name of its condition.
 APPLIES = {
     "always": "any body that moves freely",
@@ -179,8 +192,15 @@ def on_files(files: Any, config: Any) -> Any:
     """Add the reference's pages."""
     from mkdocs.structure.files import File
 
-    for name, content in {**rooms(), "commands": command_page()}.items():
+    sys.path.insert(0, str(Path(__file__).parent))  # a hook is no package
+    import gallery
+
+    pictures = {effect.name: gallery.picture(effect) for effect in catalogue}
+    shown = {name: picture for name, picture in pictures.items() if picture is not None}
+    for name, content in {**rooms(shown), "commands": command_page()}.items():
         files.append(File.generated(config, f"reference/{name}.md", content=content))
+    for name, picture in shown.items():
+        files.append(File.generated(config, f"reference/gallery/{name}.svg", content=picture))
     return files
 
 
@@ -202,8 +222,11 @@ def _linked(role: re.Match[str]) -> str:
     return f'<autoref identifier="{name}" optional><code>{shown}</code></autoref>'
 
 
-def rooms() -> dict[str, str]:
-    """Return the reference's pages: the public names of each room, and the errors."""
+def rooms(pictures: Collection[str] = ()) -> dict[str, str]:
+    """Return the reference's pages: the public names of each room, and the errors.
+
+    ``pictures`` are the names of the effects that have one.
+    """
     found: dict[str, list[str]] = {}
     for statement in ast.parse((ROOT / "pbrl_ppl" / "__init__.pyi").read_text()).body:
         if isinstance(statement, ast.ImportFrom):
@@ -223,7 +246,7 @@ def rooms() -> dict[str, str]:
         blocks = "".join(f"{_entry(path)}\n\n" for path in paths)
         pages[room] = f"# {room.capitalize()}\n\n{said}\n\n{blocks}"
         if room == "effects":
-            pages[room] = f"{effects_page()}\n\n## In Python\n\n{said}\n\n{blocks}"
+            pages[room] = f"{effects_page(pictures)}\n\n## In Python\n\n{said}\n\n{blocks}"
     return pages
 
 
@@ -237,7 +260,7 @@ def _entry(path: str) -> str:
     )
 
 
-def effects_page() -> str:
+def effects_page(pictures: Collection[str] = ()) -> str:
     """Return the page of all effects of the catalogue, by stage."""
     text = [
         "# Effects", "",
@@ -261,13 +284,16 @@ def effects_page() -> str:
     for stage in STAGES:
         said = (inspect.getdoc(stage) or "").partition("\n")[0]
         text += ["", f"## At the stage {stage.__name__.lower()}", "", said]
-        text += [effect_entry(each) for each in catalogue if isinstance(each.stage, stage)]
+        those = [each for each in catalogue if isinstance(each.stage, stage)]
+        text += [effect_entry(each, each.name in pictures) for each in those]
     return "\n".join(text)
 
 
-def effect_entry(effect: Effect) -> str:
+def effect_entry(effect: Effect, picture: bool = False) -> str:
     """Return the entry of an effect: its law, parameters, look-alikes and declaration."""
     text = ["", f"### {effect.name}", "", f"{effect.sentence[0].upper()}{effect.sentence[1:]}.", ""]
+    if picture:
+        text += [f"![A motion with and without it, and the change](gallery/{effect.name}.svg)", ""]
     if effect.name in FORMULAS:
         text += [f"- Law: {FORMULAS[effect.name]}."]
     text += [
@@ -276,6 +302,9 @@ def effect_entry(effect: Effect) -> str:
         f"- Stage: {_stage(effect)}.",
         f'- In a scene: `effects = ["{effect.name}"]`.',
     ]
+    if effect.name in FOUND:
+        text += [f"- Found on: {FOUND[effect.name]}."]
+    text += [f"- Its code: {len(_code(effect).splitlines()) - 2} lines."]
     if effect.log_odds:
         text += [
             f"- Prior odds: −{-effect.log_odds:g} nats beside common effects such as drag"
