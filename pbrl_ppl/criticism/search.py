@@ -19,7 +19,7 @@ from scipy.stats import norm
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.results import Law, LawsOfSize, Rung
 from pbrl_ppl.criticism.score import named_beside, rank_candidates
-from pbrl_ppl.criticism.subsets import Regression, Subset, best_subsets, simplicity
+from pbrl_ppl.criticism.subsets import Regression, Subset, best_subsets
 from pbrl_ppl.effects import Attached, Noise, Structure
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem, in_pieces, output_error
@@ -421,26 +421,23 @@ class Search:
         weight: Floats,
         *,
         most: int = 4,
+        near: float = 0.85,
     ) -> tuple[Subset, Mode]:
         """Return the subset and its refit, with the laws of each one's family that do better.
 
-        ``most``: laws that are tried in the place of one, the simplest.
+        ``most``: laws that are tried in the place of one, with a share of ``near`` of what the
+        regression says of it at least.
         """
-        ranked = sorted(regression.signatures, key=lambda one: simplicity(one.attached))
-        scored = {one.attached: one for one in ranked if one.linear}
         for law in subset.laws:
-            there = fitted.problem.physics.effects
-            rivals = [
-                one for one in scored
-                if law.effect.family and one.effect.family == law.effect.family
-                and one.body == law.body and one not in there
-            ][:most]  # fmt: skip
-            sizes = {  # what a law is alone says little of it beside others
-                one: np.array(list(scored[one].candidate.estimate.values()))
-                if one.effect.scan
-                else np.array(one.effect.null)
-                for one in rivals
-            }
+            rest, effects = set(subset.laws) - {law}, fitted.problem.physics.effects
+            sizes: dict[Attached, Floats] = {}
+            for other in regression.subsets:
+                (rival, *more) = set(other.laws) - rest or {law}
+                fits = not more and len(other.laws) == len(subset.laws) and rest < set(other.laws)
+                alike = rival.effect.family == law.effect.family and rival.body == law.body
+                if fits and alike and rival not in effects and other.share > near * subset.share:
+                    sizes.setdefault(rival, other.sizes[rival])
+            rivals = list(sizes)[:most] if law.effect.family else []
             swaps = in_parallel(partial(_swapped, fitted, law, sizes), rivals)
             nats = [
                 Evidence.of(before, mode, -one.effect.log_odds, weight).nats

@@ -228,11 +228,6 @@ def best_subsets(
     )
 
 
-def simplicity(law: Attached) -> float:
-    """Return the price of a law before anything is known: twice its parameters, less log odds."""
-    return 2 * len(law.labels) - law.effect.log_odds
-
-
 def _distinct(
     signatures: Sequence[Signature], candidates: Sequence[Attached]
 ) -> tuple[list[Signature], dict[Attached, tuple[Attached, ...]]]:
@@ -243,7 +238,8 @@ def _distinct(
     order = {law: place for place, law in enumerate(candidates)}
 
     def simple(signature: Signature) -> tuple[float, int]:
-        return simplicity(signature.attached), order[signature.attached]
+        law = signature.attached
+        return 2 * len(law.labels) - law.effect.log_odds, order[law]
 
     distinct: list[Signature] = []
     same: dict[Attached, tuple[Attached, ...]] = {}

@@ -17,7 +17,13 @@ _PLACE = Prior("normal", sigma=1.0)
 
 
 def _poses(history: History, body: Body, width: int) -> Floats:
-    """Return the first coordinates of a body where all were measured, shape (n, width)."""
+    """Return the first coordinates of a body where all are known, shape (n, width).
+
+    None where no place of it was measured.
+    """
+    seen = history.dataset["observed"].sel(body=body.name, state=["x", "y"]).to_numpy()
+    if not np.isfinite(seen).any():
+        return np.empty((0, width))
     poses = history.dataset["start"].sel(body=body.name).to_numpy()[..., :width].reshape(-1, width)
     return np.asarray(poses[np.isfinite(poses).all(axis=1)])
 
