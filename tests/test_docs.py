@@ -87,6 +87,7 @@ def test_the_guide_to_verdicts_quotes_the_package() -> None:
     quoted = re.findall(r"^- `([^`]+)`:", page, re.M)
     assert len(quoted) > 25
     said = "\1".join(text for path in (ROOT / "pbrl_ppl").rglob("*.py") for text in texts(path))
+    said += "".join(path.read_text() for path in (ROOT / "pbrl_ppl").rglob("*.jinja"))
     assert [words for words in quoted if words not in said] == []
 
 

@@ -177,6 +177,53 @@ pivot_one_way_damping = Effect(
 )
 
 
+def _bend(state: Floats, command: Floats, parameters: Floats, change: Floats) -> None:
+    most = parameters[1] * (1.0 + parameters[2] * math.exp(-((state[5] / parameters[3]) ** 2)))
+    bend = min(max(command[12], -most), most)  # steps that are too long go beyond
+    change[0] = state[5] - abs(state[5]) * bend / most
+
+
+def _hold_back(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
+    most = parameters[1] * (1.0 + parameters[2])
+    wrench[2] -= parameters[0] * min(max(command[12], -most), most) / parameters[1]
+
+
+def _begin_bent(state: Floats, command: Floats, parameters: Floats, memory: Floats) -> None:
+    # as in steady motion
+    memory[0] = math.copysign(parameters[1], state[5]) if state[5] != 0.0 else 0.0
+
+
+def _scan_bends(scene: Scene, history: History, body: Body) -> Floats:
+    """Return angles of bending without and with a rise; the derivative is taken by the torque."""
+    speeds = _speeds(history, body, "omega")
+    return np.array(
+        [(np.nan, bend, rise, speeds[0]) for bend in (0.01, 0.05) for rise in (0.0, 0.5)]
+        if len(speeds)
+        else []
+    ).reshape(-1, 4)
+
+
+pivot_hysteresis = Effect(
+    "pivot_hysteresis",
+    (
+        EffectParameter("torque", "N m", _SHARE, scale="torque"),
+        EffectParameter("angle", "rad", Prior("log_normal", mu=-4.0, sigma=1.0), null=0.02),
+        EffectParameter("rise", "1", _SHARE),
+        EffectParameter(
+            "speed", "rad/s", Prior("log_normal", mu=-1.5, sigma=1.0), null=0.2, scale="turn_rate"
+        ),
+    ),
+    "dry friction in the hinge that bends before it slips: after a turn it builds up over an angle,"
+    " and it may be stronger near standstill by a share",
+    "LuGre friction (C. Canudas de Wit et al., IEEE Transactions on Automatic Control 40, 1995)",
+    Force(_hold_back, memory=1, rate=_bend, begin=_begin_bent),
+    applies=is_pivoted,
+    scan=_scan_bends,
+    log_odds=-3.0,
+    family="dry friction",
+)
+
+
 def _add_turn_torque(properties: dict[str, Floats], parameters: Values, clock: Clock) -> None:
     properties["turn_torque"] = properties["turn_torque"] + parameters["torque"]
 

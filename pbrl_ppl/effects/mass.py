@@ -1,9 +1,11 @@
 """Mass, moment of inertia and centre of mass."""
 
+import math
+
 import numpy as np
 
-from pbrl_ppl.effects.effect import Effect, EffectParameter
-from pbrl_ppl.effects.stages import Clock, Properties, Values
+from pbrl_ppl.effects.effect import Effect, EffectParameter, is_unpivoted
+from pbrl_ppl.effects.stages import Clock, Force, Properties, Values
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene
@@ -79,4 +81,48 @@ mass_change = Effect(
     Properties(_scale_mass, timed=True),
     scan=_scan_begins,
     log_odds=-8.0,
+)
+
+
+def _slosh(state: Floats, command: Floats, parameters: Floats, change: Floats) -> None:
+    rate = 2.0 * math.pi * parameters[1]
+    for i in range(2):
+        off, speed = command[12 + i] - state[i], command[14 + i]
+        change[i] = speed
+        change[2 + i] = -rate * rate * off - 2.0 * parameters[2] * rate * (speed - state[3 + i])
+
+
+def _press(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
+    rate = 2.0 * math.pi * parameters[1]
+    for i in range(2):
+        off, speed = command[12 + i] - state[i], command[14 + i] - state[3 + i]
+        wrench[i] += parameters[0] * (rate * rate * off + 2.0 * parameters[2] * rate * speed)
+
+
+def _begin_at_rest(state: Floats, command: Floats, parameters: Floats, memory: Floats) -> None:
+    for i in range(2):
+        memory[i], memory[2 + i] = state[i], state[3 + i]
+
+
+def _scan_frequencies(scene: Scene, history: History, body: Body) -> Floats:
+    """Return frequencies of some intervals; the derivative is taken by the mass."""
+    return np.array([(np.nan, 1.0 / (n * scene.time_step), 0.05) for n in (6, 12, 25)])
+
+
+sloshing = Effect(
+    "sloshing",
+    (
+        EffectParameter("mass", "kg", Prior("half_normal", sigma=0.5), scale="mass"),
+        EffectParameter(
+            "frequency", "Hz", Prior("log_normal", mu=-2.0, sigma=1.0), null=0.1, scale="/interval"
+        ),
+        EffectParameter("damping", "1", Prior("half_normal", sigma=0.2), null=0.05),
+    ),
+    "a mass that swings within the body, beside the body's own: a liquid, a loose load, a flexible"
+    " mast",
+    "a mass on a spring and a damper, at rest in the body when a transition begins",
+    Force(_press, memory=4, rate=_slosh, begin=_begin_at_rest),
+    applies=is_unpivoted,
+    scan=_scan_frequencies,
+    log_odds=-4.0,
 )

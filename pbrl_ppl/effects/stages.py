@@ -204,13 +204,35 @@ class Force:
     ----------
     law : callable
         See :data:`Law`. ``command`` (3,) is the wrench after the command stage, followed by
-        :data:`TIME` and :data:`INTERVAL`; ``wrench`` is the sum so far.
+        :data:`TIME`, :data:`INTERVAL` and :data:`MEMORY`; ``wrench`` is the sum so far.
     timed : bool
         Whether the law depends on the time.
+    memory : int
+        How many numbers of its own the law has, such as the place of a mass that sloshes.
+    rate : callable, optional
+        ``rate(state, command, parameters, change)`` sets their rates of change (1/s).
+    begin : callable, optional
+        ``begin(state, command, parameters, memory)`` sets them where a transition begins; zero
+        without it.
+
+    Raises
+    ------
+    EffectError
+        If the memory is too large.
     """
 
     law: Law
     timed: bool = False
+    memory: int = 0
+    rate: Law | None = None
+    begin: Law | None = None
+
+    def __post_init__(self) -> None:
+        """Check the memory."""
+        if not 0 <= self.memory <= MOST_MEMORY:
+            raise EffectError(
+                f"a law has {self.memory} numbers of its own, expected 0 to {MOST_MEMORY}"
+            )
 
 
 @final

@@ -18,6 +18,7 @@ from pbrl_ppl.physics.laws import (
     MORE,
     WRENCHES,
     act,
+    begin_held,
     bound,
     laws_of,
     set_memory,
@@ -48,6 +49,7 @@ class Scratch(NamedTuple):
     acted: NDArray[np.float64]  # (body + 4, 12), see `act`
     memory: NDArray[np.float64]  # (2, slot), see `set_memory`
     at: NDArray[np.int64]  # (2,), the same
+    held: NDArray[np.float64]  # (2, slot), see `act`
 
 
 @numba.njit(inline="always")
@@ -124,7 +126,7 @@ def _transition(  # type: ignore[no-untyped-def]
     """
     k = len(world.bodies)
     step = batch.time_step / substeps
-    state, axes, acted, memory, at = scratch
+    state, axes, acted, memory, at, held = scratch
     inputs, end = batch.inputs[t], begin
     properties, joints = intervals(batch.given[0], p, t, len(inputs)), batch.given[1][p]
     copy(first, state)
@@ -139,7 +141,8 @@ def _transition(  # type: ignore[no-untyped-def]
     braked = len(laws.frictions) > 0
     watch = len(world.obstacles) > 0 or k > 1
     place_bodies(fn, world, bodies, state)
-    set_memory(batch, laws, p, t, begin, first, acted, memory, at)
+    set_memory(batch, laws, p, t, begin, first, acted, memory, held, at)
+    begin_held(state, laws, acted, held)
     while end < len(inputs) and (whole or near or end == begin):
         h = end
         if h > begin and len(properties) > 1:
@@ -157,7 +160,11 @@ def _transition(  # type: ignore[no-untyped-def]
         for s in range(substeps):
             near = False
             if acting:
-                act(state, inputs[h], laws, s / substeps, (s + 1) / substeps, acted, memory[1])
+                act(
+                    state, inputs[h], laws, s / substeps, (s + 1) / substeps, acted, memory[1], held
+                )
+                for slot in range(held.shape[1]):
+                    held[0, slot] += step * held[1, slot]
             if braked:
                 set_brakes(world, laws, bodies, joints, state, acted)
             for i in range(k):
@@ -190,7 +197,7 @@ def _transition(  # type: ignore[no-untyped-def]
                 touched = _TOUCHED if near else touched
         copy(state, out[h])
         if memory.shape[1] > 0:
-            act(state, inputs[h], laws, LATE, 1.0, acted, memory[1], True)
+            act(state, inputs[h], laws, LATE, 1.0, acted, memory[1], held, True)
         end += 1
     return touched, end
 
@@ -219,7 +226,9 @@ def rollout(fn, world, batch, items, begins, whole, out):  # type: ignore[no-unt
     k = len(world.bodies)
     axes = np.empty((len(world.wheel_body), 2))
     acted, memory = np.zeros((k + MORE, ACTED)), np.zeros((2, batch.slots))
-    scratch = Scratch(np.empty((k, 6)), axes, acted, memory, np.full(2, -1))
+    scratch = Scratch(
+        np.empty((k, 6)), axes, acted, memory, np.full(2, -1), np.zeros((2, batch.held))
+    )
     proposal, finer = -1, 1
     start, outcome = batch.start, _TOUCHED  # an earlier call may have left contacts
     for place in range(len(items)):

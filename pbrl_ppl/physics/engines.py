@@ -31,6 +31,7 @@ class Batch(NamedTuple):
     forces: Ints
     frictions: Ints
     slots: int
+    held: int
     follows: NDArray[np.bool_]
     start: Floats
     inputs: Floats

@@ -23,6 +23,7 @@ from pbrl_ppl.physics.laws import (
     WRENCHES,
     Laws,
     act,
+    begin_held,
     laws_of,
     set_memory,
 )
@@ -100,10 +101,16 @@ def _slope(work, laws, u, a, inputs, share, low, high):  # type: ignore[no-untyp
 @compiled
 def _load(work, flow, u, inputs, share, low, high):  # type: ignore[no-untyped-def]
     """Set what acts there: wrenches, forces, and rows of friction."""
-    laws = flow.laws
+    laws, motion, held = flow.laws, work.motion, work.n + 1
+    for s in range(flow.held):
+        work.held[0, s] = motion[u - 1, held + s]
     if len(laws.commands) + len(laws.forces) > 0:
         begin = min(max(low + _SHORTEST, share), high - _WINDOW)  # past a jump that is no switch
-        act(work.states, inputs, laws, begin, begin + _WINDOW, work.acted, flow.memory[1])
+        act(
+            work.states, inputs, laws, begin, begin + _WINDOW, work.acted, flow.memory[1], work.held
+        )
+    for s in range(flow.held):
+        motion[u, held + s] = work.held[1, s]
     set_forces(work, u)
     set_bounds(work, laws, u)
 
@@ -257,7 +264,8 @@ def _step(work, laws, inputs, share, low, high, width):  # type: ignore[no-untyp
     """
     motion, kinds, rings = work.motion, work.kinds, work.rings
     n, count, seconds, end, way = work.n, work.n_rows, width * laws.time_step, 1.0, 1.0
-    for j in range(n):
+    ends = n + 1 + laws.held  # after the numbers of laws, which have speeds alone
+    for j in range(ends):
         motion[SLOPES, j] = motion[U, j]
     for stage in range(1, 7):
         for j in range(n):
@@ -267,9 +275,16 @@ def _step(work, laws, inputs, share, low, high, width):  # type: ignore[no-untyp
                 u += _WEIGHTS[stage, k] * motion[SLOPES + 2 * k + 1, j]
             motion[END_Q, j] = motion[Q, j] + seconds * q
             motion[END_U, j] = motion[SLOPES + 2 * stage, j] = motion[U, j] + seconds * u
+        for j in range(n + 1, ends):
+            q = 0.0
+            for k in range(stage):
+                q += _WEIGHTS[stage, k] * motion[SLOPES + 2 * k, j]
+            motion[END_Q, j] = motion[Q, j] + seconds * q
         set_places(work, END_Q, END_U)
         at = share + _TIMES[stage] * width
         _slope(work, laws, END_U, SLOPES + 2 * stage + 1, inputs, at, low, high)
+        for j in range(n + 1, ends):
+            motion[SLOPES + 2 * stage, j] = motion[END_U, j]
         end = _margin(work, laws, END_U)
         way = min(way, end)
     for r in range(count, work.n_kinds):
@@ -291,6 +306,13 @@ def _step(work, laws, inputs, share, low, high, width):  # type: ignore[no-untyp
             u += _ERROR[stage] * motion[SLOPES + 2 * stage + 1, j]
         error = max(error, seconds * (abs(q) + laws.time_step * abs(u)) / motion[SIZE, j])
         if not math.isfinite(q + u):
+            return np.inf, end, way
+    for j in range(n + 1, ends):
+        q = 0.0
+        for stage in range(7):
+            q += _ERROR[stage] * motion[SLOPES + 2 * stage, j]
+        error = max(error, seconds * abs(q) / motion[SIZE, j])
+        if not math.isfinite(q):
             return np.inf, end, way
     return error / laws.tolerance, end, way
 
@@ -356,6 +378,8 @@ def _advance(work, laws, still, inputs, low, high, budget, wanted):  # type: ign
             fresh, left = end < -_LOCATED, end
             wider = width * min(5.0, 0.9 * max(error, 1e-9) ** -0.2)
             wanted = min(1.0, max(wanted, wider) if last or wanted > width else wider)
+        for j in range(n + 1, n + 1 + laws.held):
+            motion[Q, j], motion[U, j] = motion[END_Q, j], motion[END_U, j]
         for j in range(n):
             motion[Q, j], motion[U, j] = motion[END_Q, j], motion[END_U, j]
             motion[SLOPES + 1, j] = motion[SLOPES + 13, j]
@@ -393,6 +417,7 @@ class Flow(NamedTuple):
 
     laws: Laws
     memory: Floats  # (2, slot), see `laws.set_memory`
+    held: int  # numbers of force laws
     time_step: float  # s
     tolerance: float  # error of a step, as a share of natural sizes
     length: float  # natural size of a way (m)
@@ -415,7 +440,9 @@ def rollout(works, still, batch, items, begins, out):  # type: ignore[no-untyped
         item = items[place]
         p, t = item // n, item % n
         laws = laws_of(batch, p)
-        flow = Flow(laws, memory, batch.time_step, batch.tolerance, still.length)
+        flow = Flow(
+            laws, memory, batch.held, batch.time_step, batch.tolerance, still.length
+        )  # fmt: skip
         if p != proposal:
             proposal = p
             for j in range(discs.shape[1]):
@@ -440,7 +467,10 @@ def rollout(works, still, batch, items, begins, out):  # type: ignore[no-untyped
                 for k in range(bodies):
                     for d in range(6):
                         work.states[k, d] = begin[k, d]
-                set_memory(batch, laws, p, t, h, work.states, work.acted, memory, at)
+                set_memory(batch, laws, p, t, h, work.states, work.acted, memory, work.held, at)
+                begin_held(work.states, laws, work.acted, work.held)
+                for s in range(batch.held):
+                    work.motion[Q, work.n + 1 + s] = work.held[0, s]
             inputs, budget, low, high = batch.inputs[t, h], MOST_STEPS, 0.0, 0.0
             for k in range(bodies):
                 for w in range(3):
@@ -452,7 +482,7 @@ def rollout(works, still, batch, items, begins, out):  # type: ignore[no-untyped
                 high = _switch(laws, low)
                 budget, wanted = _advance(work, flow, still, inputs, low, high, budget, wanted)
             if batch.slots > 0:
-                act(work.states, inputs, laws, LATE, 1.0, work.acted, memory[1], True)
+                act(work.states, inputs, laws, LATE, 1.0, work.acted, memory[1], work.held, True)
             if budget < 0:
                 begins[place] = h
                 break

@@ -21,7 +21,8 @@ MORE = 4
 #: in the memory, how many, the component that is alone (-1: none), whether it is under a body,
 #: whether the command jumps in an interval, at the fractional part of the first parameter, the
 #: parameter that is the share of the first command that the memory begins with (-1: none), and the
-#: body that the torque acts back on, relative to which the law sees angle and speed (-1: none).
+#: body that the torque acts back on, relative to which the law sees angle and speed (-1: none). Of
+#: a force, REMEMBER is the address of `rate`, and JUMPS that of `begin` (0: none).
 LAW, ON, FIRST, REMEMBER, SLOT, SLOTS, ALONE, UNDER, JUMPS, BEGINS, OTHER = range(11)
 
 
@@ -48,13 +49,16 @@ def laws_of(batch, p):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def act(state, interval, laws, begin, end, acted, memory, after=False):  # type: ignore[no-untyped-def]
+def act(  # type: ignore[no-untyped-def]
+    state, interval, laws, begin, end, acted, memory, held, after=False
+):  # fmt: skip
     """Compute the wrench on each body in a substep: the command stage, then the force stage.
 
     ``state`` is (body, 6) and ``interval`` the inputs of the interval, (body, 3 or more); ``begin``
     and ``end`` of the substep are shares of the interval. ``acted`` (body + 4, 12) becomes command,
     command before and wrench of each body; of the other rows a command law sees the first three.
-    ``memory`` is that of all laws when the interval begins; ``after`` it, it is brought up to date.
+    ``memory`` is that of command laws when the interval begins; ``after`` it, it is brought up to
+    date. ``held`` (2, slot) has the numbers of force laws, and gets their rates of change.
     """
     k, known, data = len(interval), interval.shape[1] > 3, acted.ctypes.data
     wide = 8 * ACTED
@@ -101,17 +105,39 @@ def act(state, interval, laws, begin, end, acted, memory, after=False):  # type:
     for e in range(len(laws.commands)):
         if laws.commands[e, OTHER] >= 0:
             acted[laws.commands[e, OTHER], WRENCHES + 2] -= acted[laws.commands[e, ON], COMMAND + 2]
-    for e in range(len(laws.forces)):
+    for e in range(0 if after else len(laws.forces)):
         law = laws.forces[e]
-        at = data + wide * law[ON]
-        call_law(
-            law[LAW], state.ctypes.data + 48 * law[ON], at,
-            laws.force_parameters.ctypes.data + 8 * law[FIRST], at + 8 * WRENCHES,
-        )  # fmt: skip
+        at, state_at = data + wide * law[ON], state.ctypes.data + 48 * law[ON]
+        seen, parameters_at = at, laws.force_parameters.ctypes.data + 8 * law[FIRST]
+        if law[SLOTS] > 0:
+            seen = data + wide * k
+            for w in range(ACTED):
+                acted[k, w] = acted[law[ON], w]
+            for s in range(law[SLOTS]):
+                acted[k + 1 + s // ACTED, s % ACTED] = held[0, law[SLOT] + s]
+            rates_at = held.ctypes.data + 8 * (held.shape[1] + law[SLOT])
+            call_law(law[REMEMBER], state_at, seen, parameters_at, rates_at)
+        call_law(law[LAW], state_at, seen, parameters_at, at + 8 * WRENCHES)
 
 
 @compiled
-def set_memory(batch, laws, p, t, begin, start, acted, memory, at):  # type: ignore[no-untyped-def]
+def begin_held(state, laws, acted, held):  # type: ignore[no-untyped-def]
+    """Set the numbers of force laws where a transition begins."""
+    k = len(acted) - MORE
+    for s in range(held.shape[1]):
+        held[0, s] = held[1, s] = 0.0
+    for e in range(len(laws.forces)):
+        law = laws.forces[e]
+        if law[SLOTS] > 0 and law[JUMPS] != 0:
+            call_law(
+                law[JUMPS], state.ctypes.data + 48 * law[ON], acted.ctypes.data + 8 * ACTED * k,
+                laws.force_parameters.ctypes.data + 8 * law[FIRST],
+                held.ctypes.data + 8 * law[SLOT],
+            )  # fmt: skip
+
+
+@compiled
+def set_memory(batch, laws, p, t, begin, start, acted, memory, held, at):  # type: ignore[no-untyped-def]
     """Set ``memory[1]``, shape (slot,), to what the laws of a proposal ``p`` remember.
 
     That is before the interval ``begin`` of the transition ``t``. Commands alone decide it: those
@@ -126,19 +152,19 @@ def set_memory(batch, laws, p, t, begin, start, acted, memory, at):  # type: ign
     while batch.follows[first] and not (at[0] == p and at[1] == first):
         first -= 1
     if not (at[0] == p and at[1] == first):
-        _begin_memory(laws, inputs[first, 0], start, acted, memory[0])
+        _begin_memory(laws, inputs[first, 0], start, acted, memory[0], held)
     for earlier in range(first, t):
         for h in range(inputs.shape[1]):
-            act(start, inputs[earlier, h], laws, LATE, 1.0, acted, memory[0], True)
+            act(start, inputs[earlier, h], laws, LATE, 1.0, acted, memory[0], held, True)
     at[0], at[1] = p, t
     for s in range(slots):
         memory[1, s] = memory[0, s]
     for h in range(begin):
-        act(start, inputs[t, h], laws, LATE, 1.0, acted, memory[1], True)
+        act(start, inputs[t, h], laws, LATE, 1.0, acted, memory[1], held, True)
 
 
 @compiled
-def _begin_memory(laws, interval, start, acted, memory):  # type: ignore[no-untyped-def]
+def _begin_memory(laws, interval, start, acted, memory, held):  # type: ignore[no-untyped-def]
     """Set what laws remember where nothing but the inputs (body, 9 or more) is known.
 
     As if the oldest wrench had lasted: the previous one, or the last of those before it.
@@ -161,7 +187,7 @@ def _begin_memory(laws, interval, start, acted, memory):  # type: ignore[no-unty
             for w in range(3):
                 past[i, w] = interval[i, now + w]
                 past[i, PREVIOUS + w] = interval[i, before + w]
-        act(start, past, laws, LATE, 1.0, acted, memory, True)
+        act(start, past, laws, LATE, 1.0, acted, memory, held, True)
 
 
 @compiled

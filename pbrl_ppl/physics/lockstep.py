@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.physics.compilation import compiled
-from pbrl_ppl.physics.laws import ACTED, LATE, MORE, act, laws_of, set_memory
+from pbrl_ppl.physics.laws import ACTED, LATE, MORE, act, begin_held, laws_of, set_memory
 from pbrl_ppl.physics.lockstep_bodies import (
     BLOCK,
     BODY,
@@ -80,7 +80,7 @@ def rollout(wheels, still, batch, items, begins, out):  # type: ignore[no-untype
     proposal, transition, first, until = np.zeros((4, BLOCK), dtype=np.int64)
     states, acted = np.empty((moving, 6)), np.zeros((moving + MORE, ACTED))
     memory, at = np.zeros((2, batch.slots)), np.full(2, -1)
-    remembered = np.zeros((BLOCK, batch.slots))
+    remembered, held = np.zeros((BLOCK, batch.slots)), np.zeros((BLOCK, 2, batch.held))
     for begin in range(0, len(items), BLOCK):
         width = min(BLOCK, len(items) - begin)
         longest = 0
@@ -118,11 +118,13 @@ def rollout(wheels, still, batch, items, begins, out):  # type: ignore[no-untype
                             align(body, i)
                         force_x, force_y = inputs[t, h, k, 0], inputs[t, h, k, 1]
                         set_wrench(body, i, force_x, force_y, inputs[t, h, k, 2])
-                for i in range(width if ahead == 0 and batch.slots > 0 else 0):
+                for i in range(width if ahead == 0 and batch.slots + batch.held > 0 else 0):
                     p, t = proposal[i], transition[i]
                     for k in range(moving):
                         get_state(bodies[k], i, states, k)
-                    set_memory(batch, laws_of(batch, p), p, t, first[i], states, acted, memory, at)
+                    laws = laws_of(batch, p)
+                    set_memory(batch, laws, p, t, first[i], states, acted, memory, held[i], at)
+                    begin_held(states, laws, acted, held[i])
                     remembered[i] = memory[1]
                 for s in range(substeps):
                     if acting:
@@ -132,8 +134,10 @@ def rollout(wheels, still, batch, items, begins, out):  # type: ignore[no-untype
                                 get_state(bodies[k], i, states, k)
                             act(
                                 states, inputs[t, h], laws_of(batch, p), s / substeps,
-                                (s + 1) / substeps, acted, remembered[i],
+                                (s + 1) / substeps, acted, remembered[i], held[i],
                             )  # fmt: skip
+                            for slot in range(batch.held):
+                                held[i, 0, slot] += step * held[i, 1, slot]
                             for k in range(moving):
                                 set_wrench(bodies[k], i, acted[k, 6], acted[k, 7], acted[k, 8])
                     if shifted:
@@ -149,7 +153,7 @@ def rollout(wheels, still, batch, items, begins, out):  # type: ignore[no-untype
                     for k in range(moving):
                         get_state(bodies[k], i, states, k)
                     laws = laws_of(batch, p)
-                    act(states, inputs[t, h], laws, LATE, 1.0, acted, remembered[i], True)
+                    act(states, inputs[t, h], laws, LATE, 1.0, acted, remembered[i], held[i], True)
                 for i in range(width):
                     item, h = items[begin + i], first[i] + ahead
                     if touched[i]:

@@ -88,6 +88,7 @@ WORK = np.dtype(
         ("system", np.float64, (4 * MOST, 4 * MOST + 1)),
         ("states", np.float64, (MOST, 6)),
         ("acted", np.float64, (MOST + MORE, ACTED)),  # see `laws.act`
+        ("held", np.float64, (2, MOST)),  # numbers of force laws, and their rates of change
     ],
     align=True,
 )

@@ -166,6 +166,10 @@ class Acting:
             if stage.begins and earlier[0, 0, 7] < np.inf:
                 last += parameters[-1] * (earlier[0, i, :3] - last)
             self._memory.append(np.tile(_alone(last, stage), stage.memory))
+        self._held = [np.zeros(stage.memory) for _, stage, _ in self._forces]
+        for (i, stage, parameters), held in zip(self._forces, self._held, strict=True):
+            if stage.begin is not None:
+                stage.begin(start[i], np.zeros(MEMORY), parameters, held)
         for before, now in pairwise([np.arange(3, 6), *older][::-1]):
             self.remember(start, np.hstack([earlier[0][:, now], earlier[0][:, before], 0 * past]))
         for interval in earlier[:-1]:
@@ -204,8 +208,13 @@ class Acting:
             if (other := self._others.get(i, -1)) >= 0 and stage.reacts:
                 total[other, 2] -= self.command[i, 2]
         signals[:, :3] = self.command
-        for i, stage, parameters in self._forces:
+        for (i, stage, parameters), held in zip(self._forces, self._held, strict=True):
+            signals[i, MEMORY : MEMORY + len(held)] = held
+            change = np.zeros_like(held)
+            if stage.rate is not None and not after:
+                stage.rate(states[i], signals[i], parameters, change)
             stage.law(states[i], signals[i], parameters, total[i])
+            held += (end - begin) * self._time_step * change
         return total
 
     def remember(self, states: Floats, interval: Floats) -> None:

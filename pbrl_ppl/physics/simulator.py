@@ -248,32 +248,40 @@ class Simulator:
         return np.array(counts, dtype=np.int64), np.array(weights, dtype=float)
 
     @cached_property
-    def _laws(self) -> tuple[Ints, Ints, Ints, int]:
-        """Rows of the laws of commands, forces and friction as in `laws`, numbers remembered."""
-        names, slots = [body.name for body in self.physics.scene.moving], 0
+    def _laws(self) -> tuple[Ints, Ints, Ints, int, int]:
+        """Rows of the laws of commands, forces and friction as in `laws`.
+
+        With how many numbers command laws remember, and force laws have of their own.
+        """
+        names, numbers = [body.name for body in self.physics.scene.moving], []
         tables = []
         for kind in (Command, Force, Friction):
-            first, rows = 0, []
+            first, slots, rows = 0, 0, []
             for attached in at_stage(self.physics.effects, kind):
                 stage: Any = attached.effect.stage
                 remember, count, alone = getattr(stage, "remember", None), 0, -1
                 if remember is not None:
                     count, remember = 3 * stage.memory, calls.law_address(remember)
+                jumps = int(getattr(stage, "jumps", False))
+                if getattr(stage, "rate", None) is not None:
+                    count, remember = stage.memory, calls.law_address(stage.rate)
+                    jumps = 0 if stage.begin is None else calls.law_address(stage.begin)
                 begins, reacts = (getattr(stage, x, False) for x in ("begins", "reacts"))
                 if getattr(stage, "alone", ""):
                     alone = WRENCH.index(stage.alone)
                 rows.append((
                     calls.law_address(stage.law), names.index(attached.body), first, remember or 0,
                     slots, count, alone, int(getattr(stage, "under", False)),
-                    int(getattr(stage, "jumps", False)),
+                    jumps,
                     first + len(attached.effect.parameters) - 1 if begins else -1,
                     holder(self.physics.scene, attached) if reacts else -1,
                 ))  # fmt: skip
                 first += len(attached.effect.parameters) + len(attached.effect.constants)
                 slots += count
+            numbers.append(slots)
             tables.append(np.array(rows, dtype=np.int64).reshape(-1, 11))
         commands, forces, frictions = tables
-        return commands, forces, frictions, slots
+        return commands, forces, frictions, numbers[0], numbers[1]
 
     def _new_world(self, choice: Choice) -> World:
         joined, there = choice

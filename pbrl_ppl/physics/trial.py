@@ -203,6 +203,10 @@ def _applied(effect: Effect, state: Floats, parameters: Floats, body: Body, unit
         remembered = command[MEMORY:].copy()
         if isinstance(stage, Command) and stage.remember is not None:
             stage.remember(state.copy(), command, numbers, remembered)
+        if isinstance(stage, Force) and stage.rate is not None:
+            stage.rate(state.copy(), command, numbers, remembered)
+            if stage.begin is not None:
+                stage.begin(state.copy(), command, numbers, command[MEMORY:])
         return np.concatenate([wrench, remembered])
     if isinstance(stage, Properties):
         values = {name: np.ones((1, 1)) for name in (*COLUMNS, *SEEN)}

@@ -31,6 +31,7 @@ AWAY = {
     "quadratic_angular_drag": 1e-3,
     "power_angular_drag": 1e-3,
     "cubic_torsion_spring": 1e-2,
+    "pivot_hysteresis": 1e-2,
 }
 #: What changes dry friction under a body needs some.
 BESIDE = dict.fromkeys(("sliding_stribeck", "friction_by_place"), "sliding_friction")
@@ -107,7 +108,9 @@ def test_null_value_is_no_effect(name, path) -> None:
     }
     null, moved = np.array([(values[x], x.startswith(name)) for x in sim.physics.layout.labels]).T
     null = np.where(moved > 0, null, 0.3)
-    np.testing.assert_array_equal(sim(null, start, inputs), without)
+    # steps are chosen for a law's own numbers as well
+    within = 1e-4 if getattr(effect.stage, "rate", None) else 0.0
+    np.testing.assert_allclose(sim(null, start, inputs), without, rtol=0.0, atol=within)
     there = np.where(moved > 0, 1.0, null) if name in LIMITS else null + moved * AWAY.get(name, 0.3)
     away = sim(there, start, inputs)
     if isinstance(effect.stage, Noise):  # it changes the likelihood alone
