@@ -20,6 +20,8 @@ catalogue: tuple[Effect, ...] = (
     friction.pivot_stribeck,
     friction.slider_damping,
     friction.slider_friction,
+    friction.slider_stribeck,
+    friction.slider_place_friction,
     drag.linear_drag,
     drag.quadratic_drag,
     drag.angular_drag,

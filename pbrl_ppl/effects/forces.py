@@ -113,6 +113,7 @@ def _scan_counts(scene: Scene, history: History, body: Body) -> Floats:
     """Return numbers of teeth of which the body passes some; the derivative is by the torques."""
     theta = history.dataset["start"].sel(body=body.name, state="theta").to_numpy()
     reach = float(np.nanmax(theta, initial=-np.inf) - np.nanmin(theta, initial=np.inf))
+    reach = min(reach, 2.0 * np.pi)
     counts = [n for n in (2, 3, 4, 6, 8, 12) if 2.0 * np.pi < n * reach < 2.0 * np.pi * 12.0]
     return np.array([(np.nan, np.nan, n) for n in counts]).reshape(-1, 3)
 

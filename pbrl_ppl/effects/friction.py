@@ -310,6 +310,47 @@ sliding_stribeck = Effect(
 )
 
 
+slider_stribeck = Effect(
+    "slider_stribeck",
+    (
+        EffectParameter("force", "N", _SHARE, scale="force"),
+        EffectParameter(
+            "speed", "m/s", Prior("log_normal", mu=-1.5, sigma=1.0), null=0.2, scale="speed"
+        ),
+    ),
+    "dry friction in the slider that is stronger near standstill than in motion: it sticks, then"
+    " slips",
+    "Stribeck's curve, F = F_s exp(-(v/v_s)^2) beside Coulomb's",
+    Friction(_fall_with_speed),
+    applies=is_sliding,
+    scan=_scan_speeds,
+    log_odds=-2.0,
+    family="dry friction",
+)
+
+
+def _vary_along(state: Floats, load: Floats, parameters: Floats, most: Floats) -> None:
+    off = parameters[0] * (state[0] - parameters[2]) + parameters[1] * (state[1] - parameters[3])
+    most[0] += off / parameters[4]
+
+
+slider_place_friction = Effect(
+    "slider_place_friction",
+    (
+        EffectParameter("along_x", "N", _DIFFERENCE, scale="force"),
+        EffectParameter("along_y", "N", _DIFFERENCE, scale="force"),
+    ),
+    "dry friction in the slider that is stronger at one end of the rail, by this force at the"
+    " typical distance from the middle",
+    "Coulomb's law, F + a . (x - x0) / r0, with the mean place x0 and a typical range r0",
+    Friction(_vary_along),
+    applies=is_sliding,
+    constants=("x", "y", "range"),
+    log_odds=-3.0,
+    family="dry friction",
+)
+
+
 def _vary_with_place(state: Floats, load: Floats, parameters: Floats, most: Floats) -> None:
     share = parameters[0] * (state[0] - parameters[2]) + parameters[1] * (state[1] - parameters[3])
     most[0] *= 1.0 + share / parameters[4]

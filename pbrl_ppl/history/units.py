@@ -13,6 +13,10 @@ from pbrl_ppl.scene import MASS_PRIOR, Scene, units_of
 from pbrl_ppl.state import STATE, THETA, VELOCITY, WRENCH, Floats, wrapped
 
 
+#: A body that moves turns at least by this share of its way over its length, for its units.
+_TURNS = 0.01
+
+
 def with_units(scene: Scene, history: History) -> Scene:
     """Return the scene with the natural units of its bodies as a recording shows them.
 
@@ -76,7 +80,9 @@ def _measured(
         units["mass"] * unit_moment * spin_up,
         _size(wrench[..., WRENCH.index("torque") :]),
     )
-    rates = dict(speed=speed, turn_rate=turn_rate or speed / units["length"])
+    # the noise of an angle that never changes is no turning
+    turn_rate = max(turn_rate, _TURNS * speed / units["length"])
+    rates = dict(speed=speed, turn_rate=turn_rate)
     return {
         "force": force,
         "torque": torque,

@@ -91,7 +91,9 @@ def set_brakes(world, laws, bodies, joints, state, acted):  # type: ignore[no-un
         i = setting.row
         if setting.column != COLUMN.pivot_torque:
             continue
-        row, rest = bodies[i], 0.0
+        row, rest = bodies[i], 0.0  # of a slider the force that is commanded, and the speed
+        torque = math.sqrt(acted[i, COMMAND] ** 2 + acted[i, COMMAND + 1] ** 2)
+        speed = math.sqrt(state[i, 3] ** 2 + state[i, 4] ** 2)
         for hinge in world.pivots:
             if hinge[0] == i:  # body, joint, column of the anchor on the body
                 x, y = row[COLUMN.com_x], row[COLUMN.com_y]
@@ -102,7 +104,7 @@ def set_brakes(world, laws, bodies, joints, state, acted):  # type: ignore[no-un
                 weight_x = world.gravity_x + row[COLUMN.extra_gravity_x]
                 weight_y = world.gravity_y + row[COLUMN.extra_gravity_y]
                 rest = row[COLUMN.mass] * (x * weight_y - y * weight_x)
-        torque, speed = acted[i, COMMAND + 2], abs(state[i, 5])
+                torque, speed = acted[i, COMMAND + 2], abs(state[i, 5])
         most = bound(row[COLUMN.pivot_torque], laws, i, 0, state, torque, rest, speed, acted)
         call1(setting.function, setting.constraint, most)
 

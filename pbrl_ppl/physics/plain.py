@@ -311,7 +311,8 @@ def _place_constraints(
     """Put the far ends of rods where the substep is predicted to end; set greatest forces."""
     for constraint, setting, i, _ in world.body_settings:
         if setting.attribute == "max_force" and setting.columns == (COLUMN.pivot_torque,):
-            row, rest = bodies[i], 0.0
+            row, rest = bodies[i], 0.0  # of a slider the force that is commanded, and the speed
+            torque, speed = math.hypot(*acting.command[i, :2]), math.hypot(*states[i, 3:5])
             for body, joint, column in world.pivots:
                 if body == i:
                     arm = row[[COLUMN.com_x, COLUMN.com_y]] - joints[joint, column : column + 2]
@@ -319,7 +320,8 @@ def _place_constraints(
                     x, y = c * arm[0] - s * arm[1], s * arm[0] + c * arm[1]
                     weight = row[COLUMN.mass] * (np.array(world.scene.gravity) + row[_EXTRA])
                     rest = x * weight[1] - y * weight[0]
-            signal = acting.command[i, 2], rest, abs(states[i, 5])
+                    torque, speed = acting.command[i, 2], abs(states[i, 5])
+            signal = torque, rest, speed
             base = row[COLUMN.pivot_torque]
             constraint.max_force = acting.bound(base, i, states, False, *signal)
     for i, (along_x,), (along_y,) in world.wheels:

@@ -16,6 +16,7 @@ TILT = [e for e in catalogue if e.name == "gravity_tilt"]
 #: Without hinges there is no friction in them, without obstacles nothing to touch, a wheel is
 #: declared, and bodies that are anywhere are on no rod.
 _ELSEWHERE = ("pivot", "slider", "gravity", "hidden_obstacle", "wheel", "distance_joint")
+_ELSEWHERE += ("encoder", "askew_angle")
 OTHERS = [e for e in catalogue if not e.name.startswith(_ELSEWHERE)]
 
 

@@ -13,7 +13,7 @@ from pbrl_ppl.state import STATE, STATE_UNITS, WRENCH, WRENCH_UNITS
 
 #: Powers of length, mass and time in the units of the package.
 _POWERS = {"m": (1, 0, 0), "kg": (0, 1, 0), "s": (0, 0, 1), "N": (1, 1, -2)}
-_POWERS |= {"1": (0, 0, 0), "rad": (0, 0, 0)}
+_POWERS |= {"1": (0, 0, 0), "rad": (0, 0, 0), "W": (2, 1, -3), "Hz": (0, 0, -1)}
 #: SI units of the natural units of a body.
 _TYPICAL = dict(mass="kg", length="m", time="s", force="N", torque="N m", speed="m/s")
 _TYPICAL |= dict(turn_rate="rad/s", range="m", interval="s", x="m", y="m")

@@ -19,11 +19,14 @@ SIGNATURES = {
         "cpSpaceStep cpBodySetMass cpBodySetMoment cpBodySetAngle cpBodySetAngularVelocity"
         " cpBodySetTorque cpShapeSetElasticity cpShapeSetFriction cpConstraintSetMaxForce"
         " cpCircleShapeSetRadius cpPinJointSetDist cpDampedRotarySpringSetDamping"
+        " cpDampedSpringSetDamping"
     ),
     ("struct cpVect",): (
         "cpBodySetCenterOfGravity cpBodySetPosition cpBodySetVelocity cpBodySetForce"
         " cpCircleShapeSetOffset cpPivotJointSetAnchorA cpPivotJointSetAnchorB"
-        " cpPinJointSetAnchorA cpPinJointSetAnchorB"
+        " cpPinJointSetAnchorA cpPinJointSetAnchorB cpGrooveJointSetAnchorB"
+        " cpGrooveJointSetGrooveA cpGrooveJointSetGrooveB cpDampedSpringSetAnchorA"
+        " cpDampedSpringSetAnchorB"
     ),
     ("int",): "cpSpaceSetIterations",
     ("struct cpShape *",): "cpSpaceAddShape cpSpaceRemoveShape",

@@ -1,0 +1,280 @@
+"""Name each law of actuators, friction and shape from recordings made by a Runge-Kutta step of its own.
+
+    python analysis/benchmarks/laws.py [NAME...] [--outside]
+
+Each case is an arm on a hinge or a puck on a table with one such law, pushed at random for eight trajectories of
+five seconds; dry friction is smooth below 1 mm/s or mrad/s. ``pp.attribute`` names laws with the whole catalogue,
+or, with ``--outside``, without the law's family: then something must be said to remain.
+"""
+
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+import pbrl_ppl as pp
+from pbrl_ppl.state import Floats
+
+N, ROWS, STEP, FINE = 8, 101, 0.05, 100
+MASS, LENGTH, G = 0.5, 0.3, 9.81
+ARM = pp.Shape.box(0.04, LENGTH)
+DISC = pp.Shape.circle(0.1)
+#: Viscous friction of the hinge, which is declared (N m s).
+DAMPING = 0.03
+#: Moments of inertia about the hinge, and about the puck's centre (kg m^2).
+HINGED = MASS * (ARM.unit_moment + (LENGTH / 2) ** 2)
+CENTRAL = MASS * DISC.unit_moment
+
+
+def sign(v: Floats) -> Floats:
+    """Return a smooth sign."""
+    return np.tanh(v / 1e-3)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A law in a rig.
+
+    Parameters
+    ----------
+    torque : callable
+        ``torque(z, u, t)``: what the law adds for states z (trajectory, 2 or 6), commands u and time.
+    command : callable
+        ``command(u, memory, dt)``: what the actuator does of the command, and its memory after.
+    family : tuple of str
+        Names that are left out with it.
+    """
+
+    rig: str = "arm"
+    torque: Callable[[Floats, Floats, float], Floats] = lambda z, u, t: 0.0
+    command: Callable[[Floats, Floats, float], Floats] | None = None
+    measure: Callable[[Floats, Floats], Floats] = lambda z, t: z
+    late: float = 0.0
+    also: tuple[str, ...] = ()
+    family: tuple[str, ...] = field(default=())
+
+
+def along(z: Floats, u: Floats) -> Floats:
+    """Return the speed along a push, (trajectory, 1)."""
+    size = np.linalg.norm(u[:, :2], axis=1, keepdims=True)
+    return (z[:, 3:5] * u[:, :2]).sum(1, keepdims=True) / np.maximum(size, 1e-12)
+
+
+def pushes(x: Floats, y: Floats, torque: Floats | float = 0.0) -> Floats:
+    """Return wrenches (trajectory, 3)."""
+    return np.stack(np.broadcast_arrays(x, y, torque), axis=1)
+
+
+def polar(z: Floats, along_x: float, along_y: float, power: int) -> Floats:
+    """Return drag in the body's frame."""
+    c, s = np.cos(z[:, 2]), np.sin(z[:, 2])
+    a, b = c * z[:, 3] + s * z[:, 4], c * z[:, 4] - s * z[:, 3]
+    a, b = -along_x * np.abs(a) ** (power - 1) * a, -along_y * np.abs(b) ** (power - 1) * b
+    return pushes(c * a - s * b, s * a + c * b)
+
+
+LATE = ("actuator_delay", "first_order_lag", "rate_limit", "torque_rate_limit", "actuator_backlash",
+        "torque_backlash")  # fmt: skip
+SHAPE = ("command_power", "gain_by_sign", "dead_zone", "torque_dead_zone", "torque_saturation", "saturation",
+         "force_cutoff", "power_limit", "gain_by_speed", "gain_by_place")  # fmt: skip
+DRY = (
+    "pivot_friction",
+    "pivot_load_friction",
+    "pivot_stribeck",
+    "pivot_angle_friction",
+    "pivot_hysteresis",
+)
+ANGLE = ("torsion_spring", "cubic_torsion_spring", "upper_stop", "lower_stop", "cogging", "askew_angle",
+         "encoder_eccentricity")  # fmt: skip
+PLACE = ("spring", "cubic_spring", "cable", "ripple", "point_attractor")
+DRAG = (
+    "linear_drag",
+    "quadratic_drag",
+    "power_drag",
+    "drag_by_axis",
+    "quadratic_drag_by_axis",
+    "wind",
+)
+
+
+def lagged(u: Floats, f: Floats, dt: float) -> Floats:
+    return u + (f - u) * np.exp(-dt / 0.15)
+
+
+def limited(most: float) -> Callable[[Floats, Floats, float], Floats]:
+    def step(u: Floats, f: Floats, dt: float) -> Floats:
+        off = u - f
+        size = np.linalg.norm(off, axis=1, keepdims=True)
+        return f + off * np.minimum(1.0, most * dt / np.maximum(size, 1e-12))
+
+    return step
+
+
+def played(width: float) -> Callable[[Floats, Floats, float], Floats]:
+    return lambda u, f, dt: np.minimum(np.maximum(f, u - width), u + width)
+
+
+CASES = {
+    "first_order_lag": Case(command=lagged, family=LATE),
+    "actuator_delay": Case(late=2.3, family=LATE),
+    "torque_rate_limit": Case(command=limited(2.0), family=LATE),
+    "torque_backlash": Case(command=played(0.08), family=LATE),
+    "rate_limit": Case("puck", command=limited(6.0), family=LATE),
+    "actuator_backlash": Case("puck", command=played(0.2), family=LATE),
+    "pivot_stribeck": Case(
+        torque=lambda z, u, t: -sign(z[:, 1:]) * (0.03 + 0.06 * np.exp(-((z[:, 1:] / 0.6) ** 2))),
+        also=("pivot_friction",), family=DRY,
+    ),
+    "pivot_load_friction": Case(
+        torque=lambda z, u, t: -sign(z[:, 1:]) * (0.2 * np.abs(u) + 0.1 * np.abs(_weight(z))), family=DRY,
+    ),
+    "pivot_angle_friction": Case(
+        torque=lambda z, u, t: -sign(z[:, 1:]) * np.maximum(0.05 + 0.04 * np.cos(z[:, :1]), 0.0),
+        also=("pivot_friction",), family=DRY,
+    ),
+    "pivot_one_way_damping": Case(torque=lambda z, u, t: -0.006 * np.abs(z[:, 1:]),
+                                  family=("pivot_one_way_damping",)),
+    "quadratic_drag": Case(torque=lambda z, u, t: -0.004 * np.abs(z[:, 1:]) * z[:, 1:],
+                           family=(*DRAG, "quadratic_angular_drag", "power_angular_drag")),
+    "cubic_torsion_spring": Case(torque=lambda z, u, t: -0.3 * z[:, :1] ** 3, family=ANGLE),
+    "upper_stop": Case(torque=lambda z, u, t: -2.0 * np.maximum(z[:, :1] - 0.5, 0.0), family=ANGLE),
+    "lower_stop": Case(torque=lambda z, u, t: 2.0 * np.maximum(-0.5 - z[:, :1], 0.0), family=ANGLE),
+    "cogging": Case(torque=lambda z, u, t: 0.05 * np.sin(8 * z[:, :1]), family=ANGLE),
+    "periodic_torque": Case(torque=lambda z, u, t: 0.05 * np.sin(2 * np.pi * t / 1.3) + 0 * z[:, :1],
+                            family=("periodic_torque",)),
+    "torque_saturation": Case(torque=lambda z, u, t: np.clip(u, -0.25, 0.25) - u, family=SHAPE),
+    "torque_dead_zone": Case(torque=lambda z, u, t: -np.clip(u, -0.1, 0.1), family=SHAPE),
+    "command_power": Case(torque=lambda z, u, t: 3.0 * np.abs(u) * u - u, also=("torque_gain",), family=SHAPE),
+    "gain_by_sign": Case(torque=lambda z, u, t: 0.15 * np.abs(u), family=SHAPE),
+    "gain_by_speed": Case(torque=lambda z, u, t: -0.06 * np.abs(u) * z[:, 1:], family=SHAPE),
+    "fading_gain": Case(torque=lambda z, u, t: (np.exp(-0.1 * t) - 1.0) * u, family=("fading_gain",)),
+    "encoder_eccentricity": Case(measure=lambda z, t: z + 0.05 * np.sin(z), family=ANGLE),
+    "sensor_drift": Case(measure=lambda z, t: z + 0.02 * t, family=("sensor_drift",)),
+    "drag_by_axis": Case("puck", lambda z, u, t: polar(z, 0.1, 0.6, 1), family=DRAG),
+    "quadratic_drag_by_axis": Case("puck", lambda z, u, t: polar(z, 0.1, 0.5, 2), family=DRAG),
+    "wind": Case("puck", lambda z, u, t: _blown(z), family=DRAG),
+    "power_drag": Case("puck", lambda z, u, t: -0.3 * z[:, 3:] * (1, 1, 0) * np.hypot(z[:, 3:4], z[:, 4:5]) ** 0.5,
+                       family=DRAG),
+    "quadratic_angular_drag": Case("puck", lambda z, u, t: pushes(0 * z[:, 0], 0 * z[:, 0],
+                                   -3e-4 * np.abs(z[:, 5]) * z[:, 5]),
+                                   family=("angular_drag", "quadratic_angular_drag", "power_angular_drag")),
+    "cubic_spring": Case("puck", lambda z, u, t: -0.8 * (z[:, :3] * (1, 1, 0)) * (z[:, :2] ** 2).sum(1)[:, None],
+                         family=PLACE),
+    "ripple": Case("puck", lambda z, u, t: pushes(0.5 * np.sin(2 * np.pi * z[:, 0] / 0.8), 0.0), family=PLACE),
+    "periodic_force": Case("puck", lambda z, u, t: pushes(0.3 * np.sin(2 * np.pi * t / 1.3) + 0 * z[:, 0], 0.0),
+                           family=("periodic_force",)),
+    "gain_by_place": Case("puck", lambda z, u, t: 0.25 * u * z[:, :1], family=SHAPE),
+    "power_limit": Case("puck", lambda z, u, t: _weaker(z, u), family=SHAPE),
+    "turning_friction": Case("puck", lambda z, u, t: pushes(0 * z[:, 0], 0 * z[:, 0], -0.004 * sign(z[:, 5])),
+                             family=("turning_friction", "sliding_friction", "angular_drag",
+                                     "quadratic_angular_drag", "power_angular_drag")),
+    "askew_camera": Case("puck", measure=lambda z, t: _askew(z), family=("askew_camera", "sensor_scale")),
+}  # fmt: skip
+
+
+def _weight(z: Floats) -> Floats:
+    return -MASS * G * LENGTH / 2 * np.sin(z[:, :1])
+
+
+def _blown(z: Floats) -> Floats:
+    v = z[:, 3:5] - (1.0, -0.5)
+    return pushes(*(-0.25 * np.linalg.norm(v, axis=1)[:, None] * v).T)
+
+
+def _weaker(z: Floats, u: Floats) -> Floats:
+    power = (u * z[:, 3:]).sum(1, keepdims=True)
+    return u * (np.minimum(1.0, 0.4 / np.maximum(power, 1e-12)) - 1.0) * (power > 0)
+
+
+def _askew(z: Floats) -> Floats:
+    seen = z.copy()
+    seen[:, :2] /= 1.0 + 0.12 * z[:, :1] - 0.06 * z[:, 1:2]
+    return seen
+
+
+def scene(rig: str) -> pp.Scene:
+    """Return the rig as a user would declare it."""
+    known = {"mass": MASS, "r": 0.0, "mu_c": 0.0}
+    if rig == "puck":
+        return pp.Scene(
+            time_step=STEP, normal_gravity=G, bodies=(pp.Body("puck", DISC, known=known),)
+        )
+    hinge = pp.Joint("hinge", ("arm", "world"), (0.0, LENGTH / 2), (0.0, 0.0))
+    arm = pp.Body("arm", ARM, known=known, effects=("pivot_damping",))
+    return pp.Scene(time_step=STEP, gravity=(0.0, -G), bodies=(arm,), joints=(hinge,))
+
+
+def recorded(case: Case, seed: int) -> pp.History:
+    """Return a recording of a case."""
+    rng, arm = np.random.default_rng(seed), case.rig == "arm"
+    held = np.repeat(rng.normal(size=(N, 13, 1 if arm else 3)), 8, axis=1)[:, : ROWS - 1]
+    u = held * (0.2 if arm else np.array([0.7, 0.7, 0.01]))
+    z = (
+        rng.normal(size=(N, 2)) * (0.5, 1.0)
+        if arm
+        else rng.normal(size=(N, 6)) * (0.3, 0.3, 1, 0.4, 0.4, 2.0)
+    )
+    rows, dt, memory = [z.copy()], STEP / FINE, np.zeros_like(u[:, 0])
+
+    def slope(z: Floats, u: Floats, t: float) -> Floats:
+        if arm:
+            total = u + _weight(z) - DAMPING * z[:, 1:] + case.torque(z, u, t)
+            return np.hstack([z[:, 1:], total / HINGED])
+        return np.hstack([z[:, 3:], (u + case.torque(z, u, t)) / (MASS, MASS, CENTRAL)])
+
+    for k in range((ROWS - 1) * FINE):
+        t = k * dt
+        late = int(np.floor((k + 0.5) / FINE - case.late))
+        now = u[:, late] if late >= 0 else 0.0 * u[:, 0]
+        if case.command is not None:
+            now = memory = case.command(now, memory, dt)
+        a = slope(z, now, t)
+        b = slope(z + 0.5 * dt * a, now, t + 0.5 * dt)
+        c = slope(z + 0.5 * dt * b, now, t + 0.5 * dt)
+        z = z + dt / 6 * (a + 2 * b + 2 * c + slope(z + dt * c, now, t + dt))
+        if (k + 1) % FINE == 0:
+            rows.append(z.copy())
+    path = np.stack(rows, axis=1)
+    time_of = STEP * np.arange(ROWS)
+    states, wrenches = np.full((N, ROWS, 1, 6), np.nan), np.zeros((N, ROWS - 1, 1, 3))
+    for i in range(ROWS):
+        poses = case.measure(path[:, i, : 1 if arm else 3], time_of[i])
+        columns = [2] if arm else [0, 1, 2]
+        states[:, i, 0, columns] = poses + rng.normal(size=poses.shape) * (
+            1e-3 if arm else (5e-4, 5e-4, 1e-3)
+        )
+    wrenches[:, :, 0, 2 if arm else slice(0, 3)] = u[..., 0] if arm else u
+    return pp.History.of_arrays(states, scene(case.rig), wrenches)
+
+
+def main(names: list[str], outside: bool) -> None:
+    """Print what is named in each case."""
+    right = 0
+    for name in names:
+        case, begin = CASES[name], time.monotonic()
+        laws = pp.catalogue
+        if outside:
+            laws = tuple(law for law in laws if law.name not in (name, *case.family))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            found = pp.attribute(scene(case.rig), recorded(case, 1), catalogue=laws, seed=1)
+        named = {law.effect: law for law in found.laws}
+        like = {twin for law in found.laws for twin in law.confounded}
+        hit = name in named or name in like
+        extra = sorted(set(named) - {name, *case.also})
+        right += hit
+        sizes = {k: f"{v:.4g}" for k, v in named[name].estimate.items()} if name in named else {}
+        took = time.monotonic() - begin
+        print(
+            f"{name:24s} {'named' if hit else 'NOT  '} {sizes} beside: {', '.join(extra)} {took:.0f} s",
+            flush=True,
+        )
+    print(f"{right} of {len(names)}")
+
+
+if __name__ == "__main__":
+    flags = [name for name in sys.argv[1:] if not name.startswith("-")]
+    main(flags or list(CASES), "--outside" in sys.argv)
