@@ -1,10 +1,10 @@
-"""Name each law of actuators, friction and shape from recordings made by a Runge-Kutta step of its own.
+"""Name each law of actuators, friction and shape, recorded with a Runge-Kutta step of its own.
 
     python analysis/benchmarks/laws.py [NAME...] [--outside]
 
-Each case is an arm on a hinge or a puck on a table with one such law, pushed at random for eight trajectories of
-five seconds; dry friction is smooth below 1 mm/s or mrad/s. ``pp.attribute`` names laws with the whole catalogue,
-or, with ``--outside``, without the law's family: then something must be said to remain.
+Each case is an arm on a hinge or a puck on a table with one such law, pushed at random for eight
+trajectories of five seconds; dry friction is smooth below 1 mm/s or mrad/s. ``pp.attribute`` names
+laws with the whole catalogue, or, with ``--outside``, without the law's family.
 """
 
 import sys
@@ -22,8 +22,8 @@ N, ROWS, STEP, FINE = 8, 101, 0.05, 100
 MASS, LENGTH, G = 0.5, 0.3, 9.81
 ARM = pp.Shape.box(0.04, LENGTH)
 DISC = pp.Shape.circle(0.1)
-#: Viscous friction of the hinge, which is declared (N m s).
-DAMPING = 0.03
+#: Viscous friction of the hinge (N m s) and drag of the puck (kg/s), which are declared.
+DAMPING, DRAG_COEFFICIENT = 0.03, 0.5
 #: Moments of inertia about the hinge, and about the puck's centre (kg m^2).
 HINGED = MASS * (ARM.unit_moment + (LENGTH / 2) ** 2)
 CENTRAL = MASS * DISC.unit_moment
@@ -41,7 +41,7 @@ class Case:
     Parameters
     ----------
     torque : callable
-        ``torque(z, u, t)``: what the law adds for states z (trajectory, 2 or 6), commands u and time.
+        ``torque(z, u, t)``: what the law adds for states z (trajectory, 2 or 6), commands u, time.
     command : callable
         ``command(u, memory, dt)``: what the actuator does of the command, and its memory after.
     family : tuple of str
@@ -76,10 +76,26 @@ def polar(z: Floats, along_x: float, along_y: float, power: int) -> Floats:
     return pushes(c * a - s * b, s * a + c * b)
 
 
-LATE = ("actuator_delay", "first_order_lag", "rate_limit", "torque_rate_limit", "actuator_backlash",
-        "torque_backlash")  # fmt: skip
-SHAPE = ("command_power", "gain_by_sign", "dead_zone", "torque_dead_zone", "torque_saturation", "saturation",
-         "force_cutoff", "power_limit", "gain_by_speed", "gain_by_place")  # fmt: skip
+LATE = (
+    "actuator_delay",
+    "first_order_lag",
+    "rate_limit",
+    "torque_rate_limit",
+    "actuator_backlash",
+    "torque_backlash",
+)
+SHAPE = (
+    "command_power",
+    "gain_by_sign",
+    "dead_zone",
+    "torque_dead_zone",
+    "torque_saturation",
+    "saturation",
+    "force_cutoff",
+    "power_limit",
+    "gain_by_speed",
+    "gain_by_place",
+)
 DRY = (
     "pivot_friction",
     "pivot_load_friction",
@@ -87,8 +103,15 @@ DRY = (
     "pivot_angle_friction",
     "pivot_hysteresis",
 )
-ANGLE = ("torsion_spring", "cubic_torsion_spring", "upper_stop", "lower_stop", "cogging", "askew_angle",
-         "encoder_eccentricity")  # fmt: skip
+ANGLE = (
+    "torsion_spring",
+    "cubic_torsion_spring",
+    "upper_stop",
+    "lower_stop",
+    "cogging",
+    "askew_angle",
+    "encoder_eccentricity",
+)
 PLACE = ("spring", "cubic_spring", "cable", "ripple", "point_attractor")
 DRAG = (
     "linear_drag",
@@ -100,11 +123,11 @@ DRAG = (
 )
 
 
-def lagged(u: Floats, f: Floats, dt: float) -> Floats:
+def _lagged(u: Floats, f: Floats, dt: float) -> Floats:
     return u + (f - u) * np.exp(-dt / 0.15)
 
 
-def limited(most: float) -> Callable[[Floats, Floats, float], Floats]:
+def _limited(most: float) -> Callable[[Floats, Floats, float], Floats]:
     def step(u: Floats, f: Floats, dt: float) -> Floats:
         off = u - f
         size = np.linalg.norm(off, axis=1, keepdims=True)
@@ -113,66 +136,101 @@ def limited(most: float) -> Callable[[Floats, Floats, float], Floats]:
     return step
 
 
-def played(width: float) -> Callable[[Floats, Floats, float], Floats]:
+def _played(width: float) -> Callable[[Floats, Floats, float], Floats]:
     return lambda u, f, dt: np.minimum(np.maximum(f, u - width), u + width)
 
 
 CASES = {
-    "first_order_lag": Case(command=lagged, family=LATE),
+    "first_order_lag": Case(command=_lagged, family=LATE),
     "actuator_delay": Case(late=2.3, family=LATE),
-    "torque_rate_limit": Case(command=limited(2.0), family=LATE),
-    "torque_backlash": Case(command=played(0.08), family=LATE),
-    "rate_limit": Case("puck", command=limited(6.0), family=LATE),
-    "actuator_backlash": Case("puck", command=played(0.2), family=LATE),
+    "torque_rate_limit": Case(command=_limited(2.0), family=LATE),
+    "torque_backlash": Case(command=_played(0.08), family=LATE),
+    "rate_limit": Case("puck", command=_limited(6.0), family=LATE),
+    "actuator_backlash": Case("puck", command=_played(0.2), family=LATE),
     "pivot_stribeck": Case(
         torque=lambda z, u, t: -sign(z[:, 1:]) * (0.03 + 0.06 * np.exp(-((z[:, 1:] / 0.6) ** 2))),
-        also=("pivot_friction",), family=DRY,
+        also=("pivot_friction",),
+        family=DRY,
     ),
     "pivot_load_friction": Case(
-        torque=lambda z, u, t: -sign(z[:, 1:]) * (0.2 * np.abs(u) + 0.1 * np.abs(_weight(z))), family=DRY,
+        torque=lambda z, u, t: -sign(z[:, 1:]) * (0.2 * np.abs(u) + 0.1 * np.abs(_weight(z))),
+        family=DRY,
     ),
     "pivot_angle_friction": Case(
         torque=lambda z, u, t: -sign(z[:, 1:]) * np.maximum(0.05 + 0.04 * np.cos(z[:, :1]), 0.0),
-        also=("pivot_friction",), family=DRY,
+        also=("pivot_friction",),
+        family=DRY,
     ),
-    "pivot_one_way_damping": Case(torque=lambda z, u, t: -0.006 * np.abs(z[:, 1:]),
-                                  family=("pivot_one_way_damping",)),
-    "quadratic_drag": Case(torque=lambda z, u, t: -0.004 * np.abs(z[:, 1:]) * z[:, 1:],
-                           family=(*DRAG, "quadratic_angular_drag", "power_angular_drag")),
+    "pivot_one_way_damping": Case(
+        torque=lambda z, u, t: -0.006 * np.abs(z[:, 1:]), family=("pivot_one_way_damping",)
+    ),
+    "quadratic_drag": Case(
+        torque=lambda z, u, t: -0.004 * np.abs(z[:, 1:]) * z[:, 1:],
+        family=(*DRAG, "quadratic_angular_drag", "power_angular_drag"),
+    ),
     "cubic_torsion_spring": Case(torque=lambda z, u, t: -0.3 * z[:, :1] ** 3, family=ANGLE),
     "upper_stop": Case(torque=lambda z, u, t: -2.0 * np.maximum(z[:, :1] - 0.5, 0.0), family=ANGLE),
     "lower_stop": Case(torque=lambda z, u, t: 2.0 * np.maximum(-0.5 - z[:, :1], 0.0), family=ANGLE),
     "cogging": Case(torque=lambda z, u, t: 0.05 * np.sin(8 * z[:, :1]), family=ANGLE),
-    "periodic_torque": Case(torque=lambda z, u, t: 0.05 * np.sin(2 * np.pi * t / 1.3) + 0 * z[:, :1],
-                            family=("periodic_torque",)),
+    "periodic_torque": Case(
+        torque=lambda z, u, t: 0.05 * np.sin(2 * np.pi * t / 1.3) + 0 * z[:, :1],
+        family=("periodic_torque",),
+    ),
     "torque_saturation": Case(torque=lambda z, u, t: np.clip(u, -0.25, 0.25) - u, family=SHAPE),
     "torque_dead_zone": Case(torque=lambda z, u, t: -np.clip(u, -0.1, 0.1), family=SHAPE),
-    "command_power": Case(torque=lambda z, u, t: 3.0 * np.abs(u) * u - u, also=("torque_gain",), family=SHAPE),
+    "command_power": Case(
+        torque=lambda z, u, t: 3.0 * np.abs(u) * u - u, also=("torque_gain",), family=SHAPE
+    ),
     "gain_by_sign": Case(torque=lambda z, u, t: 0.15 * np.abs(u), family=SHAPE),
     "gain_by_speed": Case(torque=lambda z, u, t: -0.06 * np.abs(u) * z[:, 1:], family=SHAPE),
-    "fading_gain": Case(torque=lambda z, u, t: (np.exp(-0.1 * t) - 1.0) * u, family=("fading_gain",)),
+    "fading_gain": Case(
+        torque=lambda z, u, t: (np.exp(-0.1 * t) - 1.0) * u, family=("fading_gain",)
+    ),
     "encoder_eccentricity": Case(measure=lambda z, t: z + 0.05 * np.sin(z), family=ANGLE),
     "sensor_drift": Case(measure=lambda z, t: z + 0.02 * t, family=("sensor_drift",)),
     "drag_by_axis": Case("puck", lambda z, u, t: polar(z, 0.1, 0.6, 1), family=DRAG),
     "quadratic_drag_by_axis": Case("puck", lambda z, u, t: polar(z, 0.1, 0.5, 2), family=DRAG),
     "wind": Case("puck", lambda z, u, t: _blown(z), family=DRAG),
-    "power_drag": Case("puck", lambda z, u, t: -0.3 * z[:, 3:] * (1, 1, 0) * np.hypot(z[:, 3:4], z[:, 4:5]) ** 0.5,
-                       family=DRAG),
-    "quadratic_angular_drag": Case("puck", lambda z, u, t: pushes(0 * z[:, 0], 0 * z[:, 0],
-                                   -3e-4 * np.abs(z[:, 5]) * z[:, 5]),
-                                   family=("angular_drag", "quadratic_angular_drag", "power_angular_drag")),
-    "cubic_spring": Case("puck", lambda z, u, t: -0.8 * (z[:, :3] * (1, 1, 0)) * (z[:, :2] ** 2).sum(1)[:, None],
-                         family=PLACE),
-    "ripple": Case("puck", lambda z, u, t: pushes(0.5 * np.sin(2 * np.pi * z[:, 0] / 0.8), 0.0), family=PLACE),
-    "periodic_force": Case("puck", lambda z, u, t: pushes(0.3 * np.sin(2 * np.pi * t / 1.3) + 0 * z[:, 0], 0.0),
-                           family=("periodic_force",)),
+    "power_drag": Case(
+        "puck",
+        lambda z, u, t: -0.3 * z[:, 3:] * (1, 1, 0) * np.hypot(z[:, 3:4], z[:, 4:5]) ** 0.5,
+        family=DRAG,
+    ),
+    "quadratic_angular_drag": Case(
+        "puck",
+        lambda z, u, t: pushes(0 * z[:, 0], 0 * z[:, 0], -3e-4 * np.abs(z[:, 5]) * z[:, 5]),
+        family=("angular_drag", "quadratic_angular_drag", "power_angular_drag"),
+    ),
+    "cubic_spring": Case(
+        "puck",
+        lambda z, u, t: -0.8 * (z[:, :3] * (1, 1, 0)) * (z[:, :2] ** 2).sum(1)[:, None],
+        family=PLACE,
+    ),
+    "ripple": Case(
+        "puck", lambda z, u, t: pushes(0.5 * np.sin(2 * np.pi * z[:, 0] / 0.8), 0.0), family=PLACE
+    ),
+    "periodic_force": Case(
+        "puck",
+        lambda z, u, t: pushes(0.3 * np.sin(2 * np.pi * t / 1.3) + 0 * z[:, 0], 0.0),
+        family=("periodic_force",),
+    ),
     "gain_by_place": Case("puck", lambda z, u, t: 0.25 * u * z[:, :1], family=SHAPE),
     "power_limit": Case("puck", lambda z, u, t: _weaker(z, u), family=SHAPE),
-    "turning_friction": Case("puck", lambda z, u, t: pushes(0 * z[:, 0], 0 * z[:, 0], -0.004 * sign(z[:, 5])),
-                             family=("turning_friction", "sliding_friction", "angular_drag",
-                                     "quadratic_angular_drag", "power_angular_drag")),
-    "askew_camera": Case("puck", measure=lambda z, t: _askew(z), family=("askew_camera", "sensor_scale")),
-}  # fmt: skip
+    "turning_friction": Case(
+        "puck",
+        lambda z, u, t: pushes(0 * z[:, 0], 0 * z[:, 0], -0.004 * sign(z[:, 5])),
+        family=(
+            "turning_friction",
+            "sliding_friction",
+            "angular_drag",
+            "quadratic_angular_drag",
+            "power_angular_drag",
+        ),
+    ),
+    "askew_camera": Case(
+        "puck", measure=lambda z, t: _askew(z), family=("askew_camera", "sensor_scale")
+    ),
+}
 
 
 def _weight(z: Floats) -> Floats:
@@ -199,9 +257,8 @@ def scene(rig: str) -> pp.Scene:
     """Return the rig as a user would declare it."""
     known = {"mass": MASS, "r": 0.0, "mu_c": 0.0}
     if rig == "puck":
-        return pp.Scene(
-            time_step=STEP, normal_gravity=G, bodies=(pp.Body("puck", DISC, known=known),)
-        )
+        puck = pp.Body("puck", DISC, known=known, effects=("linear_drag",))
+        return pp.Scene(time_step=STEP, normal_gravity=G, bodies=(puck,))
     hinge = pp.Joint("hinge", ("arm", "world"), (0.0, LENGTH / 2), (0.0, 0.0))
     arm = pp.Body("arm", ARM, known=known, effects=("pivot_damping",))
     return pp.Scene(time_step=STEP, gravity=(0.0, -G), bodies=(arm,), joints=(hinge,))
@@ -223,7 +280,8 @@ def recorded(case: Case, seed: int) -> pp.History:
         if arm:
             total = u + _weight(z) - DAMPING * z[:, 1:] + case.torque(z, u, t)
             return np.hstack([z[:, 1:], total / HINGED])
-        return np.hstack([z[:, 3:], (u + case.torque(z, u, t)) / (MASS, MASS, CENTRAL)])
+        drag = DRAG_COEFFICIENT * z[:, 3:] * (1, 1, 0)
+        return np.hstack([z[:, 3:], (u - drag + case.torque(z, u, t)) / (MASS, MASS, CENTRAL)])
 
     for k in range((ROWS - 1) * FINE):
         t = k * dt

@@ -144,15 +144,16 @@ def _ripple(state: Floats, command: Floats, parameters: Floats, wrench: Floats) 
 
 
 def _scan_waves(scene: Scene, history: History, body: Body) -> Floats:
-    """Return wavelengths along the axis of most motion; the derivative is taken by the forces."""
+    """Return wavelengths along each axis of motion; the derivative is taken by the forces."""
     places = history.dataset["start"].sel(body=body.name, state=["x", "y"]).to_numpy()
-    reach = np.nanmax(places, axis=(0, 1), initial=-np.inf) - np.nanmin(
-        places, axis=(0, 1), initial=np.inf
-    )
-    axis = int(np.argmax(reach))
-    if not 0.0 < reach[axis] < np.inf:
-        return np.empty((0, 4))
-    return np.array([(np.nan, np.nan, reach[axis] / n, 0.5 * np.pi * axis) for n in (1.5, 3, 6)])
+    high = np.nanmax(places, axis=(0, 1), initial=-np.inf)
+    reach = high - np.nanmin(places, axis=(0, 1), initial=np.inf)
+    rows = [
+        (np.nan, np.nan, reach[axis] / n, 0.5 * np.pi * axis)
+        for axis in (0, 1) for n in 1.5 * 1.35 ** np.arange(8)
+        if 0.2 * reach.max() < reach[axis] < np.inf
+    ]  # fmt: skip
+    return np.array(rows).reshape(-1, 4)
 
 
 ripple = Effect(
