@@ -326,10 +326,9 @@ def main(names: list[str], outside: bool) -> None:
         right += hit
         sizes = {k: f"{v:.4g}" for k, v in named[name].estimate.items()} if name in named else {}
         took = time.monotonic() - begin
-        print(
-            f"{name:24s} {'named' if hit else 'NOT  '} {sizes} beside: {', '.join(extra)} {took:.0f} s",
-            flush=True,
-        )
+        beside = ", ".join(extra) or "nothing"
+        said = "named" if hit else "NOT"
+        print(f"{name:24s} {said:6s}{sizes} beside: {beside} {took:.0f} s", flush=True)
     print(f"{right} of {len(names)}")
 
 
