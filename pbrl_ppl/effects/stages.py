@@ -170,6 +170,24 @@ class Command:
     ------
     EffectError
         If the memory is too large.
+
+    Examples
+    --------
+    A valve that opens by a step in an interval at most, and what it remembers of 5 N:
+
+    >>> def valve(state, command, parameters, wrench):
+    ...     step = parameters[0] * command[7]
+    ...     wrench[0] = command[12] + min(max(command[0] - command[12], -step), step)
+    >>> def remember(state, command, parameters, memory):
+    ...     memory[0] += min(max(command[0] - memory[0], -parameters[0]), parameters[0])
+    >>> stage = Command(valve, memory=1, remember=remember)
+    >>> reached = np.zeros(3)
+    >>> for _ in range(3):
+    ...     stage.remember(np.zeros(6), np.array([5.0]), np.array([2.0]), reached)
+    ...     print(reached[0])
+    2.0
+    4.0
+    5.0
     """
 
     law: Law

@@ -12,7 +12,6 @@ from pbrl_ppl.history.kinematics import hung_bodies
 from pbrl_ppl.scene import MASS_PRIOR, Scene, units_of
 from pbrl_ppl.state import STATE, THETA, VELOCITY, WRENCH, Floats, wrapped
 
-
 #: A body that moves turns at least by this share of its way over its length, for its units.
 _TURNS = 0.01
 

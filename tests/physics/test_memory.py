@@ -1,5 +1,8 @@
 """Laws that remember: against closed forms and SciPy, and carried from piece to piece."""
 
+import re
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -8,6 +11,7 @@ from pbrl_ppl.history import History
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Body, Joint, Scene, Shape
 from pbrl_ppl.state import Floats
+from tests.helpers.places import ROOT
 from tests.helpers.worlds import BY_NAME
 
 pytestmark = pytest.mark.one_stack
@@ -152,3 +156,20 @@ def test_a_mass_that_sloshes(engine: str) -> None:
     start[..., 3] = 0.3
     states = found.predict(phi, start, wrench)[0, :, 0]
     np.testing.assert_allclose(states[:, 0], expected.y[0], atol=3e-3)
+
+
+def test_a_law_of_a_users_own_remembers() -> None:
+    """The valve of the guide to own effects: 2 N more in each interval."""
+    guide = (ROOT / "analysis/docs/pages/guides/own_effect.md").read_text()
+    (code,) = re.findall(r"```python\n# valve.py\n(.*?)```", guide, re.S)
+    names: dict[str, Any] = {}
+    exec(code, names)  # of the package's own pages
+    valve = names["slow_valve"]
+    found = Physics(puck(), (valve.on("puck"),))
+    wrench = np.zeros((1, 4, 1, 3))
+    wrench[..., 0] = 5.0
+    history = History.of_arrays(np.zeros((1, 5, 1, 6)), puck(), wrench)
+    segments = history.pieces(np.zeros((1, 5, 1, 6)), 4)
+    states = found.predict(np.array([2.0]), segments.start, found.inputs(segments))
+    gained = np.diff(states[0, :, 0, 3], prepend=0.0) * MASS / STEP
+    np.testing.assert_allclose(gained, [1.0, 3.0, 4.625, 5.0], atol=0.2)
