@@ -35,7 +35,7 @@ def test_two_fans_on_a_disc() -> None:
     scene, u = fans(), (1.0, 0.4)
 
     def slope(t: float, z: np.ndarray) -> list[float]:
-        x, y, theta, vx, vy, omega = z
+        _, _, theta, vx, vy, omega = z
         force, torque = np.zeros(2), 0.0
         turn = np.array([[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]])
         for actuator, command in zip(scene.actuators, u, strict=True):
