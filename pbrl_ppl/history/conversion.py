@@ -121,7 +121,7 @@ def with_commands(frame: pd.DataFrame, scene: Scene) -> tuple[pd.DataFrame, dict
     if "body" not in frame or missing:
         alone = len(scene.moving) == 1
         return frame, {(w if alone else f"{b}.{w}"): c for (b, w), c in slots.items()}
-    frame = frame.assign(**{w: frame[w] if w in frame else 0.0 for w in WRENCH})
+    frame = frame.assign(**{w: frame.get(w, 0.0) for w in WRENCH})
     for (body, wrench), column in slots.items():
         frame[wrench] = frame[wrench].where(frame["body"] != body, frame[column])
     return frame.drop(columns=list(slots.values())), {}

@@ -199,6 +199,7 @@ def _applied(effect: Effect, state: Floats, parameters: Floats, body: Body, unit
         command[:9] = *wrench, *(0.5 * wrench), 0.4, 0.5, 0.0
         command[[TIME, INTERVAL]] = 1.0, 0.1
         numbers = np.array([*parameters, *effect.in_si(units).constants], dtype=float)
+        wrench = np.concatenate([wrench, np.zeros(6)])  # as the compiled loop has it
         stage.law(state.copy(), command, numbers, wrench)
         remembered = command[MEMORY:].copy()
         if isinstance(stage, Command) and stage.remember is not None:

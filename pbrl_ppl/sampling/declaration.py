@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from pbrl_ppl.effects import LEARNED_REMAINDER, Attached, Effect, catalogue
+from pbrl_ppl.effects import LEARNED_REMAINDER, Attached, Effect, attach, catalogue
 from pbrl_ppl.history import History, with_units
 from pbrl_ppl.likelihood import (
     OutputErrorLikelihood,
@@ -172,8 +173,11 @@ def physics_model(
 
 
 def try_own_effects(physics: Physics, history: History) -> None:
-    """Try the effects that are not of the catalogue; see :func:`pbrl_ppl.physics.try_effect`."""
-    known = {effect.name for effect in catalogue} | {LEARNED_REMAINDER}
+    """Try the effects that are a user's own; see :func:`pbrl_ppl.physics.try_effect`."""
+    scene = physics.scene
+    bare = scene.replace(bodies=tuple(replace(body, effects=()) for body in scene.bodies))
+    implied = {attached.effect.name for attached in attach(bare)}  # of actuators, for example
+    known = {effect.name for effect in catalogue} | {LEARNED_REMAINDER} | implied
     effects = {attached.effect.name: attached.effect for attached in physics.effects}
     for name in effects.keys() - known:
         try_effect(effects[name], physics.scene, history)

@@ -6,9 +6,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
+import pbrl_ppl as pp
 from pbrl_ppl.cli import main
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History
+from pbrl_ppl.physics import Physics
+from pbrl_ppl.planning import Dynamics
+from pbrl_ppl.posterior import load_posterior, save_posterior
 from pbrl_ppl.scene import Actuator, Body, Recording, Scene, Shape
 
 pytestmark = pytest.mark.one_stack
@@ -88,3 +92,24 @@ def test_new_proposes_actuators(tmp_path: Path, column: str, shape: str, kind: s
     if kind == "thruster":
         assert actuator.at[1] > 0.0
     np.testing.assert_array_equal(commands(History.load(path, scene))[:, 0], np.arange(11) % 3)
+
+
+def test_a_fit_is_planned_with(tmp_path: Path) -> None:
+    """The posterior file has the actuators: both fans push the craft straight ahead."""
+    rng, scene = np.random.default_rng(1), craft()
+    scene = scene.replace(bodies=(Body("craft", Shape.circle(0.1), known={"mass": 0.5}),))
+    physics = Physics.declare(scene)
+    sent = np.zeros((4, 12, 1, 3))
+    sent[..., :2] = rng.integers(0, 2, (4, 12, 1, 2))
+    states = physics.predict(np.array([0.2, 0.5]), np.zeros((4, 1, 6)), sent)
+    whole = np.concatenate([np.zeros((4, 1, 1, 6)), states], axis=1)
+    noisy = whole + rng.normal(0.0, 1e-3, whole.shape)
+    model = pp.physics_model(scene, History.of_arrays(noisy, scene, sent))
+    idata = pp.fit(model, method="laplace", seed=1, progress=False)
+    save_posterior(idata, tmp_path / "craft.nc")
+    dynamics = Dynamics.of(load_posterior(tmp_path / "craft.nc"))
+    both = np.zeros((10, 1, 3))
+    both[..., :2] = 1.0
+    x, y, *_ = dynamics.rollout(np.zeros((1, 6)), both)[0, -1, 0]
+    assert x == pytest.approx(0.5 * (2 * 0.5 / 0.5) * 1.0**2, rel=1e-6)  # F t^2 / 2 m
+    assert abs(y) < 1e-9
