@@ -15,6 +15,7 @@ from pbrl_ppl.errors import GoalError
 from pbrl_ppl.oomdp import LWR, OOLWR
 from pbrl_ppl.physics import touching
 from pbrl_ppl.planning import (
+    PAST,
     ActionSet,
     Dynamics,
     Goal,
@@ -26,7 +27,7 @@ from pbrl_ppl.planning import (
 )
 from pbrl_ppl.posterior import Idata
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import THETA, Bools, Floats, wrapped
+from pbrl_ppl.state import THETA, WRENCH, Bools, Floats, wrapped
 
 
 @dataclass(frozen=True)
@@ -134,9 +135,8 @@ class Agent(ABC):
         self._options = {"nodes": nodes, **options}
         self._rng = np.random.default_rng([seed, 0])  # [seed, 1] is the world's
         self._ahead = np.empty((0, len(task.scene.moving), 3))
-        self._last = np.zeros(
-            (len(task.scene.moving), 3 * 16)
-        )  # of 16 intervals: an actuator may remember
+        # what was played, which an actuator may remember
+        self._last = np.zeros((len(task.scene.moving), PAST * len(WRENCH)))
         self.planned = False
 
     @abstractmethod

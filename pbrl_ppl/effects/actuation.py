@@ -23,9 +23,9 @@ def _act(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> 
     c, s = math.cos(state[2]), math.sin(state[2])
     force_x, force_y, torque = 0.0, 0.0, 0.0
     for a in range(3):
-        kind, at, u = int(parameters[15 + a]), 5 * a, command[a]
-        if kind in (1, 2):
-            angle = parameters[at + 2] + wrench[6 + a] + (state[2] if kind == 1 else 0.0)
+        kind, at, u = int(parameters[3 * _SIZE + a]), _SIZE * a, command[a]
+        if kind in (_FORCE, _WORLD_FORCE):
+            angle = parameters[at + 2] + wrench[6 + a] + (state[2] if kind == _FORCE else 0.0)
             x = c * parameters[at + 3] - s * parameters[at + 4]
             y = s * parameters[at + 3] + c * parameters[at + 4]
             d_x, d_y = math.cos(angle), math.sin(angle)
@@ -34,15 +34,15 @@ def _act(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> 
             force_x += force * d_x
             force_y += force * d_y
             torque += force * (x * d_y - y * d_x)
-        elif kind == 3:
+        elif kind == _TORQUE:
             torque += parameters[at] * u - parameters[at + 1] * state[5]
-        elif kind > 3:
+        elif kind in (_TO_ANGLE, _TO_SPEED):
             off = u - state[5]
-            if kind == 4:
+            if kind == _TO_ANGLE:
                 off = u - state[2]
                 off -= 2.0 * math.pi * math.floor((off + math.pi) / (2.0 * math.pi))
             turn = parameters[at] * off
-            if kind == 4:
+            if kind == _TO_ANGLE:
                 turn -= parameters[at + 1] * state[5]
             if parameters[at + 2] > 0.0:
                 turn = min(max(turn, -parameters[at + 2]), parameters[at + 2])
@@ -100,16 +100,17 @@ def _kind(actuator: Actuator) -> int:
     return _FORCE if actuator.frame == "body" else _WORLD_FORCE
 
 
+def _given(value: float) -> EffectParameter:
+    """Return a number that is known."""
+    return EffectParameter("given", "1", Prior("normal", sigma=1.0), value, given=True)
+
+
 def _numbers(actuator: Actuator) -> list[EffectParameter]:
     """Return an actuator's numbers in the order of the law, given ones at their values."""
-
-    def given(value: float) -> EffectParameter:
-        return EffectParameter("given", "1", Prior("normal", sigma=1.0), value, given=True)
-
     parameters, prior = [], dict(actuator.prior)
     for name, value in actuator.numbers.items():
         if value is not None:
-            parameters.append(given(value))
+            parameters.append(_given(value))
             continue
         family, scale = _PRIORS[actuator.kind][name]
         stated: dict[str, Any] = dict(prior.get(name, ()))
@@ -122,10 +123,10 @@ def _numbers(actuator: Actuator) -> list[EffectParameter]:
         )
     if actuator.kind == "wrench":
         turn = 0.5 * math.pi if actuator.of == "force_y" else 0.0
-        parameters = [given(1.0), given(0.0), given(turn)]
+        parameters = [_given(1.0), _given(0.0), _given(turn)]
     places = actuator.at if _kind(actuator) in (_FORCE, _WORLD_FORCE) else (0.0, 0.0)
-    parameters += [given(0.0)] * (3 - len(parameters))
-    return parameters + [given(place) for place in places]
+    parameters += [_given(0.0)] * (3 - len(parameters))
+    return parameters + [_given(place) for place in places]
 
 
 def actuation(scene: Scene, body: str) -> Effect | None:
@@ -141,11 +142,10 @@ def actuation(scene: Scene, body: str) -> Effect | None:
     acting = scene.actuators_of(body)
     if not acting:
         return None
-    nothing = EffectParameter("given", "1", Prior("normal", sigma=1.0), given=True)
     parameters: list[EffectParameter] = []
     for actuator in acting:
         parameters += _numbers(actuator)
-    parameters += [nothing] * (_SIZE * len(WRENCH) - len(parameters))
+    parameters += [_given(0.0)] * (_SIZE * len(WRENCH) - len(parameters))
     kinds = [float(_kind(actuator)) for actuator in acting]
     return Effect(
         ACTUATION,

@@ -195,10 +195,8 @@ def _ramp(state: Floats, command: Floats, parameters: Floats, wrench: Floats) ->
 
 
 def _remember_ramp(state: Floats, command: Floats, parameters: Floats, memory: Floats) -> None:
-    off, most = (
-        math.hypot(command[0] - memory[0], command[1] - memory[1]),
-        command[10] * parameters[0],
-    )
+    off = math.hypot(command[0] - memory[0], command[1] - memory[1])
+    most = command[10] * parameters[0]
     for i in range(2):
         memory[i] += min(1.0, most / max(off, 1e-300)) * (command[i] - memory[i])
 
@@ -214,6 +212,7 @@ def _scan_torque_rates(scene: Scene, history: History, body: Body) -> Floats:
 
 
 def _rates(history: History, body: Body, interval: float, components: slice) -> Floats:
+    """Return rates at which the largest change of a command takes some intervals, (rate, 1)."""
     action = history.dataset["action"].sel(body=body.name).to_numpy()[..., components]
     jumps = np.linalg.norm(np.diff(action, axis=1), axis=-1)
     most = float(np.nanmax(jumps, initial=0.0))

@@ -296,6 +296,8 @@ class Simulator:
         self, choice: Choice, numbers: EngineInput, starts: Floats, inputs: Floats, out: Floats
     ) -> None:
         follows = _following(inputs)
+        if not any(getattr(one.effect.stage, "remember", None) for one in self.physics.effects):
+            follows[:] = False  # nothing remembers the intervals before
         for item in range(len(out)):
             p, t = divmod(item, len(inputs))
             start = starts[p if len(starts) > 1 else 0, t]

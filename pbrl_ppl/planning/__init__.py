@@ -2,6 +2,7 @@
 
 from .actions import Action as Action
 from .actions import ActionSet as ActionSet
+from .dynamics import PAST as PAST
 from .dynamics import Dynamics as Dynamics
 from .dynamics import TransitionModel as TransitionModel
 from .dynamics import remembered as remembered

@@ -176,7 +176,7 @@ StepNoise = StateNoise | AccelerationNoise
 
 
 #: Intervals that an actuator with a state of its own is followed back to.
-_PAST = 16
+PAST = 16
 
 
 def _memory(attached: Attached) -> int:
@@ -229,7 +229,7 @@ class Dynamics:
         self._whole = needs_inputs(attached)
         #: Wrenches that acted before the start, shape (body, 3); three more columns for each older
         #: one that an actuator remembers.
-        past = _PAST if any(_memory(one) > 1 for one in attached) else 1
+        past = PAST if any(_memory(one) > 1 for one in attached) else 1
         self.before = np.zeros((len(scene.moving), past * len(WRENCH)))
 
     @classmethod
