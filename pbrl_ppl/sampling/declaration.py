@@ -175,7 +175,9 @@ def physics_model(
 def try_own_effects(physics: Physics, history: History) -> None:
     """Try the effects that are a user's own; see :func:`pbrl_ppl.physics.try_effect`."""
     scene = physics.scene
-    bare = scene.replace(bodies=tuple(replace(body, effects=()) for body in scene.bodies))
+    bare = scene.replace(
+        bodies=tuple(replace(body, effects=(), known=(), prior=()) for body in scene.bodies)
+    )
     implied = {attached.effect.name for attached in attach(bare)}  # of actuators, for example
     known = {effect.name for effect in catalogue} | {LEARNED_REMAINDER} | implied
     effects = {attached.effect.name: attached.effect for attached in physics.effects}

@@ -173,7 +173,7 @@ def test_what_comes_by_chance_takes_no_name_away() -> None:
         # of the place that are not linear make one together
         ("spring", (0.5, 1.0, -0.5), ("point_attractor", "cable", "cubic_spring", "ripple")),
         ("actuator_delay", 0.4, ("first_order_lag", "rate_limit", "actuator_backlash")),
-        ("corrugation", (0.3, 0.3), ()),
+        ("corrugation", (0.3, 0.3), ("ripple",)),
     ],
 )
 def test_the_search_has_no_name_for_what_is_outside(name, size, richer, make_history) -> None:
