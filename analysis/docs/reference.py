@@ -60,7 +60,7 @@ FORMULAS = {
     "turning_friction": "|torque| ≤ torque against turning",
     "sliding_stribeck": "mu → mu (1 + share · exp(−(v / speed)²))",
     "friction_by_place": "mu → mu (1 + (along_x, along_y) · (x − x₀) / r₀)",
-    "pivot_angle_friction": "|torque| ≤ cosine · cos θ + sine · sin θ, beside other friction",
+    "pivot_angle_friction": "|torque| ≤ (1 + cosine · cos θ + sine · sin θ) · other friction",
     "pivot_one_way_damping": "torque = −coefficient · |ω|",
     "pivot_hysteresis": "torque = −torque · z / angle, dz/dt = ω − |ω| z / (angle (1 "
     "+ rise · exp(−(ω / speed)²)))",

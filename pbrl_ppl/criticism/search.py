@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from scipy.stats import norm
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.results import Law, LawsOfSize, Rung
 from pbrl_ppl.criticism.score import named_beside, rank_candidates
-from pbrl_ppl.criticism.subsets import Regression, Subset, best_subsets
+from pbrl_ppl.criticism.subsets import Regression, Subset, best_subsets, worth
 from pbrl_ppl.effects import Attached, Noise, Structure
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem, in_pieces, output_error
@@ -43,6 +43,8 @@ from pbrl_ppl.threads import in_parallel
 
 #: A refit takes a share of the error away if the regression says this of it.
 LIKELY = 0.7
+#: A law of so many nats to first order is kept without a fit of the model without it.
+_CLEAR = 30.0
 #: Share of the joint sizes from which refits begin a second time.
 _SHORTER = 0.3
 
@@ -113,6 +115,12 @@ def _prior_cost(mode: Mode) -> float:
     return 0.5 * float((prior_residual(mode.problem.layout.priors, mode.phi) ** 2).sum())
 
 
+def _gained(mode: Mode, other: Mode) -> float:
+    """Return the gain in log-posterior by a mode with another law in the place of one (nats)."""
+    gain = float((weights(mode) * np.log(mode.sigma / other.sigma)).sum())
+    return gain + _prior_cost(mode) - _prior_cost(other)
+
+
 def with_effects(
     mode: Mode,
     effects: tuple[Attached, ...],
@@ -148,6 +156,21 @@ def refit(mode: Mode, effects: tuple[Attached, ...], sizes: Mapping[Attached, Fl
 def drop(mode: Mode, law: Attached) -> Mode:
     """Return the mode without a law."""
     return refit(mode, tuple(one for one in mode.problem.physics.effects if one != law), {})
+
+
+def _first_order(mode: Mode, law: Attached) -> float:
+    """Return the evidence of a law if the other parameters make up for it linearly (nats)."""
+    places = mode.problem.layout.places(law.labels)
+    phi = mode.phi.copy()
+    phi[places] = law.effect.null
+    others = np.delete(mode.jacobian, places, axis=1)
+    missed = mode.problem.whitened(phi, mode.sigma).ravel()
+    if not np.isfinite(missed).all():
+        return 0.0
+    left = missed - others @ np.linalg.lstsq(others, missed, rcond=None)[0]
+    n = max(float(weights(mode).sum()), 2.0)
+    share = 1.0 - float((mode.whitened_residual**2).sum() / max((left**2).sum(), 1e-300))
+    return worth(max(share, 0.0), len(places), n)
 
 
 def sizes_of(mode: Mode, law: Attached) -> Floats:
@@ -214,7 +237,7 @@ class _Model:
     rivals : dict of Attached to dict
         Sizes of effects that explained the data as well as a law where it was found.
     without : dict of Attached to Mode
-        The model without each law, once it is fitted.
+        The model without each law, where it is fitted.
     """
 
     mode: Mode
@@ -227,20 +250,28 @@ class _Model:
         """Evidence of each law at this length, beside the others."""
         return {law: Evidence.of(mode, self.mode) for law, mode in self.without.items()}
 
+    @cached_property
+    def clear(self) -> dict[Attached, float]:
+        """Evidence to first order of the laws that it shows clearly."""
+        nats = {law: _first_order(self.mode, law) for law in self.earlier}
+        return {law: one for law, one in nats.items() if one > _CLEAR}
+
     @property
     def nats(self) -> dict[Attached, float]:
         """Evidence of each law, summed over lengths, less its price."""
-        return {law: self.earlier[law] + one.nats for law, one in self.evidence.items()}
+        here = self.clear | {law: one.nats for law, one in self.evidence.items()}
+        return {law: nats + here[law] for law, nats in self.earlier.items()}
 
-    def fitted(self) -> _Model:
-        """Return the model with each law dropped in turn."""
-        smaller = in_parallel(partial(drop, self.mode), self.earlier)
-        return replace(self, without=dict(zip(self.earlier, smaller, strict=True)))
+    def fitted(self, *, whole: bool = False) -> _Model:
+        """Return the model with each law dropped in turn, or those alone that are not clear."""
+        laws = [one for one in self.earlier if whole or one not in self.clear]
+        smaller = in_parallel(partial(drop, self.mode), laws)
+        return replace(self, without=dict(zip(laws, smaller, strict=True)))
 
     def dropped(self, law: Attached) -> _Model:
         """Return the model without a law."""
         earlier = {one: nats for one, nats in self.earlier.items() if one != law}
-        return _Model(self.without[law], earlier, self.rivals).fitted()
+        return _Model(self.without[law], earlier, self.rivals)
 
     def at(self, mode: Mode) -> _Model:
         """Return the model on longer pieces."""
@@ -363,9 +394,12 @@ class Search:
         )
         return model, rung, first, regression
 
-    def _regression(self, mode: Mode) -> Regression:
-        """Return the subsets of what a model lacks, the noise's shape aside."""
-        candidates = [one for one in self.missing(mode) if not isinstance(one.effect.stage, Noise)]
+    def _regression(self, mode: Mode, rare: float = -np.inf) -> Regression:
+        """Return the subsets of what a model lacks, what is rare and the noise's shape aside."""
+        candidates = [
+            one for one in self.missing(mode)
+            if not isinstance(one.effect.stage, Noise) and one.effect.log_odds > rare
+        ]  # fmt: skip
         cheap = corrected(mode) if mode.problem.likelihood.simulated else mode
         return best_subsets(cheap, candidates, self.criteria)
 
@@ -409,8 +443,40 @@ class Search:
         }  # each law has to be worth its price
         paid = {law: -price for law, price in subset.prices.items()}
         grown = _Model(fitted, {**model.earlier, **paid}, {**model.rivals, **rivals})
+        for law in subset.laws:
+            grown = self._with_commoner(grown, law)
         pruned = self._pruned(grown.fitted())
         return pruned if set(pruned.earlier) - set(model.earlier) else model
+
+    def _with_commoner(
+        self, model: _Model, law: Attached, *, rare: float = -5.0, most: int = 4
+    ) -> _Model:
+        """Return the model with a more common law in the place of a rare one that does as well.
+
+        The candidates are linearised at the model without the rare one, for where other laws are
+        missing as well their derivatives say little.
+
+        ``rare``: log odds below which a law is; ``most``: laws that are tried.
+        """
+        if law.effect.log_odds > rare:
+            return model
+        without = drop(model.mode, law)
+        others = {one.effect.family for one in model.earlier if one != law} - {""}
+        alone = [one for one in self._regression(without, rare).subsets if len(one.laws) == 1]
+        rivals = {one.laws[0]: one for one in reversed(alone)}
+        rivals = {one: s for one, s in rivals.items() if one.effect.family not in others}
+        tried = list(reversed(rivals))[:most]
+        fits = in_parallel(partial(_with_subset, without), [rivals[one] for one in tried])
+        net = [
+            _gained(model.mode, fitted) + one.effect.log_odds - law.effect.log_odds
+            for one, fitted in zip(tried, fits, strict=True)
+        ]
+        if not net or max(net) < 0.0:
+            return model
+        best = int(np.argmax(net))
+        self.say(f"{_name(tried[best])} explains as much as {_name(law)}, which is rarer")
+        earlier = {tried[best] if one == law else one: v for one, v in model.earlier.items()}
+        return _Model(fits[best], earlier, model.rivals)
 
     def _best_of_family(
         self,
@@ -464,7 +530,7 @@ class Search:
             law = min(nats, key=lambda one: nats[one])
             if nats[law] >= least:
                 break
-            model = model.dropped(law)
+            model = model.dropped(law).fitted()
         return model
 
     def _judged(
@@ -483,6 +549,7 @@ class Search:
         trajectories must not contradict it.
         """
         least, rejected = self.criteria.search.least_nats, dict[Attached, str]()
+        model = model.fitted(whole=True)
         while model.earlier:
             nats, worth, main = model.nats, model.evidence, self._main(without, model)
             weak = {
@@ -498,7 +565,7 @@ class Search:
                 )
             if law is None:
                 break
-            model, rejected[law] = model.dropped(law), why
+            model, rejected[law] = model.dropped(law).fitted(whole=True), why
         absorbed = {one.attached for one in regression.signatures if not one.basis.shape[1]}
         model, confounded = self._confounded(model, absorbed)
         worth, main, mode = model.evidence, self._main(without, model), model.mode
@@ -567,11 +634,7 @@ class Search:
             same = [one for one in rivals if one in absorbed]
             rivals = [one for one in rivals if one not in absorbed][:most]
             swaps = in_parallel(partial(_swapped, mode, law, model.rivals.get(law, {})), rivals)
-            gains = [
-                float((weights(mode) * np.log(mode.sigma / other.sigma)).sum())
-                + _prior_cost(mode) - _prior_cost(other)
-                for other in swaps
-            ]  # fmt: skip
+            gains = [_gained(mode, other) for other in swaps]
             net = [
                 gain + rival.effect.log_odds - law.effect.log_odds
                 for gain, rival in zip(gains, rivals, strict=True)
@@ -585,7 +648,7 @@ class Search:
                 better = rivals[place]
                 self.say(f"{_name(better)} explains whole trajectories better than {_name(law)}")
                 earlier = {better if one == law else one: v for one, v in model.earlier.items()}
-                model = _Model(swaps[place], earlier, model.rivals).fitted()
+                model = _Model(swaps[place], earlier, model.rivals).fitted(whole=True)
                 close = {law: 0.0} if gains[place] < limits.least_nats else {}
                 law = better
             groups[law] = (*same, *close)
@@ -693,7 +756,8 @@ def _proposals(
     # structures cost contact in the engine: they are refitted where they lead
     first = _structures(subsets[0]) if subsets else set()
     subsets = [one for one in subsets if _structures(one) <= first]
-    leading = [one for one in subsets if one.share >= least][:refits]
+    kinds = {_kind(one): one for one in reversed(subsets) if one.share >= least}
+    leading = sorted(kinds.values(), key=lambda one: -one.nats)[:refits]
     alone = [one for one in subsets if len(one.laws) == 1][:singles] if leading else []
     return list({frozenset(one.laws): one for one in (*leading, *alone)}.values())
 
@@ -804,6 +868,11 @@ def _far_out(mode: Mode, laws: Sequence[Attached]) -> float:
     layout = mode.problem.layout
     places = [place for law in laws for place in layout.places(law.labels)]
     return float(np.abs(prior_residual(layout.priors, mode.phi)[places]).max(initial=0.0))
+
+
+def _kind(subset: Subset) -> frozenset[tuple[str, str]]:
+    """Return the families of a subset's laws, of which one stands for the others."""
+    return frozenset((law.effect.family or law.effect.name, law.body) for law in subset.laws)
 
 
 def _structures(subset: Subset) -> set[Attached]:

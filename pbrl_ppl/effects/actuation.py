@@ -4,7 +4,14 @@ import math
 from dataclasses import replace
 from typing import Any
 
-from pbrl_ppl.effects.effect import Effect, EffectParameter, is_pivoted
+from pbrl_ppl.effects.actuators import (
+    actuator_backlash,
+    dead_zone,
+    of_component,
+    rate_limit,
+    saturation,
+)
+from pbrl_ppl.effects.effect import Effect, EffectParameter, always, is_pivoted
 from pbrl_ppl.effects.stages import Command
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import NUMBERS, Actuator, Scene
@@ -160,6 +167,35 @@ def actuation(scene: Scene, body: str) -> Effect | None:
     )
 
 
+#: What may be wrong with the command of any actuator: name and sentence.
+_SHAPES = (
+    (dead_zone, "dead_zone", "acts by what exceeds a threshold of its command alone"),
+    (saturation, "saturation", "acts as if its command were never larger than a limit"),
+    (rate_limit, "rate_limit", "follows its command no faster than at a limit"),
+    (actuator_backlash, "backlash", "lags behind its command after a turn until the play is over"),
+)
+
+
+def _of_command(
+    actuator: Actuator, parameters: tuple[EffectParameter, ...]
+) -> tuple[EffectParameter, ...]:
+    """Return parameters of a force for an actuator's command, whose unit is the column's."""
+    gain = actuator.numbers.get("gain", 1.0 if actuator.kind == "wrench" else None)
+    natural = "torque" if _kind(actuator) == _TORQUE else "force"
+    if not gain or actuator.kind == "servo":  # natural is what the gain's prior or a goal has
+        gain, natural = 1.0, ""
+    return tuple(
+        replace(
+            one,
+            unit=one.unit.replace("N", "1"),
+            prior=one.prior.scaled(1.0 / abs(gain)),
+            null=one.null / abs(gain),
+            scale=one.scale.replace("force", natural),
+        )
+        for one in parameters
+    )
+
+
 def laws_of_actuators(scene: Scene, body: str) -> tuple[Effect, ...]:
     """Return what may be wrong with each actuator of a body that is declared as known.
 
@@ -184,6 +220,10 @@ def laws_of_actuators(scene: Scene, body: str) -> tuple[Effect, ...]:
                     Command(_scale, alone=WRENCH[slot]),
                 )
             )
+        for law, suffix, sentence in _SHAPES:
+            shape = of_component(law, f"{name}_{suffix}", f"{name} {sentence}", WRENCH[slot])
+            parameters = _of_command(actuator, law.parameters)
+            laws.append(replace(shape, parameters=parameters, applies=always))
         if force and not dict(actuator.prior).get("direction"):
             laws.append(
                 Effect(

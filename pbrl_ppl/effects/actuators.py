@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -11,16 +12,23 @@ from pbrl_ppl.effects.stages import Command
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene
-from pbrl_ppl.state import Floats
+from pbrl_ppl.state import WRENCH, Floats
 
 _GAIN = Prior("log_normal", mu=0.0, sigma=0.5)
 _THRESHOLD = EffectParameter("threshold", "N", Prior("half_normal", sigma=0.5), scale="force")
 #: Force levels that a scan tries, and torques.
 _LEVELS, _FEW = 20, 8
+#: The components that are a force.
+_FORCE = slice(0, 2)
 #: No actuator reaches this force, in typical forces.
 _UNREACHED = 1e9
 #: Intervals by which a push may be late.
 _LATEST = 8
+
+
+def sends_wrenches(scene: Scene, body: Body) -> bool:
+    """Return whether a body's commands are forces and torques: it has no actuators."""
+    return not scene.actuators_of(body.name)
 
 
 def _rotate(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
@@ -68,6 +76,7 @@ force_gain = Effect(
     " off",
     "gain of an actuator",
     Command(_scale_force),
+    applies=sends_wrenches,
 )
 
 
@@ -82,6 +91,7 @@ torque_gain = Effect(
     " off",
     "gain of an actuator",
     Command(_scale_torque),
+    applies=sends_wrenches,
 )
 
 
@@ -97,12 +107,8 @@ anisotropic_gain = Effect(
     " actuators is off",
     "gains of two actuators at right angles",
     Command(_scale_axes),
+    applies=sends_wrenches,
 )
-
-
-def sends_wrenches(scene: Scene, body: Body) -> bool:
-    """Return whether a body's commands are forces and torques: it has no actuators."""
-    return not scene.actuators_of(body.name)
 
 
 def _delay(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
@@ -201,24 +207,13 @@ def _remember_ramp(state: Floats, command: Floats, parameters: Floats, memory: F
         memory[i] += min(1.0, most / max(off, 1e-300)) * (command[i] - memory[i])
 
 
-def _scan_rates(scene: Scene, history: History, body: Body) -> Floats:
-    """Return rates at which the largest change of the force takes some intervals."""
-    return _rates(history, body, scene.time_step, slice(0, 2))
-
-
-def _scan_torque_rates(scene: Scene, history: History, body: Body) -> Floats:
-    """Return the same of the torque."""
-    return _rates(history, body, scene.time_step, slice(2, 3))
-
-
-def _rates(history: History, body: Body, interval: float, components: slice) -> Floats:
+def _scan_rates(scene: Scene, history: History, body: Body, components: slice = _FORCE) -> Floats:
     """Return rates at which the largest change of a command takes some intervals, (rate, 1)."""
     action = history.dataset["action"].sel(body=body.name).to_numpy()[..., components]
     jumps = np.linalg.norm(np.diff(action, axis=1), axis=-1)
     most = float(np.nanmax(jumps, initial=0.0))
-    return np.array([[most / (interval * n)] for n in (1.5, 4.0, 10.0) if most > 0.0]).reshape(
-        -1, 1
-    )
+    shares = (1.5, 4.0, 10.0) if most > 0.0 else ()
+    return np.array([most / (scene.time_step * n) for n in shares])[:, None]
 
 
 _RATE = Prior("log_normal", mu=0.0, sigma=2.0)
@@ -259,8 +254,9 @@ actuator_backlash = Effect(
 )
 
 
-def _levels(history: History, body: Body, most: int, components: slice = slice(0, 2)) -> Floats:
+def _levels(history: History, body: Body, components: slice, most: int | None = None) -> Floats:
     """Return at most so many sizes between those commanded, shape (level, 1), N or N m."""
+    most = most or (_LEVELS if components == _FORCE else _FEW)
     action = history.dataset["action"].sel(body=body.name).to_numpy()[..., components]
     size = np.linalg.norm(action, axis=-1)
     size = size[size > 0]  # not NaN either
@@ -278,9 +274,11 @@ def _subtract_threshold(state: Floats, command: Floats, parameters: Floats, wren
     wrench[1] *= share
 
 
-def _scan_dead_zones(scene: Scene, history: History, body: Body) -> Floats:
+def _scan_dead_zones(
+    scene: Scene, history: History, body: Body, components: slice = _FORCE
+) -> Floats:
     """Return the null value, where the derivative is taken, and thresholds to try."""
-    return np.vstack([[[np.nan]], _levels(history, body, _LEVELS)])
+    return np.vstack([[[np.nan]], _levels(history, body, components)])
 
 
 dead_zone = Effect(
@@ -308,7 +306,7 @@ def _scan_cutoffs(scene: Scene, history: History, body: Body, *, levels: int = 2
     ``levels``: the likelihood jumps where the cut-off passes a commanded force, and an optimiser
     cannot follow it: many levels.
     """
-    return _levels(history, body, levels)
+    return _levels(history, body, _FORCE, levels)
 
 
 force_cutoff = Effect(
@@ -331,9 +329,9 @@ def _saturate(state: Floats, command: Floats, parameters: Floats, wrench: Floats
         wrench[1] *= parameters[0] / size
 
 
-def _scan_limits(scene: Scene, history: History, body: Body) -> Floats:
+def _scan_limits(scene: Scene, history: History, body: Body, components: slice = _FORCE) -> Floats:
     """Return limits to try."""
-    return _levels(history, body, _LEVELS)
+    return _levels(history, body, components)
 
 
 saturation = Effect(
@@ -357,56 +355,59 @@ saturation = Effect(
 )
 
 
-def _of_torque(effect: Effect, name: str, sentence: str, scan: Scan | None) -> Effect:
+@cache
+def _scan_of(scan: Scan, place: int) -> Scan:
+    """Return a scan by one component of the commands; the same for the same, as equality asks."""
+    return partial(scan, components=slice(place, place + 1))  # type: ignore[call-arg]
+
+
+def of_component(effect: Effect, name: str, sentence: str, component: str) -> Effect:
+    """Return a law of the commanded force for one component of the commands.
+
+    Parameters
+    ----------
+    effect : Effect
+        A law of the command stage.
+    name, sentence : str
+        Of the new law.
+    component : str
+        One of :data:`pbrl_ppl.state.WRENCH`.
+    """
+    place = WRENCH.index(component)
+    scan = None if effect.scan is None else _scan_of(effect.scan, place)
+    stage: Any = effect.stage
+    stage = replace(stage, alone=component)
+    return replace(effect, name=name, sentence=sentence, stage=stage, scan=scan)
+
+
+def _of_torque(effect: Effect, name: str, sentence: str) -> Effect:
     """Return a law of the commanded force for the commanded torque."""
     parameters = tuple(
         replace(p, unit=p.unit.replace("N", "N m"), scale=p.scale.replace("force", "torque"))
         for p in effect.parameters
     )
-    stage: Any = effect.stage
-    return replace(
-        effect,
-        name=name,
-        parameters=parameters,
-        sentence=sentence,
-        stage=replace(stage, alone="torque"),
-        scan=scan,
-    )
-
-
-def _scan_torque_dead_zones(scene: Scene, history: History, body: Body) -> Floats:
-    """Return the null value, where the derivative is taken, and thresholds to try."""
-    return np.vstack([[[np.nan]], _levels(history, body, _FEW, slice(2, 3))])
-
-
-def _scan_torque_levels(scene: Scene, history: History, body: Body) -> Floats:
-    """Return limits to try."""
-    return _levels(history, body, _FEW, slice(2, 3))
+    return replace(of_component(effect, name, sentence, "torque"), parameters=parameters)
 
 
 torque_dead_zone = _of_torque(
     dead_zone,
     "torque_dead_zone",
     "only what exceeds a threshold of the torque acts: the motor has play or friction",
-    _scan_torque_dead_zones,
 )
 torque_saturation = _of_torque(
     saturation,
     "torque_saturation",
     "the torque is never stronger than a limit, whatever is commanded: the motor saturates",
-    _scan_torque_levels,
 )
 torque_rate_limit = _of_torque(
     rate_limit,
     "torque_rate_limit",
     "the torque changes no faster than at a limit, whatever is commanded",
-    _scan_torque_rates,
 )
 torque_backlash = _of_torque(
     actuator_backlash,
     "torque_backlash",
     "after a turn the torque lags behind the command until the play is taken up",
-    None,
 )
 
 

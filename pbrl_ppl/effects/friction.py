@@ -140,17 +140,18 @@ pivot_load_friction = Effect(
 
 
 def _vary_with_angle(state: Floats, load: Floats, parameters: Floats, most: Floats) -> None:
-    most[0] += parameters[0] * math.cos(state[2]) + parameters[1] * math.sin(state[2])
+    most[0] *= 1.0 + parameters[0] * math.cos(state[2]) + parameters[1] * math.sin(state[2])
 
 
 pivot_angle_friction = Effect(
     "pivot_angle_friction",
     (
-        EffectParameter("cosine", "N m", _DIFFERENCE, scale="torque"),
-        EffectParameter("sine", "N m", _DIFFERENCE, scale="torque"),
+        EffectParameter("cosine", "1", _DIFFERENCE),
+        EffectParameter("sine", "1", _DIFFERENCE),
     ),
-    "dry friction in the hinge that is stronger at some angles: the bearing is bent or worn",
-    "Coulomb's law with a torque of the first harmonic of the angle",
+    "dry friction in the hinge that is stronger at some angles, by this share: the bearing is bent"
+    " or worn",
+    "Coulomb's law with a first harmonic of the angle, tau (1 + a cos(theta) + b sin(theta))",
     Friction(_vary_with_angle),
     applies=is_pivoted,
     log_odds=-3.0,

@@ -163,7 +163,9 @@ def _without_ellipse(measured: Floats, parameters: Values) -> Floats:
     return _without_harmonic(measured, parameters, 2)
 
 
-_PARTS = (EffectParameter("cosine", "rad", _TILT), EffectParameter("sine", "rad", _TILT))
+# of a camera that looks askew by an angle a it is (1 - cos a) / 2: 0.03 rad for 20 degrees
+_HARMONIC = Prior("normal", sigma=0.03)
+_PARTS = (EffectParameter("cosine", "rad", _HARMONIC), EffectParameter("sine", "rad", _HARMONIC))
 
 encoder_eccentricity = Effect(
     "encoder_eccentricity",

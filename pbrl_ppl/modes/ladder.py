@@ -230,7 +230,7 @@ def fit_pieces(
         step = _Step(problem, linear, sigma, phi, start)
         if not failed:
             steps = step.differences(scale, sizes)
-        gained = 0.0
+        gained, promised = 0.0, step.promised
         for _ in range(n_steps):
             tried = [step.moved(damping * factor, starts_alone) for factor in dampings]
             points, starts = (np.array(values) for values in zip(*tried, strict=True))
@@ -248,12 +248,14 @@ def fit_pieces(
         if gained > tolerance:
             failed = 0
             continue
-        if failed == len(wider):
+        if failed == len(wider) or promised <= tolerance:
+            linear = replace(linear, residual=step.residual)
             break
         # friction makes kinks: over another width the derivative sees others
         steps = steps[0] * wider[failed], steps[1] * wider[failed]
         damping, failed = 1e-3, failed + 1
-    linear = _linearise(problem, phi, start, steps)
+    else:
+        linear = _linearise(problem, phi, start, steps)
     problem, sigma = _with_noise(problem, start, linear)
     step = _Step(problem, linear, sigma, phi, start)
     problem = linearised_pieces(problem, start, linear.by_start, _tau(problem))
@@ -371,7 +373,7 @@ class _Step:
         self._move(phi, start, linear.residual)
 
     def _move(self, phi: Floats, start: Floats, residual: Floats) -> None:
-        self.phi, self.start = phi, start
+        self.phi, self.start, self.residual = phi, start, residual
         self.rows = self._rows(start, residual)
         left = self._left(self.rows)
         priors = self.problem.layout.priors
@@ -412,6 +414,11 @@ class _Step:
     def covariance(self) -> Floats:
         """Laplace covariance of phi, shape (p, p)."""
         return covariance_of(self.precision)
+
+    @property
+    def promised(self) -> float:
+        """Gain that the derivatives promise (nats)."""
+        return 0.5 * float(self.gradient @ self.covariance @ self.gradient)
 
     def differences(
         self, scale: Floats, sizes: Floats, *, of_start_sd: float = 0.3
