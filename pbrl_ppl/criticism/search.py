@@ -412,11 +412,8 @@ class Search:
         fits = in_parallel(partial(_with_subset, mode), proposals)
         shares = [Evidence.of(mode, fitted).share for fitted in fits]
         if not any(map(_keeps_promise, proposals, shares)):
-            again = in_parallel(partial(_with_subset, mode, sizes=_SHORTER), proposals)
-            fits = [
-                max(pair, key=lambda one: Evidence.of(mode, one).share)
-                for pair in zip(fits, again, strict=True)
-            ]
+            again = _with_subset(mode, proposals[0], sizes=_SHORTER)
+            fits[0] = max(fits[0], again, key=lambda one: Evidence.of(mode, one).share)
             shares = [Evidence.of(mode, fitted).share for fitted in fits]
         weight = weights(fits[int(np.argmax(shares))])
         judged = [

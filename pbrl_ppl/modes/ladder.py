@@ -187,7 +187,7 @@ def fit_pieces(
     starts_alone: bool = False,
     n_steps: int = 2,
     much: float = 0.2,
-    dampings: tuple[float, ...] = (0.2, 10.0, 1e4),
+    dampings: tuple[float, ...] = (0.03, 0.3, 3.0, 30.0, 300.0, 3e3, 3e4),
     least_damping: float = 1e-8,
     wider: tuple[float, ...] = (3.0, 0.1),
     first_width: float = 1e-4,
@@ -223,9 +223,9 @@ def fit_pieces(
     scale, sizes = layout.scale(phi), output_error(problem).starts.coordinates.sizes(problem.scene)
     phi, start = inside(priors, phi), problem.segments.start
     steps = first_width * np.where(layout.discrete, 0.0, scale), first_width * sizes
-    damping, failed = 1e-3, 0
+    damping, failed, one_sided = 1e-3, 0, True
     for _ in range(rounds):
-        linear = _linearise(problem, phi, start, steps)
+        linear = _linearise(problem, phi, start, steps, one_sided)
         problem, sigma = _with_noise(problem, start, linear)
         step = _Step(problem, linear, sigma, phi, start)
         if not failed:
@@ -247,6 +247,9 @@ def fit_pieces(
             damping = min(max(damping * dampings[best], least_damping), 1.0)
         if gained > tolerance:
             failed = 0
+            continue
+        if one_sided:  # far from the optimum one side will do
+            one_sided = False
             continue
         if failed == len(wider) or promised <= tolerance:
             linear = replace(linear, residual=step.residual)
@@ -311,25 +314,36 @@ def _residual(problem: Problem, points: Floats, starts: Floats) -> Floats:
 
 
 def _linearise(
-    problem: Problem, phi: Floats, start: Floats, steps: tuple[Floats, Floats]
+    problem: Problem,
+    phi: Floats,
+    start: Floats,
+    steps: tuple[Floats, Floats],
+    one_sided: bool = False,
 ) -> Linear:
-    """Return residual and derivatives by central differences, all in one call of the engine."""
+    """Return residual and derivatives by differences, all in one call of the engine.
+
+    They are central but for those by phi where ``one_sided``.
+    """
     coordinates = output_error(problem).starts.coordinates
     lower, upper = box(problem.layout.priors)
     ahead, behind = np.minimum(phi + steps[0], upper), np.maximum(phi - steps[0], lower)
+    if one_sided:
+        ahead, behind = np.where(ahead > phi, ahead, behind), phi
     p, c = len(phi), len(coordinates.places)
-    points = np.tile(phi, (1 + 2 * p + 2 * c, 1))
+    points = np.tile(phi, (1 + (2 - one_sided) * p + 2 * c, 1))
     np.fill_diagonal(points[1 : 1 + p], ahead)
-    np.fill_diagonal(points[1 + p : 1 + 2 * p], behind)
+    if not one_sided:
+        np.fill_diagonal(points[1 + p : 1 + 2 * p], behind)
     starts = np.tile(start, (len(points), 1, 1, 1))
     flat = starts.reshape(len(points), len(start), -1)
     for i, place in enumerate(coordinates.places[:c]):
-        flat[1 + 2 * p + i, :, place] += steps[1][i]
-        flat[1 + 2 * p + c + i, :, place] -= steps[1][i]
+        flat[i - 2 * c, :, place] += steps[1][i]
+        flat[i - c, :, place] -= steps[1][i]
     residual = _residual(problem, points, coordinates.completed(problem.scene, starts))
-    width = np.maximum(ahead - behind, 1e-300)
-    by_phi = np.moveaxis(residual[1 : 1 + p] - residual[1 + p : 1 + 2 * p], 0, -1) / -width
-    begun = residual[1 + 2 * p :]
+    width = np.where(ahead == behind, 1e-300, ahead - behind)
+    before = residual[:1] if one_sided else residual[1 + p : 1 + 2 * p]
+    by_phi = np.moveaxis(residual[1 : 1 + p] - before, 0, -1) / -width
+    begun = residual[len(residual) - 2 * c :]
     by_start = np.moveaxis(begun[:c] - begun[c:], 0, -1) / (-2 * steps[1])
     return Linear(residual[0], by_phi, by_start)
 
