@@ -45,6 +45,8 @@ from pbrl_ppl.threads import in_parallel
 LIKELY = 0.7
 #: A law of so many nats to first order is kept without a fit of the model without it.
 _CLEAR = 30.0
+#: Log odds of laws that are rare, at most.
+_RARE = -5.0
 #: Share of the joint sizes from which refits begin a second time.
 _SHORTER = 0.3
 
@@ -333,8 +335,13 @@ class Search:
                 model = trial
             model, rung, _, regression = self._at_length(model.at(higher))
             rungs.append(rung)
-        # on the longest pieces, where they add up, small corrections as well
-        better = self._grown(model, regression, self.criteria.search.small_share)
+        # on the longest pieces, where they add up, small corrections as well, if they are common
+        common = tuple(
+            one for one in regression.subsets
+            if all(law.effect.log_odds > _RARE for law in one.laws)
+        )  # fmt: skip
+        small = replace(regression, subsets=common)
+        better = self._grown(model, small, self.criteria.search.small_share)
         if better is not model:
             model, regression = better, self._regression(better.mode)
         declared = _without_all(model, begin)
@@ -445,21 +452,19 @@ class Search:
         pruned = self._pruned(grown.fitted())
         return pruned if set(pruned.earlier) - set(model.earlier) else model
 
-    def _with_commoner(
-        self, model: _Model, law: Attached, *, rare: float = -5.0, most: int = 4
-    ) -> _Model:
+    def _with_commoner(self, model: _Model, law: Attached, *, most: int = 4) -> _Model:
         """Return the model with a more common law in the place of a rare one that does as well.
 
         The candidates are linearised at the model without the rare one, for where other laws are
         missing as well their derivatives say little.
 
-        ``rare``: log odds below which a law is; ``most``: laws that are tried.
+        ``most``: laws that are tried.
         """
-        if law.effect.log_odds > rare:
+        if law.effect.log_odds > _RARE:
             return model
         without = drop(model.mode, law)
         others = {one.effect.family for one in model.earlier if one != law} - {""}
-        alone = [one for one in self._regression(without, rare).subsets if len(one.laws) == 1]
+        alone = [one for one in self._regression(without, _RARE).subsets if len(one.laws) == 1]
         rivals = {one.laws[0]: one for one in reversed(alone)}
         rivals = {one: s for one, s in rivals.items() if one.effect.family not in others}
         tried = list(reversed(rivals))[:most]

@@ -58,6 +58,37 @@ def test_two_fans_on_a_disc() -> None:
     )
 
 
+def played(u: np.ndarray, width: float) -> np.ndarray:
+    """Return commands after a play, which begins where the first one is."""
+    acted = [u[0]]
+    for command in u[1:]:
+        acted.append(np.clip(acted[-1], command - width, command + width))
+    return np.array(acted)
+
+
+@pytest.mark.parametrize(
+    ("law", "size", "acted"),
+    [
+        ("dead_zone", "threshold", lambda u: np.sign(u) * np.maximum(np.abs(u) - 0.4, 0.0)),
+        ("saturation", "limit", lambda u: np.clip(u, -0.4, 0.4)),
+        ("backlash", "threshold", lambda u: played(u, 0.4)),
+    ],
+)
+def test_a_law_of_one_actuator_is_in_units_of_its_command(law, size, acted) -> None:
+    """As if that fan alone had been sent the changed commands."""
+    known = {"mass": MASS, "r": 0.0, "mu_c": 0.0}
+    one = Body("disc", DISC, effects=(f"right_{law}",), known=known)
+    u = np.random.default_rng(1).normal(size=(1, 10, 1, 3)) * (1.0, 1.0, 0.0)
+    u[0, 0] = 0.0
+    changed = u.copy()
+    changed[0, :, 0, 1] = acted(u[0, :, 0, 1])
+    start = np.zeros((1, 1, 6))
+    with_law = Transition(fans(bodies=(one,)), {f"right_{law}_{size}": 0.4})
+    got = with_law.predict(start, u)
+    np.testing.assert_allclose(got, Transition(fans(), {}).predict(start, changed), atol=1e-12)
+    assert not np.allclose(got, Transition(fans(), {}).predict(start, u), atol=1e-3)
+
+
 def arms(*actuators: Actuator) -> Scene:
     """Two arms in a row, hinged to each other and free otherwise."""
     known = {"mass": MASS, "r": 0.0, "mu_c": 0.0}
