@@ -72,6 +72,7 @@ from .sampling import fit as fit
 from .sampling import physics_model as physics_model
 from .sampling import pool as pool
 from .sampling import update as update
+from .scene import Actuator as Actuator
 from .scene import Body as Body
 from .scene import Joint as Joint
 from .scene import Scene as Scene

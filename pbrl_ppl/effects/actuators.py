@@ -1,13 +1,12 @@
 """Actuators: gains, rotation, delay, dead zone, cut-off and saturation of the command."""
 
 import math
-from dataclasses import replace
-from functools import cache, partial
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from pbrl_ppl.effects.effect import Effect, EffectParameter, Scan
+from pbrl_ppl.effects.effect import Effect, EffectParameter
 from pbrl_ppl.effects.stages import Command
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
@@ -355,10 +354,17 @@ saturation = Effect(
 )
 
 
-@cache
-def _scan_of(scan: Scan, place: int) -> Scan:
-    """Return a scan by one component of the commands; the same for the same, as equality asks."""
-    return partial(scan, components=slice(place, place + 1))  # type: ignore[call-arg]
+@dataclass(frozen=True)
+class _ScanOfComponent:
+    """A scan by one component of the commands; it compares equal in other processes too."""
+
+    scan: Any
+    place: int
+
+    def __call__(self, scene: Scene, history: History, body: Body) -> Floats:
+        """Return the grid; see :data:`pbrl_ppl.effects.effect.Scan`."""
+        grid: Floats = self.scan(scene, history, body, slice(self.place, self.place + 1))
+        return grid
 
 
 def of_component(effect: Effect, name: str, sentence: str, component: str) -> Effect:
@@ -373,8 +379,7 @@ def of_component(effect: Effect, name: str, sentence: str, component: str) -> Ef
     component : str
         One of :data:`pbrl_ppl.state.WRENCH`.
     """
-    place = WRENCH.index(component)
-    scan = None if effect.scan is None else _scan_of(effect.scan, place)
+    scan = effect.scan and _ScanOfComponent(effect.scan, WRENCH.index(component))
     stage: Any = effect.stage
     stage = replace(stage, alone=component)
     return replace(effect, name=name, sentence=sentence, stage=stage, scan=scan)
