@@ -27,6 +27,7 @@ from attribution.bodies import (
     draw_body,
     twins,
 )  # fmt: skip
+from attribution.outside import CONTAINING
 from attribution.sizes import EFFECTS, OUTSIDE_OF, STEPS, STRONGEST, makes_sense, value
 from attribution.worlds import simulate
 
@@ -102,11 +103,15 @@ class Case:
 
     @property
     def left_out(self) -> tuple[str | None, ...]:
-        """Return the effects removed from the loop's catalogue: the effect and its equivalents."""
+        """Return what is removed from the loop's catalogue: the effect, its equivalents, family."""
+        if self.kind == OUTSIDE:
+            return (CONTAINING.get(str(self.effect)),)
         if self.kind != LEFT_OUT:
             return ()
         richer = (outer for outer, own in CONTAIN[self.body.sort] if own == self.effect)
-        return (*twins(self.body.sort, self.effect), *richer)
+        families = {one.family for one in pp.catalogue if one.name == self.effect} - {""}
+        family = (one.name for one in pp.catalogue if one.family in families)
+        return (*twins(self.body.sort, self.effect), *richer, *family)
 
     @property
     def catalogue(self) -> tuple[pp.Effect, ...]:
