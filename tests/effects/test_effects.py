@@ -35,6 +35,7 @@ AWAY = {
 }
 #: What changes dry friction under a body needs some.
 BESIDE = dict.fromkeys(("sliding_stribeck", "friction_by_place"), "sliding_friction")
+BESIDE["pivot_angle_friction"] = "pivot_friction"
 PATHS = pytest.mark.parametrize("path", ["auto", "python"])
 
 
