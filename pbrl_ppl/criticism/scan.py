@@ -133,17 +133,18 @@ def _points(
     return np.array(points), plan
 
 
-def detection_limits_of_scan(
+def detection_limits(
     effect: Effect,
     points: Sequence[GridPoint],
     units: Sequence[Floats],
     candidates: int,
     criteria: ResidualCriteria,
 ) -> dict[str, float]:
-    """Return the smallest detectable sizes of a scanned effect, each at its best grid point.
+    """Return the smallest detectable sizes of an effect, the other parameters at null values.
 
-    For a whole change by a single parameter, as by a threshold, it is the detectable value nearest
-    to the null value; a whole change by several, such as an obstacle's place, has no size.
+    Of a scanned one each is at its best grid point. For a whole change by a single parameter, as by
+    a threshold, it is the detectable value nearest to the null value; a whole change by several,
+    such as an obstacle's place, has no size.
 
     Parameters
     ----------
@@ -170,10 +171,10 @@ def detection_limits_of_scan(
         seen = [values[0] for values, unit in whole if unit[0] >= _needed(tried, criteria)]
         limits[names[0]] = float(min(seen, key=lambda value: abs(value - null), default=np.inf))
     for point, unit in zip(points, units, strict=True):
-        for column, size in zip(
-            point.columns, detectable_sizes(unit, tried, criteria), strict=False
-        ):
-            limits[names[column]] = min(limits.get(names[column], np.inf), size)
+        with np.errstate(divide="ignore"):
+            sizes = _needed(tried, criteria) / unit
+        for column, size in zip(point.columns, sizes, strict=False):
+            limits[names[column]] = min(limits.get(names[column], np.inf), float(size))
     return limits
 
 
@@ -187,19 +188,3 @@ def caps(effect: Effect, points: Sequence[GridPoint]) -> bool:
 def _needed(tried: int, criteria: ResidualCriteria) -> float:
     """Return the detectable change in units of noise, for a two-sided test."""
     return float(norm.isf(criteria.detection_p / 2 / tried) + norm.ppf(criteria.detection_power))
-
-
-def detectable_sizes(unit: Floats, tried: int, criteria: ResidualCriteria) -> list[float]:
-    """Return the smallest detectable size of each column, the others at their null values.
-
-    Parameters
-    ----------
-    unit : ndarray
-        Change of the prediction by one unit of each column, in units of noise, shape (column,).
-    tried : int
-        Number of tests that the p-value is corrected for.
-    criteria : ResidualCriteria
-        P-value and power of the limit.
-    """
-    with np.errstate(divide="ignore"):
-        return [float(size) for size in _needed(tried, criteria) / unit]

@@ -14,8 +14,7 @@ from pbrl_ppl.criticism.results import Candidate
 from pbrl_ppl.criticism.scan import (
     GridPoint,
     caps,
-    detectable_sizes,
-    detection_limits_of_scan,
+    detection_limits,
     grid_points,
 )
 from pbrl_ppl.effects import Attached, Noise
@@ -129,18 +128,11 @@ def score_candidates(
         Smallest p-value first; of equal ones, the earlier in the catalogue. Effects of the noise
         stage come last.
     """
-    test, derived = _test(mode, candidates, criteria)
+    test = _score_test(mode, len(candidates), criteria)
 
     def score(attached: Attached) -> Signature:
-        if _of_noise(attached):
-            return _tail_score(mode, attached, test)
-        if attached in derived:
-            sides = null_sides(attached)
-            evidence = test.evidence(derived[attached], sides, _scales(attached))
-            null = np.array(attached.effect.null)
-            linear = (evidence.about(null, tuple(range(len(null)))),)
-            return _signature(attached, evidence, null + evidence.size, 1, test, linear)
-        return _best_grid_point(mode, attached, test)
+        best = _tail_score if _of_noise(attached) else _best_grid_point
+        return best(mode, attached, test)
 
     # the noise's shape comes last: any missing effect makes tails heavy; p-values of the same
     # physics differ by rounding
@@ -158,54 +150,35 @@ def linearised(
     Those without a scan are linearised at the null value, those of the noise not at all. Candidates
     that the declared parameters absorb have no linearisation.
     """
-    test, derived = _test(mode, candidates, criteria)
-
-    def points(attached: Attached) -> list[GridPoint]:
-        if attached not in derived:
-            return grid_points(mode, attached)
-        null = np.array(attached.effect.null, dtype=float)
-        return [GridPoint(null, derived[attached], tuple(range(len(null))))]
+    test = _score_test(mode, len(candidates), criteria)
 
     def every(attached: Attached) -> tuple[Linearisation, ...]:
-        tried = [] if _of_noise(attached) else points(attached)
-        seen = [test.at(point, attached).about(point.values, point.columns) for point in tried]
+        tried = [] if _of_noise(attached) else _points(mode, attached)
+        seen = [test.at(point, attached).about(point) for point in tried]
         return tuple(one for one in seen if one.basis.shape[1])
 
     return test, dict(zip(candidates, in_parallel(every, candidates), strict=True))
 
 
-def _test(
-    mode: Mode, candidates: Sequence[Attached], criteria: Criteria
-) -> tuple[ScoreTest, dict[Attached, Floats]]:
-    """Return the score tests at a mode, and the signatures of candidates that are not scanned."""
-    smooth = [one for one in candidates if one.effect.scan is None and not _of_noise(one)]
-    residual, jacobian, signatures = _signatures(mode, smooth)
+def _score_test(mode: Mode, candidates: int, criteria: Criteria) -> ScoreTest:
+    """Return the score tests at a mode, with the prior as further rows of the residual."""
+    priors = mode.problem.layout.priors
+    residual = np.concatenate([mode.whitened_residual.ravel(), -prior_residual(priors, mode.phi)])
+    jacobian = np.vstack([_slopes(mode), np.diag(prior_slopes(priors, mode.phi))])
     scale = 1.0 / np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
     q, r = np.linalg.qr(jacobian * scale)
     # a parameter that neither the data nor the prior inform has no direction
     informed = np.abs(np.diag(r)) > 1e-10 * np.abs(np.diag(r)).max(initial=0.0)
     back, q = scale[:, None] * np.linalg.pinv(r)[:, informed], q[:, informed]
-    test = ScoreTest(q, back, residual - q @ (q.T @ residual), len(candidates), criteria)
-    return test, dict(zip(smooth, signatures, strict=True))
+    return ScoreTest(q, back, residual - q @ (q.T @ residual), candidates, criteria)
 
 
-def _signatures(mode: Mode, candidates: Sequence[Attached]) -> tuple[Floats, Floats, list[Floats]]:
-    """Return residual, Jacobian and every candidate's signature, with the prior as further rows.
-
-    Returns
-    -------
-    residual : ndarray
-        Shape (n + p,), whitened, with the sign of measured minus predicted.
-    jacobian : ndarray
-        Derivative of the prediction by the declared parameters, shape (n + p, p).
-    signatures : list of ndarray
-        Derivative of the prediction by each candidate's parameters, shape (n + p, q) each.
-    """
-    p, priors = len(mode.phi), mode.problem.layout.priors
-    residual = np.concatenate([mode.whitened_residual.ravel(), -prior_residual(priors, mode.phi)])
-    jacobian = np.vstack([_slopes(mode), np.diag(prior_slopes(priors, mode.phi))])
-    signatures = in_parallel(partial(_slopes, mode), candidates)
-    return residual, jacobian, [np.pad(signature, ((0, p), (0, 0))) for signature in signatures]
+def _points(mode: Mode, attached: Attached) -> list[GridPoint]:
+    """Return a candidate at every grid point of its scan, or else at its null value."""
+    if attached.effect.scan is not None:
+        return grid_points(mode, attached)
+    null = np.array(attached.effect.null, dtype=float)
+    return [GridPoint(null, _slopes(mode, attached), tuple(range(len(null))))]
 
 
 def _slopes(mode: Mode, attached: Attached | None = None) -> Floats:
@@ -251,9 +224,9 @@ class _Evidence:
     absorbed: Floats
     back: Floats
 
-    def about(self, values: Floats, columns: tuple[int, ...]) -> Linearisation:
-        """Return the linearisation of a signature that was taken at some values, shape (q,)."""
-        return Linearisation(values, columns, self.basis, self.back)
+    def about(self, point: GridPoint) -> Linearisation:
+        """Return the linearisation of the signature of a grid point."""
+        return Linearisation(point.values, point.columns, self.basis, self.back)
 
 
 def _none(n: int, p: int) -> _Evidence:
@@ -357,17 +330,18 @@ def _signature(
     attached: Attached,
     evidence: _Evidence,
     values: Floats,
-    n_points: int,
     test: ScoreTest,
+    tried: Sequence[GridPoint],
+    units: Sequence[Floats],
     linear: tuple[Linearisation, ...] = (),
 ) -> Signature:
-    """Return a candidate's signature, its p-value corrected for grid points and candidates."""
-    effect, limits = attached.effect, {}
+    """Return a candidate's signature, its p-value corrected for grid points and candidates.
+
+    ``units`` are the changes by one unit of each column of the grid points that were ``tried``.
+    """
+    effect = attached.effect
     names = [parameter.name for parameter in effect.parameters]
-    if effect.scan is None:
-        sizes = detectable_sizes(evidence.unit, test.candidates, test.criteria.residual)
-        limits = dict(zip(names, sizes, strict=True))
-    log_p = min(0.0, evidence.log_p + np.log(max(1, n_points)))
+    log_p = min(0.0, evidence.log_p + np.log(max(1, len(tried))))
     candidate = Candidate(
         effect=effect.name,
         body=attached.body,
@@ -378,8 +352,9 @@ def _signature(
         estimate=dict(zip(names, values.tolist(), strict=True)),
         units={parameter.name: parameter.unit for parameter in effect.parameters},
         identifiable=evidence.share,
-        looks=n_points,
-        detectable=limits,
+        looks=len(tried),
+        detectable=detection_limits(effect, tried, units, test.candidates, test.criteria.residual),
+        caps=caps(effect, tried),
     )
     return Signature(
         attached, candidate, log_p, evidence.basis, evidence.direction, evidence.absorbed, linear
@@ -389,36 +364,31 @@ def _signature(
 def _best_grid_point(mode: Mode, attached: Attached, test: ScoreTest, again: int = 4) -> Signature:
     """Return the signature of the grid point that explains most; a whole change has one sign.
 
-    The ``again`` leading ones are simulated again with more engine steps.
+    The ``again`` leading ones of a scan are simulated again with more engine steps.
     """
-    effect, n = attached.effect, len(test.residual)
-    tried = grid_points(mode, attached)
+    tried = _points(mode, attached)
     scores = [test.at(point, attached) for point in tried]
-    units = [score.unit for score in scores]
-    best, values = _none(n, len(test.back)), np.array(effect.null)
-    leading = sorted(range(len(tried)), key=lambda i: scores[i].log_p)[:again]
-    finer: list[GridPoint] = []
-    if leading and scores[leading[0]].log_p < 0.0:
-        finer = grid_points(mode, attached, np.array([tried[i].proposed for i in leading]))
-    linear: tuple[Linearisation, ...] = ()
-    if finer:  # with more engine steps a body may pass by
+    judged = list(zip(scores, tried, strict=True))
+    if attached.effect.scan is not None:  # with more engine steps a body may pass by
+        leading = sorted(judged, key=lambda x: x[0].log_p)[:again]
+        finer: list[GridPoint] = []
+        if leading and leading[0][0].log_p < 0.0:
+            proposed = np.array([point.proposed for _, point in leading])
+            finer = grid_points(mode, attached, proposed)
         judged = sorted(
-            ((test.at(trial, attached), trial) for trial in finer), key=lambda x: x[0].log_p
+            ((test.at(point, attached), point) for point in finer), key=lambda x: x[0].log_p
         )
-        linear = tuple(one.about(at.values, at.columns) for one, at in judged if one.statistic > 0)
+    best, values = _none(len(test.residual), len(test.back)), np.array(attached.effect.null)
+    if judged:
         best, point = judged[0]
         values = point.values.copy()
         for column, size in zip(point.columns, best.size, strict=False):
             values[column] += size
-    signature = _signature(attached, best, values, len(tried), test, linear)
-    candidate = replace(
-        signature.candidate,
-        detectable=detection_limits_of_scan(
-            effect, tried, units, test.candidates, test.criteria.residual
-        ),
-        caps=caps(effect, tried),
-    )
-    return replace(signature, candidate=candidate)
+    linear = tuple(
+        one.about(point) for one, point in judged
+        if one.statistic > 0 or attached.effect.scan is None
+    )  # fmt: skip
+    return _signature(attached, best, values, test, tried, [one.unit for one in scores], linear)
 
 
 def _of_noise(attached: Attached) -> bool:
@@ -451,9 +421,10 @@ def _tail_score(mode: Mode, attached: Attached, test: ScoreTest) -> Signature:
         unit=np.array([np.sqrt(variance) if len(z) else 0.0]),
     )
     values = np.array(attached.effect.null)
+    point = GridPoint(values, np.zeros((0, 1)), (0,))
     if heavier and len(values) == 1:
         values = values + score / variance
-    return _signature(attached, evidence, values, 1, test)
+    return _signature(attached, evidence, values, test, [point], [evidence.unit])
 
 
 def same_physics(first: Signature, second: Signature, cosine: float = 0.9999) -> bool:

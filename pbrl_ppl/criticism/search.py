@@ -275,6 +275,15 @@ class _Model:
         earlier = {one: nats for one, nats in self.earlier.items() if one != law}
         return _Model(self.without[law], earlier, self.rivals)
 
+    def exchanged(self, law: Attached, other: Attached, mode: Mode) -> _Model:
+        """Return the model with another law in the place of one, and its prior odds."""
+        paid = other.effect.log_odds - law.effect.log_odds
+        earlier = {
+            other if one == law else one: nats + paid * (one == law)
+            for one, nats in self.earlier.items()
+        }
+        return _Model(mode, earlier, self.rivals)
+
     def at(self, mode: Mode) -> _Model:
         """Return the model on longer pieces."""
         return _Model(mode, self.nats, self.rivals)
@@ -401,14 +410,14 @@ class Search:
         )
         return model, rung, first, regression
 
-    def _regression(self, mode: Mode, rare: float = -np.inf) -> Regression:
-        """Return the subsets of what a model lacks, what is rare and the noise's shape aside."""
-        candidates = [
-            one for one in self.missing(mode)
-            if not isinstance(one.effect.stage, Noise) and one.effect.log_odds > rare
-        ]  # fmt: skip
+    def _regression(
+        self, mode: Mode, missing: Sequence[Attached] | None = None, largest: int = 4
+    ) -> Regression:
+        """Return the subsets of what a model lacks, the noise's shape aside."""
+        missing = self.missing(mode) if missing is None else missing
+        candidates = [one for one in missing if not isinstance(one.effect.stage, Noise)]
         cheap = corrected(mode) if mode.problem.likelihood.simulated else mode
-        return best_subsets(cheap, candidates, self.criteria)
+        return best_subsets(cheap, candidates, self.criteria, largest=largest)
 
     def _grown(self, model: _Model, regression: Regression, least_share: float) -> _Model:
         """Return the model with the best subset that takes enough away, or the model itself."""
@@ -438,90 +447,51 @@ class Search:
         top = max(one[0].nats for one in enough)
         tied = [one for one in enough if one[0].nats > top - limits.least_nats]
         _, subset, fitted = min(tied, key=lambda one: (len(one[2].phi), -one[0].nats))
-        subset, fitted = self._best_of_family(mode, subset, fitted, regression, weight)
-        self.say(f"simulations name {' and '.join(map(_name, subset.laws))}")
-        rivals = {
-            law: _rivals(regression, subset, law, limits.least_nats)
-            for law in subset.laws
-            if law in regression.same
-        }  # each law has to be worth its price
+        # each law has to be worth its price
         paid = {law: -price for law, price in subset.prices.items()}
-        grown = _Model(fitted, {**model.earlier, **paid}, {**model.rivals, **rivals})
+        grown = _Model(fitted, {**model.earlier, **paid}, model.rivals)
         for law in subset.laws:
-            grown = self._with_commoner(grown, law)
-        pruned = self._pruned(grown.fitted())
+            grown = self._exchanged(grown, law, mode, _family(regression, subset, law))
+        laws = [law for law in grown.earlier if law not in model.earlier]
+        self.say(f"simulations name {' and '.join(map(_name, laws))}")
+        subset = next((one for one in regression.subsets if set(one.laws) == set(laws)), subset)
+        rivals = {law: _rivals(regression, subset, law, limits.least_nats) for law in subset.laws}
+        pruned = self._pruned(replace(grown, rivals={**model.rivals, **rivals}).fitted())
         return pruned if set(pruned.earlier) - set(model.earlier) else model
 
-    def _with_commoner(self, model: _Model, law: Attached, *, most: int = 4) -> _Model:
-        """Return the model with a more common law in the place of a rare one that does as well.
+    def _exchanged(
+        self, model: _Model, law: Attached, before: Mode, family: Mapping[Attached, Floats]
+    ) -> _Model:
+        """Return the model with a law of its family in the place of one that does better.
 
-        The candidates are linearised at the model without the rare one, for where other laws are
-        missing as well their derivatives say little.
-
-        ``most``: laws that are tried.
+        In the place of a rare law, common ones are tried as well. They are linearised at the model
+        without it, for where other laws are missing as well their derivatives say little.
         """
-        if law.effect.log_odds > _RARE:
+        begin, least = model.mode, self.criteria.search.least_nats
+        if law.effect.log_odds <= _RARE:
+            begin = before = drop(model.mode, law)
+            others = {one.effect.family for one in model.earlier if one != law} - {""}
+            family, least = self._as_common(begin, law, others), 0.0
+        swaps = _swaps(begin, law, family)
+        net = _net(before, model.mode, law, swaps)
+        better = max(net, key=lambda one: net[one], default=law)
+        if better == law or net[better] < least:
             return model
-        without = drop(model.mode, law)
-        others = {one.effect.family for one in model.earlier if one != law} - {""}
-        alone = [one for one in self._regression(without, _RARE).subsets if len(one.laws) == 1]
-        rivals = {one.laws[0]: one for one in reversed(alone)}
-        rivals = {one: s for one, s in rivals.items() if one.effect.family not in others}
-        tried = list(reversed(rivals))[:most]
-        fits = in_parallel(partial(_with_subset, without), [rivals[one] for one in tried])
-        net = [
-            _gained(model.mode, fitted) + one.effect.log_odds - law.effect.log_odds
-            for one, fitted in zip(tried, fits, strict=True)
-        ]
-        if not net or max(net) < 0.0:
-            return model
-        best = int(np.argmax(net))
-        self.say(f"{_name(tried[best])} explains as much as {_name(law)}, which is rarer")
-        earlier = {tried[best] if one == law else one: v for one, v in model.earlier.items()}
-        return _Model(fits[best], earlier, model.rivals)
+        self.say(f"{_name(better)} explains simulations better than {_name(law)}")
+        return model.exchanged(law, better, swaps[better])
 
-    def _best_of_family(
-        self,
-        before: Mode,
-        subset: Subset,
-        fitted: Mode,
-        regression: Regression,
-        weight: Floats,
-        *,
-        most: int = 4,
-        near: float = 0.85,
-    ) -> tuple[Subset, Mode]:
-        """Return the subset and its refit, with the laws of each one's family that do better.
-
-        ``most``: laws that are tried in the place of one, with a share of ``near`` of what the
-        regression says of it at least.
-        """
-        for law in subset.laws:
-            rest, effects = set(subset.laws) - {law}, fitted.problem.physics.effects
-            sizes: dict[Attached, Floats] = {}
-            for other in regression.subsets:
-                (rival, *more) = set(other.laws) - rest or {law}
-                fits = not more and len(other.laws) == len(subset.laws) and rest < set(other.laws)
-                alike = rival.effect.family == law.effect.family and rival.body == law.body
-                if fits and alike and rival not in effects and other.share > near * subset.share:
-                    sizes.setdefault(rival, other.sizes[rival])
-            rivals = list(sizes)[:most] if law.effect.family else []
-            swaps = in_parallel(partial(_swapped, fitted, law, sizes), rivals)
-            nats = [
-                Evidence.of(before, mode, -one.effect.log_odds, weight).nats
-                for one, mode in zip((law, *rivals), (fitted, *swaps), strict=True)
-            ]
-            best = int(np.argmax(nats))
-            if nats[best] > nats[0] + self.criteria.search.least_nats:
-                better, fitted = rivals[best - 1], swaps[best - 1]
-                price = subset.prices[law] + law.effect.log_odds - better.effect.log_odds
-                subset = replace(
-                    subset,
-                    sizes={better if one == law else one: v for one, v in subset.sizes.items()},
-                    prices={better if one == law else one: v for one, v in subset.prices.items()}
-                    | {better: price},
-                )
-        return subset, fitted
+    def _as_common(self, mode: Mode, law: Attached, others: set[str]) -> dict[Attached, Floats]:
+        """Return common effects and a rare law's family, ``others``' aside, and their sizes."""
+        missing = [
+            one for one in self.missing(mode)
+            if one != law and one.effect.family not in others
+            and (one.effect.log_odds > _RARE or _is_alike(one, law))
+        ]  # fmt: skip
+        sizes: dict[Attached, Floats] = {}
+        for subset in self._regression(mode, missing, largest=1).subsets:
+            for one, size in subset.sizes.items():
+                sizes.setdefault(one, size)
+        return sizes
 
     def _pruned(self, model: _Model, least: float = 0.0) -> _Model:
         """Drop laws whose evidence, summed over lengths, does not pay their price.
@@ -559,12 +529,14 @@ class Search:
                 for law, one in worth.items()
             }
             law: Attached | None = min(weak, key=lambda one: weak[one])
+            small = [one for one in worth if one not in main]
+            rare = [one for one in small if one.effect.log_odds <= _RARE]
             if law is not None and weak[law] < least:
                 why = f"longer simulations do not need it ({weak[law]:.1f} nats)"
+            elif rare:
+                law, why = rare[0], "small, and rare"
             else:
-                law, why = self._unconfirmed(
-                    whole, model, [one for one in worth if one not in main]
-                )
+                law, why = self._unconfirmed(whole, model, small)
             if law is None:
                 break
             model, rejected[law] = model.dropped(law).fitted(whole=True), why
@@ -628,30 +600,21 @@ class Search:
         refitted in a law's place. One that explains the pieces better by as much as a law needs
         takes the place.
         """
-        limits = self.criteria.search
+        least = self.criteria.search.least_nats
         groups: dict[Attached, tuple[Attached, ...]] = {}
         for law in tuple(model.earlier):
-            mode = model.mode
-            rivals = [one for one in model.rivals.get(law, {}) if one not in model.earlier]
+            mode, without = model.mode, model.without[law]
+            rivals = model.rivals.get(law, {})
             same = [one for one in rivals if one in absorbed]
-            rivals = [one for one in rivals if one not in absorbed][:most]
-            swaps = in_parallel(partial(_swapped, mode, law, model.rivals.get(law, {})), rivals)
-            gains = [_gained(mode, other) for other in swaps]
-            net = [
-                gain + rival.effect.log_odds - law.effect.log_odds
-                for gain, rival in zip(gains, rivals, strict=True)
-            ]
-            close = {
-                rival: gain for rival, gain in zip(rivals, gains, strict=True)
-                if gain > -limits.least_nats
-            }  # fmt: skip
-            if net and max(net) > limits.least_nats:
-                place = int(np.argmax(net))
-                better = rivals[place]
+            rivals = {one: size for one, size in rivals.items() if one not in absorbed}
+            swaps = _swaps(mode, law, rivals, most)
+            close = [one for one, other in swaps.items() if _gained(mode, other) > -least]
+            net = _net(without, mode, law, swaps)
+            better = max(net, key=lambda one: net[one], default=law)
+            if better != law and net[better] > least:
                 self.say(f"{_name(better)} explains whole trajectories better than {_name(law)}")
-                earlier = {better if one == law else one: v for one, v in model.earlier.items()}
-                model = _Model(swaps[place], earlier, model.rivals).fitted(whole=True)
-                close = {law: 0.0} if gains[place] < limits.least_nats else {}
+                model = model.exchanged(law, better, swaps[better]).fitted(whole=True)
+                close = [law] if _gained(mode, swaps[better]) < least else []
                 law = better
             groups[law] = (*same, *close)
         return model, groups
@@ -842,10 +805,47 @@ def _keeps_promise(subset: Subset, share: float, *, kept: float = 0.5) -> bool:
     return 1.0 - (1.0 - share) ** 2 >= kept * subset.share
 
 
-def _swapped(mode: Mode, law: Attached, sizes: Mapping[Attached, Floats], rival: Attached) -> Mode:
-    """Return the refit with another law in the place of one."""
-    effects = tuple(rival if one == law else one for one in mode.problem.physics.effects)
-    return refit(mode, effects, {rival: sizes[rival]})
+def _swaps(
+    mode: Mode, law: Attached, sizes: Mapping[Attached, Floats], most: int = 4
+) -> dict[Attached, Mode]:
+    """Return refits with one of the first ``most`` effects in the place of a law, from sizes."""
+    rest = tuple(one for one in mode.problem.physics.effects if one != law)
+
+    def swapped(rival: Attached) -> Mode:
+        return refit(mode, (*rest, rival), {rival: sizes[rival]})
+
+    rivals = [one for one in sizes if one not in rest][:most]
+    return dict(zip(rivals, in_parallel(swapped, rivals), strict=True))
+
+
+def _net(
+    before: Mode, mode: Mode, law: Attached, swaps: Mapping[Attached, Mode]
+) -> dict[Attached, float]:
+    """Return how much more evidence refits with others in a law's place have, with prior odds."""
+    weight = weights(mode)
+
+    def evidence(one: Attached, fitted: Mode) -> float:
+        return Evidence.of(before, fitted, -one.effect.log_odds, weight).nats
+
+    return {one: evidence(one, other) - evidence(law, mode) for one, other in swaps.items()}
+
+
+def _is_alike(law: Attached, other: Attached) -> bool:
+    """Return whether laws are of one family and body."""
+    family = law.effect.family
+    return bool(family) and family == other.effect.family and law.body == other.body
+
+
+def _family(
+    regression: Regression, subset: Subset, law: Attached, near: float = 0.85
+) -> dict[Attached, Floats]:
+    """Return members of a law's family and their sizes, if subsets with them are near as good."""
+    sizes: dict[Attached, Floats] = {}
+    for one in regression.alternatives(subset, law):
+        (other,) = set(one.laws) - set(subset.laws)
+        if _is_alike(other, law) and one.share > near * subset.share:
+            sizes.setdefault(other, one.sizes[other])
+    return sizes
 
 
 def _rivals(
@@ -857,8 +857,10 @@ def _rivals(
     def size(one: Attached) -> Floats:
         return np.array(list(scored[one].estimate.values()))
 
-    rivals = {twin: size(twin) for twin in regression.same[law]}
-    for alternative in regression.alternatives(subset, law, within):
+    rivals = {twin: size(twin) for twin in regression.same.get(law, ())}
+    for alternative in regression.alternatives(subset, law):
+        if alternative.evidence <= subset.evidence - within:
+            continue
         (other,) = set(alternative.laws) - set(subset.laws)
         rivals.setdefault(other, alternative.sizes[other])
         rivals |= {twin: size(twin) for twin in regression.same[other] if twin not in rivals}

@@ -57,6 +57,11 @@ class Subset:
         """The laws, in the order of the catalogue."""
         return tuple(self.sizes)
 
+    @property
+    def evidence(self) -> float:
+        """Log-evidence less its price, prior odds aside."""
+        return self.nats - sum(law.effect.log_odds for law in self.laws)
+
 
 def worth(share: float, columns: int, n: float) -> float:
     """Return the log-evidence (nats) of columns that take a share of n squared residuals away."""
@@ -89,18 +94,13 @@ class Regression:
             best.setdefault(len(subset.laws), subset)
         return tuple(best[size] for size in sorted(best))
 
-    def alternatives(self, subset: Subset, law: Attached, within: float) -> list[Subset]:
-        """Return subsets that differ by one law and are worth as much, prior odds aside."""
+    def alternatives(self, subset: Subset, law: Attached) -> list[Subset]:
+        """Return the subsets with another law in the place of one, best first."""
         rest = set(subset.laws) - {law}
-
-        def evidence(one: Subset) -> float:
-            return one.nats - sum(member.effect.log_odds for member in one.laws)
-
         return [
             other for other in self.subsets
             if len(other.laws) == len(subset.laws)
             and law not in other.laws and rest < set(other.laws)
-            and evidence(other) > evidence(subset) - within
         ]  # fmt: skip
 
 

@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import binom, chi2, norm
 
 from pbrl_ppl.criticism.criteria import DEFAULT
-from pbrl_ppl.criticism.scan import GridPoint, caps, detection_limits_of_scan, grid_points
+from pbrl_ppl.criticism.scan import GridPoint, caps, detection_limits, grid_points
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.effects import candidates, catalogue
 from pbrl_ppl.state import STATE
@@ -65,23 +65,23 @@ def test_the_smallest_size_is_of_the_look_that_shows_it_best() -> None:
     signature = np.zeros((3, 1))
     free = [GridPoint(np.array([1.0, begin, 0.0]), signature, (0,)) for begin in (0.5, 1.5)]
     units = [np.array([2.0]), np.array([5.0])]
-    sizes = detection_limits_of_scan(EFFECTS["mass_change"], free, units, 2, DEFAULT.residual)
+    sizes = detection_limits(EFFECTS["mass_change"], free, units, 2, DEFAULT.residual)
     assert sizes == {"factor": pytest.approx(needed / 5.0)}
     whole = [GridPoint(np.array([value]), signature, ()) for value in (1.0, 2.0, 3.0)]
     units = [np.array([change]) for change in (1.0, 9.0, 12.0)]
-    assert detection_limits_of_scan(EFFECTS["force_cutoff"], whole, units, 2, DEFAULT.residual) == {
+    assert detection_limits(EFFECTS["force_cutoff"], whole, units, 2, DEFAULT.residual) == {
         "threshold": 2.0
     }
-    assert detection_limits_of_scan(EFFECTS["saturation"], whole, units, 2, DEFAULT.residual) == {
+    assert detection_limits(EFFECTS["saturation"], whole, units, 2, DEFAULT.residual) == {
         "limit": 3.0
     }
-    none = detection_limits_of_scan(
+    none = detection_limits(
         EFFECTS["force_cutoff"], whole[:1], units[:1], 2, DEFAULT.residual
     )
     assert none == {"threshold": np.inf}
     there = [GridPoint(np.zeros(3), signature, ())]
     assert (
-        detection_limits_of_scan(EFFECTS["hidden_obstacle"], there, units[1:2], 2, DEFAULT.residual)
+        detection_limits(EFFECTS["hidden_obstacle"], there, units[1:2], 2, DEFAULT.residual)
         == {}
     )
     assert caps(EFFECTS["saturation"], whole)
