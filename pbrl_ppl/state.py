@@ -29,6 +29,11 @@ WRENCH_UNITS = ("N", "N", "N m")
 INPUT = (*WRENCH, *(f"previous_{name}" for name in WRENCH), "trajectory", "begin", "end")
 
 
+def acceleration_unit(velocity: str) -> str:
+    """Return the unit of the acceleration of a velocity such as ``vx`` or ``omega``."""
+    return "rad/s²" if velocity == "omega" else "m/s²"
+
+
 def wrapped(angle: Any) -> Any:
     """Return an angle, or an array of any shape, in (-pi, pi] (rad).
 

@@ -14,8 +14,6 @@ from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.held_out import HeldOut, example_rollout, longest_rollout, rollout_horizon
 from pbrl_ppl.criticism.loop import ADEQUATE, EFFECTS_ADDED, NOT_CONVERGED, UNEXPLAINED, Loop
 from pbrl_ppl.criticism.misfit import (
-    NOTHING_RECORDED,
-    PRIOR,
     Misfit,
     find_misfit,
     held_out_forecasts,
@@ -28,11 +26,13 @@ from pbrl_ppl.criticism.ranking import declared_mode
 from pbrl_ppl.criticism.recordings import checked_histories, outliers
 from pbrl_ppl.criticism.refinement import shift
 from pbrl_ppl.criticism.results import (
+    NOTHING_RECORDED,
     Acceleration,
     Added,
     Candidate,
     Errors,
     Estimate,
+    KindOfTest,
     Law,
     Numerical,
     ResidualTest,
@@ -428,7 +428,7 @@ def _prior_test(
     sentence, *more = checked.summary
     if more:
         sentence = f"{sentence}; {len(more)} more likewise"
-    return ResidualTest(PRIOR, float("nan"), share, not checked.sentences, sentence)
+    return ResidualTest(KindOfTest.PRIOR, float("nan"), share, not checked.sentences, sentence)
 
 
 def _fits(task: _Task, modes: list[Mode]) -> list[Fit]:

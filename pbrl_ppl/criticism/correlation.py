@@ -13,7 +13,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
-from pbrl_ppl.criticism.results import Correlations, ResidualTest
+from pbrl_ppl.criticism.results import Correlations, KindOfTest, ResidualTest
 from pbrl_ppl.criticism.unexplained import innovations_over_steps
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.state import STATE, WRENCH, Bools, Floats, Ints
@@ -21,7 +21,6 @@ from pbrl_ppl.state import STATE, WRENCH, Bools, Floats, Ints
 #: Intervals up to which innovations are correlated with earlier ones and with commands; a
 #: correlation counts if it is taken over more pairs than this.
 _LAGS, _LEAST_PAIRS = 5, 10
-_WHITENESS, _COMMANDS = "whiteness", "correlation with commands"
 
 
 class _Place(NamedTuple):
@@ -96,12 +95,12 @@ def correlation_tests(
     cells = [f"{STATE[p % len(STATE)]} of {scene.moving[p // len(STATE)].name}" for p in places]
     by_lag = _lagged(white, seen, number, None, criteria)
     few = "too few pairs of intervals"
-    whiteness = ResidualTest.untested(_WHITENESS, few)
+    whiteness = ResidualTest.untested(KindOfTest.WHITENESS, few)
     if by_lag.enough.any():
         whiteness = _test(by_lag, by_lag.p_value, share, cells, [])
     series, names = _commands(mode)
     values = np.zeros((0, 0, len(cells)))
-    commands = ResidualTest.untested(_COMMANDS, few if names else "no command varies")
+    commands = ResidualTest.untested(KindOfTest.COMMANDS, few if names else "no command varies")
     if names:
         driven = _lagged(white, seen, number, series, criteria)
         values = driven.values
@@ -191,7 +190,7 @@ def _test(
     if not passed:
         error = f"the error of {cells[worst.cell]}"
         sentence = f"{error} is correlated with {other} {when} ({worst.value:.2f})"
-    name = _COMMANDS if names else _WHITENESS
+    name = KindOfTest.COMMANDS if names else KindOfTest.WHITENESS
     dimension, _, body = ("" if passed else cells[worst.cell]).partition(" of ")
     return ResidualTest(
         name, p_value, abs(worst.value), passed, sentence, body=body, dimension=dimension

@@ -8,14 +8,12 @@ import numpy as np
 from scipy.stats import rankdata
 
 from pbrl_ppl.criticism.criteria import Criteria
-from pbrl_ppl.criticism.results import ResidualTest, Unexplained
+from pbrl_ppl.criticism.results import KindOfTest, ResidualTest, Unexplained
 from pbrl_ppl.criticism.unexplained import innovations_over_steps
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.state import STATE, Floats, Ints
 
-#: Name of the test.
-DEPENDENCE = "dependence on state, command and time"
 #: Ridge of the regression, over the kernel's variance of each term.
 _RIDGE = 1.0
 #: Recorded quantities that a residual may depend on, with their units.
@@ -119,7 +117,7 @@ def find_dependence(
     problem = mode.problem
     n, limits = problem.segments.n, criteria.residual
     if n < least_transitions:
-        return ResidualTest.untested(DEPENDENCE, "too few transitions"), None
+        return ResidualTest.untested(KindOfTest.DEPENDENCE, "too few transitions"), None
     tests = len(problem.scene.dynamic)
     permutations = permutations_a_body * tests - 1
     chosen = np.sort(rng.permutation(n)[:most_transitions])
@@ -152,9 +150,9 @@ def find_dependence(
             best = _describe(body.name, names[at], features, y[:, at], shares[at], p_value)
     if best is None:
         sentence = "the innovations depend on no recorded quantity"
-        return ResidualTest(DEPENDENCE, 1.0, 0.0, True, sentence), None
+        return ResidualTest(KindOfTest.DEPENDENCE, 1.0, 0.0, True, sentence), None
     test = ResidualTest(
-        DEPENDENCE, best.p_value, best.share, False, best.sentence,
+        KindOfTest.DEPENDENCE, best.p_value, best.share, False, best.sentence,
         body=best.body, dimension=best.dimension,
     )  # fmt: skip
     return test, best

@@ -10,9 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.remainder import learn_remainder, remainder_in_words
 from pbrl_ppl.criticism.results import (
+    NOTHING_RECORDED,
     Acceleration,
     Added,
     Candidate,
@@ -150,6 +153,53 @@ class Loop:
     def posterior_after(self) -> Idata:
         """Posterior of the revised model; that of the declared one if nothing was added."""
         return self.revised.posterior
+
+    @property
+    def accepted(self) -> tuple[Added, ...]:
+        """Return the added effects, main laws first, or none without a verdict."""
+        main_first = tuple(sorted(self.added, key=lambda one: not one.main))
+        return () if self.verdict == NOT_CONVERGED else main_first
+
+    @property
+    def main_laws(self) -> tuple[Added, ...]:
+        """Return the main laws among the added effects; all of them where none is a main one."""
+        return tuple(one for one in self.added if one.main) or self.added
+
+    @property
+    def rejected(self) -> tuple[Candidate, ...]:
+        """Return the significant candidates that were not added, best first."""
+        present = {(added.effect, added.body) for added in self.added}
+        return tuple(
+            one
+            for one in self.candidates
+            if one.why
+            and one.p_value < self.criteria.try_p
+            and (one.effect, one.body) not in present
+        )
+
+    @property
+    def diverges(self) -> bool:
+        """Return whether held-out forecasts of the revised model diverge."""
+        return any(np.isposinf(far) for far in self.after.rollout_rmse.values())
+
+    @property
+    def forecasts_at_noise(self) -> bool:
+        """Return whether all held-out errors are near those that noise alone makes."""
+        most, floor = self.criteria.worse_forecast, self.noise_floor.rollout_rmse
+        errors = self.after.rollout_rmse.items()
+        near = all(error < most * floor.get(name, 0.0) for name, error in errors)
+        return near and self.after.normalised_rmse < most
+
+    @property
+    def depends_on_records(self) -> bool:
+        """Return whether the residual depends on a recorded quantity."""
+        left = self.unexplained
+        return left is not None and left.depends_on != NOTHING_RECORDED
+
+    @property
+    def rollout_seconds(self) -> float:
+        """Return how far ahead rollouts predict (s)."""
+        return self.rollout_horizon * self.scene.time_step
 
     @property
     def remainder_words(self) -> str:

@@ -12,7 +12,14 @@ from pbrl_ppl.criticism.correlation import correlation_tests
 from pbrl_ppl.criticism.criteria import Criteria
 from pbrl_ppl.criticism.dependence import find_dependence
 from pbrl_ppl.criticism.forecast import forecast
-from pbrl_ppl.criticism.results import Correlations, Growth, ResidualTest, Unexplained
+from pbrl_ppl.criticism.results import (
+    NOTHING_RECORDED,
+    Correlations,
+    Growth,
+    KindOfTest,
+    ResidualTest,
+    Unexplained,
+)
 from pbrl_ppl.criticism.score import Signature
 from pbrl_ppl.criticism.unexplained import (
     UnexplainedAcceleration,
@@ -22,15 +29,8 @@ from pbrl_ppl.criticism.unexplained import (
 from pbrl_ppl.effects import Noise
 from pbrl_ppl.likelihood import bodies_acceleration
 from pbrl_ppl.modes import Mode
-from pbrl_ppl.state import STATE, STATE_UNITS, Floats
+from pbrl_ppl.state import STATE, STATE_UNITS, Floats, acceleration_unit
 
-#: Names of the tests that a model must pass to predict well.
-ACCELERATION, FORECASTS, PRIOR = "unexplained acceleration", "forecasts", "prior"
-HELD_OUT, SIMULATION = "held-out forecasts", "held-out simulation"
-#: Name of the test for effects of the catalogue.
-CANDIDATES = "effects of the catalogue"
-#: What an unexplained residual depends on where no quantity predicts it.
-NOTHING_RECORDED = "nothing that was recorded"
 #: Shares of the bodies' acceleration from here on are of bodies that hardly accelerate.
 LARGEST_SHARE = 0.995
 
@@ -61,13 +61,14 @@ class Misfit:
 
         What remains is then small: significant one step ahead, and not over a forecast. Beside an
         unexplained acceleration forecasts must be near the noise; that none is known to be worse is
-        not enough.
+        not enough. A test that is missing is not passed.
         """
         tests = {test.name: test for test in self.tests}
-        forecasts = [tests[name] for name in (FORECASTS, HELD_OUT) if name in tests]
-        near = all(test.size < criteria.worse_forecast for test in forecasts)
-        passed = all(tests[name].passed for name in (FORECASTS, HELD_OUT, PRIOR) if name in tests)
-        return passed and (near or tests[ACCELERATION].passed)
+        forecasts = (KindOfTest.FORECASTS, KindOfTest.HELD_OUT)
+        if not all(kind in tests and tests[kind].passed for kind in (*forecasts, KindOfTest.PRIOR)):
+            return False
+        near = all(tests[kind].size < criteria.worse_forecast for kind in forecasts)
+        return near or tests[KindOfTest.ACCELERATION].passed
 
     def with_test(self, test: ResidualTest) -> Misfit:
         """Return the misfit with one more test, which is the unexplained one if no other fails."""
@@ -140,7 +141,13 @@ def _acceleration(mode: Mode, excess: UnexplainedAcceleration) -> ResidualTest:
             sentence += ", which is negligible"
     p_value = float(min(1.0, excess.p_value[largest] * len(excess.names)))
     return ResidualTest(
-        ACCELERATION, p_value, relative, passed, sentence, body=body, dimension=name if body else ""
+        KindOfTest.ACCELERATION,
+        p_value,
+        relative,
+        passed,
+        sentence,
+        body=body,
+        dimension=name if body else "",
     )
 
 
@@ -161,7 +168,7 @@ def acceleration_in_words(name: str, size: float) -> str:
     >>> acceleration_in_words("omega", 0.1234)
     '0.12 rad/s² in omega'
     """
-    return f"{size:.2g} {'rad/s²' if name == 'omega' else 'm/s²'} in {name}"
+    return f"{size:.2g} {acceleration_unit(name)} in {name}"
 
 
 def share_in_words(relative: float) -> str:
@@ -184,7 +191,7 @@ def held_out_forecasts(mode: Mode, sigma: Floats, horizon: int, criteria: Criter
     ``sigma`` is the noise alone.
     """
     test, _ = _forecasts(mode, sigma, horizon, criteria)
-    return replace(test, name=HELD_OUT, sentence=f"held out: {test.sentence}")
+    return replace(test, name=KindOfTest.HELD_OUT, sentence=f"held out: {test.sentence}")
 
 
 def simulation_test(
@@ -210,7 +217,7 @@ def simulation_test(
     simulated = {name: error for name, error in simulated.items() if name in noise}
     if not simulated:
         return ResidualTest.untested(
-            SIMULATION, "no simulation is as long as a held-out trajectory"
+            KindOfTest.SIMULATION, "no simulation is as long as a held-out trajectory"
         )
     name = max(simulated, key=lambda one: simulated[one] / noise[one])
     error, times = simulated[name], simulated[name] / noise[name]
@@ -224,7 +231,13 @@ def simulation_test(
         f" {STATE_UNITS[STATE.index(name)]} off in {name}, {times:.3g} times the measurement noise"
     )
     return ResidualTest(
-        SIMULATION, float("nan"), times, passed, sentence, body="", dimension="" if passed else name
+        KindOfTest.SIMULATION,
+        float("nan"),
+        times,
+        passed,
+        sentence,
+        body="",
+        dimension="" if passed else name,
     )
 
 
@@ -235,7 +248,7 @@ def score_test(mode: Mode, ranked: Sequence[Signature], criteria: Criteria) -> R
     """
     scored = [one for one in ranked if not isinstance(one.attached.effect.stage, Noise)]
     if not scored:
-        return ResidualTest.untested(CANDIDATES, "no effect of the catalogue is left")
+        return ResidualTest.untested(KindOfTest.CANDIDATES, "no effect of the catalogue is left")
     first = min(scored, key=lambda one: one.candidate.p_value)
     candidate, white = first.candidate, mode.whitened_residual
     change = np.sqrt(candidate.statistic) * first.direction[: white.size].reshape(white.shape)
@@ -247,7 +260,9 @@ def score_test(mode: Mode, ranked: Sequence[Signature], criteria: Criteria) -> R
         sentence = f"{name} would change a step by {100 * size:.2g} %"
         sentence += ", which is negligible" if size < criteria.negligible else ""
     passed = not certain or size < criteria.negligible
-    return ResidualTest(CANDIDATES, candidate.p_value, size, passed, sentence, body=candidate.body)
+    return ResidualTest(
+        KindOfTest.CANDIDATES, candidate.p_value, size, passed, sentence, body=candidate.body
+    )
 
 
 def _forecasts(
@@ -308,5 +323,7 @@ def _forecasts(
     )
     if passed:
         body = name = ""
-    test = ResidualTest(FORECASTS, p_value, worst, passed, sentence, body=body, dimension=name)
+    test = ResidualTest(
+        KindOfTest.FORECASTS, p_value, worst, passed, sentence, body=body, dimension=name
+    )
     return test, growth

@@ -25,7 +25,7 @@ from pbrl_ppl.posterior import Fit, Idata, group
 from pbrl_ppl.posterior import draws as posterior_draws
 from pbrl_ppl.sampling import sample
 from pbrl_ppl.scene import state_sizes
-from pbrl_ppl.state import STATE, Floats
+from pbrl_ppl.state import STATE, Floats, acceleration_unit
 from pbrl_ppl.threads import one_blas_thread
 
 
@@ -129,10 +129,9 @@ def remainder_in_words(before: Mode, after: Idata) -> str:
     names = group(after, "posterior")[ACCELERATION]
     worst = int(np.argmax(sizes[0] - sizes[1]))
     name = str(names[names.dims[-1]].values[worst])
-    unit = "rad/s²" if name == "omega" else "m/s²"
     return (
         f"learned remainder, a force without a law: what a step adds unexplained to {name} falls"
-        f" from {sizes[0][worst]:.2g} to {sizes[1][worst]:.2g} {unit}"
+        f" from {sizes[0][worst]:.2g} to {sizes[1][worst]:.2g} {acceleration_unit(name)}"
     )
 
 

@@ -153,14 +153,28 @@ class Rung:
     correlated: Mapping[str, float]
 
 
+class KindOfTest(StrEnum):
+    """A test of a model's residual: a name for programs, and one for people."""
+
+    ACCELERATION = "unexplained acceleration"
+    WHITENESS = "whiteness"
+    COMMANDS = "correlation with commands"
+    FORECASTS = "forecasts"
+    DEPENDENCE = "dependence on state, command and time"
+    PRIOR = "prior"
+    HELD_OUT = "held-out forecasts"
+    SIMULATION = "held-out simulation"
+    CANDIDATES = "effects of the catalogue"
+
+
 @dataclass(frozen=True)
 class ResidualTest:
     """Result of a test of a model's residual.
 
     Parameters
     ----------
-    name : str
-        Name of the test.
+    name : KindOfTest
+        Which test.
     p_value : float
         P-value of the result if nothing is missing.
     size : float
@@ -175,7 +189,7 @@ class ResidualTest:
         Where the misfit is largest; empty where the test names no place.
     """
 
-    name: str
+    name: KindOfTest
     p_value: float
     size: float
     passed: bool
@@ -185,7 +199,7 @@ class ResidualTest:
     dimension: str = ""
 
     @classmethod
-    def untested(cls, name: str, why: str) -> ResidualTest:
+    def untested(cls, name: KindOfTest, why: str) -> ResidualTest:
         """Return the result of a test that the data cannot fail."""
         return cls(name, float("nan"), 0.0, True, f"not tested: {why}", tested=False)
 
@@ -251,6 +265,12 @@ class Acceleration:
     relative_before: Mapping[str, float]
     relative_after: Mapping[str, float]
     certain_after: Mapping[str, bool]
+
+    @property
+    def remaining(self) -> str:
+        """Return the velocity with the largest relative one that is significant; empty if none."""
+        sure = [name for name, certain in self.certain_after.items() if certain]
+        return max(sure, key=self.relative_after.__getitem__, default="")
 
 
 @dataclass(frozen=True)
@@ -387,6 +407,10 @@ def diverged_after(time: Floats, predicted: Floats) -> float | None:
     if finite.all():
         return None
     return float(time[max(int(np.argmin(finite)) - 1, 0)])
+
+
+#: What an unexplained residual depends on where no quantity predicts it.
+NOTHING_RECORDED = "nothing that was recorded"
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ from pbrl_ppl.reporting.style import (
     name_axes,
     zero_line,
 )
-from pbrl_ppl.reporting.words import accepted, plain
+from pbrl_ppl.reporting.words import plain
 from pbrl_ppl.scene import units_of
 from pbrl_ppl.state import Floats
 
@@ -97,7 +97,7 @@ def plot_added(loop: Loop, width: float = WIDE, most: int = 12) -> Figure:
     """Plot the posterior of the added effects' parameters, and the values that mean no effect."""
     shown = [
         (added, name, estimate)
-        for added in accepted(loop)
+        for added in loop.accepted
         for name, estimate in added.parameters.items()
     ][:most]
     columns = min(max(len(shown), 1), 2)

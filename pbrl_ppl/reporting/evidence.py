@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from pbrl_ppl.criticism import QUANTITIES, Loop, recorded_quantities
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import Mode
-from pbrl_ppl.reporting.style import acceleration_unit
-from pbrl_ppl.state import STATE, Bools, Floats, Ints
+from pbrl_ppl.state import STATE, Bools, Floats, Ints, acceleration_unit
 
 
 @dataclass(frozen=True, eq=False)

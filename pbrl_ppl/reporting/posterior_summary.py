@@ -30,9 +30,9 @@ from pbrl_ppl.posterior import (
     separate,
     stored_fields,
 )
-from pbrl_ppl.reporting.style import UNITS, acceleration_unit
+from pbrl_ppl.reporting.style import UNITS
 from pbrl_ppl.reporting.words import number, plain
-from pbrl_ppl.state import Floats
+from pbrl_ppl.state import Floats, acceleration_unit
 
 #: Chains are good up to this R-hat and from this effective sample size on.
 GOOD_R_HAT, GOOD_ESS = 1.01, 400.0

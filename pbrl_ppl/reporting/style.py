@@ -19,12 +19,6 @@ from pbrl_ppl.state import STATE, STATE_UNITS, Floats
 #: Unit of each state dimension.
 UNITS: Mapping[str, str] = dict(zip(STATE, STATE_UNITS, strict=True))
 
-
-def acceleration_unit(velocity: str) -> str:
-    """Return the unit of the acceleration of a velocity such as ``vx`` or ``omega``."""
-    return "rad/s²" if velocity == "omega" else "m/s²"
-
-
 # Okabe and Ito's colours: distinct for colour-blind readers and in grey print
 BEFORE, AFTER, PLAIN, BAND = "#D55E00", "#0072B2", "#999999", "#e9e9e9"
 #: Lines of up to six state dimensions.

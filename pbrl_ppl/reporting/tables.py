@@ -15,7 +15,7 @@ from pbrl_ppl.parameters import Prior
 from pbrl_ppl.posterior import Comparison, Identifiability, interval, scalars
 from pbrl_ppl.reporting.evidence import Evidence
 from pbrl_ppl.reporting.posterior_summary import Parameters, prior_draws
-from pbrl_ppl.reporting.style import UNITS, acceleration_unit
+from pbrl_ppl.reporting.style import UNITS
 from pbrl_ppl.reporting.words import (
     chance,
     digits_of,
@@ -25,11 +25,10 @@ from pbrl_ppl.reporting.words import (
     percent,
     plain,
     quantity,
-    seconds_ahead,
     share,
 )
 from pbrl_ppl.scene import units_of
-from pbrl_ppl.state import STATE, Floats
+from pbrl_ppl.state import STATE, Floats, acceleration_unit
 
 #: Text of a cell of a table, or text and a small note beside it.
 Cell = str | tuple[str, str]
@@ -115,7 +114,7 @@ def error_tables(loop: Loop) -> list[Table]:
     heads, intervals = (*models_of(loop), "Noise floor"), loop.rollout_horizon
     titles = {
         "one_step_rmse": f"One interval ahead, {loop.scene.time_step:g} s",
-        "rollout_rmse": f"{intervals} intervals ahead, {number(seconds_ahead(loop))} s",
+        "rollout_rmse": f"{intervals} intervals ahead, {number(loop.rollout_seconds)} s",
         "simulated_rmse": "Whole trajectories, simulated from start states fitted to them",
     }
     tables = []

@@ -13,7 +13,6 @@ from pbrl_ppl.criticism import (
     ONE_TRAJECTORY,
     UNEXPLAINED,
     Added,
-    Candidate,
     Estimate,
     Loop,
     acceleration_in_words,
@@ -22,7 +21,7 @@ from pbrl_ppl.criticism import (
 from pbrl_ppl.reporting.style import UNITS
 
 #: Candidates and bad frames that are listed one by one.
-_LISTED = 4
+LISTED = 4
 #: A share of the bodies' acceleration below which a remainder that forecasts do not show is small.
 _SMALL = 0.05
 #: A held-out error above this many times the noise needs an explanation.
@@ -35,7 +34,7 @@ def verdict_in_words(loop: Loop) -> str:
     It is the first line of the report and of the summary in a terminal.
     """
     if loop.verdict == NOT_CONVERGED:
-        named = [_named(one) for one in main_laws(loop)]
+        named = [_named(one) for one in loop.main_laws]
         so_far = f" (found so far: {_listed(named, 'and')})" if named else ""
         return (
             f"No verdict: the chains have not converged{so_far}; take more draws (--draws),"
@@ -49,19 +48,14 @@ def _found(loop: Loop) -> str:
     if not loop.added:
         if loop.verdict == UNEXPLAINED:
             return "No effect in the catalogue explains the residual"
-        matters = " that matters" if loop.small or remaining_acceleration(loop) else ""
+        matters = " that matters" if loop.small or loop.acceleration.remaining else ""
         return f"Nothing{matters} was found missing"
-    first, *more = main_laws(loop)
+    first, *more = loop.main_laws
     sentence = _listed([_named(one) for one in (first, *more)], "and")
     if not more and has_size(first):
         (size,) = first.parameters.values()
         sentence += f", {with_interval(size)}"
     return f"{sentence[0].upper()}{sentence[1:]}"
-
-
-def main_laws(loop: Loop) -> tuple[Added, ...]:
-    """Return the main laws among the added effects; all of them where none is a main one."""
-    return tuple(one for one in loop.added if one.main) or loop.added
 
 
 def _named(added: Added) -> str:
@@ -95,9 +89,9 @@ def _gained(loop: Loop) -> str:
 
 def _remains(loop: Loop) -> str:
     """Write what remains, and whether it matters."""
-    if diverges(loop):
-        return f"forecasts of {number(seconds_ahead(loop))} s diverge"
-    left, name = loop.unexplained, remaining_acceleration(loop)
+    if loop.diverges:
+        return f"forecasts of {number(loop.rollout_seconds)} s diverge"
+    left, name = loop.unexplained, loop.acceleration.remaining
     where = _where(loop, left.dimension, left.body) if left is not None and left.body else ""
     if loop.verdict == UNEXPLAINED:
         return _unexplained(loop, where)
@@ -130,7 +124,7 @@ def _unexplained(loop: Loop, where: str) -> str:
     left, still = loop.unexplained, " still" * bool(loop.added)
     failed = [test.name for test in loop.tests if not test.passed]
     if left is not None and where:
-        depends = f", which depends on {left.depends_on}," * depends_on_records(loop)
+        depends = f", which depends on {left.depends_on}," * loop.depends_on_records
         text = f"what remains {where}{depends} is{still} unexplained"
         if not where.startswith("in "):
             text = text.removeprefix("what remains ")
@@ -139,22 +133,9 @@ def _unexplained(loop: Loop, where: str) -> str:
     else:
         text = "held-out forecasts became worse"
     share = max(loop.acceleration.relative_after.values(), default=0.0)
-    if forecasts_at_noise(loop) and share < LARGEST_SHARE:
+    if loop.forecasts_at_noise and share < LARGEST_SHARE:
         text += ", but forecasts are as good as the noise allows"
     return text
-
-
-def diverges(loop: Loop) -> bool:
-    """Return whether held-out forecasts of the last model diverge."""
-    return any(np.isposinf(far) for far in loop.after.rollout_rmse.values())
-
-
-def forecasts_at_noise(loop: Loop) -> bool:
-    """Return whether all held-out errors are near those that noise alone makes."""
-    most, floor = loop.criteria.worse_forecast, loop.noise_floor.rollout_rmse
-    errors = loop.after.rollout_rmse.items()
-    near = all(error < most * floor.get(name, 0.0) for name, error in errors)
-    return near and loop.after.normalised_rmse < most
 
 
 def remains_in_words(loop: Loop) -> str:
@@ -173,7 +154,7 @@ def remains_in_words(loop: Loop) -> str:
     passed = f"The {model} model passes all {tested} tests of its residual"
     if untested := [test.name for test in loop.tests if not test.tested]:
         passed += f" that these data can fail (not {joined(untested, 'nor')})"
-    if name := remaining_acceleration(loop):
+    if name := loop.acceleration.remaining:
         size, relative = loop.acceleration.after[name], loop.acceleration.relative_after[name]
         passed += (
             f". An acceleration of {acceleration_in_words(name, size)} is left"
@@ -190,44 +171,15 @@ def remains_in_words(loop: Loop) -> str:
     return f"{passed}.{small}"
 
 
-def remaining_acceleration(loop: Loop) -> str:
-    """Return the velocity with the largest significant unexplained acceleration; empty if none.
-
-    The largest over the bodies' acceleration.
-    """
-    left = loop.acceleration
-    sure = {
-        name: left.relative_after[name] for name, certain in left.certain_after.items() if certain
-    }
-    return max(sure, key=sure.__getitem__, default="")
-
-
 def model_of(loop: Loop) -> str:
     """Return the name of the model of which the page says what remains: revised, or declared."""
     return "revised" if loop.added else "declared"
 
 
-def seconds_ahead(loop: Loop) -> float:
-    """Return how far ahead rollouts predict (s)."""
-    return loop.rollout_horizon * loop.scene.time_step
-
-
-def accepted(loop: Loop) -> tuple[Added, ...]:
-    """Return the added effects, main laws first, or none without a verdict."""
-    main_first = tuple(sorted(loop.added, key=lambda one: not one.main))
-    return () if loop.verdict == NOT_CONVERGED else main_first
-
-
-def depends_on_records(loop: Loop) -> bool:
-    """Return whether the residual depends on a recorded quantity: the dependence test failed."""
-    left = loop.unexplained
-    return left is not None and not left.depends_on.startswith("nothing")
-
-
 def error_in_words(loop: Loop) -> str:
     """Explain a held-out error that seems to contradict the verdict; empty if none does."""
     model, after = model_of(loop), loop.after.normalised_rmse
-    if loop.unexplained is not None or remaining_acceleration(loop):
+    if loop.unexplained is not None or loop.acceleration.remaining:
         return "The noise is that of the measurements alone, one interval ahead."
     if after > _TOO_LARGE and loop.verdict != NOT_CONVERGED:
         return (
@@ -243,19 +195,9 @@ def caution_in_words(loop: Loop) -> str:
     return f"{ONE_TRAJECTORY[0].upper()}{ONE_TRAJECTORY[1:]}." if single else ""
 
 
-def rejected(loop: Loop) -> list[Candidate]:
-    """Return the leading significant candidates that were not added."""
-    present = {(added.effect, added.body) for added in loop.added}
-    return [
-        one
-        for one in loop.candidates
-        if one.why and one.p_value < loop.criteria.try_p and (one.effect, one.body) not in present
-    ][:_LISTED]
-
-
 def left_out_in_words(loop: Loop) -> str:
     """Return which bad frames were left out of the histories, the first few one by one."""
-    first, more = loop.bad_frames[:_LISTED], len(loop.bad_frames) - _LISTED
+    first, more = loop.bad_frames[:LISTED], len(loop.bad_frames) - LISTED
     rest = f"; and {more} more (report.json lists them)" if more > 0 else ""
     return f"{'; '.join(first)}{rest}." if first else ""
 

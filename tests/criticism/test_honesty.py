@@ -13,8 +13,9 @@ import pbrl_ppl as pp
 from pbrl_ppl.criticism import close_loop
 from pbrl_ppl.criticism.criteria import DEFAULT
 from pbrl_ppl.criticism.dependence import find_dependence
-from pbrl_ppl.criticism.misfit import ACCELERATION, find_misfit
+from pbrl_ppl.criticism.misfit import find_misfit
 from pbrl_ppl.criticism.refinement import with_enough_substeps
+from pbrl_ppl.criticism.results import KindOfTest
 from pbrl_ppl.criticism.unexplained import unexplained_acceleration
 from pbrl_ppl.effects import attach
 from pbrl_ppl.likelihood import Problem, bodies_acceleration, smoothed
@@ -67,7 +68,7 @@ def test_one_that_is_not_negligible_fails() -> None:
     left = unexplained_acceleration(mode)
     assert left.worst == pytest.approx(6.0 * DEFAULT.negligible, rel=0.3)
     tests = find_misfit(mode, left, horizon=30, seed=1).tests
-    assert ACCELERATION in {test.name for test in tests if not test.passed}
+    assert KindOfTest.ACCELERATION in {test.name for test in tests if not test.passed}
 
 
 def test_the_bodies_acceleration_does_not_depend_on_the_axes() -> None:

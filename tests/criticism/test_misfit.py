@@ -10,8 +10,9 @@ import pytest
 from scipy.stats import binom
 
 from pbrl_ppl.criticism.criteria import DEFAULT
-from pbrl_ppl.criticism.dependence import DEPENDENCE, _kernels
-from pbrl_ppl.criticism.misfit import ACCELERATION, FORECASTS, find_misfit
+from pbrl_ppl.criticism.dependence import _kernels
+from pbrl_ppl.criticism.misfit import find_misfit
+from pbrl_ppl.criticism.results import KindOfTest, ResidualTest
 from pbrl_ppl.criticism.unexplained import (
     UnexplainedAcceleration,
     noise_alone,
@@ -22,10 +23,12 @@ from tests.helpers.histories import NOISE
 
 pytestmark = pytest.mark.one_stack
 
-WHITENESS, COMMANDS = "whiteness", "correlation with commands"
 #: Chance that each fails on clean data, as stated; the permutation test has a level of its own.
-RATES = dict.fromkeys((ACCELERATION, WHITENESS, COMMANDS, FORECASTS), DEFAULT.false_alarm)
-RATES |= {DEPENDENCE: 0.01}
+RATES = dict.fromkeys(
+    (KindOfTest.ACCELERATION, KindOfTest.WHITENESS, KindOfTest.COMMANDS, KindOfTest.FORECASTS),
+    DEFAULT.false_alarm,
+)
+RATES |= {KindOfTest.DEPENDENCE: 0.01}
 #: Engine steps that leave nothing of an engine's error.
 FINE = DISC.replace(substeps=40)
 
@@ -56,15 +59,27 @@ def test_each_fails_on_clean_data_no_more_often_than_it_says(trajectories, inter
 def test_clean_data_of_another_engine_pass(make_history) -> None:
     found = misfit(fitted(BOX, box2d(make_history, 3)[0]))
     assert found.unexplained is None
+    assert not found.predicts(DEFAULT)  # a test that is missing is not passed
+    for kind in (KindOfTest.HELD_OUT, KindOfTest.PRIOR):
+        found = found.with_test(ResidualTest(kind, 0.5, 0.0, True, "as expected"))
     assert found.predicts(DEFAULT)
-    assert {test.name for test in found.tests if test.tested} == set(RATES)
+    failed = found.with_test(ResidualTest(KindOfTest.PRIOR, 0.5, 1.0, False, "impossible"))
+    assert not failed.predicts(DEFAULT)
+    assert {test.name for test in found.tests if test.tested} == {
+        *RATES,
+        KindOfTest.HELD_OUT,
+        KindOfTest.PRIOR,
+    }
 
 
 def test_trajectories_shorter_than_the_lags_are_tested() -> None:
     for intervals in range(1, 7):
         mode = Disc(1, intervals, FINE).mode(np.random.default_rng(1))
         tested = {test.name for test in misfit(mode).tests if test.tested}
-        assert tested == {ACCELERATION, FORECASTS}  # the data cannot fail the others
+        assert tested == {
+            KindOfTest.ACCELERATION,
+            KindOfTest.FORECASTS,
+        }  # the data cannot fail the others
 
 
 def test_forecasts_of_few_intervals_are_as_good_as_their_noise() -> None:
@@ -74,7 +89,7 @@ def test_forecasts_of_few_intervals_are_as_good_as_their_noise() -> None:
     for _ in range(4):
         mode = disc.mode(rng)
         left = unexplained_acceleration(mode)
-        assert FORECASTS not in failed(mode)
+        assert KindOfTest.FORECASTS not in failed(mode)
         # and the floor of the report is one that the disc's sensors can have
         assert (noise_alone(mode, left)[:6] > 0.1 * np.array(NOISE)).all()
 
@@ -86,8 +101,8 @@ def test_a_disturbance_without_memory_is_an_acceleration() -> None:
     size = 0.3  # m/s^2
     mode = disc.mode(rng, size * rng.normal(size=disc.pushes.shape))
     left = unexplained_acceleration(mode)
-    assert ACCELERATION in failed(mode)
-    assert WHITENESS not in failed(mode)
+    assert KindOfTest.ACCELERATION in failed(mode)
+    assert KindOfTest.WHITENESS not in failed(mode)
     # 240 steps of each velocity, of which the noise of the speed hides little: 20 % is 4 sd
     np.testing.assert_allclose(left.size[:2], size, rtol=0.2)
     assert left.worst > 2 * DEFAULT.negligible
@@ -107,7 +122,7 @@ def test_body_dimension_and_size_of_what_remains_have_one_source() -> None:
     """The largest of those that are significant; a larger one that may be noise is not named."""
     found, left = disturbed([0.1, 0.2, 0.9], [1e-9, 1e-9, 0.5])
     test, remains = found.tests[0], found.unexplained
-    assert (test.name, test.body, test.dimension) == (ACCELERATION, "puck", "vy")
+    assert (test.name, test.body, test.dimension) == (KindOfTest.ACCELERATION, "puck", "vy")
     assert (remains.body, remains.dimension, remains.share) == ("puck", "vy", 0.2)
     assert remains.sentence == test.sentence
     assert test.sentence == (
@@ -159,7 +174,9 @@ def test_a_disturbance_that_lasts_is_correlated_with_itself() -> None:
     for k in range(1, disc.intervals):
         drawn[:, k] = 0.9 * drawn[:, k - 1] + np.sqrt(1 - 0.9**2) * drawn[:, k]
     found = misfit(disc.mode(rng, drawn))
-    assert {ACCELERATION, WHITENESS} <= {test.name for test in found.tests if not test.passed}
+    assert {KindOfTest.ACCELERATION, KindOfTest.WHITENESS} <= {
+        test.name for test in found.tests if not test.passed
+    }
     assert found.unexplained is not None
 
 
@@ -167,7 +184,7 @@ def test_a_late_command_is_an_error_that_follows_commands(make_history) -> None:
     mode = fitted(BOX, box2d(make_history, 3, actuator_delay=0.4)[0])
     found = misfit(mode)
     names = {test.name for test in found.tests if not test.passed}
-    assert {ACCELERATION, COMMANDS, DEPENDENCE} <= names
+    assert {KindOfTest.ACCELERATION, KindOfTest.COMMANDS, KindOfTest.DEPENDENCE} <= names
     assert "command" in found.unexplained.depends_on
     assert not found.predicts(DEFAULT)
 
@@ -177,7 +194,12 @@ def test_a_spring_that_is_not_in_the_scene_fails_all_that_look_at_states(make_hi
     mode = fitted(BOX, train)
     found = misfit(mode)
     names = {test.name for test in found.tests if not test.passed}
-    assert {ACCELERATION, WHITENESS, FORECASTS, DEPENDENCE} <= names
+    assert {
+        KindOfTest.ACCELERATION,
+        KindOfTest.WHITENESS,
+        KindOfTest.FORECASTS,
+        KindOfTest.DEPENDENCE,
+    } <= names
     assert found.unexplained.body == "puck"
     assert found.unexplained.depends_on.startswith("position")
 
@@ -186,7 +208,7 @@ def test_a_force_that_takes_two_quantities_depends_on_their_product(make_history
     """Magnus: neither the spin nor the speed says anything of it alone."""
     train, _ = box2d(make_history, 3, trajectories=20, intervals=10, magnus_force=0.15)
     found = misfit(fitted(BOX, train))
-    assert DEPENDENCE in {test.name for test in found.tests if not test.passed}
+    assert KindOfTest.DEPENDENCE in {test.name for test in found.tests if not test.passed}
     assert found.unexplained.depends_on.startswith("angular speed × ")
     assert found.unexplained.dimension in ("forward speed", "sideways speed")
 

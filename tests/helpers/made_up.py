@@ -15,6 +15,7 @@ from pbrl_ppl.criticism.results import (
     Errors,
     Estimate,
     Growth,
+    KindOfTest,
     Numerical,
     ResidualTest,
     Rollout,
@@ -200,8 +201,10 @@ def made_up_tests(verdict: str) -> tuple[ResidualTest, ...]:
     said = "no acceleration is left" if whole else "an acceleration of 0.2 rad/s² in omega is left"
     p_value, share = (0.4, 0.001) if whole else (1e-9, 0.34)
     return (
-        ResidualTest("unexplained acceleration", p_value, share, whole, said),
-        ResidualTest("whiteness", 0.3, 0.05, True, "errors say nothing of those of the next"),
+        ResidualTest(KindOfTest.ACCELERATION, p_value, share, whole, said),
+        ResidualTest(
+            KindOfTest.WHITENESS, 0.3, 0.05, True, "errors say nothing of those of the next"
+        ),
     )
 
 
