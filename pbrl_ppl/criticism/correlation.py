@@ -192,6 +192,4 @@ def _test(
         sentence = f"{error} is correlated with {other} {when} ({worst.value:.2f})"
     name = KindOfTest.COMMANDS if names else KindOfTest.WHITENESS
     dimension, _, body = ("" if passed else cells[worst.cell]).partition(" of ")
-    return ResidualTest(
-        name, p_value, abs(worst.value), passed, sentence, body=body, dimension=dimension
-    )
+    return ResidualTest(name, p_value, abs(worst.value), passed, sentence, body, dimension)

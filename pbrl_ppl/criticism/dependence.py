@@ -153,7 +153,7 @@ def find_dependence(
         return ResidualTest(KindOfTest.DEPENDENCE, 1.0, 0.0, True, sentence), None
     test = ResidualTest(
         KindOfTest.DEPENDENCE, best.p_value, best.share, False, best.sentence,
-        body=best.body, dimension=best.dimension,
+        best.body, best.dimension,
     )  # fmt: skip
     return test, best
 

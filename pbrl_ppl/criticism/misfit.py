@@ -141,13 +141,7 @@ def _acceleration(mode: Mode, excess: UnexplainedAcceleration) -> ResidualTest:
             sentence += ", which is negligible"
     p_value = float(min(1.0, excess.p_value[largest] * len(excess.names)))
     return ResidualTest(
-        KindOfTest.ACCELERATION,
-        p_value,
-        relative,
-        passed,
-        sentence,
-        body=body,
-        dimension=name if body else "",
+        KindOfTest.ACCELERATION, p_value, relative, passed, sentence, body, name if body else ""
     )
 
 
@@ -231,13 +225,7 @@ def simulation_test(
         f" {STATE_UNITS[STATE.index(name)]} off in {name}, {times:.3g} times the measurement noise"
     )
     return ResidualTest(
-        KindOfTest.SIMULATION,
-        float("nan"),
-        times,
-        passed,
-        sentence,
-        body="",
-        dimension="" if passed else name,
+        KindOfTest.SIMULATION, float("nan"), times, passed, sentence, "", "" if passed else name
     )
 
 
@@ -261,7 +249,7 @@ def score_test(mode: Mode, ranked: Sequence[Signature], criteria: Criteria) -> R
         sentence += ", which is negligible" if size < criteria.negligible else ""
     passed = not certain or size < criteria.negligible
     return ResidualTest(
-        KindOfTest.CANDIDATES, candidate.p_value, size, passed, sentence, body=candidate.body
+        KindOfTest.CANDIDATES, candidate.p_value, size, passed, sentence, candidate.body
     )
 
 
@@ -301,10 +289,9 @@ def _forecasts(
         chance = len(dimensions) * float(chi2.sf(total, max(z.size / 2, 1)))
         if np.sqrt(z.mean()) > worst:
             worst, p_value, name = float(np.sqrt(z.mean())), min(1.0, chance), STATE[d]
-            worst_place = int(
-                noise.coordinates.places[columns[int(np.argmax(np.nansum(square, axis=0)))]]
-            )
-            body = mode.problem.scene.moving[worst_place // len(STATE)].name
+            column = columns[int(np.argmax(np.nansum(square, axis=0)))]
+            place = int(noise.coordinates.places[column])
+            body = mode.problem.scene.moving[place // len(STATE)].name
     passed = p_value > criteria.false_alarm or worst < criteria.worse_forecast
     dt = mode.problem.scene.time_step
     seconds = longest * dt
@@ -323,7 +310,5 @@ def _forecasts(
     )
     if passed:
         body = name = ""
-    test = ResidualTest(
-        KindOfTest.FORECASTS, p_value, worst, passed, sentence, body=body, dimension=name
-    )
+    test = ResidualTest(KindOfTest.FORECASTS, p_value, worst, passed, sentence, body, name)
     return test, growth

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from cycler import cycler
@@ -14,22 +14,7 @@ from scipy.stats import norm
 
 from pbrl_ppl.criticism import Loop, diverged_after
 from pbrl_ppl.posterior import HDI_PROB
-from pbrl_ppl.reporting.style import (
-    AFTER,
-    BAND,
-    BEFORE,
-    BOX,
-    LINES,
-    PLAIN,
-    UNITS,
-    WIDE,
-    bars,
-    blank_figure,
-    label,
-    legend,
-    name_axes,
-    zero_line,
-)
+from pbrl_ppl.reporting import style
 from pbrl_ppl.state import Floats
 
 T = TypeVar("T")
@@ -38,17 +23,17 @@ T = TypeVar("T")
 def _models(loop: Loop, before: T, after: T) -> list[tuple[str, T, str]]:
     """Return name, values and colour of the models to show: one, or before and after."""
     if not loop.added:
-        return [("declared model", before, AFTER)]
-    return [("before", before, BEFORE), ("after", after, AFTER)]
+        return [("declared model", before, style.AFTER)]
+    return [("before", before, style.BEFORE), ("after", after, style.AFTER)]
 
 
-def plot_residuals(loop: Loop, width: float = WIDE) -> Figure:
+def plot_residuals(loop: Loop, width: float = style.WIDE) -> Figure:
     """Plot held-out residuals of each state dimension in units of noise, before and after."""
     names = list(loop.residuals_before)
-    figure, (axes,) = blank_figure(width, 3.6)
+    figure, (axes,) = style.blank_figure(width, 3.6)
     edge = float(norm.ppf(0.5 + HDI_PROB / 2))
-    axes.axhspan(-edge, edge, color=BAND, zorder=0)
-    zero_line(axes)
+    axes.axhspan(-edge, edge, color=style.BAND, zorder=0)
+    style.zero_line(axes)
     models = _models(loop, loop.residuals_before, loop.residuals_after)
     largest = 0.0
     for i, (_, residuals, colour) in enumerate(models):
@@ -57,7 +42,7 @@ def plot_residuals(loop: Loop, width: float = WIDE) -> Figure:
             values = np.asarray(residuals[name], dtype=float)
             values = values[np.isfinite(values)]
             if values.size < len(residuals[name]):
-                label(axes, "diverged", (place, 0.0), color=colour)
+                style.label(axes, "diverged", (place, 0.0), color=colour)
             if not values.size:
                 continue
             largest = max(largest, float(np.abs(values).max()))
@@ -76,12 +61,12 @@ def plot_residuals(loop: Loop, width: float = WIDE) -> Figure:
     axes.set_xticks(range(len(names)), names)
     axes.set_ylabel("residual / noise")
     handles: list[Artist] = [Line2D([], [], color=c, linewidth=3, label=n) for n, _, c in models]
-    handles.append(Patch(color=BAND, label=f"noise alone, {100 * HDI_PROB:.0f} %"))
-    legend(figure, handles)
+    handles.append(Patch(color=style.BAND, label=f"noise alone, {100 * HDI_PROB:.0f} %"))
+    style.legend(figure, handles)
     return figure
 
 
-def plot_errors(loop: Loop, width: float = WIDE) -> Figure:
+def plot_errors(loop: Loop, width: float = style.WIDE) -> Figure:
     """Plot held-out errors one step ahead and at the end of a rollout, before and after."""
     titles = {
         "one_step_rmse": "one step ahead",
@@ -89,7 +74,7 @@ def plot_errors(loop: Loop, width: float = WIDE) -> Figure:
     }
     kinds = [kind for kind in titles if getattr(loop.before, kind)]
     height = 1.2 + 0.42 * max((len(getattr(loop.before, kind)) for kind in kinds), default=1)
-    figure, panels = blank_figure(width, height, max(len(kinds), 1), max(len(kinds), 1), "x")
+    figure, panels = style.blank_figure(width, height, max(len(kinds), 1), max(len(kinds), 1), "x")
     for axes, kind in zip(panels, kinds, strict=False):
         before, after, floor = (
             getattr(e, kind) for e in (loop.before, loop.after, loop.noise_floor)
@@ -101,41 +86,42 @@ def plot_errors(loop: Loop, width: float = WIDE) -> Figure:
             found = {d: values.get(d, np.nan) for d in before}
             shown = [np.nan_to_num(v / (scale[d] or np.nan), posinf=0.0) for d, v in found.items()]
             texts = [
-                "diverged" if np.isinf(v) else f"{v:.3g} {UNITS.get(d, '')}" * bool(np.isfinite(v))
+                "diverged"
+                if np.isinf(v)
+                else f"{v:.3g} {style.UNITS.get(d, '')}" * bool(np.isfinite(v))
                 for d, v in found.items()
             ]
             shift = 0.38 * (i - (len(models) - 1) / 2)
-            bars(axes, list(before), shown, colour, texts, shift=shift, height=0.36)
+            style.bars(axes, list(before), shown, colour, texts, shift=shift, height=0.36)
         axes.axvline(1.0, color="black", linewidth=1.0, linestyle=":")
         axes.margins(x=0.3)
         axes.set_xlim(left=0.0)
         scaled_by = "noise floor" if has_floor else "error before"
-        name_axes(axes, titles[kind], f"error / {scaled_by}")
-    legend(figure, [Patch(color=colour, label=name) for name, _, colour in _models(loop, 0, 0)])
+        style.name_axes(axes, titles[kind], f"error / {scaled_by}")
+    handles = [Patch(color=colour, label=name) for name, _, colour in _models(loop, 0, 0)]
+    style.legend(figure, handles)
     return figure
 
 
-def plot_rollout(loop: Loop, width: float = WIDE) -> Figure:
+def plot_rollout(loop: Loop, width: float = style.WIDE) -> Figure:
     """Plot one held-out trajectory: measured, and predicted before and after."""
     rollout = loop.rollout
     count = len(rollout.names)
     columns = min(count, 2)
-    figure, panels = blank_figure(width, 1.9, count, columns, spare=0.8)
-    models = _models(loop, rollout.before, rollout.after)
-    both: tuple[Literal["--", "-"], ...] = ("--", "-")
-    styles = both[-len(models) :]
+    figure, panels = style.blank_figure(width, 1.9, count, columns, spare=0.8)
     for place, (name, unit) in enumerate(zip(rollout.names, rollout.units, strict=True)):
         axes, measured = panels[place], rollout.measured[:, place]
         if unit == "rad":
             measured = unwrap(measured)
-        axes.plot(rollout.time, measured, "o", color="black", markersize=2.5)
+        axes.plot(rollout.time, measured, "o", color="black", markersize=2.5, label="measured")
         notes = [("black", _measured_until(rollout.time, measured))]
-        shown = [measured]
-        for (which, values, colour), dashes in zip(models, styles, strict=True):
+        shown, models = [measured], _models(loop, rollout.before, rollout.after)
+        for which, values, colour in models:
             line = values[:, place]
             if unit == "rad":
                 line = _beside(unwrap(line), measured)
-            axes.plot(rollout.time, line, linestyle=dashes, color=colour, linewidth=1.6)
+            dashes = "--" if which == "before" else "-"
+            axes.plot(rollout.time, line, dashes, color=colour, linewidth=1.6, label=which)
             end = diverged_after(rollout.time, values)
             if end is None:
                 shown.append(line)
@@ -149,17 +135,12 @@ def plot_rollout(loop: Loop, width: float = WIDE) -> Figure:
         for i, (colour, text) in enumerate(note for note in notes if note[1]):
             axes.text(
                 0.98, 0.97 - 0.11 * i, text, color=colour, transform=axes.transAxes, ha="right",
-                va="top", fontsize=8, bbox=BOX,
+                va="top", fontsize=8, bbox=style.BOX,
             )  # fmt: skip
         axes.set_ylabel(f"{name} ({unit})")
         if place >= count - columns:
             axes.set_xlabel("time (s)")
-    handles = [Line2D([], [], color="black", label="measured", marker="o", ls="", markersize=3)]
-    handles += [
-        Line2D([], [], color=colour, linestyle=dashes, label=name)
-        for (name, _, colour), dashes in zip(models, styles, strict=True)
-    ]
-    legend(figure, handles)
+    style.legend(figure, panels[0].lines)
     return figure
 
 
@@ -189,7 +170,7 @@ def _beside(line: Floats, measured: Floats) -> Floats:
     return np.asarray(line + 2 * np.pi * turns)
 
 
-def plot_correlations(loop: Loop, width: float = WIDE, most: int = 4) -> Figure:
+def plot_correlations(loop: Loop, width: float = style.WIDE, most: int = 4) -> Figure:
     """Plot correlations of errors with earlier errors and with commands; name the largest.
 
     Noise alone puts any curve of a panel outside the band once in 100 times.
@@ -201,31 +182,33 @@ def plot_correlations(loop: Loop, width: float = WIDE, most: int = 4) -> Figure:
         names = [f"{c}, {u.replace('_', ' ')}" for u in found.commands for c in found.cells]
         driven = found.driven.reshape(len(found.driven), -1)
         panels_of["with commands"] = (driven, 0, found.pairs.max(initial=1), names)
-    figure, panels = blank_figure(width, 3.2, len(panels_of), len(panels_of))
+    figure, panels = style.blank_figure(width, 3.2, len(panels_of), len(panels_of))
     for axes, (title, (values, first, size, names)) in zip(panels, panels_of.items(), strict=True):
         edge = norm.isf(0.01 / 2 / max(values.size, 1)) / np.sqrt(max(size, 1))
-        axes.axhspan(-edge, edge, color=BAND, zorder=0)
-        zero_line(axes)
+        axes.axhspan(-edge, edge, color=style.BAND, zorder=0)
+        style.zero_line(axes)
         largest, lags = np.abs(values).max(axis=0), np.arange(first, len(values) + first)
         shown = [i for i in np.argsort(-largest) if largest[i] > edge][:most]
         for i in (i for i in range(values.shape[1]) if i not in shown):
-            axes.plot(lags, values[:, i], ".-", color=PLAIN, linewidth=0.7, markersize=4)
+            axes.plot(lags, values[:, i], ".-", color=style.PLAIN, linewidth=0.7, markersize=4)
         for i in shown:
             axes.plot(lags, values[:, i], ".-", linewidth=1.6, markersize=7, label=names[i])
         if shown:
             axes.legend(frameon=False, fontsize="small")
         top = max(1.3 * edge, 1.1 * largest.max())
         axes.set(ylim=(-top, top), xticks=lags)
-        name_axes(axes, title, "intervals before", "correlation of errors" * (axes is panels[0]))
+        style.name_axes(
+            axes, title, "intervals before", "correlation of errors" * (axes is panels[0])
+        )
     return figure
 
 
-def plot_growth(loop: Loop, width: float = WIDE) -> Figure:
+def plot_growth(loop: Loop, width: float = style.WIDE) -> Figure:
     """Plot errors of forecasts over their length, as multiples of the error from noise alone."""
     growth = loop.growth
-    figure, (axes,) = blank_figure(width, 3.2)
+    figure, (axes,) = style.blank_figure(width, 3.2)
     axes.axhline(1.0, color="black", linewidth=0.8)
-    axes.set_prop_cycle(LINES + cycler(marker=list("ooss^^")))
+    axes.set_prop_cycle(style.LINES + cycler(marker=list("ooss^^")))
     for name in (name for name, size in growth.floor[-1].items() if size > 0):
         ratio = [
             error.get(name, np.nan) / (floor.get(name) or np.nan)

@@ -13,16 +13,13 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from pbrl_ppl import __version__
 from pbrl_ppl.criticism import Loop, close_loop
 from pbrl_ppl.criticism.loop import FILES
-from pbrl_ppl.effects import Effect
-from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import ManifestError, PbrlError
 from pbrl_ppl.files import write_text
 from pbrl_ppl.history import read_recording, read_scene
@@ -141,38 +138,25 @@ _MAKING = ".making-"
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of all logs; as of :func:`pbrl_ppl.close_loop` and `History.load`.
+    """Settings of all logs: arguments of what reads a scene and a recording, and closes the loop.
 
     Parameters
     ----------
-    seed, substeps, draws, method, catalogue : optional
-        Of the loop; the whole catalogue without one.
-    noise : mapping of str to float
-        Known errors of measuring, by state dimension.
-    estimate_velocities, columns, units, trim : optional
-        How histories are read.
-    time_step : float, optional
-        In place of the scene's (s); uneven samples are then interpolated to it.
+    scene, recording : mapping of str to object
+        Of `history.read_scene` and of `history.read_recording`.
+    loop : mapping of str to object
+        Of :func:`pbrl_ppl.close_loop`; the whole catalogue without one.
     """
 
-    seed: int = 0
-    substeps: int | None = None
-    draws: int | None = None
-    method: str = "importance"
-    catalogue: tuple[Effect, ...] | None = None
-    noise: Mapping[str, float] = field(default_factory=dict)
-    estimate_velocities: bool = False
-    columns: Mapping[str, str | float] = field(default_factory=dict)
-    units: Mapping[str, str] = field(default_factory=dict)
-    time_step: float | None = None
-    trim: bool = False
+    scene: Mapping[str, Any]
+    recording: Mapping[str, Any]
+    loop: Mapping[str, Any]
 
     def to_dict(self) -> dict[str, object]:
         """Return the settings as JSON values."""
-        effects = None
-        if self.catalogue is not None:
-            effects = [[effect.name, repr(effect.parameters)] for effect in self.catalogue]
-        return vars(self) | {"catalogue": effects}
+        own = self.loop.get("catalogue")
+        effects = own and [[effect.name, repr(effect.parameters)] for effect in own]
+        return {**self.scene, **self.recording, **self.loop, "catalogue": effects}
 
 
 #: Summary of one log, of values that JSON has.
@@ -194,22 +178,11 @@ class LoopWithPage:
 
 def close_log(log: Log, settings: Settings) -> LoopWithPage:
     """Read a log's files and close the loop."""
-    scene = read_scene(
-        log.scene, noise=settings.noise, substeps=settings.substeps, time_step=settings.time_step
-    )
-    read = partial(
-        read_recording, scene=scene, estimate_velocities=settings.estimate_velocities,
-        columns=settings.columns, units=settings.units, trim=settings.trim,
-        resample=settings.time_step is not None,
-    )  # fmt: skip
-    train, test = read(log.train), None if log.test is None else read(log.test)
-    catalogue = full_catalogue if settings.catalogue is None else settings.catalogue
-    return LoopWithPage(
-        close_loop(
-            scene, train, test, catalogue=catalogue, seed=settings.seed, draws=settings.draws,
-            method=settings.method,
-        )
-    )  # fmt: skip
+    scene = read_scene(log.scene, **settings.scene)
+    reading = {"resample": settings.scene["time_step"] is not None, **settings.recording}
+    train = read_recording(log.train, scene, **reading)
+    test = None if log.test is None else read_recording(log.test, scene, **reading)
+    return LoopWithPage(close_loop(scene, train, test, **settings.loop))
 
 
 def inputs_sha256(log: Log, settings: Settings) -> str:

@@ -6,19 +6,21 @@ import json
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import pandas as pd
 
 from pbrl_ppl.background import as_ended
-from pbrl_ppl.criticism import NOT_CONVERGED, UNEXPLAINED, check_folder
+from pbrl_ppl.criticism import ADEQUATE, EFFECTS_ADDED, check_folder
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.errors import OutputError, PbrlError
 from pbrl_ppl.files import write_text
 from pbrl_ppl.posterior import load_posterior
+from pbrl_ppl.reporting import many_page
 from pbrl_ppl.reporting.logs import (
+    DONE,
     FAILED,
     Log,
     Row,
@@ -31,7 +33,6 @@ from pbrl_ppl.reporting.logs import (
     row_of,
     settle,
 )
-from pbrl_ppl.reporting.many_page import effect_table, in_words, page, summary_table
 from pbrl_ppl.reporting.page import Source
 from pbrl_ppl.sampling import Pooled, pool
 
@@ -69,14 +70,14 @@ class ManyLoops:
 
     def table(self) -> pd.DataFrame:
         """Return one row a log: status, verdict, effects, errors, message, folder."""
-        return summary_table(self.rows)
+        return many_page.summary_table(self.rows)
 
     def effects(self) -> pd.DataFrame:
         """Return one row an effect and log that it was found in, with its estimate."""
-        return effect_table(self.rows)
+        return many_page.effect_table(self.rows)
 
     def __repr__(self) -> str:
-        return f"ManyLoops({in_words(self.rows)})"
+        return f"ManyLoops({many_page.in_words(self.rows)})"
 
 
 def close_loop_many(
@@ -162,50 +163,46 @@ def close_loop_many(
     logs = read_manifest(manifest) if isinstance(manifest, str | Path) else tuple(manifest)
     folder = _opened(Path(folder))
     settings = Settings(
-        seed, substeps, draws, method, None if catalogue is None else tuple(catalogue),
-        dict(noise or {}), estimate_velocities, dict(columns or {}), dict(units or {}), time_step,
-        trim,
+        {"noise": dict(noise or {}), "substeps": substeps, "time_step": time_step},
+        {"estimate_velocities": estimate_velocities, "columns": dict(columns or {}),
+         "units": dict(units or {}), "trim": trim},
+        {"seed": seed, "draws": draws, "method": method}
+        | ({} if catalogue is None else {"catalogue": tuple(catalogue)}),
     )  # fmt: skip
     tell = progress or (lambda _: None)
     inputs = {log.name: inputs_sha256(log, settings) for log in logs}
-    rows: dict[str, Row] = {}
+    rows: dict[str, Row] = {
+        log.name: {"name": log.name, "kind": log.kind, "status": "waiting"} for log in logs
+    }
     for log in logs:
         if again:
-            (folder / log.name / "report.json").unlink(missing_ok=True)
+            (folder / log.name / DONE).unlink(missing_ok=True)
         elif row := row_of(log, folder, inputs[log.name]):
             rows[log.name] = row
             (folder / log.name / FAILED).unlink(missing_ok=True)
-    if rows:
-        tell(f"{len(rows)} of {len(logs)} logs are in {folder}")
-    left = [log for log in logs if log.name not in rows]
+    left = [log for log in logs if rows[log.name]["status"] == "waiting"]
+    finished = len(logs) - len(left)
+    if finished:
+        tell(f"{finished} of {len(logs)} logs are in {folder}")
     tasks = {log: partial(settle, log, folder, settings, inputs[log.name], run) for log in left}
-    write = partial(_write_summary, folder, source)
-    write(_ordered(logs, rows), {}, {})
+    loops = _written(ManyLoops(folder, tuple(rows.values()), {}, {}), source)
     with closing(as_ended(tasks, executor)) as results:
-        for log, result in results:
+        for count, (log, result) in enumerate(results, finished + 1):
             try:
-                row = result()
+                rows[log.name] = result()
             except Exception as error:  # its worker died, or it could not be sent there
-                row = failed(log, folder, error)
-            rows[log.name] = row
-            tell(f"{len(rows)}/{len(logs)} {_row_in_words(row)}")
-            write(_ordered(logs, rows), {}, {})
-    summary = _ordered(logs, rows), *_pooled(logs, rows, folder)
-    write(*summary)
-    return ManyLoops(folder, *summary)
+                rows[log.name] = failed(log, folder, error)
+            tell(f"{count}/{len(logs)} {_row_in_words(rows[log.name])}")
+            loops = _written(replace(loops, rows=tuple(rows.values())), source)
+    pooled, not_pooled = _pooled(logs, rows, folder)
+    return _written(replace(loops, pooled=pooled, not_pooled=not_pooled), source)
 
 
 def _row_in_words(row: Row) -> str:
     if row["status"] == "failed":
         return f"{row['name']}: failed: {row['message']}"
-    names = ", ".join(f"{effect['effect']}[{effect['body']}]" for effect in row["effects"])
+    names = ", ".join(map(many_page.effect_label, row["effects"]))
     return f"{row['name']}: {row['verdict']}{f' ({names})' if names else ''}, {row['seconds']:g} s"
-
-
-def _ordered(logs: Iterable[Log], rows: Mapping[str, Row]) -> tuple[Row, ...]:
-    """Return the rows in the manifest's order; logs without one are waiting."""
-    waiting = {"status": "waiting"}
-    return tuple(rows.get(log.name, {"name": log.name, "kind": log.kind} | waiting) for log in logs)
 
 
 def _opened(folder: Path) -> Path:
@@ -237,8 +234,7 @@ def _pooled(
     """Return the hyper-parameters of each kind with at least two adequate models."""
     kinds: dict[str, list[str]] = {log.kind: [] for log in logs if log.kind}
     for log in logs:
-        verdict = rows[log.name].get("verdict", NOT_CONVERGED)
-        if log.kind and verdict not in (UNEXPLAINED, NOT_CONVERGED):
+        if log.kind and rows[log.name].get("verdict") in (ADEQUATE, EFFECTS_ADDED):
             kinds[log.kind].append(log.name)
     pooled, reasons = {}, {}
     for kind, names in kinds.items():
@@ -253,28 +249,24 @@ def _pooled(
     return pooled, reasons
 
 
-def _write_summary(
-    folder: Path,
-    source: Source,
-    rows: tuple[Row, ...],
-    pooled: Mapping[str, Pooled],
-    not_pooled: Mapping[str, str],
-) -> None:
-    """Write the files of all logs together, each whole or not at all."""
+def _written(loops: ManyLoops, source: Source) -> ManyLoops:
+    """Write the files of all logs together, each whole or not at all, and return the results."""
     contents = {
         "contents": _KIND,
-        "logs": rows,
-        "pooled": {kind: population.to_dict() for kind, population in pooled.items()},
-        "not_pooled": not_pooled,
+        "logs": loops.rows,
+        "pooled": {kind: population.to_dict() for kind, population in loops.pooled.items()},
+        "not_pooled": loops.not_pooled,
     }
+    tables = {"summary.csv": loops.table(), "effects.csv": loops.effects()}
     texts = {
         "summary.json": json.dumps(contents, indent=1, default=dict) + "\n",
-        "summary.csv": summary_table(rows).to_csv(index=False, lineterminator="\n"),
-        "effects.csv": effect_table(rows).to_csv(index=False, lineterminator="\n"),
-        "index.html": page(rows, pooled, not_pooled, source),
+        "index.html": many_page.page(loops.rows, loops.pooled, loops.not_pooled, source),
     }
-    for kind, population in pooled.items():
+    for kind, population in loops.pooled.items():
         texts[f"kind-{kind}.toml"] = population.scene.to_toml()
-        texts[f"kind-{kind}.csv"] = population.robots().to_csv(index=False, lineterminator="\n")
+        tables[f"kind-{kind}.csv"] = population.robots()
+    for name, table in tables.items():
+        texts[name] = table.to_csv(index=False, lineterminator="\n")
     for name, text in texts.items():
-        write_text(folder / name, text)
+        write_text(loops.folder / name, text)
+    return loops

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -13,7 +14,7 @@ from markupsafe import Markup
 from pbrl_ppl.criticism import NOT_CONVERGED
 from pbrl_ppl.reporting.logs import Row
 from pbrl_ppl.reporting.page import Section, Source, render_page
-from pbrl_ppl.reporting.tables import Cell, Table
+from pbrl_ppl.reporting.tables import Cell, Table, tabulate
 from pbrl_ppl.reporting.words import chance, joined, number, plain, quantity
 from pbrl_ppl.sampling import Pooled
 
@@ -30,17 +31,21 @@ def summary_table(rows: Iterable[Row]) -> pd.DataFrame:
     """Return one row a log; errors are in units of the noise, paths relative to the folder."""
     columns = ["name", "kind", "status", "verdict", "effects", "error_before", "error_after",
                "seconds", "warnings", "message", "report"]  # fmt: skip
-    table = []
-    for row in rows:
-        done = row["status"] == "done"
-        named = [f"{effect['effect']}[{effect['body']}]" for effect in row.get("effects", ())]
-        more = {
-            "effects": "; ".join(named),
+    table = [
+        {
+            **row,
+            "effects": "; ".join(map(effect_label, row.get("effects", ()))),
             "warnings": len(row.get("warnings", ())),
-            "report": f"{row['name']}/report.html" if done else "",
+            "report": f"{row['name']}/report.html" if row["status"] == "done" else "",
         }
-        table.append({name: (dict(row) | more).get(name, "") for name in columns})
-    return pd.DataFrame(table, columns=columns)
+        for row in rows
+    ]
+    return pd.DataFrame([{name: row.get(name, "") for name in columns} for row in table])
+
+
+def effect_label(effect: Row) -> str:
+    """Return an effect and its body as ``angular_drag[cart]``."""
+    return f"{effect['effect']}[{effect['body']}]"
 
 
 def effect_table(rows: Iterable[Row]) -> pd.DataFrame:
@@ -59,8 +64,12 @@ def effect_table(rows: Iterable[Row]) -> pd.DataFrame:
 
 def in_words(rows: Iterable[Row]) -> str:
     """Return how many logs had which verdict or status."""
-    ends = Counter(str(row.get("verdict", row["status"])) for row in rows)
-    return ", ".join(f"{count} {end}" for end, count in sorted(ends.items()))
+    return ", ".join(f"{count} {end}" for end, count in sorted(Counter(map(_end, rows)).items()))
+
+
+def _end(row: Row) -> str:
+    """Return the verdict of a log, or its status without one."""
+    return str(row.get("verdict", row["status"]))
 
 
 def page(
@@ -82,7 +91,7 @@ def page(
         "logs_header",
         SECTIONS,
         rows=rows,
-        headline=_verdict(in_words(rows)),
+        headline=in_words(rows).replace("-", " "),
         found={_title(*pair): names for pair, names in found.items()},
         logs=_logs(rows),
         effects=[_effects(rows, pairs[i:j]) for i, j in parts],
@@ -95,54 +104,57 @@ def page(
 
 def _logs(rows: Iterable[Row]) -> Table:
     """Tabulate the logs, one row each."""
-    cells, marks = [], []
-    for row in rows:
-        words, numbers = row.get("message", ""), ["", "", "", ""]
-        if row["status"] == "done":
-            words = joined(map(_named, row["effects"])) or words
-            numbers = [number(row["error_before"]), number(row["error_after"]),
-                       str(len(row["warnings"]) or ""), number(row["seconds"])]  # fmt: skip
-        verdict = row.get("verdict", row["status"])
-        cells.append([(_link(row), row["kind"]), _verdict(verdict), words, *numbers])
-        marks.append("bad" * (verdict in ("failed", NOT_CONVERGED)))
-    heads = ("Log", "Verdict", "Effects, or what went wrong", "Error before", "Error after",
-             "Warnings", "Time (s)")  # fmt: skip
-    return Table("All logs", heads, cells, (1, 2), marks)
+
+    def numbers(key: str) -> Callable[[Row], str]:
+        return lambda row: number(row[key]) if key in row else ""
+
+    return tabulate(
+        "All logs",
+        rows,
+        {
+            "Log": lambda row: (_link(row), row["kind"]),
+            "Verdict": lambda row: _end(row).replace("-", " "),
+            "Effects, or what went wrong": lambda row: (
+                joined(map(_named, row.get("effects", ()))) or row.get("message", "")
+            ),
+            "Error before": numbers("error_before"),
+            "Error after": numbers("error_after"),
+            "Warnings": lambda row: str(len(row.get("warnings", ())) or ""),
+            "Time (s)": numbers("seconds"),
+        },
+        {"Verdict", "Effects, or what went wrong"},
+        lambda row: "bad" * (_end(row) in ("failed", NOT_CONVERGED)),
+    )
 
 
 def _effects(rows: Iterable[Row], pairs: Sequence[tuple[str, str]]) -> Table:
     """Tabulate the effects, one row a finished log, one column an effect."""
-    done = [row for row in rows if row["status"] == "done"]
-    cells = [[_link(row), *(_cell(row, *pair) for pair in pairs)] for row in done]
-    heads = ["Log", *(_title(*pair) for pair in pairs)]
-    return Table("Effects found, by log", heads, cells, range(1, len(heads)))
+    done = (row for row in rows if row["status"] == "done")
+    columns = {_title(*pair): partial(_cell, effect=pair[0], body=pair[1]) for pair in pairs}
+    return tabulate("Effects found, by log", done, {"Log": _link, **columns}, columns)
 
 
 def _pooled(pooled: Pooled, kind: str) -> Table:
     """Tabulate the hyper-parameters of a kind, one row a parameter."""
 
-    def interval(row: Mapping[Any, Any], middle: str, name: str) -> Cell:
-        low, high = number(row[f"{name}_low"]), number(row[f"{name}_high"])
-        return number(row[middle]), f"{low} to {high}"
+    def interval(middle: str, name: str) -> Callable[[Mapping[Any, Any]], Cell]:
+        return lambda row: (
+            number(row[middle]),
+            f"{number(row[f'{name}_low'])} to {number(row[f'{name}_high'])}",
+        )
 
-    cells = [
-        [
-            (row["parameter"], row["scale"]),
-            interval(row, "mean", "mean"),
-            interval(row, "spread", "spread"),
-            interval(row, "next_median", "next"),
-            str(row["informed"]),
-            chance(row["p_same"]),
-        ]
-        for row in pooled.table().to_dict("records")
-    ]
-    heads = ("Parameter", "Mean of the kind", "Spread of robots", "Next robot",
-             "Robots that inform", "Same in all, p")  # fmt: skip
-    return Table(f"Robots of the kind {kind}", heads, cells)
-
-
-def _verdict(name: str) -> str:
-    return name.replace("-", " ")
+    return tabulate(
+        f"Robots of the kind {kind}",
+        pooled.table().to_dict("records"),
+        {
+            "Parameter": lambda row: (row["parameter"], row["scale"]),
+            "Mean of the kind": interval("mean", "mean"),
+            "Spread of robots": interval("spread", "spread"),
+            "Next robot": interval("next_median", "next"),
+            "Robots that inform": lambda row: str(row["informed"]),
+            "Same in all, p": lambda row: chance(row["p_same"]),
+        },
+    )
 
 
 def _named(effect: Row) -> str:

@@ -15,6 +15,7 @@ from scipy.stats import binom, rankdata
 
 from pbrl_ppl.criticism import PriorCheck
 from pbrl_ppl.posterior import DATATREE, Idata, convergence, from_groups, scalars
+from pbrl_ppl.reporting import style
 from pbrl_ppl.reporting.posterior_summary import (
     most_interesting,
     pit_values,
@@ -22,27 +23,12 @@ from pbrl_ppl.reporting.posterior_summary import (
     rank_correlations,
     summary,
 )
-from pbrl_ppl.reporting.style import (
-    AFTER,
-    BAND,
-    BEFORE,
-    LINES,
-    NARROW,
-    PLAIN,
-    UNITS,
-    WIDE,
-    blank_figure,
-    density,
-    legend,
-    name_axes,
-    shares_below,
-)
 from pbrl_ppl.sampling import Calibration, bins
 from pbrl_ppl.state import Floats
 
 
 def plot_trace(
-    posterior: Idata, parameters: Sequence[str] | None = None, width: float = WIDE
+    posterior: Idata, parameters: Sequence[str] | None = None, width: float = style.WIDE
 ) -> Figure:
     """Plot ArviZ's trace of some parameters, laid out alike on every ArviZ.
 
@@ -61,14 +47,14 @@ def plot_trace(
         # ArviZ uses what newer Matplotlib deprecates, and a constant parameter makes it complain
         warnings.simplefilter("ignore")
         if not DATATREE:
-            figure, panels = blank_figure(width, 1.5, 2 * count, 2, None, spare=0.6)
+            figure, panels = style.blank_figure(width, 1.5, 2 * count, 2, None, spare=0.6)
             grid = np.array(panels, dtype=object).reshape(count, 2)
             az.plot_trace(draws, axes=grid, compact=False, trace_kwargs={"linewidth": 0.5})
             for axes in panels:
                 for text in (axes.title, axes.xaxis.label, axes.yaxis.label):
                     text.set_fontsize(9)
             return figure
-        columns = 1 if count == 1 or width <= NARROW else 2
+        columns = 1 if count == 1 or width <= style.NARROW else 2
         size = (width, 0.6 + 1.7 * -(-count // columns))
         trace = {"alpha": 0.5, "width": 0.5}
         collection = az.plot_trace(
@@ -84,7 +70,7 @@ def plot_trace(
 
 
 def plot_rank(
-    posterior: Idata, parameters: Sequence[str] | None = None, width: float = WIDE
+    posterior: Idata, parameters: Sequence[str] | None = None, width: float = style.WIDE
 ) -> Figure:
     """Plot how evenly the ranks of each chain's draws are spread; arguments as :func:`plot_trace`.
 
@@ -99,17 +85,19 @@ def plot_rank(
         for i in range(draws.sizes["chain"])
     ]
     count = len(draws.data_vars)
-    figure, panels = blank_figure(width, 1.7, count, min(count, 2), spare=0.6)
+    figure, panels = style.blank_figure(width, 1.7, count, min(count, 2), spare=0.6)
     for axes, (name, values) in zip(panels, draws.items(), strict=False):
         chains = values.to_numpy()
         ranks = rankdata(chains).reshape(chains.shape) / chains.size
         fewest = min(ess[str(name)] for ess in sizes)
         size = fewest if np.isfinite(fewest) else 1.0
-        edge, largest = shares_below(axes, {str(i): chain for i, chain in enumerate(ranks)}, size)
+        edge, largest = style.shares_below(
+            axes, {str(i): chain for i, chain in enumerate(ranks)}, size
+        )
         top = max(1.4 * edge, 1.1 * largest)
         axes.set_ylim(-top, top)
         differ = ": chains differ" * (largest > edge)
-        name_axes(axes, f"{name}{differ}", "rank among all draws", small=True)
+        style.name_axes(axes, f"{name}{differ}", "rank among all draws", small=True)
     return figure
 
 
@@ -120,7 +108,7 @@ def _chosen(posterior: Idata, parameters: Sequence[str] | None) -> xr.Dataset:
     return scalars(posterior)[list(parameters)]
 
 
-def plot_prior(posterior: Idata, parameters: Sequence[str], width: float = WIDE) -> Figure:
+def plot_prior(posterior: Idata, parameters: Sequence[str], width: float = style.WIDE) -> Figure:
     """Plot posterior densities over those of the prior.
 
     Parameters
@@ -134,35 +122,38 @@ def plot_prior(posterior: Idata, parameters: Sequence[str], width: float = WIDE)
     """
     after, before = scalars(posterior), prior_draws(posterior)
     count = len(parameters)
-    columns = min(3, count) if width > NARROW else 2
-    figure, panels = blank_figure(width, 1.5, count, columns, None, spare=0.6, stack=False)
+    columns = min(3, count) if width > style.NARROW else 2
+    figure, panels = style.blank_figure(width, 1.5, count, columns, None, spare=0.6, stack=False)
     for axes, name in zip(panels, parameters, strict=False):
         drawn = {
             colour: draws[name].to_numpy().ravel()
-            for colour, draws in ((PLAIN, before), (AFTER, after))
+            for colour, draws in ((style.PLAIN, before), (style.AFTER, after))
             if name in draws
         }
         low, high = np.quantile(next(iter(drawn.values())), [0.01, 0.99])
-        ends = min(low, drawn[AFTER].min()), max(high, drawn[AFTER].max())
+        ends = min(low, drawn[style.AFTER].min()), max(high, drawn[style.AFTER].max())
         for colour, values in drawn.items():
-            density(axes, values, colour, ends, ends)
+            style.density(axes, values, colour, ends, ends)
         axes.set_yticks([])
-        name_axes(axes, name, small=True)
+        style.name_axes(axes, name, small=True)
         axes.set_ylim(bottom=0)
         axes.tick_params(labelsize=8)
-    legend(figure, [Patch(color=PLAIN, label="prior"), Patch(color=AFTER, label="posterior")])
+    style.legend(
+        figure,
+        [Patch(color=style.PLAIN, label="prior"), Patch(color=style.AFTER, label="posterior")],
+    )
     return figure
 
 
 def plot_pairs(
-    posterior: Idata, parameters: Sequence[str], width: float = WIDE, points: int = 800
+    posterior: Idata, parameters: Sequence[str], width: float = style.WIDE, points: int = 800
 ) -> Figure:
     """Plot some draws of each pair of parameters, with the rank correlation of all."""
     draws = scalars(posterior)
     n = len(parameters) - 1
     correlation = rank_correlations(draws, parameters)
     height = 0.4 + min(width, 6.4) * n / max(n, 2) * 0.9
-    figure, panels = blank_figure(width, height / n, n * n, n, None, stack=False)
+    figure, panels = style.blank_figure(width, height / n, n * n, n, None, stack=False)
     for i, axes in enumerate(panels):
         row, column = divmod(i, n)
         if column > row:
@@ -171,10 +162,10 @@ def plot_pairs(
         first, second = parameters[column], parameters[row + 1]
         x, y = (draws[name].to_numpy().ravel() for name in (first, second))
         some = slice(None, None, max(1, len(x) // points))
-        axes.plot(x[some], y[some], ".", color=AFTER, markersize=2, alpha=0.4)
+        axes.plot(x[some], y[some], ".", color=style.AFTER, markersize=2, alpha=0.4)
         axes.locator_params(nbins=3)
         axes.tick_params(labelsize=7)
-        name_axes(
+        style.name_axes(
             axes, f"{correlation[row + 1, column]:+.2f}".replace("-", "−"),
             first.replace("[", "\n[") * (row == n - 1), second.replace("[", "\n[") * (column == 0),
             small=True,
@@ -182,31 +173,31 @@ def plot_pairs(
     return figure
 
 
-def plot_predictions(posterior: Idata, width: float = WIDE) -> Figure:
+def plot_predictions(posterior: Idata, width: float = style.WIDE) -> Figure:
     """Plot the calibration of leave-one-out predictions, one curve a state dimension.
 
     A curve is the share of measurements below each quantile, less what calibrated predictions give;
     those of independent measurements stay in the band 99 times of 100.
     """
     seen = pit_values(posterior)
-    figure, (axes,) = blank_figure(width, 3.4)
-    axes.set_prop_cycle(LINES)
-    shares_below(axes, seen, min((len(values) for values in seen.values()), default=1))
+    figure, (axes,) = style.blank_figure(width, 3.4)
+    axes.set_prop_cycle(style.LINES)
+    style.shares_below(axes, seen, min((len(values) for values in seen.values()), default=1))
     x = "position in the prediction: 0 below all draws, 1 above"
-    name_axes(axes, x=x, y="share below, less expected")
+    style.name_axes(axes, x=x, y="share below, less expected")
     if seen:
-        legend(figure, axes.lines)
+        style.legend(figure, axes.lines)
     return figure
 
 
-def plot_pareto(k: Floats, good: float, unit: str, width: float = WIDE) -> Figure:
+def plot_pareto(k: Floats, good: float, unit: str, width: float = style.WIDE) -> Figure:
     """Plot Pareto k of every unit left out, and the threshold above which LOO is unreliable."""
-    figure, (axes,) = blank_figure(width, 2.8)
+    figure, (axes,) = style.blank_figure(width, 2.8)
     high = ~(k <= good)
-    axes.axhline(good, color=BEFORE, linewidth=1.2, linestyle="--")
-    axes.plot(np.flatnonzero(~high), k[~high], ".", color=AFTER, markersize=4)
-    axes.plot(np.flatnonzero(high), np.nan_to_num(k[high], posinf=2.0), "x", color=BEFORE)
-    name_axes(axes, x=unit, y="Pareto k")
+    axes.axhline(good, color=style.BEFORE, linewidth=1.2, linestyle="--")
+    axes.plot(np.flatnonzero(~high), k[~high], ".", color=style.AFTER, markersize=4)
+    axes.plot(np.flatnonzero(high), np.nan_to_num(k[high], posinf=2.0), "x", color=style.BEFORE)
+    style.name_axes(axes, x=unit, y="Pareto k")
     return figure
 
 
@@ -214,10 +205,12 @@ def plot_prior_check(check: PriorCheck) -> Figure:
     """Plot the measured changes of state over a segment beside those that the prior predicts."""
     bodies, states = check.dataset["body"].values, check.dataset["state"].values
     pairs = [(body, state) for body in bodies for state in states]
-    figure, panels = blank_figure(8.0, 1.3, len(pairs), 2, "x", spare=0.8)
+    figure, panels = style.blank_figure(8.0, 1.3, len(pairs), 2, "x", spare=0.8)
     for axes, (body, state) in zip(panels, pairs, strict=False):
         changes = check.dataset.sel(body=body, state=state)
-        for place, (name, colour) in enumerate((("predicted", PLAIN), ("measured", AFTER))):
+        for place, (name, colour) in enumerate(
+            (("predicted", style.PLAIN), ("measured", style.AFTER))
+        ):
             low, lower, middle, upper, high = changes[name].to_numpy()
             axes.plot([low, high], [place] * 2, color=colour, linewidth=2)
             axes.plot([lower, upper], [place] * 2, color=colour, linewidth=7)
@@ -225,8 +218,8 @@ def plot_prior_check(check: PriorCheck) -> Figure:
         axes.set_yticks([0, 1], ["prior", "measured"])
         share = float(changes["share_inside"])
         axes.set_ylim(1.6, -0.6)
-        x = f"change in {check.seconds:g} s ({UNITS[str(state)]})"
-        name_axes(axes, f"{state} of {body}: {100 * share:.0f} % as expected", x, small=True)
+        x = f"change in {check.seconds:g} s ({style.UNITS[str(state)]})"
+        style.name_axes(axes, f"{state} of {body}: {100 * share:.0f} % as expected", x, small=True)
     return figure
 
 
@@ -245,13 +238,13 @@ def plot_calibration(calibration: Calibration) -> Figure:
     """
     table, positions = calibration.table(), calibration.dataset["position"]
     n, columns = positions.sizes["replication"], min(4, len(table))
-    figure, panels = blank_figure(2.6 * columns, 1.7, len(table), columns, spare=0.6)
+    figure, panels = style.blank_figure(2.6 * columns, 1.7, len(table), columns, spare=0.6)
     count = bins(n)
     low, high = binom.interval(0.99, n, 1 / count)
     for axes, (label, row) in zip(panels, table.iterrows(), strict=False):
-        axes.axhspan(low, high, color=BAND)
-        axes.axhline(n / count, color=PLAIN, linewidth=1)
-        color = AFTER if row["passed"] else BEFORE
+        axes.axhspan(low, high, color=style.BAND)
+        axes.axhline(n / count, color=style.PLAIN, linewidth=1)
+        color = style.AFTER if row["passed"] else style.BEFORE
         axes.hist(
             positions.sel(parameter=label), bins=count, range=(0, 1), histtype="step", color=color
         )

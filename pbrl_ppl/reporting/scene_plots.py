@@ -108,18 +108,21 @@ def plot_recording(
         draw_scene(axes, scene, poses[trajectory, time], names=True)
     places = poses[..., :2].reshape(-1, 2)
     reach = max(body.shape.bounding_radius for body in scene.moving)
-    low, high = np.nanmin(places, axis=0) - 1.5 * reach, np.nanmax(places, axis=0) + 1.5 * reach
-    # as wide and high as the figure is
-    share = figure.get_figheight() / figure.get_figwidth()
-    middle, half = (low + high) / 2, (high - low) / 2
-    half = np.maximum(half, [half[1] / share, half[0] * share])
-    axes.set_xlim(middle[0] - half[0], middle[0] + half[0])
-    axes.set_ylim(middle[1] - half[1], middle[1] + half[1])
+    _show(axes, places, 1.5 * reach, figure.get_figheight() / figure.get_figwidth())
     handles = [Line2D([], [], color="black", label="fitted")]
     if held_out is not None:
         handles.append(Line2D([], [], color="black", linestyle=":", label="held out"))
     legend(figure, handles)
     return figure
+
+
+def _show(axes: Axes, places: Floats, margin: float, share: float = 1.0) -> None:
+    """Set the limits so that places are seen, with a margin (m); height over width is `share`."""
+    low, high = np.nanmin(places, axis=0) - margin, np.nanmax(places, axis=0) + margin
+    middle, half = (low + high) / 2, (high - low) / 2
+    half = np.maximum(half, [half[1] / share, half[0] * share])
+    (left, bottom), (right, top) = middle - half, middle + half
+    axes.set(xlim=(left, right), ylim=(bottom, top))
 
 
 def draw_goal(axes: Axes, scene: Scene, goal: Goal) -> None:
@@ -185,8 +188,6 @@ def animate_plan(plan: Plan, path: str | Path, *, frames: int = 20, draws: int =
     reach = max(body.shape.bounding_radius for body in plan.scene.moving)
     targets = [(t.x, t.y) for t in plan.goal.targets if t.x is not None and t.y is not None]
     places = np.concatenate([states[..., :2].reshape(-1, 2), np.reshape(targets, (-1, 2))])
-    low, high = places.min(axis=0) - 2 * reach, places.max(axis=0) + 2 * reach
-    middle, half = (low + high) / 2, float((high - low).max()) / 2
 
     def draw(time: int) -> None:
         axes.clear()
@@ -194,8 +195,7 @@ def animate_plan(plan: Plan, path: str | Path, *, frames: int = 20, draws: int =
         for others in states[1:]:
             draw_scene(axes, plan.scene, others[time], faded=True)
         draw_scene(axes, plan.scene, states[0, time])
-        axes.set_xlim(middle[0] - half, middle[0] + half)
-        axes.set_ylim(middle[1] - half, middle[1] + half)
+        _show(axes, places, 2 * reach)
         axes.set_title(f"{time * plan.scene.time_step:.3g} s")
 
     moving = FuncAnimation(figure, draw, frames=times, init_func=lambda: None)

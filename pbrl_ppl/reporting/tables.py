@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import xarray as xr
 
-from pbrl_ppl.criticism import Candidate, Loop
+from pbrl_ppl.criticism import Candidate, Errors, Loop
 from pbrl_ppl.effects import Sensor
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.posterior import Comparison, Identifiability, interval, scalars
@@ -32,6 +32,7 @@ from pbrl_ppl.state import STATE, Floats, acceleration_unit
 
 #: Text of a cell of a table, or text and a small note beside it.
 Cell = str | tuple[str, str]
+T = TypeVar("T")
 
 
 class Table(NamedTuple):
@@ -45,8 +46,8 @@ class Table(NamedTuple):
         Their heads.
     rows : sequence of sequence
         Cells, as many as there are columns.
-    words : tuple of int
-        Columns that hold words; others hold numbers, and the first one the row's name.
+    words : sequence of str
+        Heads of columns that hold words; others hold numbers, and the first one the row's name.
     marks : sequence of str
         ``added`` or ``bad`` for rows that stand out; as many as rows, or none.
     """
@@ -54,17 +55,36 @@ class Table(NamedTuple):
     caption: str
     columns: Sequence[str]
     rows: Sequence[Sequence[Cell]]
-    words: Sequence[int] = ()
+    words: Collection[str] = ()
     marks: Sequence[str] = ()
+
+
+def tabulate(
+    caption: str,
+    items: Iterable[T],
+    columns: Mapping[str, Callable[[T], Cell]],
+    words: Collection[str] = (),
+    mark: Callable[[T], str] = lambda item: "",
+) -> Table:
+    """Tabulate items, one row each; a column is a head and what it shows of an item."""
+    items = tuple(items)
+    rows = [[cell(item) for cell in columns.values()] for item in items]
+    return Table(caption, tuple(columns), rows, words, [mark(item) for item in items])
+
+
+def compare_models(
+    caption: str, models: Mapping[str, T], measures: Mapping[str, Callable[[T], str]]
+) -> Table:
+    """Tabulate measures of models, one row a measure, one column a model."""
+    rows = [(name, *map(measure, models.values())) for name, measure in measures.items()]
+    return Table(caption, ("Measure", *models), rows)
 
 
 def measured_parameters(candidate: Candidate, loop: Loop) -> tuple[str, ...]:
     """Return a candidate's parameters without those of state dimensions that were not measured."""
-    effect = next((other for other in loop.catalogue if other.name == candidate.effect), None)
-    names = tuple(candidate.units)
-    if effect is None or not isinstance(effect.stage, Sensor):
-        return names
-    return tuple(name for name in names if name not in STATE or name in loop.residuals_after)
+    sensors = {effect.name for effect in loop.catalogue if isinstance(effect.stage, Sensor)}
+    unseen = {*STATE} - {*loop.residuals_after} if candidate.effect in sensors else set()
+    return tuple(name for name in candidate.units if name not in unseen)
 
 
 def limits_in_words(candidate: Candidate, loop: Loop) -> str:
@@ -110,27 +130,24 @@ def _draws(prior: Prior) -> Floats:
 
 def error_tables(loop: Loop) -> list[Table]:
     """Tabulate the held-out errors, one interval and a rollout ahead, and overall."""
-    errors = [loop.before, *[loop.after] * bool(loop.added), loop.noise_floor]
-    heads, intervals = (*models_of(loop), "Noise floor"), loop.rollout_horizon
+    errors = dict(zip(models_of(loop), (loop.before, loop.after), strict=False))
+    errors["Noise floor"] = loop.noise_floor
     titles = {
         "one_step_rmse": f"One interval ahead, {loop.scene.time_step:g} s",
-        "rollout_rmse": f"{intervals} intervals ahead, {number(loop.rollout_seconds)} s",
+        "rollout_rmse": f"{loop.rollout_horizon} intervals ahead, {number(loop.rollout_seconds)} s",
         "simulated_rmse": "Whole trajectories, simulated from start states fitted to them",
     }
     tables = []
     for kind, title in titles.items():
-        sizes = [getattr(each, kind) for each in errors]
+        sizes = [getattr(each, kind) for each in errors.values()]
         rows = [(d, *(error(size.get(d)) for size in sizes), UNITS[d]) for d in sizes[0]]
-        columns = ("State dimension", *heads, "Unit")
-        if rows:
-            caption = f"{title} (root mean square error)"
-            tables.append(Table(caption, columns, rows, words=(len(heads) + 1,)))
-    elpd = "Log predictive density in nats (more is better)"
-    overall = [
-        ("Error in units of the noise", *(error(each.normalised_rmse) for each in errors)),
-        (elpd, *(error(each.elpd, 4) for each in errors)),
-    ]
-    return [*tables, Table("Overall", ("Measure", *heads), overall)]
+        caption, heads = f"{title} (root mean square error)", ("State dimension", *errors, "Unit")
+        tables += [Table(caption, heads, rows, {"Unit"})] * bool(rows)
+    overall: dict[str, Callable[[Errors], str]] = {
+        "Error in units of the noise": lambda each: error(each.normalised_rmse),
+        "Log predictive density in nats (more is better)": lambda each: error(each.elpd, 4),
+    }
+    return [*tables, compare_models("Overall", errors, overall)]
 
 
 def models_of(loop: Loop) -> tuple[str, ...]:
@@ -148,22 +165,25 @@ def loo_table(loo: Comparison, columns: Sequence[str]) -> Table:
     columns : sequence of str
         Heads of the columns: one for the model before alone, or two.
     """
-    models = (loo.before, loo.after)[: len(columns)]
     high = f"How many have a Pareto k above {number(loo.before.good_k, 2)}"
-    rows = [
-        ("elpd_loo (nats; more is better)", *(number(each.elpd_loo, 4) for each in models)),
-        ("Standard error", *(number(each.se) for each in models)),
-        ("p_loo, the effective number of parameters", *(number(each.p_loo) for each in models)),
-        (high, *(str(each.high_pareto_k) for each in models)),
-    ]
-    return Table(f"{loo.method} (az.loo)", ("Measure", *columns), rows)
+    return compare_models(
+        f"{loo.method} (az.loo)",
+        dict(zip(columns, (loo.before, loo.after), strict=False)),
+        {
+            "elpd_loo (nats; more is better)": lambda each: number(each.elpd_loo, 4),
+            "Standard error": lambda each: number(each.se),
+            "p_loo, the effective number of parameters": lambda each: number(each.p_loo),
+            high: lambda each: str(each.high_pareto_k),
+        },
+    )
 
 
 def acceleration_table(loop: Loop) -> Table:
     """Tabulate the unexplained acceleration and its share of the bodies' acceleration."""
-    left, models, both = loop.acceleration, models_of(loop), bool(loop.added)
-    sizes = [left.before, left.after][not both :]
-    shares = [left.relative_before, left.relative_after][not both :]
+    left, models = loop.acceleration, models_of(loop)
+    sizes = (left.before, left.after)[-len(models) :]
+    shares = (left.relative_before, left.relative_after)[-len(models) :]
+    heads = [f"{model}, share" for model in models] if loop.added else ["Share"]
     rows = [
         (
             name,
@@ -174,54 +194,61 @@ def acceleration_table(loop: Loop) -> Table:
         )
         for name in left.before
     ]
-    heads = ("Before, share", "After, share") if both else ("Share",)
-    return Table(
-        "Unexplained acceleration (standard deviation in an interval)",
-        ("Velocity", *models, *heads, "Unit", "Significant"),
-        rows,
-        words=(1 + 2 * len(models), 2 + 2 * len(models)),
-    )
+    caption = "Unexplained acceleration (standard deviation in an interval)"
+    words = ("Unit", "Significant")
+    return Table(caption, ("Velocity", *models, *heads, *words), rows, words)
 
 
 def residual_test_table(loop: Loop) -> Table:
     """Tabulate the tests of the model's residual."""
-    caption = f"Tests of the {model_of(loop)} model's residual, on the recordings that it was"
-    passed = [("yes" if t.passed else "no") if t.tested else "not tested" for t in loop.tests]
-    rows = [
-        (test.name, test.sentence, chance(test.p_value), said)
-        for test, said in zip(loop.tests, passed, strict=True)
-    ]
-    marks = ["" if test.passed else "bad" for test in loop.tests]
-    return Table(f"{caption} fitted to", ("Test", "Result", "p", "Passed"), rows, (1, 3), marks)
+    return tabulate(
+        f"Tests of the {model_of(loop)} model's residual, on the recordings that it was fitted to",
+        loop.tests,
+        {
+            "Test": lambda test: test.name,
+            "Result": lambda test: test.sentence,
+            "p": lambda test: chance(test.p_value),
+            "Passed": lambda test: yes_or_no(test.passed) if test.tested else "not tested",
+        },
+        {"Result", "Passed"},
+        lambda test: "" if test.passed else "bad",
+    )
+
+
+def yes_or_no(said: Any) -> str:
+    """Write yes or no."""
+    return "yes" if said else "no"
 
 
 def candidate_table(loop: Loop) -> Table:
     """Tabulate the candidates: scores, the search's regression for each alone, the decision."""
     added = {(effect.effect, effect.body) for effect in loop.added}
-    rows = [
-        (
-            (plain(one.effect), one.body),
-            number(one.statistic),
-            str(one.dof),
-            chance(one.p_value),
-            ", ".join(
-                f"{plain(name)} {quantity(one.estimate[name], one.units[name])}"
-                for name in measured_parameters(one, loop)
-                if name in one.estimate
-            ),
-            percent(one.identifiable),
-            percent(one.simulated_share),
-            number(one.simulated_nats),
-            limits_in_words(one, loop) or "–",
-            one.why or "–",
+
+    def estimate(one: Candidate) -> str:
+        return ", ".join(
+            f"{plain(name)} {quantity(one.estimate[name], one.units[name])}"
+            for name in measured_parameters(one, loop)
+            if name in one.estimate
         )
-        for one in loop.candidates
-    ]
-    marks = ["added" * ((one.effect, one.body) in added) for one in loop.candidates]
-    heads = ("Effect", "Score", "Degrees of freedom", "p (corrected)", "First estimate",
-             "Identifiable", "Alone: share of simulation error", "Alone: evidence (nats)",
-             "Detection limit", "Decision")  # fmt: skip
-    return Table("All candidates, those of the largest score first", heads, rows, (4, 8, 9), marks)
+
+    return tabulate(
+        "All candidates, those of the largest score first",
+        loop.candidates,
+        {
+            "Effect": lambda one: (plain(one.effect), one.body),
+            "Score": lambda one: number(one.statistic),
+            "Degrees of freedom": lambda one: str(one.dof),
+            "p (corrected)": lambda one: chance(one.p_value),
+            "First estimate": estimate,
+            "Identifiable": lambda one: percent(one.identifiable),
+            "Alone: share of simulation error": lambda one: percent(one.simulated_share),
+            "Alone: evidence (nats)": lambda one: number(one.simulated_nats),
+            "Detection limit": lambda one: limits_in_words(one, loop) or "–",
+            "Decision": lambda one: one.why or "–",
+        },
+        {"First estimate", "Detection limit", "Decision"},
+        lambda one: "added" * ((one.effect, one.body) in added),
+    )
 
 
 def search_tables(loop: Loop) -> list[Table]:
@@ -234,7 +261,7 @@ def search_tables(loop: Loop) -> list[Table]:
                 (", ".join(map(plain, best.laws)), number(best.nats), number(best.error))
                 for best in rung.path
             ],
-            marks=["added" if {*best.laws} == {*rung.accepted} else "" for best in rung.path],
+            marks=["added" * ({*best.laws} == {*rung.accepted}) for best in rung.path],
         )
         for rung in loop.rungs
     ]
@@ -242,44 +269,39 @@ def search_tables(loop: Loop) -> list[Table]:
 
 def carrier_table(evidence: Evidence, most: int = 8) -> Table:
     """Tabulate the transitions that carry most of the evidence."""
-    gains = evidence.by_transition
-    heads = ("Trajectory", "Time (s)", "Gain (nats)", "Mostly in", "Speed (m/s)", "Force x (N)",
-             "Force y (N)", "Torque (N m)", "Touching")  # fmt: skip
-    rows = [
-        (
-            str(evidence.trajectory[i]),
-            f"{evidence.time[i]:.4g}",
-            number(gains[i]),
-            evidence.names[int(np.argmax(evidence.nats[i]))],
-            number(evidence.speed[i]),
-            *map(number, evidence.wrench[i]),
-            "yes" if evidence.touching[i] else "no",
-        )
-        for i in np.argsort(-gains, kind="stable")[:most]
-    ]
-    return Table(f"The {len(rows)} transitions with most evidence", heads, rows, (3, 8))
+    shown = np.argsort(-evidence.by_transition, kind="stable")[:most].tolist()
+    columns: dict[str, Callable[[int], Cell]] = {
+        "Trajectory": lambda i: str(evidence.trajectory[i]),
+        "Time (s)": lambda i: f"{evidence.time[i]:.4g}",
+        "Gain (nats)": lambda i: number(evidence.by_transition[i]),
+        "Mostly in": lambda i: evidence.names[int(np.argmax(evidence.nats[i]))],
+        "Speed (m/s)": lambda i: number(evidence.speed[i]),
+        "Force x (N)": lambda i: number(evidence.wrench[i, 0]),
+        "Force y (N)": lambda i: number(evidence.wrench[i, 1]),
+        "Torque (N m)": lambda i: number(evidence.wrench[i, 2]),
+        "Touching": lambda i: yes_or_no(evidence.touching[i]),
+    }
+    caption = f"The {len(shown)} transitions with most evidence"
+    return tabulate(caption, shown, columns, {"Mostly in", "Touching"})
 
 
 def parameter_table(parameters: Parameters) -> Table:
     """Tabulate the posterior of all parameters, in their units."""
-    return Table(
+    return tabulate(
         "Posterior of all parameters",
-        ("Parameter", "Mean", "sd", "94 % interval", "Unit", "R-hat", "ESS bulk", "ESS tail"),
-        [
-            (
-                (str(label), row["meaning"]),
-                number(row["mean"]),
-                number(row["sd"]),
-                _span(row["lower"], row["upper"]),
-                row["unit"],
-                number(row["r_hat"], 4),
-                number(row["ess_bulk"]),
-                number(row["ess_tail"]),
-            )
-            for label, row in parameters.summary.iterrows()
-        ],
-        words=(4,),
-        marks=["bad" if wrong else "" for wrong in parameters.summary["wrong"]],
+        parameters.summary.rename_axis("label").reset_index().to_dict("records"),
+        {
+            "Parameter": lambda row: (str(row["label"]), row["meaning"]),
+            "Mean": lambda row: number(row["mean"]),
+            "sd": lambda row: number(row["sd"]),
+            "94 % interval": lambda row: _span(row["lower"], row["upper"]),
+            "Unit": lambda row: row["unit"],
+            "R-hat": lambda row: number(row["r_hat"], 4),
+            "ESS bulk": lambda row: number(row["ess_bulk"]),
+            "ESS tail": lambda row: number(row["ess_tail"]),
+        },
+        {"Unit"},
+        lambda row: "bad" if row["wrong"] else "",
     )
 
 
@@ -291,39 +313,33 @@ def _span(low: float, high: float) -> str:
 
 def width_table(known: Identifiability, parameters: Parameters) -> Table:
     """Tabulate the intervals of each parameter before and after the data."""
-    both = [draws(parameters.posterior) for draws in (prior_draws, scalars)]
-    units, bad = parameters.summary["unit"], "say nothing beyond the prior"
-    data = {"informed": "inform it", "weak": "inform it weakly", "prior only": bad}
+    before, after = (draws(parameters.posterior) for draws in (prior_draws, scalars))
+    data = {"informed": "inform it", "weak": "inform it weakly"}
 
     def span(draws: xr.Dataset, name: str) -> str:
         return _span(*interval(draws[name].to_numpy())) if name in draws else "–"
 
-    rows = [
-        (
-            one.parameter,
-            *(span(draws, one.parameter) for draws in both),
-            units.get(one.parameter, ""),
-            f"{100 * one.ratio:.3g} %",
-            data[one.verdict],
-        )
-        for one in known.parameters
-    ]
-    return Table(
+    return tabulate(
         "What was believed, and what is known now (94 % intervals)",
-        ("Parameter", "Before the data", "After", "Unit", "Width left", "The data"),
-        rows,
-        words=(3, 5),
-        marks=["bad" if row[-1] == bad else "" for row in rows],
+        known.parameters,
+        {
+            "Parameter": lambda one: one.parameter,
+            "Before the data": lambda one: span(before, one.parameter),
+            "After": lambda one: span(after, one.parameter),
+            "Unit": lambda one: parameters.summary["unit"].get(one.parameter, ""),
+            "Width left": lambda one: f"{100 * one.ratio:.3g} %",
+            "The data": lambda one: data.get(one.verdict, "say nothing beyond the prior"),
+        },
+        {"Unit", "The data"},
+        lambda one: "bad" * (one.verdict == "prior only"),
     )
 
 
 def coverage_table(covered: Mapping[str, tuple[float, float, int]]) -> Table:
     """Tabulate the shares of measurements inside leave-one-out predictions."""
-    return Table(
-        "Measurements inside leave-one-out predictions",
-        ("State dimension", "In the central 50 %", "In the central 94 %", "Measurements"),
-        [
-            (name, f"{100 * half:.1f} %", f"{100 * wide:.1f} %", str(count))
-            for name, (half, wide, count) in covered.items()
-        ],
-    )
+    heads = ("State dimension", "In the central 50 %", "In the central 94 %", "Measurements")
+    rows = [
+        (name, f"{100 * half:.1f} %", f"{100 * wide:.1f} %", str(count))
+        for name, (half, wide, count) in covered.items()
+    ]
+    return Table("Measurements inside leave-one-out predictions", heads, rows)

@@ -61,12 +61,22 @@ def test_many(logs: list[Settings], capsys: pytest.CaptureFixture[str]) -> None:
     # the page says what makes it again
     page = Path("out/index.html").read_text()
     assert "pbrl-ppl close-logs" in page and "logs.csv" in page and "--units x=mm" in page
-    assert logs == [
-        Settings(
-            7, 5, 300, "laplace", None, {"x": 0.1}, True,
-            {"x": "px", "force_y": 0.0, "time": "t"}, {"x": "mm", "theta": "deg"}, 0.2,
-        )
-    ] * 2  # fmt: skip
+    assert (
+        logs
+        == [
+            Settings(
+                scene={"noise": {"x": 0.1}, "substeps": 5, "time_step": 0.2},
+                recording={
+                    "estimate_velocities": True,
+                    "columns": {"x": "px", "force_y": 0.0, "time": "t"},
+                    "units": {"x": "mm", "theta": "deg"},
+                    "trim": False,
+                },
+                loop={"seed": 7, "draws": 300, "method": "laplace"},
+            )
+        ]
+        * 2
+    )
     Path("blue.csv").write_text("fail")
     assert main([*argv, "-q"]) == 1
     captured = capsys.readouterr()
