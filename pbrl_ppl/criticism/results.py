@@ -183,10 +183,10 @@ class ResidualTest:
         Whether there is no misfit, or a negligible one.
     sentence : str
         The result in words.
-    body, dimension : str
-        Where the misfit is largest; empty where the test names no place.
     tested : bool
         Whether the data could fail the test; one that they could not was not passed either.
+    body, dimension : str
+        Where the misfit is largest; empty where the test names no place.
     """
 
     name: KindOfTest
@@ -194,9 +194,9 @@ class ResidualTest:
     size: float
     passed: bool
     sentence: str
+    tested: bool = field(default=True, kw_only=True)
     body: str = ""
     dimension: str = ""
-    tested: bool = True
 
     @classmethod
     def untested(cls, name: KindOfTest, why: str) -> ResidualTest:
