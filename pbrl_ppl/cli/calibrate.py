@@ -12,19 +12,23 @@ import typer
 
 from pbrl_ppl.cli import options
 from pbrl_ppl.cli.options import command
-from pbrl_ppl.cli.terminal import FAILED, check_can_make, interruptible, print_result
+from pbrl_ppl.cli.terminal import FAILED, Result, check_can_make
 from pbrl_ppl.errors import FitError, PbrlError
 
 if TYPE_CHECKING:
     from pbrl_ppl.sampling import Calibration
 
 
-@command("calibrate", 12, "pbrl-ppl calibrate scene.toml train.csv -o ranks/ --jobs 4")
+@command(
+    "calibrate", 12, "pbrl-ppl calibrate scene.toml train.csv -o ranks/ --jobs 4",
+    kept="finished replications are in {output}; the same command goes on",
+)  # fmt: skip
 def calibrate(
     scene: Path,
     history: Path,
     output: options.OutputFolder,
     reading: options.SceneReading,
+    quiet: bool,
     likelihood: str = "transitions",
     trajectories: options.OldLikelihood = None,
     colour: Annotated[float, typer.Option(min=0.0)] = 0.0,
@@ -32,9 +36,7 @@ def calibrate(
     seed: options.Seed = 1,
     jobs: options.Count = 1,
     draws: Annotated[int, typer.Option(min=100)] = 1500,
-    as_json: options.AsJson = False,
-    quiet: options.Quiet = False,
-) -> None:
+) -> Result:
     """Simulate from the prior, fit, and test whether the true values' ranks are uniform.
 
     Parameters
@@ -56,40 +58,35 @@ def calibrate(
     draws
         Posterior draws of each chain.
     """
-    with interruptible(f"finished replications are in {output}; the same command goes on"):
-        if trajectories is not None:  # older spellings
-            likelihood = "trajectories" if trajectories else "transitions"
-        check_can_make(output)
-        declared, (design,) = reading.read(scene, [history])
-        declared, effects = reading.with_effects(declared)
-        import pbrl_ppl.reporting as report
-        from pbrl_ppl.files import write_atomically
-        from pbrl_ppl.sampling import calibration
+    if trajectories is not None:  # older spellings
+        likelihood = "trajectories" if trajectories else "transitions"
+    check_can_make(output)
+    declared, (design,) = reading.read(scene, [history])
+    declared, effects = reading.with_effects(declared)
+    import pbrl_ppl.reporting as report
+    from pbrl_ppl.files import write_atomically
+    from pbrl_ppl.sampling import calibration
 
-        # fresh processes: PyMC's threads do not survive a fork
-        with ProcessPoolExecutor(jobs, get_context("spawn")) if jobs > 1 else nullcontext() as pool:
-            try:
-                result = calibration.calibrate(
-                    declared, design, effects=effects, likelihood=likelihood, colour=colour,
-                    seed=seed, draws=draws, replications=replications, folder=output,
-                    executor=pool, progress=not quiet,
-                )  # fmt: skip
-            except PbrlError:
-                raise
-            except ValueError as error:  # an option that calibrate refuses
-                raise FitError(f"calibrate: {error}") from None
-        result.save(output / "ranks.nc")
-        write_atomically(output / "table.csv", result.table().to_csv)
-        picture = report.png(report.plot_calibration(result))
-        write_atomically(output / "ranks.png", lambda to: to.write_bytes(picture))
+    # fresh processes: PyMC's threads do not survive a fork
+    with ProcessPoolExecutor(jobs, get_context("spawn")) if jobs > 1 else nullcontext() as pool:
+        try:
+            result = calibration.calibrate(
+                declared, design, effects=effects, likelihood=likelihood, colour=colour,
+                seed=seed, draws=draws, replications=replications, folder=output,
+                executor=pool, progress=not quiet,
+            )  # fmt: skip
+        except PbrlError:
+            raise
+        except ValueError as error:  # an option that calibrate refuses
+            raise FitError(f"calibrate: {error}") from None
+    result.save(output / "ranks.nc")
+    write_atomically(output / "table.csv", result.table().to_csv)
+    picture = report.png(report.plot_calibration(result))
+    write_atomically(output / "ranks.png", lambda to: to.write_bytes(picture))
     table, page = result.table().to_dict("index"), output / "ranks.png"
-    print_result(
-        as_json,
-        {"passed": result.passed, "parameters": table, "picture": page},
-        [_calibrated(result), f"{'passed' if result.passed else 'failed'}: {page}"],
-    )
-    if not result.passed:
-        raise typer.Exit(FAILED)
+    contents = {"passed": result.passed, "parameters": table, "picture": page}
+    verdict = f"{'passed' if result.passed else 'failed'}: {page}"
+    return Result(contents, [_calibrated(result), verdict], 0 if result.passed else FAILED)
 
 
 def _calibrated(calibration: Calibration) -> str:

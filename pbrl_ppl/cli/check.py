@@ -6,25 +6,19 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from pbrl_ppl.cli import options
 from pbrl_ppl.cli.options import command
-from pbrl_ppl.cli.terminal import (
-    FAILED,
-    interruptible,
-    print_json,
-    print_result,
-    print_table,
-    stages,
-)
+from pbrl_ppl.cli.terminal import FAILED, Progress, Result, sizes, table
 from pbrl_ppl.state import STATE
 
 if TYPE_CHECKING:
@@ -36,84 +30,76 @@ if TYPE_CHECKING:
 
 @command("check", 2, "pbrl-ppl check scene.toml train.csv")
 def check(
-    scene: options.SceneFile,
-    history: options.HistoryFile,
+    scene: Path,
+    history: Path,
     reading: options.SceneReading,
-    prior: Annotated[
-        bool, typer.Option(help="Whether to compare the data with draws from the prior.")
-    ] = True,
-    draws: Annotated[int, typer.Option(min=50, help="Draws from the prior.")] = 400,
+    progress: Progress,
+    as_json: bool,
+    prior: Annotated[bool, typer.Option()] = True,
+    draws: Annotated[int, typer.Option(min=50)] = 400,
     seed: options.Seed = 0,
-    as_json: options.AsJson = False,
-    quiet: options.Quiet = False,
-) -> None:
+) -> Result:
     """Read a scene and a history: what is in them, what is missing, whether the prior fits.
 
     Warns where a velocity and the changes of its position differ by the factor of a unit.
+
+    Parameters
+    ----------
+    prior
+        Whether to compare the data with draws from the prior.
+    draws
+        Draws from the prior.
     """
-    with interruptible(), stages(quiet) as progress:
-        declared, (loaded,) = reading.read(scene, [history])
-        catalogue = reading.catalogue()
-        from pbrl_ppl.history import (
-            mass_contradictions,
-            unit_mismatches,
-            unused_velocities,
-            with_units,
-        )
-        from pbrl_ppl.physics import Physics, check_history
+    declared, (loaded,) = reading.read(scene, [history])
+    catalogue = reading.catalogue()
+    from pbrl_ppl import history as histories
+    from pbrl_ppl.physics import Physics, check_history
 
-        check_history(declared, loaded, loaded.segments(1))
-        contents, missing = _contents(declared, loaded), _missing(loaded)
-        unused = unused_velocities(loaded)
-        console = Console(highlight=False, quiet=as_json)
-        listed = Table(show_header=False, box=None)
-        for name, value in contents.items():
-            listed.add_row(name, value)
-        console.print(listed)
-        console.print(_missing_table(missing, int(loaded.dataset["n_rows"].sum())))
-        masses = mass_contradictions(declared, loaded)
-        for sentence in (*(velocity.sentence for velocity in unused), *masses):
-            console.print(sentence, soft_wrap=True)
-        sized = with_units(declared, loaded)
-        priors = _default_priors(sized, catalogue)
-        console.print(_priors_table(priors))
-        checked = None
-        if prior:
-            progress("comparing with draws from the prior")
-            from pbrl_ppl.criticism import prior_predictive_check, telling_horizon
-            from pbrl_ppl.effects import attach
-            from pbrl_ppl.likelihood import Problem
+    check_history(declared, loaded, loaded.segments(1))
+    contents, missing = _contents(declared, loaded), _missing(loaded)
+    unused = histories.unused_velocities(loaded)
+    console = Console(highlight=False, quiet=as_json)
+    listed = Table(show_header=False, box=None)
+    for row in contents.items():
+        listed.add_row(*row)
+    console.print(listed)
+    console.print(_missing_table(missing, int(loaded.dataset["n_rows"].sum())))
+    masses = histories.mass_contradictions(declared, loaded)
+    for sentence in (*(velocity.sentence for velocity in unused), *masses):
+        console.print(sentence, soft_wrap=True)
+    sized = histories.with_units(declared, loaded)
+    priors = _default_priors(sized, catalogue)
+    console.print(_priors_table(priors))
+    checked = None
+    if prior:
+        progress("comparing with draws from the prior")
+        from pbrl_ppl.criticism import prior_predictive_check, telling_horizon
+        from pbrl_ppl.effects import attach
+        from pbrl_ppl.likelihood import Problem
 
-            horizon = telling_horizon(loaded)
-            physics = Physics(sized, attach(sized, (), catalogue))
-            problem = Problem.of(physics, loaded, horizon=horizon)
-            checked = prior_predictive_check(problem, draws=draws, seed=seed)
-            for sentence in checked.summary:
-                console.print(f"prior: {sentence}", soft_wrap=True)
-    if as_json:
-        prior_check = checked and {"passed": not checked.sentences, "sentences": checked.summary}
-        print_json(
-            {
-                **contents,
-                "trajectories": loaded.n_trajectories,
-                "transitions": loaded.n_transitions,
-                "missing": missing,
-                "velocities_not_used": [vars(column) for column in unused],
-                "unit_mismatches": unit_mismatches(loaded),
-                "mass_contradictions": masses,
-                "typical": {body.name: dict(body.typical) for body in sized.dynamic},
-                "default_priors": priors,
-                "prior": prior_check,
-            }
-        )
+        physics = Physics(sized, attach(sized, (), catalogue))
+        problem = Problem.of(physics, loaded, horizon=telling_horizon(loaded))
+        checked = prior_predictive_check(problem, draws=draws, seed=seed)
+        for sentence in checked.summary:
+            console.print(f"prior: {sentence}", soft_wrap=True)
+    facts = {
+        "trajectories": loaded.n_trajectories,
+        "transitions": loaded.n_transitions,
+        "missing": missing,
+        "velocities_not_used": [vars(column) for column in unused],
+        "unit_mismatches": histories.unit_mismatches(loaded),
+        "mass_contradictions": masses,
+        "typical": {body.name: dict(body.typical) for body in sized.dynamic},
+        "default_priors": priors,
+        "prior": checked and {"passed": not checked.sentences, "sentences": checked.summary},
+    }
+    return Result(contents | facts, ())  # it is shown by now
 
 
 def _contents(scene: Scene, history: History) -> dict[str, str]:
     """Return what a scene and a history hold, for people."""
-    rows = history.dataset["n_rows"].to_numpy()
-    intervals = (
-        f"{rows.min() - 1}" if rows.min() == rows.max() else f"{rows.min() - 1} to {rows.max() - 1}"
-    )
+    rows = history.dataset["n_rows"].to_numpy() - 1
+    intervals = " to ".join(dict.fromkeys(f"{number}" for number in (rows.min(), rows.max())))
     return {
         "moving bodies": ", ".join(body.name for body in scene.moving),
         "walls, joints": f"{len(scene.walls)}, {len(scene.joints)}",
@@ -137,14 +123,12 @@ def _missing(history: History) -> dict[str, dict[str, int]]:
 
 def _missing_table(missing: dict[str, dict[str, int]], rows: int) -> Table:
     """Return a table of missing measurements; a body has `rows` of each state dimension."""
-    table = Table(title="missing measurements", title_justify="left")
-    table.add_column("body")
-    for name in STATE:
-        table.add_column(name, justify="right")
+    numbers = [Column(name, justify="right") for name in STATE]
+    listed = Table("body", *numbers, title="missing measurements", title_justify="left")
     words = {0: "none", rows: "all"}
     for body, counts in missing.items():
-        table.add_row(body, *(words.get(n, f"{n} of {rows}") for n in counts.values()))
-    return table
+        listed.add_row(body, *(words.get(n, f"{n} of {rows}") for n in counts.values()))
+    return listed
 
 
 def _default_priors(scene: Scene, catalogue: Sequence[Effect]) -> dict[str, dict[str, str]]:
@@ -164,164 +148,128 @@ def _default_priors(scene: Scene, catalogue: Sequence[Effect]) -> dict[str, dict
 
 def _priors_table(priors: dict[str, dict[str, str]]) -> Table:
     """Return a table of default priors, a column for each body."""
-    table = Table(title="default priors of effects, from the recording", title_justify="left")
-    table.add_column("parameter")
-    for body in priors:
-        table.add_column(body)
-    for name in dict.fromkeys(name for priors_of in priors.values() for name in priors_of):
-        table.add_row(name, *(priors_of.get(name, "") for priors_of in priors.values()))
-    return table
+    title = "default priors of effects, from the recording"
+    listed = Table("parameter", *priors, title=title, title_justify="left")
+    for name in dict.fromkeys(chain(*priors.values())):
+        listed.add_row(name, *(those.get(name, "") for those in priors.values()))
+    return listed
 
 
 @command("criticise", 4, "pbrl-ppl criticise scene.toml train.csv")
 def criticise(
-    scene: options.SceneFile,
-    history: options.HistoryFile,
+    scene: Path,
+    history: Path,
     reading: options.SceneReading,
+    progress: Progress,
     seed: options.Seed = 1,
-    simulate: Annotated[
-        bool,
-        typer.Option(
-            "--simulate",
-            help="Search for missing laws by simulation error, on short pieces, then longer ones.",
-        ),
-    ] = False,
-    as_json: options.AsJson = False,
-    quiet: options.Quiet = False,
-) -> None:
+    simulate: Annotated[bool, typer.Option("--simulate")] = False,
+) -> Result:
     """Rank the effects that the declared model might lack by the score test: no refit, no verdict.
 
     The score test says which effect's signature the residual looks like; close-loop finds out
     whether that effect helps on data that it has not seen. With --simulate, pieces of trajectories
     are simulated without process noise: on each length a regression proposes the best subset of
     laws, and refits decide. A main law takes at least a fifth off the error of the longest pieces.
-    """
-    with interruptible(), stages(quiet) as progress:
-        progress("reading the scene and the history")
-        declared, (loaded,) = reading.read(scene, [history])
-        catalogue = reading.catalogue()
-        progress("loading the model")
-        from pbrl_ppl import criticism
-        from pbrl_ppl.physics import check_history
 
-        if simulate:
-            simulated = criticism.attribute(
-                declared, loaded, catalogue=catalogue, seed=seed, progress=progress
-            )
-        else:
-            check_history(declared, loaded, loaded.segments(1))
-            ranking = criticism.criticise(
-                declared, loaded, catalogue=catalogue, seed=seed, progress=progress
-            )
+    Parameters
+    ----------
+    simulate
+        Search for missing laws by simulation error, on short pieces, then longer ones.
+    """
+    progress("reading the scene and the history")
+    declared, (loaded,) = reading.read(scene, [history])
+    catalogue = reading.catalogue()
+    progress("loading the model")
+    from pbrl_ppl import criticism
+    from pbrl_ppl.physics import check_history
+
+    settings: dict[str, Any] = {"catalogue": catalogue, "seed": seed, "progress": progress}
     if simulate:
-        _print_laws(simulated, as_json)
-        return
-    if as_json:
-        print_json(
-            {
-                "candidates": [vars(candidate) for candidate in ranking.candidates],
-                "mode": ranking.mode,
-                "unexplained_acceleration": ranking.unexplained_acceleration,
-                "substeps": ranking.substeps,
-            }
-        )
-        return
-    print_table(
+        attribution = criticism.attribute(declared, loaded, **settings)
+        return Result(vars(attribution), _shown_laws(attribution))
+    check_history(declared, loaded, loaded.segments(1))
+    ranking = criticism.criticise(declared, loaded, **settings)
+    columns = {"effect": "<", "body": "<", "S": ".1f", "dof": "", "p (corrected)": ".2g"}
+    candidates = table(
         "what the declared model might lack, by the score test",
-        ["effect", "<body", "S", "dof", "p (corrected)", "<first estimate"],
+        columns | {"first estimate": "<"},
         map(_candidate_row, ranking.candidates),
     )
-    typer.echo(
+    note = (
         "small p: the residual looks like that effect's signature; close-loop says whether it is"
         " missing"
     )
+    numbers = {
+        "mode": ranking.mode,
+        "unexplained_acceleration": ranking.unexplained_acceleration,
+        "substeps": ranking.substeps,
+    }
+    return Result({"candidates": ranking.candidates, **numbers}, [candidates, note])
 
 
-def _print_laws(attribution: Attribution, as_json: bool) -> None:
-    """Print the search on each length of pieces, the laws found, and the simulation error."""
-    if as_json:
-        print_json(vars(attribution))
-        return
+def _shown_laws(attribution: Attribution) -> Iterator[str | Table]:
+    """Yield the search on each length of pieces, the laws found, and the simulation error."""
     for rung in attribution.rungs:
-        print_table(
+        yield table(
             f"best subsets of laws on pieces of {rung.seconds:.3g} s, intervals: {rung.rows}",
-            ["laws", "nats", "error relative to none"],
-            ([", ".join(best.laws), f"{best.nats:.1f}", f"{best.error:.3f}"] for best in rung.path),
+            {"laws": "<", "nats": ".1f", "error relative to none": ".3f"},
+            ([", ".join(best.laws), best.nats, best.error] for best in rung.path),
         )
-        typer.echo(f"accepted: {', '.join(rung.accepted) or 'none'}")
-        typer.echo(f"dropped: {', '.join(rung.dropped) or 'none'}\n")
-    print_table(
+        yield f"accepted: {', '.join(rung.accepted) or 'none'}"
+        yield f"dropped: {', '.join(rung.dropped) or 'none'}\n"
+    columns = {"law": "<", "body": "<", "kind": "<", "nats": ".1f", "share of error": ""}
+    yield table(
         "laws that the simulation error of trajectories shows",
-        ["law", "<body", "<kind", "nats", "share of error", "<size"],
+        columns | {"size": "<"},
         map(_law_row, attribution.laws),
     )
-    print_table(
+    errors, correlated = (attribution.before, attribution.after), attribution.correlated
+    yield table(
         f"simulation error over {attribution.seconds:.3g} s (SI)",
-        ["state", "declared", "with them", "autocorrelation (rows)"],
-        (
-            [
-                name,
-                f"{error:.3g}",
-                f"{attribution.after[name]:.3g}",
-                f"{attribution.correlated[name]:.1f}",
-            ]
-            for name, error in attribution.before.items()
-        ),
+        {"state": "<", "declared": ".3g", "with them": ".3g", "autocorrelation (rows)": ".1f"},
+        ([name, *(each[name] for each in errors), correlated[name]] for name in errors[0]),
     )
-    rejected = (f"rejected {law}: {why}" for law, why in attribution.rejected.items())
-    for sentence in (*attribution.sentences, *rejected):
-        typer.echo(sentence)
+    yield from attribution.sentences
+    yield from (f"rejected {law}: {why}" for law, why in attribution.rejected.items())
 
 
-def _law_row(law: Law) -> list[str]:
-    sizes = (
-        f"{name} {value:.3g} ± {law.sd[name]:.2g} {law.units[name].removesuffix('1')}".rstrip()
-        for name, value in law.estimate.items()
-    )
-    numbers = [f"{law.nats:.1f}", f"{100 * law.share:.2g} %"]
-    kind = "main" if law.main else "small"
-    return [law.effect, law.body, kind, *numbers, ", ".join(sizes)]
+def _law_row(law: Law) -> list[Any]:
+    numbers = ((name, f"{value:.3g} ± {law.sd[name]:.2g}") for name, value in law.estimate.items())
+    kind, share = "main" if law.main else "small", f"{100 * law.share:.2g} %"
+    return [law.effect, law.body, kind, law.nats, share, sizes(numbers, law.units)]
 
 
-def _candidate_row(candidate: Candidate) -> list[str]:
-    sizes = (
-        f"{name} {value:.3g} {candidate.units[name].removesuffix('1')}".rstrip()
-        for name, value in candidate.estimate.items()
-    )
+def _candidate_row(one: Candidate) -> list[Any]:
+    numbers = ((name, f"{value:.3g}") for name, value in one.estimate.items())
     # where the declared parameters absorb the effect, its size is not identifiable
-    seen = ", ".join(sizes) if candidate.statistic > 0 else ""
-    numbers = [f"{candidate.statistic:.1f}", str(candidate.dof), f"{candidate.p_value:.2g}"]
-    return [candidate.effect, candidate.body, *numbers, seen]
+    seen = sizes(numbers, one.units) if one.statistic > 0 else ""
+    return [one.effect, one.body, one.statistic, one.dof, one.p_value, seen]
 
 
 @command("doctor", 13, "pbrl-ppl doctor --json")
-def doctor(as_json: options.AsJson = False, quiet: options.Quiet = False) -> None:
+def doctor(progress: Progress) -> Result:
     """Report versions, whether the compiled engine loop works, and the number of threads.
 
     Exits with 1 if the compiled loop is wrong; where there is none, a slow one serves.
     """
-    with interruptible(), stages(quiet) as progress:
-        progress("loading the packages")
-        import threadpoolctl
+    progress("loading the packages")
+    import threadpoolctl
 
-        from pbrl_ppl.posterior import versions
+    from pbrl_ppl.posterior import versions
 
-        facts: dict[str, Any] = {"versions": versions(), "platform": platform.platform()}
-        progress("trying the engine")
-        facts["engine"] = _engine()
-        facts["threads"] = {
-            "processors": _processors(),
-            **{
-                str(pool["user_api"]): int(pool["num_threads"])
-                for pool in threadpoolctl.threadpool_info()
-            },
-        }
-        facts["package"] = str(Path(__file__).parents[1])
+    facts: dict[str, Any] = {"versions": versions(), "platform": platform.platform()}
+    progress("trying the engine")
+    facts["engine"] = _engine()
+    pools = threadpoolctl.threadpool_info()
+    threads = {str(pool["user_api"]): int(pool["num_threads"]) for pool in pools}
+    facts["threads"] = {"processors": _processors(), **threads}
+    facts["package"] = str(Path(__file__).parents[1])
     wrong = facts["engine"]["difference"] > 1e-9  # the paths agree to rounding
-    print_result(as_json, facts | {"ok": not wrong}, _doctor_lines(facts))
-    if wrong:
-        typer.echo("error: the compiled engine loop is wrong here; please report this", err=True)
-        raise typer.Exit(FAILED)
+    contents, shown = facts | {"ok": not wrong}, _doctor_lines(facts)
+    if not wrong:
+        return Result(contents, shown)
+    error = "error: the compiled engine loop is wrong here; please report this"
+    return Result(contents, shown, FAILED, error)
 
 
 def _processors() -> int:

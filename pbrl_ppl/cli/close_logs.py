@@ -18,25 +18,27 @@ import typer
 from pbrl_ppl.cli import options
 from pbrl_ppl.cli.close_loop import Draws, Method
 from pbrl_ppl.cli.options import command
-from pbrl_ppl.cli.terminal import FAILED, check_can_make, interruptible, print_result, stages
+from pbrl_ppl.cli.terminal import FAILED, Progress, Result, check_can_make
 from pbrl_ppl.errors import OutputError
 
 
-@command("close-logs", 6, "pbrl-ppl close-logs logs.csv -o results/ --jobs 4")
+@command(
+    "close-logs", 6, "pbrl-ppl close-logs logs.csv -o results/ --jobs 4",
+    kept="finished logs are in {output}; the same command goes on",
+)  # fmt: skip
 def close_logs(
     context: typer.Context,
     manifest: Path,
     output: options.OutputFolder,
     reading: options.SceneReading,
+    progress: Progress,
     seed: options.Seed = 1,
     overwrite: bool = False,
     draws: Draws = None,
     method: Method = Method.IMPORTANCE,
     jobs: options.Count = 1,
     scheduler: str | None = None,
-    as_json: options.AsJson = False,
-    quiet: options.Quiet = False,
-) -> None:
+) -> Result:
     """Close the loop on each log of a manifest, and report which effects are where.
 
     The same command goes on after an interrupt. Exits with 1 if some logs failed.
@@ -59,21 +61,19 @@ def close_logs(
     scheduler : ADDRESS
         A Dask scheduler that has the workers.
     """
-    kept = f"finished logs are in {output}; the same command goes on"
-    with interruptible(kept), stages(quiet) as progress:
-        check_can_make(output)
-        progress("reading the manifest")
-        import pbrl_ppl.reporting as report
+    check_can_make(output)
+    progress("reading the manifest")
+    import pbrl_ppl.reporting as report
 
-        catalogue = reading.catalogue() if reading.effect_file else None
-        logs = report.read_manifest(manifest)  # its errors come before a cluster is sought
-        with _executor(jobs, scheduler) as executor:
-            loops = report.close_loop_many(
-                logs, output, executor=executor, progress=progress, again=overwrite, seed=seed,
-                source=report.Source(command=options.command_line(context)), draws=draws,
-                method=method.value, catalogue=catalogue, **reading.scene_settings(),
-                **reading.settings(),
-            )  # fmt: skip
+    catalogue = reading.catalogue() if reading.effect_file else None
+    logs = report.read_manifest(manifest)  # its errors come before a cluster is sought
+    with _executor(jobs, scheduler) as executor:
+        loops = report.close_loop_many(
+            logs, output, executor=executor, progress=progress, again=overwrite, seed=seed,
+            source=report.Source(command=options.command_line(context)), draws=draws,
+            method=method.value, catalogue=catalogue, **reading.scene_settings(),
+            **reading.settings(),
+        )  # fmt: skip
     effects = loops.effects().drop_duplicates(["name", "effect", "body"])
     lines = [
         f"{effect}[{body}]: {', '.join(rows['name'])}"
@@ -81,9 +81,7 @@ def close_logs(
     ]
     page = output / "index.html"
     lines += [report.in_words(loops.rows), f"page: {page}"]
-    print_result(as_json, {"page": page, "logs": loops.rows}, lines)
-    if loops.failed:
-        raise typer.Exit(FAILED)
+    return Result({"page": page, "logs": loops.rows}, lines, FAILED if loops.failed else 0)
 
 
 def _executor(jobs: int, scheduler: str | None) -> AbstractContextManager[Executor | None]:

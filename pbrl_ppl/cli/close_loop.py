@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
@@ -16,11 +16,10 @@ from pbrl_ppl.cli.options import command
 from pbrl_ppl.cli.terminal import (
     INTERRUPTED,
     UNDECIDED,
+    Progress,
+    Result,
     check_can_make,
     interrupted,
-    interruptible,
-    print_result,
-    stages,
 )
 
 if TYPE_CHECKING:
@@ -52,15 +51,14 @@ def close_loop(
     train: Path,
     output: options.OutputFolder,
     reading: options.SceneReading,
+    progress: Progress,
     test: Path | None = None,
     seed: options.Seed = 1,
     overwrite: bool = False,
     draws: Draws = None,
     method: Method = Method.IMPORTANCE,
     learn_remainder: bool = False,
-    as_json: options.AsJson = False,
-    quiet: options.Quiet = False,
-) -> None:
+) -> Result:
     """Find what the declared model lacks, add it, refit, and report before and after.
 
     Exits with 3 if the chains have not converged: then there is no verdict.
@@ -83,40 +81,36 @@ def close_loop(
     learn_remainder
         Where something stays unexplained, learn a force for it, into remainder.nc; it gets no name.
     """
-    with interruptible(), stages(quiet) as progress:
-        check_can_make(output)  # before the long work, which would be lost
-        progress("reading the scene and the histories")
-        paths = [train] if test is None else [train, test]
-        declared, histories = reading.read(scene, paths)
-        catalogue = reading.catalogue()
-        progress("loading the sampler")
-        import pbrl_ppl.reporting as report
-        from pbrl_ppl import criticism
+    check_can_make(output)  # before the long work, which would be lost
+    progress("reading the scene and the histories")
+    paths = [train] if test is None else [train, test]
+    declared, histories = reading.read(scene, paths)
+    catalogue = reading.catalogue()
+    progress("loading the sampler")
+    import pbrl_ppl.reporting as report
+    from pbrl_ppl import criticism
 
-        criticism.check_folder(output, overwrite)
-        if learn_remainder:
-            criticism.check_scikit_learn()
-        settings = {"seed": seed, "draws": draws, "method": method.value, "catalogue": catalogue}
-        loop, stopped = _finished(declared, histories, progress, **settings)
-        progress("writing the report")
-        files = str(scene), str(train), str(test or "")
-        source = report.Source(*files, options.command_line(context))
-        loop.save(output, overwrite, page=report.render(loop, source))
-        remainder = _remainder(loop, output, source, seed, progress) if learn_remainder else {}
+    criticism.check_folder(output, overwrite)
+    if learn_remainder:
+        criticism.check_scikit_learn()
+    settings = {"seed": seed, "draws": draws, "method": method.value, "catalogue": catalogue}
+    loop, stopped = _finished(declared, histories, progress, **settings)
+    progress("writing the report")
+    files = str(scene), str(train), str(test or "")
+    source = report.Source(*files, options.command_line(context))
+    loop.save(output, overwrite, page=report.render(loop, source))
+    remainder = _remainder(loop, output, source, seed, progress) if learn_remainder else {}
     words = remainder["learned_remainder"]["words"] if remainder else ""
-    print_result(
-        as_json,
+    undecided = UNDECIDED if loop.verdict == criticism.NOT_CONVERGED else 0
+    return Result(
         loop.to_dict() | {"report": output / "report.html"} | remainder,
         report.in_brief(loop, output, words),
+        INTERRUPTED if stopped else undecided,
     )
-    if stopped:
-        raise typer.Exit(INTERRUPTED)
-    if loop.verdict == criticism.NOT_CONVERGED:
-        raise typer.Exit(UNDECIDED)
 
 
 def _finished(
-    scene: Scene, histories: Sequence[History], progress: Callable[[str], None], **settings: Any
+    scene: Scene, histories: Sequence[History], progress: Progress, **settings: Any
 ) -> tuple[Loop, bool]:
     """Return the loop, with Gaussians at the modes if it is interrupted while it samples.
 
@@ -144,7 +138,7 @@ def _finished(
 
 
 def _remainder(
-    loop: Loop, folder: Path, source: Source, seed: int, progress: Callable[[str], None]
+    loop: Loop, folder: Path, source: Source, seed: int, progress: Progress
 ) -> dict[str, dict[str, Any]]:
     """Learn a force for the residual and save it with the results, or return why there is none."""
     from pbrl_ppl.errors import FitError
@@ -164,13 +158,14 @@ def _remainder(
 @command("demo", 0, "pbrl-ppl demo")
 def demo(
     context: typer.Context,
+    progress: Progress,
+    as_json: bool,
+    quiet: bool,
     output: options.OutputFolder = Path("pbrl-ppl-demo"),
     method: Method = Method.LAPLACE,
     seed: options.Seed = 1,
     overwrite: bool = False,
-    as_json: options.AsJson = False,
-    quiet: options.Quiet = False,
-) -> None:
+) -> Result:
     """Close the loop on a recording that comes with the package, and write its report.
 
     A shopping cart is pushed. Its castor resists turning, which the scene does not declare.
@@ -190,10 +185,12 @@ def demo(
             "A shopping cart is pushed; the scene does not declare that its castor resists turning."
             "\nThis takes some 30 s on an idle machine, the first time a minute more to compile."
         )
-    close_loop(
+    result = close_loop(
         context, cart / "scene.toml", cart / "recorded" / "train.csv", output,
-        options.SceneReading(), cart / "recorded" / "test.csv", method=method, seed=seed,
-        overwrite=overwrite, as_json=as_json, quiet=quiet,
+        options.SceneReading(), progress, cart / "recorded" / "test.csv", method=method, seed=seed,
+        overwrite=overwrite,
     )  # fmt: skip
-    if not (as_json or quiet):
-        typer.echo("With a recording of yours: pbrl-ppl new scene.toml --history train.csv")
+    if quiet or result.code:
+        return result
+    last = "With a recording of yours: pbrl-ppl new scene.toml --history train.csv"
+    return replace(result, shown=[*result.shown, last])

@@ -8,19 +8,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.table import Table
 
 from pbrl_ppl.cli import options
 from pbrl_ppl.cli.options import command
 from pbrl_ppl.cli.terminal import (
     INTERRUPTED,
     UNDECIDED,
+    Progress,
+    Result,
     check_file,
-    interruptible,
     noted_warnings,
-    print_json,
-    print_result,
-    print_table,
     stages,
+    table,
 )
 from pbrl_ppl.errors import ConvergenceWarning, FitError, LinearisationWarning, PosteriorError
 from pbrl_ppl.files import write_text
@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 
     from pbrl_ppl.posterior import Idata
 
+#: Formats of a summary's columns; of others, four digits.
+_DIGITS = {"ess": ".0f", "r_hat": ".3f"}
+
 
 @command("fit", 3, "pbrl-ppl fit scene.toml train.csv -o cart.nc")
 def fit(
@@ -37,6 +40,8 @@ def fit(
     history: Path,
     output: options.OutputFile,
     reading: options.SceneReading,
+    quiet: bool,
+    interrupts: list[int],
     likelihood: str = "trajectories",
     trajectories: options.OldLikelihood = None,
     horizon: options.Count = 1,
@@ -50,9 +55,7 @@ def fit(
     resume: Path | None = None,
     seed: options.Seed = 1,
     overwrite: bool = False,
-    as_json: options.AsJson = False,
-    quiet: options.Quiet = False,
-) -> None:
+) -> Result:
     """Fit the declared model to a history: a posterior file, and a table of it.
 
     Exits with 3 if chains have not converged or draws are too few, and with 130 if it was
@@ -85,7 +88,7 @@ def fit(
     resume : FILE
         Go on with this posterior: its chains, or more draws.
     """
-    with interruptible(), stages(quiet) as progress:
+    with stages(quiet) as progress:
         check_file(output, (".nc",), overwrite)
         if trajectories is not None:  # older spellings
             likelihood = "trajectories" if trajectories else "transitions"
@@ -113,39 +116,37 @@ def fit(
         except ValueError as error:  # an option that the model refuses
             raise FitError(f"fit: {error}") from None
     # the sampler shows its own progress
-    with interruptible() as interrupts, noted_warnings("was interrupted") as caught:
-        with redirect_stdout(sys.stderr):
-            idata = sampling.fit(
-                model, method=method, seed=seed, draws=draws, tune=tune, chains=chains, thin=thin,
-                resume=earlier, progress=not quiet,
-            )  # fmt: skip
+    with noted_warnings("was interrupted") as caught, redirect_stdout(sys.stderr):
+        idata = sampling.fit(
+            model, method=method, seed=seed, draws=draws, tune=tune, chains=chains, thin=thin,
+            resume=earlier, progress=not quiet,
+        )  # fmt: skip
         save_posterior(idata, output)
     record = PosteriorRecord.of(idata)
-    cut = bool(interrupts) or record.interrupted is not None
-    converged = not any(isinstance(warning, ConvergenceWarning) for warning in caught)
-    table = _summary(idata)
-    if as_json:
-        numbers = {"max_rhat": record.max_rhat, "min_ess": record.min_ess}
-        reached = None if record.max_rhat is None else converged
-        print_json(
-            {"posterior": output, "converged": reached, **numbers}
-            | {"parameters": table.to_dict("index"), "warnings": list(record.warnings or ())}
-        )
-    else:
-        print_table(None, ["parameter", *table.columns], _rows(table))
-        if any(isinstance(one, LinearisationWarning) for one in caught):
-            typer.echo("intervals: not to be trusted, the likelihood does not hold (warning above)")
-        typer.echo(f"posterior: {output}")
-    if cut:
-        kept = group(idata, "posterior").sizes
-        typer.echo(
-            f"interrupted; {kept['draw']} draws of each of {kept['chain']} chains are kept in"
-            f" {output}; --resume {output} goes on",
-            err=True,
-        )
-        raise typer.Exit(INTERRUPTED)
-    if not converged:
-        raise typer.Exit(UNDECIDED)
+    undecided = any(isinstance(warning, ConvergenceWarning) for warning in caught)
+    rows = _summary(idata)
+    contents = {
+        "posterior": output,
+        "converged": None if record.max_rhat is None else not undecided,
+        "max_rhat": record.max_rhat,
+        "min_ess": record.min_ess,
+        "parameters": rows.to_dict("index"),
+        "warnings": list(record.warnings or ()),
+    }
+    formats = {str(name): _DIGITS.get(str(name), ".4g") for name in rows.columns}
+    listed = table(None, {"parameter": "<"} | formats, rows.itertuples(name=None))
+    shown: list[str | Table] = [listed]
+    if any(isinstance(warning, LinearisationWarning) for warning in caught):
+        shown += ["intervals: not to be trusted, the likelihood does not hold (warning above)"]
+    shown += [f"posterior: {output}"]
+    if not interrupts and record.interrupted is None:
+        return Result(contents, shown, UNDECIDED if undecided else 0)
+    kept = group(idata, "posterior").sizes
+    warning = (
+        f"interrupted; {kept['draw']} draws of each of {kept['chain']} chains are kept in"
+        f" {output}; --resume {output} goes on"
+    )
+    return Result(contents, shown, INTERRUPTED, warning)
 
 
 def _summary(idata: Idata) -> pd.DataFrame:
@@ -154,22 +155,10 @@ def _summary(idata: Idata) -> pd.DataFrame:
     from pbrl_ppl.reporting import summary
 
     if PosteriorRecord.of(idata).max_rhat is None:
-        import pandas as pd
-
-        places = {str(name): float(value) for name, value in scalars(idata).mean().items()}
-        return pd.DataFrame({"mean": places})
+        return scalars(idata).mean().to_array().to_series().to_frame("mean")
     table = summary(idata)
     table.insert(4, "ess", table[["ess_bulk", "ess_tail"]].min(axis=1))
     return table.drop(columns=["ess_bulk", "ess_tail"])
-
-
-def _rows(table: pd.DataFrame) -> list[list[str]]:
-    """Return the rows of a summary as text."""
-    digits = {"ess": ".0f", "r_hat": ".3f"}
-    return [
-        [str(name), *(f"{value:{digits.get(str(column), '.4g')}}" for column, value in row.items())]
-        for name, row in table.iterrows()
-    ]
 
 
 @command("update", 9, "pbrl-ppl update cart.nc since.csv -o new.nc")
@@ -178,11 +167,10 @@ def update(
     history: Path,
     output: options.OutputFile,
     reading: options.PosteriorReading,
+    progress: Progress,
     seed: options.Seed = 1,
     overwrite: bool = False,
-    as_json: options.AsJson = False,
-    quiet: options.Quiet = False,
-) -> None:
+) -> Result:
     """Bring a posterior up to date with new transitions, without a fit from scratch.
 
     Exits with 3 if the new posterior has not converged.
@@ -196,48 +184,41 @@ def update(
     output
         The new posterior file.
     """
-    with interruptible(), stages(quiet) as progress:
-        check_file(output, (".nc",), overwrite)
-        catalogue = reading.catalogue()
-        progress("reading the posterior and the history")
-        from pbrl_ppl import posterior as posteriors
+    check_file(output, (".nc",), overwrite)
+    catalogue = reading.catalogue()
+    progress("reading the posterior and the history")
+    from pbrl_ppl import posterior as posteriors
 
-        idata = posteriors.load_posterior(posterior)
-        new = reading.recording(history, posteriors.scene_of(idata))
-        progress("updating")
-        from pbrl_ppl.sampling import updating
+    idata = posteriors.load_posterior(posterior)
+    new = reading.recording(history, posteriors.scene_of(idata))
+    progress("updating")
+    from pbrl_ppl.sampling import updating
 
-        with noted_warnings() as caught:
-            idata = updating.update(idata, new, effects=catalogue, seed=seed, progress=False)
-        record = posteriors.PosteriorRecord.of(idata)
-        if record.interrupted is not None:  # half a posterior is no prior for the next update
-            raise KeyboardInterrupt
-        posteriors.save_posterior(idata, output)
-        (*_, last) = record.updates or ()
+    with noted_warnings() as caught:
+        idata = updating.update(idata, new, effects=catalogue, seed=seed, progress=False)
+    record = posteriors.PosteriorRecord.of(idata)
+    if record.interrupted is not None:  # half a posterior is no prior for the next update
+        raise KeyboardInterrupt
+    posteriors.save_posterior(idata, output)
+    (*_, last) = record.updates or ()
     converged = not any(isinstance(warning, ConvergenceWarning) for warning in caught)
     share = last["share"]
-    print_result(
-        as_json,
+    worth = f", the weights worth {share:.0%} of the draws" if share is not None else ""
+    return Result(
         {**last, "posterior": output, "converged": converged},
-        [
-            f"{last['did']}: {last['transitions']} transitions"
-            + (f", the weights worth {share:.0%} of the draws" if share is not None else ""),
-            f"posterior: {output}",
-        ],
+        [f"{last['did']}: {last['transitions']} transitions{worth}", f"posterior: {output}"],
+        0 if converged else UNDECIDED,
     )
-    if not converged:
-        raise typer.Exit(UNDECIDED)
 
 
 @command("report", 8, "pbrl-ppl report cart.nc")
 def report(
     context: typer.Context,
     posterior: Path,
+    progress: Progress,
     output: options.OutputFile | None = None,
     overwrite: bool = False,
-    as_json: options.AsJson = False,
-    quiet: options.Quiet = False,
-) -> None:
+) -> Result:
     """Diagnose a posterior on one self-contained page: chains, prior, predictions, LOO.
 
     Parameters
@@ -245,18 +226,17 @@ def report(
     output
         The page; POSTERIOR with .html if not given.
     """
-    with interruptible(), stages(quiet) as progress:
-        page = posterior.with_suffix(".html") if output is None else output
-        check_file(page, (".html",), overwrite)
-        progress("reading the posterior")
-        from pbrl_ppl.posterior import load_posterior
-        from pbrl_ppl.reporting import Source, render_posterior
+    page = posterior.with_suffix(".html") if output is None else output
+    check_file(page, (".html",), overwrite)
+    progress("reading the posterior")
+    from pbrl_ppl.posterior import load_posterior
+    from pbrl_ppl.reporting import Source, render_posterior
 
-        idata = load_posterior(posterior)
-        progress("computing and drawing")
-        try:
-            text = render_posterior(idata, source=Source(command=options.command_line(context)))
-        except PosteriorError as error:
-            raise PosteriorError(f"{posterior}: {error}") from error
-        write_text(page, text)
-    print_result(as_json, {"report": page}, [f"report: {page}"])
+    idata = load_posterior(posterior)
+    progress("computing and drawing")
+    try:
+        text = render_posterior(idata, source=Source(command=options.command_line(context)))
+    except PosteriorError as error:
+        raise PosteriorError(f"{posterior}: {error}") from error
+    write_text(page, text)
+    return Result({"report": page}, [f"report: {page}"])

@@ -7,7 +7,7 @@ import shutil
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -18,7 +18,7 @@ import typer
 
 from pbrl_ppl.cli import options
 from pbrl_ppl.cli.options import command
-from pbrl_ppl.cli.terminal import check_file, interruptible, print_json
+from pbrl_ppl.cli.terminal import Result, check_file
 from pbrl_ppl.errors import HistoryError, LayoutError, OutputError, RecordingWarning, SceneError
 from pbrl_ppl.files import write_text
 from pbrl_ppl.scene import WORLD, Actuator, Body, Joint, Recording, Scene, Shape, nearest
@@ -34,16 +34,14 @@ SHAPES = "box:0.9x0.55, circle:0.1 or polygon:0,2/-1,-1/1,-1, in m"
 
 @dataclass(frozen=True)
 class Recorded:
-    """Bodies and time steps of a recording.
+    """Bodies and time steps of a recording; by default of none.
 
     Parameters
     ----------
     names : tuple of str
         In order of appearance.
-    time_step : float
-        Median time between a body's rows (s), to six digits.
-    even : bool
-        Whether all are that long.
+    time_step : float, optional
+        Median time between a body's rows (s), to four digits.
     layout : Recording, optional
         How it is laid out; None where it is a history's.
     said : list of str
@@ -56,21 +54,17 @@ class Recorded:
         Takes the outline of the one body; returns actuators that columns' names give away.
     """
 
-    names: tuple[str, ...]
-    time_step: float
-    layout: Recording | None
-    said: list[str]
-    angles: tuple[str, ...]
-    circles: dict[str, tuple[float, float, float]]
+    names: tuple[str, ...] = ()
+    time_step: float | None = None
+    layout: Recording | None = None
+    said: Sequence[str] = ()
+    angles: tuple[str, ...] = ()
+    circles: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     actuators: Callable[[Shape], tuple[Actuator, ...]] = lambda shape: ()
 
 
 def recorded(
-    path: Path,
-    layout: Recording,
-    given: Sequence[str] = (),
-    *,
-    time_step: float | None = None,
+    path: Path, layout: Recording, given: Sequence[str], time_step: float | None
 ) -> Recorded:
     """Read bodies, time step and layout from a recording.
 
@@ -92,54 +86,42 @@ def recorded(
     """
     import pandas as pd
 
-    from pbrl_ppl.history import (
-        as_history,
-        guessed_actuators,
-        is_history,
-        propose,
-        read_commands,
-        read_table,
-        unused_columns,
-        with_guesses,
-    )
+    from pbrl_ppl import history as histories
 
-    said: list[str] = []
-    frame = read_table(path, layout=layout)
-    plain = is_history(frame) and layout == Recording()
-    commands = read_commands(path, layout)
+    source, said = f"history {path}", list[str]()
+    frame = histories.read_table(path, layout=layout)
+    plain = histories.is_history(frame) and layout == Recording()
+    commands = histories.read_commands(path, layout)
     if not plain:
-        layout = with_guesses(frame, commands, layout, said.append)
+        layout = histories.with_guesses(frame, commands, layout, said.append)
     columns = dict(layout.columns)
     names = _names(frame, columns) or list(given)
     if not names:
         raise HistoryError(
-            f"history {path}: no column has the bodies' names; give --body NAME=SHAPE for one body,"
+            f"{source}: no column has the bodies' names; give --body NAME=SHAPE for one body,"
             " --columns body=COLUMN, or --columns NAME.x=COLUMN,... for bodies side by side"
         )
     # later commands read it with the scene; any outline will do here
-    stand_in = Scene(
-        time_step=time_step or 1.0, bodies=tuple(Body(n, Shape.circle(1.0)) for n in names)
-    )  # fmt: skip
+    bodies = tuple(Body(name, Shape.circle(1.0)) for name in names)
+    stand_in = Scene(time_step=time_step or 1.0, bodies=bodies)
     timed = {"time", "duration"} & {*columns, *frame.columns} or layout.time
     if not plain and time_step is None and not timed:
         raise HistoryError(
-            f"history {path}: it has no column time; say which it is (--columns time=COLUMN, or"
+            f"{source}: it has no column time; say which it is (--columns time=COLUMN, or"
             " duration=COLUMN for times since the row before), or give --time-step"
         )
-    read = partial(as_history, frame, stand_in, f"history {path}", commands=commands)
-    table, layout = _read_with_cures(read, layout, f"history {path}: ", said, plain=plain)
+    read = partial(histories.as_history, frame, stand_in, source, commands=commands)
+    table, layout = _read_with_cures(read, layout, f"{source}: ", said, plain=plain)
     for name in ("trajectory", "body"):
         if name not in table:
             raise HistoryError(
-                f"history {path}: it has no column {name}; say which it is (--columns"
-                f" {name}=COLUMN)"
+                f"{source}: it has no column {name}; say which it is (--columns {name}=COLUMN)"
             )
     table["time"] = pd.to_numeric(table["time"], errors="coerce")
-    steps = table.groupby(["trajectory", "body"])["time"].diff().dropna().to_numpy()
-    step = float(np.median(steps)) if len(steps) else float("nan")
+    step = float(table.groupby(["trajectory", "body"])["time"].diff().median())
     if not step > 0:
         raise HistoryError(
-            f"history {path}: its times do not rise from row to row of a body and trajectory;"
+            f"{source}: its times do not rise from row to row of a body and trajectory;"
             " correct them, or give --time-step; times since the row before are a column duration"
         )
     step = time_step or _longer_step(float(f"{step:.4g}"), commands, layout, said)
@@ -150,7 +132,7 @@ def recorded(
         for name, track in tracks
         if not measured["theta"][name] and (circle := _circle(track.to_numpy(float)))
     }
-    proposed, shown = propose(table, layout, step, jumps=not circles)
+    proposed, shown = histories.propose(table, layout, step, jumps=not circles)
     angles = measured["theta"] & ~measured["x"] & ~measured["y"]
     hung = tuple(name for name in names if angles.get(name, False))
     if hung:
@@ -158,17 +140,19 @@ def recorded(
             f"only the angle of {' and '.join(hung)} was measured: hung by the upper end; correct"
             " the places of [[joint]]"
         )
-    for name, (x, y, radius) in circles.items():
-        shown.append(
-            f"{name} swings on a circle of {radius:g} m about ({x:g}, {y:g}): hung on a hinge there"
-        )
+    shown += [
+        f"{name} swings on a circle of {radius:g} m about ({x:g}, {y:g}): hung on a hinge there"
+        for name, (x, y, radius) in circles.items()
+    ]
     acting: Callable[[Shape], tuple[Actuator, ...]] = Recorded.actuators
     if not plain and len(names) == 1:
-        acting = partial(guessed_actuators, frame, proposed, hung=bool(hung or circles))
+        pivoted = bool(hung or circles)
+        acting = partial(histories.guessed_actuators, frame, proposed, hung=pivoted)
     sent = [one.column or one.name for one in acting(Shape.circle(1.0))]
     if sent:
         shown.append(f"commands by their names: {', '.join(sent)}; correct [[actuator]]")
-    unused = [] if plain else [n for n in unused_columns(frame, proposed) if n not in sent]
+    left = () if plain else histories.unused_columns(frame, proposed)
+    unused = [name for name in left if name not in sent]
     if unused:
         shown.append(f"columns that are not used: {', '.join(unused)}")
     layout_found = None if plain and not shown else proposed
@@ -264,95 +248,78 @@ _MODELS = (Path(__file__).parents[1] / "models", Path(__file__).parents[2] / "mo
 
 @command("new", 1, "pbrl-ppl new scene.toml --history train.csv --body cart=box:0.9x0.55")
 def new(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="The file to write.")] = Path(
-        "scene.toml"
-    ),
-    bodies: Annotated[
-        list[str] | None,
-        typer.Option("--body", metavar="NAME=SHAPE", help=f"A body and its outline: {SHAPES}."),
-    ] = None,
-    side: Annotated[
-        bool | None,
-        typer.Option("--side/--top", help="Seen from the side (gravity acts in y), or from above."),
-    ] = None,
-    time_step: Annotated[
-        float | None, typer.Option(min=0.0, help="Time between rows of the history (s).")
-    ] = None,
-    history: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="HISTORY", help="A recording: has the bodies' names and the time step."
-        ),
-    ] = None,
-    columns: options.Columns = None,
-    units: options.Units = None,
-    commands: Annotated[
-        str,
-        typer.Option(metavar="FILE", help="Commands with times of their own, beside the history."),
-    ] = "",
-    topics: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--topic", metavar="NAME=TOPIC,...", help="Topics of a body in a ROS bag: cart=/odom."
-        ),
-    ] = None,
-    model: Annotated[
-        str | None,
-        typer.Option("--from", metavar="MODEL", help="Copy a model that comes with the package."),
-    ] = None,
-    overwrite: options.Overwrite = False,
-    as_json: options.AsJson = False,
-    quiet: options.Quiet = False,
-) -> None:
+    *,
+    scene: Annotated[Path, typer.Argument()] = Path("scene.toml"),
+    bodies: Annotated[list[str] | None, typer.Option("--body")] = None,
+    side: Annotated[bool | None, typer.Option("--side/--top")] = None,
+    time_step: Annotated[float | None, typer.Option(min=0.0)] = None,
+    history: Path | None = None,
+    columns: options.Columns,
+    commands: str = "",
+    topics: Annotated[list[str] | None, typer.Option("--topic")] = None,
+    model: Annotated[str | None, typer.Option("--from")] = None,
+    overwrite: bool = False,
+    quiet: bool,
+) -> Result:
     """Write a commented scene, from options or from a few questions; or copy a model.
 
     Asks at a terminal for what the options leave open. Joints, walls, wheels and what is known of a
     body are in the scene as examples to uncomment. Models to copy: apartment, namo, pendulum and
     shopping_cart; recordings that a model has go beside the scene.
+
+    Parameters
+    ----------
+    scene : SCENE
+        The file to write.
+    bodies : NAME=SHAPE
+        A body and its outline: box:0.9x0.55, circle:0.1 or polygon:0,2/-1,-1/1,-1, in m.
+    side
+        Seen from the side (gravity acts in y), or from above.
+    time_step
+        Time between rows of the history (s).
+    history : HISTORY
+        A recording: has the bodies' names and the time step.
+    commands : FILE
+        Commands with times of their own, beside the history.
+    topics : NAME=TOPIC,...
+        Topics of a body in a ROS bag: cart=/odom.
+    model : MODEL
+        Copy a model that comes with the package.
     """
-    with interruptible():
-        check_file(scene, (".toml",), overwrite)
-        layout = Recording(
-            columns=tuple(options.columns_of(columns).items()),
-            units=tuple(options.units_of(units).items()),
-            commands=commands,
-            topics=tuple(_topics(topics).items()),
+    check_file(scene, (".toml",), overwrite)
+    named = columns.layout()
+    layout = Recording(commands=commands).with_entries(**named, topics=_topics(topics))
+    described = (bodies, time_step, history, columns.columns, columns.units)
+    if model is not None and (side is not None or any(described)):
+        raise SceneError("--from copies a model as it is: leave the other options, or --from")
+    if history is None and (columns.columns or columns.units or commands):
+        raise SceneError(
+            "--columns, --units and --commands say how a recording is read: add --history"
         )
-        described = (bodies, time_step, history, columns, units)
-        if model is not None and (side is not None or any(described)):
-            raise SceneError("--from copies a model as it is: leave the other options, or --from")
-        if history is None and (columns or units or commands):
-            raise SceneError(
-                "--columns, --units and --commands say how a recording is read: add --history"
-            )
-        recording: Recorded | None = None
+    recording = Recorded()
+    if model is not None:
+        written = _copied(model, scene, overwrite)
+    else:
+        shapes = outlines(bodies or [])
+        if history is not None:
+            recording = recorded(history, layout, [*shapes], time_step)
         try:
-            if model is not None:
-                written = _copied(model, scene, overwrite)
-            else:
-                shapes = outlines(bodies or [])
-                if history is not None:
-                    recording = recorded(history, layout, [*shapes], time_step=time_step)
-                answers = _asked(shapes, side, time_step, history, recording)
-                text = scene_text(answers, recording)
-                Scene.from_toml(text)  # written whole and valid, or not at all
-                write_text(scene, text)
-                written = [scene]
+            answers = _asked(shapes, side, time_step, history, recording)
         except typer.Abort:  # Ctrl-C at a question
             raise KeyboardInterrupt from None
-    if as_json:
-        print_json({"scene": scene, "written": written})
-    elif not quiet:
-        for path in written:
-            typer.echo(f"wrote {path}")
-        for sentence in recording.said if recording else ():
-            typer.echo(f"{history}: {sentence}")
-        if model is None:
-            typer.echo(f"joints, walls, wheels, known masses: uncomment them in {scene}")
-        log = history or (written[-1] if len(written) > 1 else None)
-        command = ["pbrl-ppl", "check", str(scene), str(log or "history.csv")]
-        begin = "next" if log else "next, with your recording"
-        typer.echo(f"{begin}: {shlex.join(command)}")
+        text = scene_text(*answers, recording)
+        Scene.from_toml(text)  # written whole and valid, or not at all
+        write_text(scene, text)
+        written = [scene]
+    shown = [f"wrote {path}" for path in written]
+    shown += [f"{history}: {sentence}" for sentence in recording.said]
+    if model is None:
+        shown += [f"joints, walls, wheels, known masses: uncomment them in {scene}"]
+    log = history or (written[-1] if len(written) > 1 else None)
+    following = ["pbrl-ppl", "check", str(scene), str(log or "history.csv")]
+    begin = "next" if log else "next, with your recording"
+    shown += [f"{begin}: {shlex.join(following)}"]
+    return Result({"scene": scene, "written": written}, () if quiet else shown)
 
 
 def _topics(texts: list[str] | None) -> dict[str, tuple[str, ...]]:
@@ -398,32 +365,21 @@ def _copied(model: str, scene: Path, overwrite: bool) -> list[Path]:
     return list(copies)
 
 
-@dataclass(frozen=True)
-class Answers:
-    """Scene settings from options, recording and answers."""
-
-    shapes: Mapping[str, Shape]
-    side: bool
-    time_step: float
-
-
 def _asked(
     given: Mapping[str, Shape],
     side: bool | None,
     time_step: float | None,
     history: Path | None,
-    found: Recorded | None,
-) -> Answers:
-    """Return scene settings from options, a recording and answers to questions."""
-    names, shapes = [*given], dict(given)
-    if found is not None:
-        names = list(found.names)
-        time_step = found.time_step if time_step is None else time_step
-        for name in shapes:
-            if name not in names:
-                raise SceneError(
-                    f"--body: {history} has no rows of {name!r}, only of {', '.join(names)}"
-                )
+    found: Recorded,
+) -> tuple[dict[str, Shape], bool, float]:
+    """Return shapes, whether seen from the side, and time step, asked for where not given."""
+    names, shapes = [*(found.names or given)], dict(given)
+    time_step = found.time_step if time_step is None else time_step
+    for name in shapes:
+        if name not in names:
+            raise SceneError(
+                f"--body: {history} has no rows of {name!r}, only of {', '.join(names)}"
+            )
     lacking = [f"--body {name}={SHAPES}" for name in names or ["NAME"] if name not in shapes]
     lacking += ["--time-step"] if time_step is None else []
     if lacking and not sys.stdin.isatty():
@@ -441,38 +397,38 @@ def _asked(
                 typer.echo(str(error), err=True)
     if time_step is None:
         time_step = typer.prompt("Time between two rows of the recording (s)", type=float)
-    return Answers({name: shapes[name] for name in names}, bool(side), time_step)
+    return {name: shapes[name] for name in names}, bool(side), time_step
 
 
-def scene_text(answers: Answers, found: Recorded | None = None) -> str:
+def scene_text(shapes: Mapping[str, Shape], side: bool, time_step: float, found: Recorded) -> str:
     """Return a commented scene as TOML.
 
     Bodies of which angles alone were measured hang in a chain, each by its upper end.
 
     Examples
     --------
-    >>> text = scene_text(Answers(outlines(["cart=box:0.9x0.55"]), side=False, time_step=0.1))
+    >>> text = scene_text(outlines(["cart=box:0.9x0.55"]), False, 0.1, Recorded())
     >>> Scene.from_toml(text).moving[0].shape
     Shape(kind='box', size=(0.9, 0.55), radius=None, vertices=None)
     """
     joints: list[Joint] = []
     above, end = WORLD, (0.0, 0.0)
-    for name in found.angles if found else ():
-        *_, low, high = answers.shapes[name].bounds
+    for name in found.angles:
+        *_, low, high = shapes[name].bounds
         joints.append(Joint("hinge", (name, above), (0.0, high), end))
         above, end = name, (0.0, low)
-    for name, (x, y, radius) in (found.circles if found else {}).items():
+    for name, (x, y, radius) in found.circles.items():
         joints.append(Joint("hinge", (name, WORLD), (0.0, radius), (x, y)))
-    name, shape = next(iter(answers.shapes.items()))
-    actuators = [replace(one, body=name) for one in (found.actuators(shape) if found else ())]
+    name, shape = next(iter(shapes.items()))
+    actuators = [replace(one, body=name) for one in found.actuators(shape)]
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("pbrl_ppl", "cli"), undefined=jinja2.StrictUndefined,
         trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
     )  # fmt: skip
     return environment.get_template("scene.toml.jinja").render(
-        shapes={name: vars(shape) for name, shape in answers.shapes.items()},
-        side=answers.side, time_step=answers.time_step, joints=joints, actuators=actuators,
-        recording=found and found.layout, said=found.said if found else (),
+        shapes={name: vars(shape) for name, shape in shapes.items()},
+        side=side, time_step=time_step, joints=joints, actuators=actuators,
+        recording=found.layout, said=found.said,
         entry=lambda key, value: scene_toml.write([("", {key: value})]).strip(),
     )  # fmt: skip
 

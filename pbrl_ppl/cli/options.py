@@ -24,10 +24,6 @@ seed
     Same seed, same answer.
 overwrite
     Replace what exists.
-as_json
-    Print one JSON object, and nothing else.
-quiet
-    Show no progress.
 """
 
 from __future__ import annotations
@@ -37,15 +33,17 @@ import inspect
 import pkgutil
 import re
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from copy import copy
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin
 
 import typer
 
 from pbrl_ppl.cli import effect_files
+from pbrl_ppl.cli.terminal import Result, interruptible, stages
 from pbrl_ppl.errors import GoalError
 
 if TYPE_CHECKING:
@@ -54,7 +52,7 @@ if TYPE_CHECKING:
     from pbrl_ppl.scene import Scene
 
 T = TypeVar("T")
-F = TypeVar("F", bound=Callable[..., None])
+F = TypeVar("F", bound=Callable[..., Result])
 
 
 @dataclass(frozen=True)
@@ -70,8 +68,14 @@ class Command:
 _COMMANDS: dict[str, Command] = {}
 
 
-def command(name: str, rank: int, example: str) -> Callable[[F], F]:
-    """Declare a function of this room to be a command.
+def command(
+    name: str, rank: int, example: str, kept: str = "nothing was written"
+) -> Callable[[F], F]:
+    """Declare a function of this room to be a command, whose result is printed.
+
+    An interrupt says what is ``kept``, in terms of the arguments. Every command has the options of
+    `Printing`; its function takes those and the arguments ``progress`` and ``interrupts`` where it
+    needs them.
 
     An argument that is a dataclass stands for the options that are its fields. The help of an
     argument, and after a colon what stands for its value, are in the docstring of the function or
@@ -80,7 +84,7 @@ def command(name: str, rank: int, example: str) -> Callable[[F], F]:
     """
 
     def declare(function: F) -> F:
-        _COMMANDS[name] = Command(name, rank, example, _bound(function))
+        _COMMANDS[name] = Command(name, rank, example, _bound(function, kept))
         return function
 
     return declare
@@ -94,37 +98,56 @@ def commands() -> list[Command]:
     return sorted(_COMMANDS.values(), key=lambda command: command.rank)
 
 
-def _bound(function: Callable[..., None]) -> Callable[..., None]:
+@dataclass(frozen=True)
+class Printing:
+    """Options of every command.
+
+    Parameters
+    ----------
+    as_json
+        Print one JSON object, and nothing else.
+    quiet
+        Show no progress.
+    """
+
+    as_json: Annotated[bool, typer.Option("--json")] = False
+    quiet: Annotated[bool, typer.Option("--quiet", "-q")] = False
+
+    def run(self, function: Callable[..., Result], kept: str, given: Mapping[str, Any]) -> None:
+        """Run a command with what it takes, and print its result."""
+        taken = inspect.signature(function).parameters
+        staged = stages(self.quiet) if "progress" in taken else nullcontext()
+        with interruptible(kept.format(**given)) as interrupts, staged as progress:
+            session = {"progress": progress, "interrupts": interrupts}
+            known = {**given, **vars(self), **session}
+            result = function(**{name: known[name] for name in taken})
+        result.show(self.as_json)
+
+
+def _bound(function: Callable[..., Result], kept: str) -> Callable[..., None]:
     """Return the function as Typer takes it: fields in place of dataclasses, each with its help."""
     summary, documented = _documented(function.__doc__)
+    taken = inspect.signature(function, eval_str=True).parameters
     groups: dict[str, type] = {}
-    parameters = []
-    for parameter in inspect.signature(function, eval_str=True).parameters.values():
-        kind = parameter.annotation
+    parameters: list[inspect.Parameter] = []
+    kinds = {name: parameter.annotation for name, parameter in taken.items()}
+    for name, kind in (kinds | {"printing": Printing}).items():
         if isinstance(kind, type) and is_dataclass(kind):
-            groups[parameter.name] = kind
-            hints = get_type_hints(kind, include_extras=True)
+            groups[name] = kind
             for base in kind.__mro__:
                 documented = _documented(base.__doc__)[1] | documented
-            parameters += [
-                parameter.replace(name=each.name, default=each.default, annotation=hints[each.name])
-                for each in fields(kind)
-            ]
-        else:
-            parameters.append(parameter)
+            parameters += inspect.signature(kind, eval_str=True).parameters.values()
+        elif name not in ("as_json", "quiet", "progress", "interrupts"):
+            parameters.append(taken[name])
 
-    def call(**given: object) -> None:
+    def call(**given: Any) -> None:
         for name, kind in groups.items():
             given[name] = kind(**{field.name: given.pop(field.name) for field in fields(kind)})
-        function(**given)
+        given.pop("printing").run(function, kept, given)
 
     documented = _documented(__doc__)[1] | documented
-    call.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-        [
-            _declared(parameter, *documented.get(parameter.name, ("", "")))
-            for parameter in parameters
-        ]
-    )
+    declared = [_declared(each, *documented.get(each.name, ("", ""))) for each in parameters]
+    call.__signature__ = inspect.Signature(declared)  # type: ignore[attr-defined]
     call.__doc__ = summary
     return call
 
@@ -157,22 +180,30 @@ def _documented(docstring: str | None) -> tuple[str, dict[str, tuple[str, str]]]
     return summary, {name: (metavar, " ".join(said.split())) for name, metavar, said in entries}
 
 
-SceneFile = Path
-HistoryFile = Path
 OutputFile = Annotated[Path, typer.Option("-o", "--output", metavar="FILE")]
 OutputFolder = Annotated[Path, typer.Option("-o", "--output", metavar="DIR")]
 OldLikelihood = Annotated[bool | None, typer.Option("--trajectories/--transitions", hidden=True)]
 Seed = Annotated[int, typer.Option(min=0)]
 Count = Annotated[int, typer.Option(min=1)]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q")]
-AsJson = Annotated[bool, typer.Option("--json")]
-Overwrite = bool
-Columns = list[str] | None
-Units = list[str] | None
 
 
 @dataclass(frozen=True)
-class Reading:
+class Columns:
+    """Options of each command that reads a recording's columns."""
+
+    columns: list[str] | None = None
+    units: list[str] | None = None
+
+    def layout(self) -> dict[str, Any]:
+        """Return arguments of `History.load`: names, or numbers, and units of columns."""
+        return {
+            "columns": pairs(self.columns, "--columns", "x=pos_x", _number_or_name),
+            "units": pairs(self.units, "--units", "x=mm", str),
+        }
+
+
+@dataclass(frozen=True)
+class Reading(Columns):
     """Options of each command that reads a recording.
 
     Each is in place of what the scene file's ``[recording]`` says.
@@ -186,8 +217,6 @@ class Reading:
         stop.
     """
 
-    columns: list[str] | None = None
-    units: list[str] | None = None
     estimate_velocities: bool = False
     trim: bool = False
     effect_file: list[Path] | None = None
@@ -198,8 +227,7 @@ class Reading:
     def settings(self, **others: Any) -> dict[str, Any]:
         """Return arguments of `history.read_recording`: what the options say, and others."""
         flags = {"estimate_velocities": self.estimate_velocities, "trim": self.trim}
-        read = {"columns": columns_of(self.columns), "units": units_of(self.units)}
-        return read | flags | others
+        return self.layout() | flags | others
 
     def catalogue(self) -> tuple[Effect, ...]:
         """Return the catalogue and after it the effects of effect files."""
@@ -286,16 +314,6 @@ def given(**values: Any) -> dict[str, Any]:
 def noise_of(texts: list[str] | None) -> dict[str, float]:
     """Return standard deviations by state dimension from ``--noise``."""
     return pairs(texts, "--noise", "x=0.002", float)
-
-
-def columns_of(texts: list[str] | None) -> dict[str, str | float]:
-    """Return column names, or numbers, from options such as ``x=pos_x,force_x=0``."""
-    return pairs(texts, "--columns", "x=pos_x", _number_or_name)
-
-
-def units_of(texts: list[str] | None) -> dict[str, str]:
-    """Return units from options such as ``x=mm,theta=deg``."""
-    return pairs(texts, "--units", "x=mm", str)
 
 
 def _number_or_name(text: str) -> str | float:

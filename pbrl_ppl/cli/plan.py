@@ -5,17 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import typer
-
 from pbrl_ppl.cli import effect_files, options
 from pbrl_ppl.cli.options import command
-from pbrl_ppl.cli.terminal import FAILED, check_file, interruptible, print_result, stages
+from pbrl_ppl.cli.terminal import FAILED, Progress, Result, check_file
 from pbrl_ppl.errors import EffectError, GoalError
 
 
 @command("plan", 10, "pbrl-ppl plan cart.nc --start -2,0,0 --goal 2,1,1.57 -o plan.csv")
 def plan(
     posterior: Path,
+    progress: Progress,
     start: list[str] | None = None,
     goal: list[str] | None = None,
     output: options.OutputFile | None = None,
@@ -34,9 +33,7 @@ def plan(
     seed: options.Seed = 1,
     animate: Path | None = None,
     overwrite: bool = False,
-    as_json: options.AsJson = False,
-    quiet: options.Quiet = False,
-) -> None:
+) -> Result:
     """Plan from a start to a goal with a posterior file alone.
 
     Parameters
@@ -70,60 +67,57 @@ def plan(
     animate : FILE
         Show the plan as a picture that moves (.gif).
     """
-    with interruptible(), stages(quiet) as progress:
-        if output is None and animate is None:
-            raise GoalError("plan: say where it should be written: -o plan.csv")
-        for path, ending in ((output, ".csv"), (animate, ".gif")):
-            if path is not None:
-                check_file(path, (ending,), overwrite)
-        catalogue = effect_files.with_catalogue(effect_file)
-        progress("reading the posterior")
-        from pbrl_ppl.planning import ActionSet, Goal
-        from pbrl_ppl.planning import plan as make_plan
-        from pbrl_ppl.posterior import load_posterior, scene_of
+    if output is None and animate is None:
+        raise GoalError("plan: say where it should be written: -o plan.csv")
+    for path, ending in ((output, ".csv"), (animate, ".gif")):
+        if path is not None:
+            check_file(path, (ending,), overwrite)
+    catalogue = effect_files.with_catalogue(effect_file)
+    progress("reading the posterior")
+    from pbrl_ppl.planning import ActionSet, Goal
+    from pbrl_ppl.planning import plan as make_plan
+    from pbrl_ppl.posterior import load_posterior, scene_of
 
-        idata = load_posterior(posterior)
-        bodies = [body.name for body in scene_of(idata).dynamic]
-        weights = options.given(
-            tolerance=tolerance, angle_tolerance=angle_tolerance, contact_penalty=contact_penalty
-        )
-        if goal and goal[0].endswith(".toml"):
-            if len(goal) > 1 or weights:
-                raise GoalError("--goal: a file has the whole goal; drop the other options of it")
-            wanted = Goal.load(goal[0])
-        else:
-            targets = dict(options.pose(text, bodies, "--goal") for text in goal or ())
-            wanted = Goal.of(targets, **weights)
-        starts = options.starts_of(start, bodies)
-        allowed = None if actions is None else ActionSet.load(actions)
-        if weight is not None and method != "astar":
-            raise GoalError(f"--weight: it is for astar, not --method {method}; leave it out")
-        progress("planning")
-        result = make_plan(
-            idata, starts, wanted, allowed, method=method, draws=draws, tail=tail, noise=noise,
-            seconds=seconds, effects=catalogue, seed=seed, progress=progress,
-            **options.given(nodes=nodes, weight=weight),
-        )  # fmt: skip
-        if output is not None:
-            result.save(output)
-        if animate is not None:
-            progress("drawing")
-            from pbrl_ppl.reporting import animate_plan
+    idata = load_posterior(posterior)
+    bodies = [body.name for body in scene_of(idata).dynamic]
+    weights = options.given(
+        tolerance=tolerance, angle_tolerance=angle_tolerance, contact_penalty=contact_penalty
+    )
+    if goal and goal[0].endswith(".toml"):
+        if len(goal) > 1 or weights:
+            raise GoalError("--goal: a file has the whole goal; drop the other options of it")
+        wanted = Goal.load(goal[0])
+    else:
+        targets = dict(options.pose(text, bodies, "--goal") for text in goal or ())
+        wanted = Goal.of(targets, **weights)
+    starts = options.starts_of(start, bodies)
+    allowed = None if actions is None else ActionSet.load(actions)
+    if weight is not None and method != "astar":
+        raise GoalError(f"--weight: it is for astar, not --method {method}; leave it out")
+    progress("planning")
+    result = make_plan(
+        idata, starts, wanted, allowed, method=method, draws=draws, tail=tail, noise=noise,
+        seconds=seconds, effects=catalogue, seed=seed, progress=progress,
+        **options.given(nodes=nodes, weight=weight),
+    )  # fmt: skip
+    if output is not None:
+        result.save(output)
+    if animate is not None:
+        progress("drawing")
+        from pbrl_ppl.reporting import animate_plan
 
-            animate_plan(result, animate)
+        animate_plan(result, animate)
     written = [path for path in (output, animate) if path is not None]
     words = result.in_words()
-    facts = {"reached": result.reached, "duration": result.duration, "words": words}
-    print_result(
-        as_json, facts | {"written": written}, [words, *(f"plan: {path}" for path in written)]
-    )
-    if not result.reached:
-        raise typer.Exit(FAILED)
+    contents = {"reached": result.reached, "duration": result.duration, "words": words}
+    shown = [words, *(f"plan: {path}" for path in written)]
+    return Result(contents | {"written": written}, shown, 0 if result.reached else FAILED)
 
 
 @command("suggest", 7, "pbrl-ppl suggest report/after.nc --start 0,0,0 -o next.csv")
 def suggest(
     posterior: Path,
+    progress: Progress,
     start: list[str] | None = None,
     output: options.OutputFile | None = None,
     effect: list[str] | None = None,
@@ -135,9 +129,7 @@ def suggest(
     effect_file: list[Path] | None = None,
     seed: options.Seed = 1,
     overwrite: bool = False,
-    as_json: options.AsJson = False,
-    quiet: options.Quiet = False,
-) -> None:
+) -> Result:
     """Suggest the actions that tell apart effects which the data so far cannot separate.
 
     Parameters
@@ -160,51 +152,46 @@ def suggest(
     draws
         Posterior draws of each effect's model.
     """
-    with interruptible(), stages(quiet) as progress:
-        if output is None:
-            raise GoalError("suggest: say where it should be written: -o next.csv")
-        if bounds and actions is not None:
-            raise GoalError("suggest: --bounds and --actions both say what is allowed; drop one")
-        check_file(output, (".csv",), overwrite)
-        catalogue = effect_files.with_catalogue(effect_file)
-        progress("reading the posterior")
-        from pbrl_ppl.criticism import kept_groups
-        from pbrl_ppl.planning import ActionSet, suggest_actions
-        from pbrl_ppl.posterior import load_posterior, scene_of
+    if output is None:
+        raise GoalError("suggest: say where it should be written: -o next.csv")
+    if bounds and actions is not None:
+        raise GoalError("suggest: --bounds and --actions both say what is allowed; drop one")
+    check_file(output, (".csv",), overwrite)
+    catalogue = effect_files.with_catalogue(effect_file)
+    progress("reading the posterior")
+    from pbrl_ppl.criticism import kept_groups
+    from pbrl_ppl.planning import ActionSet, suggest_actions
+    from pbrl_ppl.posterior import load_posterior, scene_of
 
-        idata = load_posterior(posterior)
-        if len(effect or ()) < 2 and (effect or not kept_groups(idata)):
-            why = f"{posterior} names no effects that its data cannot separate"
-            why = f"got --effect '{effect[0]}' alone" if effect else why
-            raise EffectError(
-                f"suggest: {why}; name two or more, such as --effect linear_drag --effect"
-                " quadratic_drag"
-            )
-        bodies = [body.name for body in scene_of(idata).dynamic]
-        starts = options.starts_of(start, bodies)
-        allowed = _bounds(bounds, bodies) if bounds else None
-        result = suggest_actions(
-            idata, starts, allowed if actions is None else ActionSet.load(actions),
-            effects=effect, steps=steps, hold=hold, draws=draws, seed=seed, catalogue=catalogue,
-            progress=progress,
-        )  # fmt: skip
-        result.to_csv(output)
-    print_result(
-        as_json,
-        {
-            "effects": [str(name) for name in result.separation["true"].values],
-            "expected_log_bayes_factor": result.expected,
-            "separation": result.separation.values,
-            "at_random": result.at_random,
-            "decisive": result.decisive,
-            "meeting": result.meeting,
-            "sentences": result.sentences,
-            "written": [output],
-        },
-        [*result.sentences, f"experiment: {output}"],
-    )
-    if not result.decisive:
-        raise typer.Exit(FAILED)
+    idata = load_posterior(posterior)
+    if len(effect or ()) < 2 and (effect or not kept_groups(idata)):
+        why = f"{posterior} names no effects that its data cannot separate"
+        why = f"got --effect '{effect[0]}' alone" if effect else why
+        raise EffectError(
+            f"suggest: {why}; name two or more, such as --effect linear_drag --effect"
+            " quadratic_drag"
+        )
+    bodies = [body.name for body in scene_of(idata).dynamic]
+    starts = options.starts_of(start, bodies)
+    allowed = _bounds(bounds, bodies) if bounds else None
+    result = suggest_actions(
+        idata, starts, allowed if actions is None else ActionSet.load(actions),
+        effects=effect, steps=steps, hold=hold, draws=draws, seed=seed, catalogue=catalogue,
+        progress=progress,
+    )  # fmt: skip
+    result.to_csv(output)
+    contents = {
+        "effects": [str(name) for name in result.separation["true"].values],
+        "expected_log_bayes_factor": result.expected,
+        "separation": result.separation.values,
+        "at_random": result.at_random,
+        "decisive": result.decisive,
+        "meeting": result.meeting,
+        "sentences": result.sentences,
+        "written": [output],
+    }
+    shown = [*result.sentences, f"experiment: {output}"]
+    return Result(contents, shown, 0 if result.decisive else FAILED)
 
 
 def _bounds(texts: Sequence[str], bodies: Sequence[str]) -> dict[str, dict[str, list[float]]]:

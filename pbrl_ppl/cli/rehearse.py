@@ -10,7 +10,7 @@ import typer
 
 from pbrl_ppl.cli import options
 from pbrl_ppl.cli.options import command
-from pbrl_ppl.cli.terminal import check_file, interruptible, print_json, print_table, stages
+from pbrl_ppl.cli.terminal import Progress, Result, check_file, sizes, table
 from pbrl_ppl.files import json_values, write_text
 
 if TYPE_CHECKING:
@@ -21,14 +21,13 @@ if TYPE_CHECKING:
 def rehearse(
     scene: Path,
     reading: options.SceneReading,
+    progress: Progress,
     commands: Annotated[Path | None, typer.Argument()] = None,
     output: options.OutputFile | None = None,
     given: Annotated[list[str] | None, typer.Option("--set")] = None,
     seed: options.Seed = 0,
     overwrite: bool = False,
-    as_json: options.AsJson = False,
-    quiet: options.Quiet = False,
-) -> None:
+) -> Result:
     """Find out before a recording is made which laws it would name, and from which size on.
 
     The declared model is simulated with the commands and with measurement noise, and each law of
@@ -44,54 +43,50 @@ def rehearse(
         A declared parameter (SI units): mass=8 for all bodies, or 'mass[cart]=8'; repeat. The
         prior's centre if not given.
     """
-    with interruptible(), stages(quiet) as progress:
-        if output is not None:
-            check_file(output, (".json", ".csv", ".parquet", ".nc"), overwrite)
-        values = options.pairs(given, "--set", "mass=8", float)
-        progress("reading the scene and the commands")
-        declared, histories = reading.read(scene, [] if commands is None else [commands])
-        catalogue = reading.catalogue()
-        progress("loading the model")
-        from pbrl_ppl import criticism
-        from pbrl_ppl.posterior import versions
+    if output is not None:
+        check_file(output, (".json", ".csv", ".parquet", ".nc"), overwrite)
+    values = options.pairs(given, "--set", "mass=8", float)
+    progress("reading the scene and the commands")
+    declared, histories = reading.read(scene, [] if commands is None else [commands])
+    catalogue = reading.catalogue()
+    progress("loading the model")
+    from pbrl_ppl import criticism
+    from pbrl_ppl.posterior import versions
 
-        found = criticism.rehearse(
-            declared, *histories, parameters=values, catalogue=catalogue, seed=seed,
-            progress=progress,
-        )  # fmt: skip
-        contents = {key: value for key, value in vars(found).items() if key != "history"}
-        contents = {"versions": versions(), **contents}
-        if output is not None and output.suffix == ".json":
-            write_text(output, json.dumps(json_values(contents), indent=1, allow_nan=False) + "\n")
-        elif output is not None:
-            found.history.save(output)
-    if as_json:
-        print_json(contents)
-        return
+    found = criticism.rehearse(
+        declared, *histories, parameters=values, catalogue=catalogue, seed=seed,
+        progress=progress,
+    )  # fmt: skip
+    contents = {key: value for key, value in vars(found).items() if key != "history"}
+    contents = {"versions": versions(), **contents}
+    if output is not None and output.suffix == ".json":
+        write_text(output, json.dumps(json_values(contents), indent=1, allow_nan=False) + "\n")
+    elif output is not None:
+        found.history.save(output)
     noise = ", ".join(f"{name} {sd:.2g}" for name, sd in found.noise.items())
-    print_table(
+    columns = {"law": "<", "body": "<", "named from": "<", "of typical": "", "named as": "<"}
+    laws = table(
         f"laws that a recording would show; measurement noise (SI): {noise}",
-        ["law", "<body", "<named from", "of typical", "<named as", "<confounded with", "<note"],
+        columns | {"confounded with": "<", "note": "<"},
         (_row(law) for law in found.laws if law.named),
     )
-    for why in dict.fromkeys(law.note for law in found.laws if not law.named):
-        unseen = (law for law in found.laws if law.note == why and not law.named)
-        names = ", ".join(f"{law.effect} on {law.body}" for law in unseen)
-        typer.echo(f"unseen, {why}: {names}")
-    if output is not None:
-        typer.echo(f"written: {output}")
+    unseen: dict[str, list[str]] = {}
+    for law in found.laws:
+        if not law.named:
+            unseen.setdefault(law.note, []).append(f"{law.effect} on {law.body}")
+    lines = [f"unseen, {why}: {', '.join(names)}" for why, names in unseen.items()]
+    lines += [f"written: {output}"] if output is not None else []
+    return Result(contents, [laws, *lines])
 
 
 def _row(law: RehearsedLaw) -> list[str]:
     """Return a law's row of the table."""
-    sizes = [
-        f"{name} {f'{law.null[name]:g} ± ' if law.null[name] and name in law.sizes else ''}"
-        f"{size:.3g} {law.units[name].removesuffix('1')}".rstrip()
-        for name, size in (*law.sizes.items(), *law.levels.items())
-    ]
+    null = {name: f"{law.null[name]:g} ± " for name in law.sizes if law.null[name]}
+    numbers = [(name, f"{null.get(name, '')}{size:.3g}") for name, size in law.sizes.items()]
+    numbers += [(name, f"{null.get(name, '')}{size:.3g}") for name, size in law.levels.items()]
     typical = f"{100 * law.share:.2g} %" if law.sizes else ""
     named = law.named if law.named != law.effect else ""
     return [
-        law.effect, law.body, ", ".join(sizes), typical, named,
+        law.effect, law.body, sizes(numbers, law.units), typical, named,
         ", ".join(law.confounded), law.note,
     ]  # fmt: skip

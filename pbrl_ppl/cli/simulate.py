@@ -11,7 +11,7 @@ import typer
 
 from pbrl_ppl.cli import options
 from pbrl_ppl.cli.options import command
-from pbrl_ppl.cli.terminal import check_file, interruptible, print_result, stages
+from pbrl_ppl.cli.terminal import Progress, Result, check_file
 from pbrl_ppl.errors import ParameterError, PosteriorError
 from pbrl_ppl.state import STATE, Floats
 
@@ -28,14 +28,13 @@ def simulate(
     history: Path,
     output: options.OutputFile,
     reading: options.PosteriorReading,
+    progress: Progress,
     given: Annotated[list[str] | None, typer.Option("--set")] = None,
     draws: options.Count | None = None,
     noise: list[str] | None = None,
     seed: options.Seed = 1,
     overwrite: bool = False,
-    as_json: options.AsJson = False,
-    quiet: options.Quiet = False,
-) -> None:
+) -> Result:
     """Simulate a recording: its start states and wrenches, under parameters that are given.
 
     Each trajectory is followed from its first complete state to its end. With --noise, measurement
@@ -52,32 +51,28 @@ def simulate(
     draws
         Posterior draws, a copy of each trajectory for each; else MAP.
     """
-    with interruptible(), stages(quiet) as progress:
-        check_file(output, (".csv", ".parquet", ".nc"), overwrite)
-        values = options.pairs(given, "--set", "mass=8", float)
-        errors = options.noise_of(noise)
-        progress("reading the parameters and the history")
-        catalogue = reading.catalogue()
-        physics, phi = _parameters(source, values, draws, seed, catalogue)
-        scene = physics.scene
-        scene.replace(noise=errors)  # raises where the noise is invalid
-        recorded = reading.recording(history, scene)
-        progress("simulating")
-        from pbrl_ppl.physics import simulated_recording
+    check_file(output, (".csv", ".parquet", ".nc"), overwrite)
+    values = options.pairs(given, "--set", "mass=8", float)
+    errors = options.noise_of(noise)
+    progress("reading the parameters and the history")
+    catalogue = reading.catalogue()
+    physics, phi = _parameters(source, values, draws, seed, catalogue)
+    scene = physics.scene
+    scene.replace(noise=errors)  # raises where the noise is invalid
+    recorded = reading.recording(history, scene)
+    progress("simulating")
+    from pbrl_ppl.physics import simulated_recording
 
-        simulated = simulated_recording(physics, phi, recorded)
-        result = _history(recorded, simulated, errors, seed, labelled=draws is not None)
-        result.save(output)
-    print_result(
-        as_json,
-        {
-            "history": output,
-            "trajectories": result.n_trajectories,
-            "transitions": result.n_transitions,
-            "parameters": dict(zip(physics.layout.labels, phi.T, strict=True)),
-        },
-        [f"history: {output} ({result.n_trajectories} trajectories)"],
-    )
+    simulated = simulated_recording(physics, phi, recorded)
+    result = _history(recorded, simulated, errors, seed, labelled=draws is not None)
+    result.save(output)
+    contents = {
+        "history": output,
+        "trajectories": result.n_trajectories,
+        "transitions": result.n_transitions,
+        "parameters": dict(zip(physics.layout.labels, phi.T, strict=True)),
+    }
+    return Result(contents, [f"history: {output} ({result.n_trajectories} trajectories)"])
 
 
 def _parameters(

@@ -12,6 +12,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -29,9 +30,12 @@ from pbrl_ppl.files import json_values
 #: shells report it.
 FAILED, BAD_INPUT, UNDECIDED, INTERRUPTED = 1, 2, 3, 130
 
+#: Takes the name of a stage that begins.
+Progress = Callable[[str], None]
+
 
 @contextmanager
-def stages(quiet: bool) -> Iterator[Callable[[str], None]]:
+def stages(quiet: bool) -> Iterator[Progress]:
     """Show stages on stderr with the time elapsed; a terminal also shows the running stage."""
     console = Console(stderr=True, quiet=quiet, highlight=False, markup=False)
     running = Status()
@@ -132,37 +136,59 @@ def noted_warnings(hidden: str | None = None) -> Iterator[list[Warning]]:
         yield noted
 
 
-def print_json(contents: Mapping[str, Any]) -> None:
-    """Print one JSON object; numbers that are not finite become null."""
-    typer.echo(json.dumps(json_values(contents), indent=1, allow_nan=False))
+@dataclass(frozen=True)
+class Result:
+    """What a command prints at its end: one JSON object, or lines of text and tables.
 
-
-def print_result(as_json: bool, contents: Mapping[str, Any], lines: Iterable[str]) -> None:
-    """Print the result of a command: one JSON object, or lines of text."""
-    if as_json:
-        print_json(contents)
-    else:
-        typer.echo("\n".join(lines))
-
-
-def print_table(
-    title: str | None, columns: Sequence[str], rows: Iterable[Sequence[str]], *, wide: int = 160
-) -> None:
-    """Print a table; its first column, and those whose name begins with <, are text.
-
-    ``wide``: width of a page where there is no terminal.
+    Parameters
+    ----------
+    contents : mapping of str to object
+        The JSON object; numbers that are not finite become null.
+    shown : iterable of str or Table
+        Lines and tables for people.
+    code : int
+        Exit code.
+    warning : str
+        A last line on stderr.
     """
-    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
-    for i, name in enumerate(columns):
-        left = i == 0 or name.startswith("<")
-        table.add_column(
-            name.removeprefix("<"), justify="left" if left else "right", no_wrap=not left
-        )
+
+    contents: Mapping[str, Any]
+    shown: Iterable[str | Table]
+    code: int = 0
+    warning: str = ""
+
+    def show(self, as_json: bool) -> None:
+        """Print the result, and end the command with its exit code."""
+        if as_json:
+            typer.echo(json.dumps(json_values(self.contents), indent=1, allow_nan=False))
+        # a file or a pipe has no width
+        console = Console(highlight=False, markup=False, width=None if sys.stdout.isatty() else 160)
+        for each in () if as_json else self.shown:
+            if isinstance(each, Table):
+                console.print(each)
+            else:
+                typer.echo(each)
+        if self.warning:
+            typer.echo(self.warning, err=True)
+        if self.code:
+            raise typer.Exit(self.code)
+
+
+def table(title: str | None, columns: Mapping[str, str], rows: Iterable[Sequence[Any]]) -> Table:
+    """Return a table whose columns have a format each; those that begin with < are text."""
+    made = Table(title=title, title_justify="left", box=None, pad_edge=False)
+    for name, form in columns.items():
+        left = form.startswith("<")
+        made.add_column(name, justify="left" if left else "right", no_wrap=not left)
     for row in rows:
-        table.add_row(*row)
-    # a file or a pipe has no width
-    width = None if sys.stdout.isatty() else wide
-    Console(highlight=False, markup=False, width=width).print(table)
+        made.add_row(*(f"{each:{form}}" for each, form in zip(row, columns.values(), strict=True)))
+    return made
+
+
+def sizes(numbers: Iterable[tuple[str, str]], units: Mapping[str, str]) -> str:
+    """Return numbers by name with their units, of which "1" is none."""
+    each = (f"{name} {text} {units[name].removesuffix('1')}" for name, text in numbers)
+    return ", ".join(map(str.rstrip, each))
 
 
 def check_file(path: Path, endings: tuple[str, ...], overwrite: bool) -> None:
@@ -182,7 +208,7 @@ def check_file(path: Path, endings: tuple[str, ...], overwrite: bool) -> None:
     if not path.parent.is_dir():
         raise OutputError(f"{path}: there is no folder {path.parent}; make it, or choose another")
     try:
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.stem}."):
+        with tempfile.TemporaryFile(dir=path.parent):
             pass
     except OSError as error:
         raise OutputError(
@@ -198,12 +224,10 @@ def check_can_make(folder: Path) -> None:
     OutputError
         If it cannot.
     """
-    made: list[Path] = []
+    missing: list[Path] = []
     try:
-        for place in reversed((folder, *folder.parents)):
-            if not place.exists():
-                place.mkdir()
-                made.append(place)
+        missing += [place for place in (folder, *folder.parents) if not place.exists()]
+        folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
     except (NotADirectoryError, FileExistsError):
@@ -214,6 +238,6 @@ def check_can_make(folder: Path) -> None:
             " another path"
         ) from None
     finally:
-        with contextlib.suppress(OSError):
-            for place in reversed(made):
+        for place in missing:
+            with contextlib.suppress(OSError):
                 place.rmdir()
