@@ -58,6 +58,7 @@ def check(
     check_history(declared, loaded, loaded.segments(1))
     contents, missing = _contents(declared, loaded), _missing(loaded)
     unused = histories.unused_velocities(loaded)
+    # shown at once: the prior's draws take long
     console = Console(highlight=False, quiet=as_json)
     listed = Table(show_header=False, box=None)
     for row in contents.items():
@@ -265,11 +266,9 @@ def doctor(progress: Progress) -> Result:
     facts["threads"] = {"processors": _processors(), **threads}
     facts["package"] = str(Path(__file__).parents[1])
     wrong = facts["engine"]["difference"] > 1e-9  # the paths agree to rounding
-    contents, shown = facts | {"ok": not wrong}, _doctor_lines(facts)
-    if not wrong:
-        return Result(contents, shown)
-    error = "error: the compiled engine loop is wrong here; please report this"
-    return Result(contents, shown, FAILED, error)
+    error = "error: the compiled engine loop is wrong here; please report this" if wrong else ""
+    code = FAILED if wrong else 0
+    return Result(facts | {"ok": not wrong}, _doctor_lines(facts), code, error)
 
 
 def _processors() -> int:

@@ -10,17 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pbrl_ppl.cli import options
+from pbrl_ppl.cli import options, terminal
 from pbrl_ppl.cli.new import models_folder
 from pbrl_ppl.cli.options import command
-from pbrl_ppl.cli.terminal import (
-    INTERRUPTED,
-    UNDECIDED,
-    Progress,
-    Result,
-    check_can_make,
-    interrupted,
-)
+from pbrl_ppl.cli.terminal import Progress, Result
 
 if TYPE_CHECKING:
     from pbrl_ppl.criticism import Loop
@@ -81,7 +74,7 @@ def close_loop(
     learn_remainder
         Where something stays unexplained, learn a force for it, into remainder.nc; it gets no name.
     """
-    check_can_make(output)  # before the long work, which would be lost
+    terminal.check_can_make(output)  # before the long work, which would be lost
     progress("reading the scene and the histories")
     paths = [train] if test is None else [train, test]
     declared, histories = reading.read(scene, paths)
@@ -99,14 +92,13 @@ def close_loop(
     files = str(scene), str(train), str(test or "")
     source = report.Source(*files, options.command_line(context))
     loop.save(output, overwrite, page=report.render(loop, source))
-    remainder = _remainder(loop, output, source, seed, progress) if learn_remainder else {}
-    words = remainder["learned_remainder"]["words"] if remainder else ""
-    undecided = UNDECIDED if loop.verdict == criticism.NOT_CONVERGED else 0
-    return Result(
-        loop.to_dict() | {"report": output / "report.html"} | remainder,
-        report.in_brief(loop, output, words),
-        INTERRUPTED if stopped else undecided,
-    )
+    contents, words = loop.to_dict() | {"report": output / "report.html"}, ""
+    if learn_remainder:
+        words, path = _remainder(loop, output, source, seed, progress)
+        contents["learned_remainder"] = {"words": words, "posterior": path}
+    undecided = terminal.UNDECIDED if loop.verdict == criticism.NOT_CONVERGED else 0
+    code = terminal.INTERRUPTED if stopped else undecided
+    return Result(contents, report.in_brief(loop, output, words), code)
 
 
 def _finished(
@@ -134,13 +126,16 @@ def _finished(
     except KeyboardInterrupt:
         so_far = f"so far: {'; '.join(names)}; " if names else ""
         advice = "--method laplace, fewer rows or a coarser log take less time"
-        raise typer.Exit(interrupted(f"nothing was written; {so_far}{advice}")) from None
+        raise typer.Exit(terminal.interrupted(f"nothing was written; {so_far}{advice}")) from None
 
 
 def _remainder(
     loop: Loop, folder: Path, source: Source, seed: int, progress: Progress
-) -> dict[str, dict[str, Any]]:
-    """Learn a force for the residual and save it with the results, or return why there is none."""
+) -> tuple[str, Path | None]:
+    """Learn a force for the residual and save it with the results.
+
+    Returns what it does, or why there is none, and its file.
+    """
     from pbrl_ppl.errors import FitError
     from pbrl_ppl.reporting import render
 
@@ -149,10 +144,10 @@ def _remainder(
     try:
         loop = replace(loop, remainder=loop.learn_remainder(seed=seed, progress=progress))
     except FitError as error:
-        return {"learned_remainder": {"words": str(error), "posterior": None}}
+        return str(error), None
     progress("writing the report with it")
     loop.save(folder, overwrite=True, page=render(loop, source))
-    return {"learned_remainder": {"words": loop.remainder_words, "posterior": path}}
+    return loop.remainder_words, path
 
 
 @command("demo", 0, "pbrl-ppl demo")

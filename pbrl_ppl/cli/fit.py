@@ -10,18 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.table import Table
 
-from pbrl_ppl.cli import options
+from pbrl_ppl.cli import options, terminal
 from pbrl_ppl.cli.options import command
-from pbrl_ppl.cli.terminal import (
-    INTERRUPTED,
-    UNDECIDED,
-    Progress,
-    Result,
-    check_file,
-    noted_warnings,
-    stages,
-    table,
-)
+from pbrl_ppl.cli.terminal import Progress, Result, check_file
 from pbrl_ppl.errors import ConvergenceWarning, FitError, LinearisationWarning, PosteriorError
 from pbrl_ppl.files import write_text
 
@@ -88,7 +79,7 @@ def fit(
     resume : FILE
         Go on with this posterior: its chains, or more draws.
     """
-    with stages(quiet) as progress:
+    with terminal.stages(quiet) as progress:
         check_file(output, (".nc",), overwrite)
         if trajectories is not None:  # older spellings
             likelihood = "trajectories" if trajectories else "transitions"
@@ -116,7 +107,7 @@ def fit(
         except ValueError as error:  # an option that the model refuses
             raise FitError(f"fit: {error}") from None
     # the sampler shows its own progress
-    with noted_warnings("was interrupted") as caught, redirect_stdout(sys.stderr):
+    with terminal.noted_warnings("was interrupted") as caught, redirect_stdout(sys.stderr):
         idata = sampling.fit(
             model, method=method, seed=seed, draws=draws, tune=tune, chains=chains, thin=thin,
             resume=earlier, progress=not quiet,
@@ -134,19 +125,19 @@ def fit(
         "warnings": list(record.warnings or ()),
     }
     formats = {str(name): _DIGITS.get(str(name), ".4g") for name in rows.columns}
-    listed = table(None, {"parameter": "<"} | formats, rows.itertuples(name=None))
+    listed = terminal.table(None, {"parameter": "<"} | formats, rows.itertuples(name=None))
     shown: list[str | Table] = [listed]
     if any(isinstance(warning, LinearisationWarning) for warning in caught):
         shown += ["intervals: not to be trusted, the likelihood does not hold (warning above)"]
     shown += [f"posterior: {output}"]
     if not interrupts and record.interrupted is None:
-        return Result(contents, shown, UNDECIDED if undecided else 0)
+        return Result(contents, shown, terminal.UNDECIDED if undecided else 0)
     kept = group(idata, "posterior").sizes
     warning = (
         f"interrupted; {kept['draw']} draws of each of {kept['chain']} chains are kept in"
         f" {output}; --resume {output} goes on"
     )
-    return Result(contents, shown, INTERRUPTED, warning)
+    return Result(contents, shown, terminal.INTERRUPTED, warning)
 
 
 def _summary(idata: Idata) -> pd.DataFrame:
@@ -156,9 +147,9 @@ def _summary(idata: Idata) -> pd.DataFrame:
 
     if PosteriorRecord.of(idata).max_rhat is None:
         return scalars(idata).mean().to_array().to_series().to_frame("mean")
-    table = summary(idata)
-    table.insert(4, "ess", table[["ess_bulk", "ess_tail"]].min(axis=1))
-    return table.drop(columns=["ess_bulk", "ess_tail"])
+    rows = summary(idata)
+    rows.insert(4, "ess", rows[["ess_bulk", "ess_tail"]].min(axis=1))
+    return rows.drop(columns=["ess_bulk", "ess_tail"])
 
 
 @command("update", 9, "pbrl-ppl update cart.nc since.csv -o new.nc")
@@ -190,11 +181,12 @@ def update(
     from pbrl_ppl import posterior as posteriors
 
     idata = posteriors.load_posterior(posterior)
-    new = reading.recording(history, posteriors.scene_of(idata))
+    scene = posteriors.scene_of(idata)
+    new = reading.recording(history, scene, resample=reading.resample)
     progress("updating")
     from pbrl_ppl.sampling import updating
 
-    with noted_warnings() as caught:
+    with terminal.noted_warnings() as caught:
         idata = updating.update(idata, new, effects=catalogue, seed=seed, progress=False)
     record = posteriors.PosteriorRecord.of(idata)
     if record.interrupted is not None:  # half a posterior is no prior for the next update
@@ -207,7 +199,7 @@ def update(
     return Result(
         {**last, "posterior": output, "converged": converged},
         [f"{last['did']}: {last['transitions']} transitions{worth}", f"posterior: {output}"],
-        0 if converged else UNDECIDED,
+        0 if converged else terminal.UNDECIDED,
     )
 
 

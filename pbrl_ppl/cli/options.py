@@ -224,10 +224,16 @@ class Reading(Columns):
     def __post_init__(self) -> None:
         self.settings()  # bad usage is reported before any file is read
 
-    def settings(self, **others: Any) -> dict[str, Any]:
-        """Return arguments of `history.read_recording`: what the options say, and others."""
+    def settings(self) -> dict[str, Any]:
+        """Return arguments of `history.read_recording`."""
         flags = {"estimate_velocities": self.estimate_velocities, "trim": self.trim}
-        return self.layout() | flags | others
+        return self.layout() | flags
+
+    def recording(self, path: Path, scene: Scene, *, resample: bool) -> History:
+        """Return the history of a file."""
+        from pbrl_ppl.history import read_recording
+
+        return read_recording(path, scene, resample=resample, **self.settings())
 
     def catalogue(self) -> tuple[Effect, ...]:
         """Return the catalogue and after it the effects of effect files."""
@@ -250,12 +256,6 @@ class PosteriorReading(Reading):
     """
 
     resample: bool = False
-
-    def recording(self, path: Path, scene: Scene) -> History:
-        """Return the history of a file."""
-        from pbrl_ppl.history import read_recording
-
-        return read_recording(path, scene, **self.settings(resample=self.resample))
 
 
 @dataclass(frozen=True)
@@ -281,11 +281,10 @@ class SceneReading(Reading):
 
     def read(self, scene: Path, histories: Sequence[Path]) -> tuple[Scene, list[History]]:
         """Return the scene and its histories."""
-        from pbrl_ppl.history import read_recording, read_scene
+        from pbrl_ppl.history import read_scene
 
-        declared = read_scene(scene, **self.scene_settings())
-        settings = self.settings(resample=self.time_step is not None)
-        return declared, [read_recording(path, declared, **settings) for path in histories]
+        declared, resample = read_scene(scene, **self.scene_settings()), self.time_step is not None
+        return declared, [self.recording(each, declared, resample=resample) for each in histories]
 
 
 def command_line(context: typer.Context) -> str:

@@ -82,8 +82,8 @@ def rehearse(
 def _row(law: RehearsedLaw) -> list[str]:
     """Return a law's row of the table."""
     null = {name: f"{law.null[name]:g} ± " for name in law.sizes if law.null[name]}
-    numbers = [(name, f"{null.get(name, '')}{size:.3g}") for name, size in law.sizes.items()]
-    numbers += [(name, f"{null.get(name, '')}{size:.3g}") for name, size in law.levels.items()]
+    found = (*law.sizes.items(), *law.levels.items())
+    numbers = ((name, f"{null.get(name, '')}{size:.3g}") for name, size in found)
     typical = f"{100 * law.share:.2g} %" if law.sizes else ""
     named = law.named if law.named != law.effect else ""
     return [

@@ -59,7 +59,7 @@ def simulate(
     physics, phi = _parameters(source, values, draws, seed, catalogue)
     scene = physics.scene
     scene.replace(noise=errors)  # raises where the noise is invalid
-    recorded = reading.recording(history, scene)
+    recorded = reading.recording(history, scene, resample=reading.resample)
     progress("simulating")
     from pbrl_ppl.physics import simulated_recording
 
@@ -110,22 +110,20 @@ def _set(layout: Layout, phi: Floats, values: Mapping[str, float]) -> None:
     """Set values in parameter vectors, in place: by label, or by name for all bodies."""
     from pbrl_ppl.scene import nearest
 
+    labels = np.array(layout.labels)
+    names = np.array([label.partition("[")[0] for label in layout.labels])
     for name, value in values.items():
-        places = [i for i, label in enumerate(layout.labels) if name in (label, _bare(label))]
-        if not places:
-            known = [*dict.fromkeys(map(_bare, layout.labels)), *layout.labels]
+        places = (labels == name) | (names == name)
+        if not places.any():
+            known = [*dict.fromkeys(names.tolist()), *layout.labels]
             raise ParameterError(f'--set: there is no parameter "{name}"{nearest(name, known)}')
         phi[:, places] = value
-    missing = [layout.labels[i] for i in np.flatnonzero(np.isnan(phi).any(axis=0))]
-    if missing:
+    missing = labels[np.isnan(phi).any(axis=0)]
+    if len(missing):
         raise ParameterError(
             f"--set: no value for {', '.join(missing)}; give one, such as"
             f" --set '{missing[0]}=...', or in the scene (known = ...)"
         )
-
-
-def _bare(label: str) -> str:
-    return label.partition("[")[0]
 
 
 def _history(
@@ -136,16 +134,14 @@ def _history(
 
     from pbrl_ppl.history import History
 
-    rng = np.random.default_rng(seed)
     spread = np.array([errors.get(name, 0.0) for name in STATE])
     free = ~recorded.dataset["kinematic"].to_numpy()[:, None]
-    copies = []
-    for draw, simulated in enumerate(states):
-        measured = simulated + free * spread * rng.standard_normal(simulated.shape)
-        copy = recorded.dataset.copy()
-        copy["observed"] = copy["observed"].copy(data=measured)
-        if labelled:
-            labels = [f"{name}/draw {draw}" for name in copy["trajectory"].to_numpy()]
-            copy = copy.assign_coords(trajectory=labels)
-        copies.append(copy)
-    return History(xr.concat(copies, dim="trajectory"))
+    simulated = np.concatenate(states)
+    noise = np.random.default_rng(seed).standard_normal(simulated.shape)
+    copies = xr.concat([recorded.dataset] * len(states), dim="trajectory")
+    copies["observed"] = copies["observed"].copy(data=simulated + free * spread * noise)
+    if labelled:
+        names = recorded.dataset["trajectory"].to_numpy()
+        labels = [f"{name}/draw {draw}" for draw in range(len(states)) for name in names]
+        copies = copies.assign_coords(trajectory=labels)
+    return History(copies)
