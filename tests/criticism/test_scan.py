@@ -75,14 +75,11 @@ def test_the_smallest_size_is_of_the_look_that_shows_it_best() -> None:
     assert detection_limits(EFFECTS["saturation"], whole, units, 2, DEFAULT.residual) == {
         "limit": 3.0
     }
-    none = detection_limits(
-        EFFECTS["force_cutoff"], whole[:1], units[:1], 2, DEFAULT.residual
-    )
+    none = detection_limits(EFFECTS["force_cutoff"], whole[:1], units[:1], 2, DEFAULT.residual)
     assert none == {"threshold": np.inf}
     there = [GridPoint(np.zeros(3), signature, ())]
     assert (
-        detection_limits(EFFECTS["hidden_obstacle"], there, units[1:2], 2, DEFAULT.residual)
-        == {}
+        detection_limits(EFFECTS["hidden_obstacle"], there, units[1:2], 2, DEFAULT.residual) == {}
     )
     assert caps(EFFECTS["saturation"], whole)
     assert not caps(EFFECTS["force_cutoff"], whole)
