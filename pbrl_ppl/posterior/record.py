@@ -129,7 +129,8 @@ class PosteriorRecord:
         Of draws by importance sampling: Pareto k of the proposals' weights, and the number of
         independent draws that the resampled draws are worth, which limits every parameter's ESS.
     proposals : str, optional
-        The density that was weighted: Gaussians at the modes, or that of few engine steps.
+        The density that was weighted: Gaussians at the modes; of older posteriors also that of few
+        engine steps.
     rungs : int, optional
         Rungs at which the engine moved particles, where weights alone did not suffice.
     acceptance : float, optional

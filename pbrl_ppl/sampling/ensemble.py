@@ -1,16 +1,14 @@
 """Ensemble of particles: Metropolis moves of many at once, and annealing between two densities.
 
 All particles move together: one engine batch a sweep, accepted for each independent part by itself.
-Where there is a cheaper density, several moves under it make one proposal: the surrogate transition
-method (Liu, 2001, section 9.4.3). Annealing is a sequential Monte Carlo sampler (Del Moral, Doucet
-and Jasra, 2006): particles are weighted, resampled and moved along a geometric path whose rungs
-their effective sample size sets.
+Annealing is a sequential Monte Carlo sampler (Del Moral, Doucet and Jasra, 2006): particles are
+weighted, resampled and moved along a geometric path whose rungs their effective sample size sets.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import permutations
 from typing import Any, NamedTuple, Protocol
 
@@ -53,12 +51,6 @@ class Posterior:
     def __init__(self, space: Space) -> None:
         self.space = space
 
-    @classmethod
-    def of_few_steps(cls, space: Space) -> Posterior | None:
-        """Return that of few engine steps, corrected at the centre; none if it is not cheaper."""
-        corrected = space.problem.corrected(space.centre)
-        return None if corrected is space.problem else cls(space.on(corrected))
-
     def look(self, q: Floats) -> Floats:
         """Return residuals, shape (n, transition, H, body, state)."""
         return np.array(self.space.residual(q), dtype=float)
@@ -73,27 +65,23 @@ class Posterior:
 
 
 class Path:
-    """Geometric path from one density to another, at a share ``beta`` of the way."""
+    """Geometric path from Gaussians to a density, at a share ``beta`` of the way, above 0."""
 
-    def __init__(self, start: Target, end: Target, beta: float) -> None:
+    def __init__(self, start: Reference, end: Target, beta: float) -> None:
         self.start, self.end, self.beta = start, end, beta
 
-    def look(self, q: Floats) -> tuple[Any, Any]:
-        """Return what both are, at particles (n, d); nothing of one without a share."""
-        start = self.start.look(q) if self.beta < 1 else None
-        return start, self.end.look(q) if self.beta > 0 else None
+    def look(self, q: Floats) -> Any:
+        """Return what the end is, at particles (n, d); Gaussians need no look."""
+        return self.end.look(q)
 
-    def columns(self, q: Floats, look: tuple[Any, Any]) -> Floats:
+    def columns(self, q: Floats, look: Any) -> Floats:
         """Return the weighted mean of both, shape (n, part + 1)."""
-        if self.beta == 0:
-            return self.start.columns(q, look[0])
-        end = self.end.columns(q, look[1])
+        end = self.end.columns(q, look)
         if self.beta == 1:
             return end
-        start = self.start.columns(q, look[0])
         with np.errstate(invalid="ignore"):
-            both = (1.0 - self.beta) * start + self.beta * end
-        return np.where(np.isneginf(start) | np.isneginf(end), -np.inf, both)
+            both = (1.0 - self.beta) * self.start.columns(q) + self.beta * end
+        return np.where(np.isneginf(end), -np.inf, both)
 
 
 class _Gaussian(NamedTuple):
@@ -216,6 +204,7 @@ def _gaussian(mean: Floats, covariance: Floats) -> _Gaussian:
     return _Gaussian(mean, deviation[:, None] * factor, inverse / deviation)
 
 
+@dataclass(frozen=True, eq=False)
 class Reference:
     """A product over independent parts, and the noise, of mixtures of Gaussians about the modes.
 
@@ -229,46 +218,43 @@ class Reference:
         In the order of the space's parts; blocks of the noise.
     """
 
-    def __init__(
-        self, space: Space, origin: Floats, parts: list[Block], noise: list[Block]
-    ) -> None:
-        self.space, self.origin, self.parts, self.noise = space, origin, parts, noise
+    space: Space
+    origin: Floats
+    parts: list[Block]
+    noise: list[Block]
 
     @classmethod
-    def about(cls, space: Space, mode: Mode, cheap: Space | None = None) -> Reference:
-        """Return the Laplace approximations about a mode and its others, somewhat wider.
+    def of(cls, space: Space, gaussians: Sequence[tuple[Floats, Floats]]) -> Reference:
+        """Return mixtures of Gaussians, each a mean (d,) and a covariance (d, d), made wider.
 
-        ``cheap`` is the space of fewer engine steps, which tells how far off densities fall.
+        Gaussians whose means are within each other's width are one.
         """
-        near = cheap or space
-        gaussians = [space.laplace(one) for one in (mode, *mode.others)]
-        gaussians = [(mean, _WIDER * near.widened(mean, spread)) for mean, spread in gaussians]
 
         def block(places: Ints) -> Block:
             modes: list[_Gaussian] = []
             for mean, covariance in gaussians:
-                one = _gaussian(mean[places], covariance[np.ix_(places, places)])
+                one = _gaussian(mean[places], _WIDER * covariance[np.ix_(places, places)])
                 if all((np.abs(old.standardised(one.mean[None])) > 1.0).any() for old in modes):
                     modes.append(one)
             return Block(places, tuple(modes))
 
-        return cls._of_blocks(space, gaussians[0][0], block)
+        parts = [block(part.places) for part in space.parts]
+        return cls(space, gaussians[0][0], parts, [block(places) for places in space.noise_blocks])
+
+    @classmethod
+    def about(cls, space: Space, mode: Mode, cheap: Space | None = None) -> Reference:
+        """Return the Laplace approximations about a mode and its others.
+
+        ``cheap`` is the space of fewer engine steps, which tells how far off densities fall.
+        """
+        gaussians = [space.laplace(one) for one in (mode, *mode.others)]
+        near = cheap or space
+        return cls.of(space, [(mean, near.widened(mean, spread)) for mean, spread in gaussians])
 
     @classmethod
     def of_draws(cls, space: Space, q: Floats) -> Reference:
-        """Return the product of Gaussians of a posterior's draws (n, d), somewhat wider."""
-        middle = q.mean(axis=0)
-
-        def block(places: Ints) -> Block:
-            covariance = _WIDER * np.cov(q[:, places], rowvar=False)
-            return Block(places, (_gaussian(middle[places], covariance),))
-
-        return cls._of_blocks(space, middle, block)
-
-    @classmethod
-    def _of_blocks(cls, space: Space, origin: Floats, block: Callable[[Ints], Block]) -> Reference:
-        parts = [block(part.places) for part in space.parts]
-        return cls(space, origin, parts, [block(places) for places in space.noise_blocks])
+        """Return the product of Gaussians of a posterior's draws (n, d)."""
+        return cls.of(space, [(q.mean(axis=0), np.atleast_2d(np.cov(q, rowvar=False)))])
 
     def draw(self, n: int, rng: np.random.Generator) -> Floats:
         """Draw n particles, silent parameters from their prior, shape (n, d)."""
@@ -277,10 +263,7 @@ class Reference:
             q[:, block.places] = block.draw(n, rng)
         return self.space.prior_draws(q, rng)
 
-    def look(self, q: Floats) -> None:
-        """Return nothing: no engine is needed."""
-
-    def columns(self, q: Floats, look: None) -> Floats:
+    def columns(self, q: Floats) -> Floats:
         """Return the log-density of each part and of the noise, shape (n, part + 1)."""
         parts = [block.log_density(q[:, block.places]) for block in self.parts]
         noise = sum(block.log_density(q[:, block.places]) for block in self.noise)
@@ -288,17 +271,19 @@ class Reference:
 
     def log_density(self, q: Floats) -> Floats:
         """Return the log-density of particles (n, d), shape (n,)."""
-        return np.asarray(self.columns(q, None).sum(axis=1))
+        return np.asarray(self.columns(q).sum(axis=1))
 
     def learned(self, q: Floats, kept: float = 0.0) -> Reference:
         """Return the product of Gaussians of particles; of several modes, this one.
 
         A share ``kept`` of the covariances stays.
         """
-        copies = [[Block(b.places, b.modes) for b in blocks] for blocks in (self.parts, self.noise)]
-        for block in (*copies[0], *copies[1]):
+        parts, noise = (
+            [Block(b.places, b.modes) for b in some] for some in (self.parts, self.noise)
+        )
+        for block in (*parts, *noise):
             block.learn(q[:, block.places], _WIDER, kept)
-        return Reference(self.space, self.origin, *copies)
+        return replace(self, parts=parts, noise=noise)
 
 
 class Ensemble:
@@ -315,7 +300,7 @@ class Ensemble:
     """
 
     def __init__(self, reference: Reference, q: Floats, rng: np.random.Generator) -> None:
-        self.space, self.q, self.rng, self._sweeps = reference.space, q.copy(), rng, 0
+        self.space, self.q, self.rng = reference.space, q.copy(), rng
         learned = reference.learned(q[:0])
         self.parts, self.noise = learned.parts, learned.noise
 
@@ -329,9 +314,7 @@ class Ensemble:
         for block in self.blocks:
             block.learn(self.q[:, block.places])
 
-    def move(
-        self, target: Target, sweeps: int, cheap: Target | None = None, *, adapt: bool = True
-    ) -> float:
+    def move(self, target: Target, sweeps: int, *, adapt: bool = True) -> float:
         """Move all particles by Metropolis sweeps; return the share of accepted moves.
 
         After each sweep the noise moves several times, fewer along trajectories, where each move
@@ -343,9 +326,6 @@ class Ensemble:
             Density that is kept.
         sweeps : int
             Engine batches of each group.
-        cheap : Target, optional
-            Density under which several moves make one proposal; every other sweep does without,
-            which frees particles from where it is far too low.
         adapt : bool
             Whether step sizes follow acceptance rates.
         """
@@ -355,16 +335,14 @@ class Ensemble:
             q, of_sweeps = self.q[chosen], []
             look = target.look(q)
             here = target.columns(q, look)
-            for i in range(self._sweeps, self._sweeps + sweeps):
-                ahead = cheap if i % 2 == 0 else None
-                y, gain, kinds = (
-                    self._proposed(q) if ahead is None else self._ahead(q, ahead, adapt)
-                )
+            for _ in range(sweeps):
+                y, gain, kinds = self._proposed(q)
                 seen = target.look(y)
                 there = target.columns(y, seen)
                 accepted, rate = self._accepted(there[:, :-1], here[:, :-1], gain)
                 if adapt:
-                    self._adapt(kinds, rate)
+                    for block, kind, one in zip(self.parts, kinds, rate, strict=True):
+                        block.adapt(kind, float(one))
                 q, look = self._chosen(accepted, y, q), self._merged(accepted, seen, look)
                 here[:, :-1] = np.where(accepted, there[:, :-1], here[:, :-1])
                 of_sweeps.append(rate.mean() if len(rate) else 1.0)
@@ -372,7 +350,6 @@ class Ensemble:
                     q, here = self._of_noise(block, q, here, target, look, adapt)
             self.q[chosen] = q
             rates.append(np.mean(of_sweeps))
-        self._sweeps += sweeps
         return float(np.mean(rates))
 
     def _proposed(self, q: Floats) -> tuple[Floats, Floats, list[str]]:
@@ -385,33 +362,6 @@ class Ensemble:
                     q[:, block.places], kinds[-1], self.rng
                 )
         return y, gain, kinds
-
-    def _ahead(
-        self, q: Floats, cheap: Target, adapt: bool, *, inner: int = 10
-    ) -> tuple[Floats, Floats, list[str]]:
-        """Return a proposal of several moves under a cheaper density.
-
-        They must be as likely in the reverse order: step sizes adapt only at the end.
-
-        ``inner``: moves under a cheaper density that make one proposal.
-        """
-        begin = here = cheap.columns(q, cheap.look(q))[:, :-1]
-        learned: list[tuple[list[str], Floats]] = []
-        for _ in range(inner):
-            y, gain, kinds = self._proposed(q)
-            there = cheap.columns(y, cheap.look(y))[:, :-1]
-            accepted, rate = self._accepted(there, here, gain)
-            learned.append((kinds, rate))
-            q, here = self._chosen(accepted, y, q), np.where(accepted, there, here)
-        if adapt:
-            for kinds, rate in learned:
-                self._adapt(kinds, rate / inner + TARGET_ACCEPTANCE * (1 - 1 / inner))
-        with np.errstate(invalid="ignore"):
-            return q, np.nan_to_num(begin - here, nan=-np.inf), []
-
-    def _adapt(self, kinds: list[str], rates: Floats) -> None:
-        for block, kind, rate in zip(self.parts, kinds, rates, strict=False):
-            block.adapt(kind, float(rate))
 
     def _accepted(self, there: Floats, here: Floats, gain: Floats) -> tuple[Bools, Floats]:
         """Return which proposals are accepted, same shape, and the mean rates over particles.
@@ -433,10 +383,6 @@ class Ensemble:
 
     def _merged(self, accepted: Bools, new: Any, old: Any) -> Any:
         """Return what is known of particles, from the proposals for the parts that accept them."""
-        if isinstance(old, tuple):
-            return tuple(self._merged(accepted, *pair) for pair in zip(new, old, strict=True))
-        if old is None:
-            return None
         for j, part in enumerate(self.space.parts):
             which = accepted[:, j]
             if len(self.parts) == 1:
@@ -458,9 +404,7 @@ class Ensemble:
             block.adapt(kind, float(rate))
         return np.where(accepted[:, None], y, q), np.where(accepted[:, None], there, here)
 
-    def settle(
-        self, target: Target, cheap: Target | None = None, looks: int = _LOOKS
-    ) -> tuple[float, float]:
+    def settle(self, target: Target, looks: int = _LOOKS) -> tuple[float, float]:
         """Move until particles have decorrelated from where they were, ``looks`` times at most.
 
         Returns
@@ -472,32 +416,13 @@ class Ensemble:
         """
         begin, rates = self.q.copy(), []
         places = np.concatenate([block.places for block in self.blocks])
-        sweeps = 1 if cheap is not None else 3
         for _ in range(looks):
-            rates.append(self.move(target, sweeps, cheap))
+            rates.append(self.move(target, 3))
             correlation = _correlation(begin[:, places], self.q[:, places])
             if correlation < 0.5:
                 break
             self.learn()
         return float(np.mean(rates)), correlation
-
-    def snapshots(self, target: Target, cheap: Target | None, times: int) -> tuple[Floats, float]:
-        """Return the particles now and after further moves, and how independent they are.
-
-        Returns
-        -------
-        q : ndarray
-            Shape (times * n, d).
-        independent : float
-            Independent particles over all, as of chains whose correlation falls geometrically.
-        """
-        taken, correlation = [self.q.copy()], []
-        for _ in range(times - 1):
-            correlation.append(self.settle(target, cheap, looks=2)[1])
-            taken.append(self.q.copy())
-        lags = np.arange(1, times)
-        shared = (np.mean(correlation) if correlation else 0.0) ** lags @ (1.0 - lags / times)
-        return np.concatenate(taken), 1.0 / float(1.0 + 2.0 * shared)
 
 
 def groups(space: Space, n: int, numbers: int = 8_000_000) -> Iterator[slice]:
@@ -507,7 +432,7 @@ def groups(space: Space, n: int, numbers: int = 8_000_000) -> Iterator[slice]:
         yield slice(first, first + width)
 
 
-def heights(space: Space, target: Target, q: Floats) -> Floats:
+def _heights(space: Space, target: Target, q: Floats) -> Floats:
     """Return the log-density of all particles (n, d), shape (n,)."""
     parts = (q[chosen] for chosen in groups(space, len(q)))
     return np.concatenate([target.columns(x, target.look(x)).sum(axis=1) for x in parts])
@@ -528,8 +453,8 @@ class Annealed(NamedTuple):
 
     Attributes
     ----------
-    beta : float
-        Where on the path they are; 1 at its end.
+    log_weight : ndarray
+        Of the particles, for what remains of the path, shape (n,); 0 at its end.
     log_z : float
         Logarithm of the ratio of the densities' integrals.
     rungs : int
@@ -540,7 +465,7 @@ class Annealed(NamedTuple):
         Independent particles that the moves left, over all.
     """
 
-    beta: float
+    log_weight: Floats
     log_z: float
     rungs: int
     accepted: float
@@ -548,46 +473,40 @@ class Annealed(NamedTuple):
 
 
 def anneal(
-    ensemble: Ensemble,
-    start: Target,
-    end: Target,
-    *,
-    cheap: Target | None = None,
-    weigh: bool = False,
-    most: int = 60,
+    ensemble: Ensemble, start: Reference, end: Target, *, worth: float = 0.3, most: int = 60
 ) -> Annealed:
-    """Take particles of one density to another, in place.
+    """Take particles of Gaussians to a density, in place, until weights suffice for what remains.
 
     Parameters
     ----------
     ensemble : Ensemble
         Independent particles of ``start``.
-    start, end : Target
-        Log-densities; the first is normalised if the evidence matters.
-    cheap : Target, optional
-        As of :meth:`Ensemble.move`.
-    weigh : bool
-        Whether to end where weights suffice for the rest of the path.
+    start : Reference
+        The Gaussians.
+    end : Target
+        Log-density of the end.
+    worth : float
+        Effective share of the particles that weights must leave to end with them.
     most : int
         Rungs at most.
     """
-    beta, log_z, rungs, kept = 0.0, 0.0, 0, 1.0
+    beta, log_z, kept = 0.0, 0.0, 1.0
     rates: list[float] = []
-    while beta < 1.0:
-        space, q = ensemble.space, ensemble.q
+    while True:
         with np.errstate(invalid="ignore"):
-            gap = heights(space, end, q) - heights(space, start, q)
+            gap = _heights(ensemble.space, end, ensemble.q) - start.log_density(ensemble.q)
         gap = np.where(np.isnan(gap), -np.inf, gap)
         if np.isneginf(gap).all():
             raise FitError(
                 f"fit: the model gives none of {len(gap)} draws about its mode a density; start"
                 " from another mode, or use the method 'laplace'"
             )
-        rest = (1.0 - beta) * gap
-        if weigh and (rungs == most or _suffices(rest)):
+        rest = (1.0 - beta) * gap if beta < 1.0 else np.zeros_like(gap)
+        if beta == 1.0 or len(rates) == most or _suffices(rest, worth):
             log_z += float(logsumexp(rest) - np.log(len(rest)))
-            return Annealed(beta, log_z, rungs, _mean(rates), kept)
-        step = _step(gap, 1.0 - beta) if rungs < most else 1.0 - beta
+            accepted = float(np.mean(rates)) if rates else 1.0
+            return Annealed(rest, log_z, len(rates), accepted, kept)
+        step = _step(gap, 1.0 - beta)
         total = logsumexp(step * gap)
         log_z += float(total - np.log(len(gap)))
         beta = 1.0 if step == 1.0 - beta else beta + step
@@ -595,24 +514,15 @@ def anneal(
         ensemble.q = ensemble.q[chosen]
         ensemble.learn()
         looks = _LOOKS if beta == 1.0 else 1  # the next rung moves on
-        rate, correlation = ensemble.settle(Path(start, end, beta), cheap, looks)
+        rate, correlation = ensemble.settle(Path(start, end, beta), looks)
         rates.append(rate)
-        rungs += 1
         # copies of a particle are as alike as each is to where they began, squared
         copies = np.bincount(chosen).astype(float)
         kept = len(gap) / float((copies + copies * (copies - 1) * correlation**2).sum())
-    return Annealed(1.0, log_z, rungs, _mean(rates), kept)
 
 
-def _mean(rates: list[float]) -> float:
-    return float(np.mean(rates)) if rates else 1.0
-
-
-def _suffices(log_weight: Floats, *, worth: float = 0.3) -> bool:
-    """Return whether weights are good enough to end with.
-
-    ``worth``: effective share that a last weighting must leave.
-    """
+def _suffices(log_weight: Floats, worth: float) -> bool:
+    """Return whether weights leave an effective share ``worth``, without a heavy tail."""
     if not np.isfinite(log_weight).sum() > 2:
         return False
     weight, k = smoothed(log_weight[np.isfinite(log_weight)])

@@ -91,15 +91,14 @@ def fit(
     method : str
         ``importance``: proposals from Gaussians about the modes, weighted by the engine in batches
         of which each teaches the next, and resampled; where the weights do not suffice, particles
-        are moved by the engine in rungs, after one of few engine steps where that is cheaper;
-        ``metropolis``: chains of the same moves under the engine's posterior, each of which is
-        many walkers, one after another; ``paper``: one random walk a variable, by default on the
-        schedule of the paper's Table 2 for the cart (30 chains of 20,000 iterations, 1,000 of them
-        burn-in, each tenth kept); with a library, on that for the apartment (``draws=400,
-        tune=1000, thin=10, chains=1``), each body's set proposed uniformly;
-        ``demetropolisz``; ``smc``; ``nuts``, on the finite-difference gradient; ``laplace``:
-        independent draws from the Gaussian at the mode, which no chain has checked; ``map``: the
-        mode alone, as one draw.
+        are moved by the engine in rungs; ``metropolis``: chains of the same moves under the
+        engine's posterior, each of which is many walkers, one after another; ``paper``: one random
+        walk a variable, by default on the schedule of the paper's Table 2 for the cart (30 chains
+        of 20,000 iterations, 1,000 of them burn-in, each tenth kept); with a library, on that for
+        the apartment (``draws=400, tune=1000, thin=10, chains=1``), each body's set proposed
+        uniformly; ``demetropolisz``; ``smc``; ``nuts``, on the finite-difference gradient;
+        ``laplace``: independent draws from the Gaussian at the mode, which no chain has checked;
+        ``map``: the mode alone, as one draw.
     seed : int
         The same seed gives the same posterior.
     draws, tune : int, optional

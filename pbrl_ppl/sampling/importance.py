@@ -1,7 +1,7 @@
 """Importance sampling: proposals from Gaussians about the modes, weighted by the engine in batches.
 
-Where the weights are not good enough after some batches, particles are annealed: to the posterior
-of few engine steps if that is cheaper, from there to the engine's.
+Where the weights are not good enough after some batches, particles are annealed: weighted,
+resampled and moved from the Gaussians to the engine's posterior.
 """
 
 from __future__ import annotations
@@ -15,19 +15,8 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.modes import adaptive_importance, systematic
 from pbrl_ppl.posterior import MAX_PARETO_K, smoothed
-from pbrl_ppl.sampling.ensemble import (
-    Ensemble,
-    Path,
-    Posterior,
-    Reference,
-    anneal,
-    heights,
-    log_densities,
-)
+from pbrl_ppl.sampling.ensemble import Ensemble, Posterior, Reference, anneal, log_densities
 from pbrl_ppl.state import Floats
-
-#: The density that was weighted, in words.
-_GAUSSIANS, _FEW_STEPS = "Gaussians at the modes", "few engine steps"
 
 
 class Proposals(NamedTuple):
@@ -49,8 +38,6 @@ class Proposals(NamedTuple):
         Share of those moves that were accepted; 1 without any.
     kept : float
         Independent particles over all that the moves left.
-    cheaper : str
-        The density that was weighted, in words.
     """
 
     phi: Floats
@@ -58,10 +45,9 @@ class Proposals(NamedTuple):
     log_weight: Floats
     log_likelihood: Floats
     log_evidence: float
-    rungs: int
-    accepted: float
-    kept: float
-    cheaper: str
+    rungs: int = 0
+    accepted: float = 1.0
+    kept: float = 1.0
 
 
 def draw_proposals(
@@ -85,7 +71,7 @@ def draw_proposals(
     seed : int or sequence of int
         Source of the draws.
     batches : int
-        Batches of the proposals asked for; while particles are annealed, they are one batch.
+        Batches of the proposals asked for; annealed particles are one batch.
     effective_share : float
         Effective share of the proposals asked for that suffices.
     most_batches : int
@@ -96,41 +82,20 @@ def draw_proposals(
     rng, batch = np.random.default_rng(seed), -(-n // batches)
     space = reference.space
     most = int(np.clip(numbers // (batch * space.problem.segments.n), batches, most_batches))
-    proposals, reference = adaptive_importance(
-        reference, partial(log_densities, Posterior(space)), len(space.loud), rng, batch=batch,
+    exact = Posterior(space)
+    proposals, learned = adaptive_importance(
+        reference, partial(log_densities, exact), len(space.loud), rng, batch=batch,
         enough=effective_share * n, smooth=smoothed, most_batches=most, max_pareto_k=MAX_PARETO_K,
     )  # fmt: skip
-    if not proposals.good:
-        return _annealed(reference, batch, batches, rng)
+    if proposals.good:
+        phi, sigma = space.split(proposals.q)
+        return Proposals(phi, sigma, proposals.log_weight, proposals.values, proposals.log_z)
+    particles = Ensemble(learned, learned.draw(batch * batches, rng), rng)
+    reached = anneal(particles, learned, exact)
+    q = space.prior_draws(particles.q, rng)
     return Proposals(
-        *space.split(proposals.q), proposals.log_weight, proposals.values, proposals.log_z, 0, 1.0,
-        1.0, _GAUSSIANS,
-    )  # fmt: skip
-
-
-def _annealed(
-    reference: Reference, batch: int, batches: int, rng: np.random.Generator
-) -> Proposals:
-    """Return proposals that were taken from Gaussians towards the engine's posterior."""
-    space = reference.space
-    exact, cheap = Posterior(space), Posterior.of_few_steps(space)
-    # the engine is cheap beside the filter of each particle's noise
-    alone = space.problem.likelihood.independent
-    times = 1 if alone else batches
-    particles = Ensemble(reference, reference.draw(batch * batches // times, rng), rng)
-    first = None if cheap is None else anneal(particles, reference, cheap)
-    start = cheap or reference
-    reached = anneal(particles, start, exact, cheap=cheap, weigh=True)
-    q, independent = particles.snapshots(Path(start, exact, reached.beta), cheap, times)
-    q = space.prior_draws(q, rng)
-    height, log_likelihood = log_densities(exact, q)
-    with np.errstate(invalid="ignore"):
-        left = (1.0 - reached.beta) * (height - heights(space, start, q))
-    kept = independent * reached.kept * (1.0 if first is None else first.kept)
-    return Proposals(
-        *space.split(q), np.where(np.isnan(left), -np.inf, left), log_likelihood,
-        reached.log_z + (0.0 if first is None else first.log_z), reached.rungs, reached.accepted,
-        kept, _GAUSSIANS if cheap is None else _FEW_STEPS,
+        *space.split(q), reached.log_weight, log_densities(exact, q)[1], reached.log_z,
+        reached.rungs, reached.accepted, reached.kept,
     )  # fmt: skip
 
 

@@ -174,20 +174,18 @@ def _importance(job: SamplerRun, *, proposals: float = 1.4) -> Idata:
     trace = as_trace(job.problem, values, {"log_weight": pool.log_weight[chosen].reshape(shape)})
     trace.attrs |= {
         PARETO_K: k, SIZE: pool.kept * size, LIKELIHOOD: pool.log_likelihood[chosen],
-        "proposals": pool.cheaper, "rungs": pool.rungs, "acceptance": pool.accepted,
+        "proposals": "Gaussians at the modes", "rungs": pool.rungs, "acceptance": pool.accepted,
         "log_evidence": pool.log_evidence,
     }  # fmt: skip
     return trace
 
 
-def _metropolis(job: SamplerRun, *, most_walkers: int = 20, little: int = 2000) -> Idata:
+def _metropolis(job: SamplerRun, *, most_walkers: int = 20) -> Idata:
     """Run the ensemble as chains; see `ensemble`. A chain is its walkers, one after another.
 
     ``most_walkers``: walkers of a chain of the ensemble.
-    ``little``: engine steps below which a cheaper posterior does not pay.
     """
     reference, rng = job.reference(), np.random.default_rng(stream(job.seed, job.starts()))
-    problem = reference.space.problem
     walkers = min(most_walkers, job.draws)
     per_walker = -(-job.draws // walkers)
     chains = job.chains
@@ -196,12 +194,8 @@ def _metropolis(job: SamplerRun, *, most_walkers: int = 20, little: int = 2000) 
     else:
         phi, sigma = last_draws(job.problem, job.resume, walkers)
         chains = len(phi) // walkers
-        q = reference.space.at(nearest(problem.layout, phi, any_prior=True), sigma)
+        q = reference.space.at(nearest(job.problem.layout, phi, any_prior=True), sigma)
     ensemble, exact = Ensemble(reference, q, rng), Posterior(reference.space)
-    cost = problem.simulator.steps * problem.segments.n * problem.data.horizon
-    cheap = None
-    if cost / len(problem.simulator.parts) > little:
-        cheap = Posterior.of_few_steps(reference.space)
     tune = -(-job.tune // walkers) * job.thin
     kept, rates = [], []
     steps = track(
@@ -211,7 +205,7 @@ def _metropolis(job: SamplerRun, *, most_walkers: int = 20, little: int = 2000) 
     try:
         for i in steps:
             sweeps = 1 if i < tune else job.thin
-            rate = ensemble.move(exact, sweeps, cheap, adapt=i < tune)
+            rate = ensemble.move(exact, sweeps, adapt=i < tune)
             ensemble.q = reference.space.prior_draws(ensemble.q, rng)
             if i < tune:
                 ensemble.learn()

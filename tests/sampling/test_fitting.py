@@ -31,7 +31,7 @@ from pbrl_ppl.posterior import (
 )
 from pbrl_ppl.posterior import save_posterior as save
 from pbrl_ppl.posterior.completion import MAX_RHAT, MIN_ESS, complete
-from pbrl_ppl.sampling import methods, physics_model
+from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.sampling.ensemble import Ensemble
 from pbrl_ppl.sampling.fitting import METHODS, fit
 from pbrl_ppl.scene import Shape, Wall
@@ -304,7 +304,6 @@ def interrupt_at(patch: pytest.MonkeyPatch, number: int) -> None:
 @pytest.mark.parametrize("number", [1, 5, 12])
 def test_an_interrupt_before_there_are_draws_leaves_nothing(model, mode, monkeypatch, number):
     """In tuning, or at the second draw of each walker."""
-    monkeypatch.setattr(methods.Posterior, "of_few_steps", lambda space: None)
     interrupt_at(monkeypatch, number)
     with pytest.raises(KeyboardInterrupt):
         fit(model, seed=4, start=mode, **(CHAINS | {"draws": 60}))
@@ -314,7 +313,6 @@ def test_an_interrupt_before_there_are_draws_leaves_nothing(model, mode, monkeyp
 def interrupted(model, mode):
     """Twenty walkers a chain, 10 moves of tuning, then 2 draws of 3 each: 40 draws of 50."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(methods.Posterior, "of_few_steps", lambda space: None)
         interrupt_at(patch, 13)
         with (
             pytest.warns(ConvergenceWarning, match="have not converged"),
