@@ -152,7 +152,7 @@ class LibraryAgent(PhysicsAgent):
             index = group(posterior, "posterior")["library_index"].to_numpy()
         else:
             # as many draws as the paper's schedule gives
-            _, _, index, _, _ = choose_from_library(problem, 400, 1, self.seed)
+            _, _, index, _ = choose_from_library(problem, 400, 1, self.seed)
         drawn = np.array(among.names)[index[..., 0].ravel()]
         self._probability[name] = np.array([(drawn == one).mean() for one in self.library.names])
         self._choice[name] = int(self._probability[name].argmax())

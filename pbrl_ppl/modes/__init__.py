@@ -21,9 +21,9 @@ from .ladder import simulated_states as simulated_states
 from .ladder import with_robust_covariance as with_robust_covariance
 from .laplace import Mode as Mode
 from .laplace import covariance_of as covariance_of
-from .laplace import laplace_covariance as laplace_covariance
 from .laplace import posterior_slopes as posterior_slopes
 from .library_choice import choose_from_library as choose_from_library
+from .library_choice import library_of as library_of
 from .noise import NOTHING as NOTHING
 from .noise import profile_sigma as profile_sigma
 from .search import find_mode as find_mode

@@ -12,8 +12,17 @@ from scipy.special import logsumexp, softmax
 
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import Observations, Problem, estimate_sigma, log_noise_prior
+from pbrl_ppl.modes.importance import systematic
+from pbrl_ppl.parameters import ParameterLibrary
 from pbrl_ppl.physics import Part
 from pbrl_ppl.state import Floats, Ints
+
+
+def library_of(problem: Problem) -> ParameterLibrary:
+    """Return the library of a problem, which must have one."""
+    if problem.library is None:
+        raise FitError("fit: the model has no library to choose from")
+    return problem.library
 
 
 class _Combinations:
@@ -26,10 +35,7 @@ class _Combinations:
 
     def __init__(self, problem: Problem, part: Part, table: Floats) -> None:
         bodies = list(part.physics.scene.owners)
-        library = problem.library
-        if library is None:
-            raise FitError("fit: the model has no library to choose from")
-        priors = [library.prior(body) for body in bodies]
+        priors = [library_of(problem).prior(body) for body in bodies]
         possible = [np.flatnonzero(p) for p in priors]
         count = prod(len(sets) for sets in possible)
         measured = problem.observations.values[:, :, part.bodies]
@@ -79,14 +85,13 @@ def choose_from_library(
     *,
     df: int = 5,
     wider: float = 1.2,
-    thin: int = 10,
-    burn: int = 200,
-) -> tuple[Floats, Floats, Ints, Floats, Ints]:
+    proposals: int = 10,
+) -> tuple[Floats, Floats, Ints, Ints]:
     """Draw sigma from its marginal posterior, and the parameter sets given sigma.
 
     Given sigma, bodies that have nothing to do with each other are independent, and the sum over
-    every combination is a product of sums. Sigma is drawn by an independence Metropolis sampler
-    about the maximum of that product.
+    every combination is a product of sums. Sigma is drawn by importance resampling about the
+    maximum of that product.
 
     Parameters
     ----------
@@ -100,10 +105,8 @@ def choose_from_library(
         Degrees of freedom of the proposal of log sigma.
     wider : float
         Its width over the posterior's.
-    thin : int
+    proposals : int
         Proposals a draw.
-    burn : int
-        Proposals before the first draw.
 
     Returns
     -------
@@ -113,8 +116,6 @@ def choose_from_library(
         Shape (chain, draw, state), or (chain, draw, 1) for a scalar sigma.
     index : ndarray of int
         Of the parameter set in the library, shape (chain, draw, owner), as in `Scene.owners`.
-    accepted : ndarray
-        Share of the proposals of sigma that were, shape (chain, draw).
     best : ndarray of int
         Most probable choice, sigma summed out by the draws, shape (owner,): of bodies that meet,
         their most probable combination.
@@ -124,11 +125,9 @@ def choose_from_library(
     FitError
         If bodies that meet have too many combinations.
     """
-    if problem.library is None:
-        raise FitError("fit: the model has no library to choose from")
     rng = np.random.default_rng(seed)
     names = list(problem.scene.owners)
-    table = problem.library.table(problem.layout, problem.scene)
+    table = library_of(problem).table(problem.layout, problem.scene)
     parts = [_Combinations(problem, part, table) for part in problem.simulator.parts]
     median, spread = problem.noise_prior
     counts = problem.observations.measured.sum((0, 1, 2)).astype(float)
@@ -142,42 +141,28 @@ def choose_from_library(
     begin = problem.likelihood.centre(_rough_sigma(problem, parts, median))
     top = minimize(lambda x: -float(density(x[None])[0]), begin, method="L-BFGS-B").x
     # log sigma of n residuals has about this precision; wider, for combinations that mix
-    shape = wider**2 / (2.0 * counts + spread**-2.0)
-    proposal = stats.multivariate_t(top, np.diag(shape), df=df)
-    n = draws * thin + burn
-    sigmas, chosen, accepted = [], [], []
-    shares = [np.zeros(len(choice.indices)) for choice in parts]
-    for _ in range(chains):
-        x = proposal.rvs(n, random_state=rng).reshape(n, -1)
-        log_weight = density(x) - np.atleast_1d(proposal.logpdf(x))
-        log_uniform = np.log(rng.uniform(size=n))
-        kept = np.zeros(n, dtype=int)
-        for i in range(1, n):
-            moves = log_uniform[i] < log_weight[i] - log_weight[kept[i - 1]]
-            kept[i] = i if moves else kept[i - 1]
-        drawn = slice(burn + thin - 1, None, thin)
-        moved = np.diff(kept, prepend=0)[burn:] != 0
-        accepted.append(moved.reshape(draws, thin).mean(axis=1))
-        log_sigma = x[kept[drawn]]
-        sigmas.append(np.exp(log_sigma))
-        index = np.zeros((draws, len(names)), dtype=np.intp)
-        for choice, part, share in zip(parts, problem.simulator.parts, shares, strict=True):
-            joint = choice.log_joint(np.exp(log_sigma) * ones, problem.nu())
-            share += softmax(joint, axis=1).sum(axis=0)
-            # the largest of log-probabilities with Gumbel noise is a draw
-            which = (joint + rng.gumbel(size=joint.shape)).argmax(axis=1)
-            columns = [names.index(owner) for owner in part.physics.scene.owners]
-            index[:, columns] = choice.indices[which]
-        chosen.append(index)
-    owners = [owner for block in problem.layout.blocks for owner in block.owners]
-    indices = np.stack(chosen)
-    of = indices[..., [names.index(owner) for owner in owners]]
-    phi = table[np.arange(len(owners)), of]
+    variance = wider**2 / (2.0 * counts + spread**-2.0)
+    proposal = stats.multivariate_t(top, np.diag(variance), df=df)
+    n = draws * chains
+    x = proposal.rvs(proposals * n, random_state=rng).reshape(proposals * n, -1)
+    # in parts, for there may be many combinations
+    heights = np.concatenate([density(some) for some in np.array_split(x, 4 * chains)])
+    log_weight = heights - proposal.logpdf(x)
+    drawn = systematic(np.exp(log_weight - log_weight.max()), n, rng)
+    log_sigma = x[rng.permutation(drawn)]
+    index = np.zeros((n, len(names)), dtype=np.intp)
     best = np.zeros(len(names), dtype=np.intp)
-    for choice, part, share in zip(parts, problem.simulator.parts, shares, strict=True):
+    for choice, part in zip(parts, problem.simulator.parts, strict=True):
+        joint = choice.log_joint(np.exp(log_sigma) * ones, problem.nu())
+        # the largest of log-probabilities with Gumbel noise is a draw
+        which = (joint + rng.gumbel(size=joint.shape)).argmax(axis=1)
         columns = [names.index(owner) for owner in part.physics.scene.owners]
-        best[columns] = choice.indices[share.argmax()]
-    return phi, np.stack(sigmas), indices, np.stack(accepted), best
+        index[:, columns] = choice.indices[which]
+        best[columns] = choice.indices[softmax(joint, axis=1).sum(axis=0).argmax()]
+    owners = [owner for block in problem.layout.blocks for owner in block.owners]
+    phi = table[np.arange(len(owners)), index[:, [names.index(owner) for owner in owners]]]
+    shape = (chains, draws, -1)
+    return phi.reshape(shape), np.exp(log_sigma).reshape(shape), index.reshape(shape), best
 
 
 def _rough_sigma(problem: Problem, parts: list[_Combinations], sigma: Floats) -> Floats:

@@ -251,17 +251,21 @@ class Space:
         there = np.isfinite(phi).all(axis=-1, keepdims=True)
         return inside(self.problem.layout.priors, np.where(there, phi, self.centre))
 
-    def log_density(self, q: Floats, *, numbers: int = 4_000_000) -> Floats:
-        """Return the log-posterior up to the evidence at points (n, d), shape (n,).
+    def log_densities(self, q: Floats, *, numbers: int = 4_000_000) -> tuple[Floats, Floats]:
+        """Return the log-posterior up to the evidence at points (n, d), and the log-likelihoods.
+
+        Shapes (n,) and (n, transition).
 
         ``numbers``: numbers held at once.
         """
         width = max(1, numbers // max(self.problem.measured.size, 1))
-        density = self.log_priors(q).sum(axis=-1)
-        for first in range(0, len(q), width):
-            some = q[first : first + width]
-            density[first : first + width] += self.each(some, self.residual(some)).sum(axis=1)
-        return np.asarray(density)
+        parts = (q[first : first + width] for first in range(0, len(q), width))
+        each = np.concatenate([self.each(some, self.residual(some)) for some in parts])
+        return self.log_priors(q).sum(axis=-1) + each.sum(axis=1), each
+
+    def log_density(self, q: Floats) -> Floats:
+        """Return the log-posterior up to the evidence at points (n, d), shape (n,)."""
+        return self.log_densities(q)[0]
 
     def prior_draws(self, q: Floats, rng: np.random.Generator) -> Floats:
         """Return points (n, d) with the silent parameters drawn from their prior."""

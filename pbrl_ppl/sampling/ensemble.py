@@ -438,44 +438,43 @@ def _heights(space: Space, target: Target, q: Floats) -> Floats:
     return np.concatenate([target.columns(x, target.look(x)).sum(axis=1) for x in parts])
 
 
-def log_densities(target: Posterior, q: Floats) -> tuple[Floats, Floats]:
-    """Return the log-density of particles (n, d), and their log-likelihoods (n, transition)."""
-    height, likelihood = [], []
-    for chosen in groups(target.space, len(q)):
-        look = target.look(q[chosen])
-        height.append(target.columns(q[chosen], look).sum(axis=1))
-        likelihood.append(target.space.each(q[chosen], look))
-    return np.concatenate(height), np.concatenate(likelihood)
-
-
-class Annealed(NamedTuple):
-    """How particles were taken along a path.
+class Proposals(NamedTuple):
+    """Proposals with the logarithm of their importance weights.
 
     Attributes
     ----------
+    q : ndarray
+        Shape (n, d).
     log_weight : ndarray
-        Of the particles, for what remains of the path, shape (n,); 0 at its end.
+        Of the posterior over the density they are from, up to a constant, shape (n,).
     log_z : float
-        Logarithm of the ratio of the densities' integrals.
+        Logarithm of the posterior's integral: the evidence, without what a mode's Gaussian does not
+        reach.
+    log_likelihood : ndarray, optional
+        Of each transition, shape (n, transition), where it is known.
     rungs : int
-        Rungs at which particles were moved.
+        Rungs at which the engine moved particles.
     accepted : float
-        Share of accepted moves; 1 without any.
+        Share of those moves that were accepted; 1 without any.
     kept : float
-        Independent particles that the moves left, over all.
+        Independent particles over all that the moves left.
     """
 
+    q: Floats
     log_weight: Floats
     log_z: float
-    rungs: int
-    accepted: float
-    kept: float
+    log_likelihood: Floats | None = None
+    rungs: int = 0
+    accepted: float = 1.0
+    kept: float = 1.0
 
 
 def anneal(
-    ensemble: Ensemble, start: Reference, end: Target, *, worth: float = 0.3, most: int = 60
-) -> Annealed:
+    ensemble: Ensemble, start: Reference, end: Target, *, worth: float = 0.4, most: int = 60
+) -> Proposals:
     """Take particles of Gaussians to a density, in place, until weights suffice for what remains.
+
+    A weight is for what remains of the path: 0 at its end.
 
     Parameters
     ----------
@@ -505,7 +504,7 @@ def anneal(
         if beta == 1.0 or len(rates) == most or _suffices(rest, worth):
             log_z += float(logsumexp(rest) - np.log(len(rest)))
             accepted = float(np.mean(rates)) if rates else 1.0
-            return Annealed(rest, log_z, len(rates), accepted, kept)
+            return Proposals(ensemble.q, rest, log_z, None, len(rates), accepted, kept)
         step = _step(gap, 1.0 - beta)
         total = logsumexp(step * gap)
         log_z += float(total - np.log(len(gap)))

@@ -39,7 +39,7 @@ from pbrl_ppl.posterior import (
     parameter_draws,
     stored_mode,
 )
-from pbrl_ppl.sampling.methods import METHODS, OVER_LIBRARY, Method, SamplerRun
+from pbrl_ppl.sampling.methods import METHODS, OVER_LIBRARY, SamplerRun
 from pbrl_ppl.sampling.mixture import mix, most_frequent, most_probable, summed
 from pbrl_ppl.state import Floats
 from pbrl_ppl.threads import one_blas_thread
@@ -170,15 +170,12 @@ def sample(
     *,
     method: str = DEFAULT,
     seed: int = 0,
-    draws: int | None = None,
-    tune: int | None = None,
-    chains: int | None = None,
-    thin: int | None = None,
     cores: int | None = None,
     start: Mode | None = None,
     resume: Idata | None = None,
     progress: bool = False,
     declared: pm.Model | None = None,
+    **schedule: int | None,
 ) -> Fit:
     """Sample the posterior of a problem; see :func:`pbrl_ppl.fit`, which takes its pm.Model.
 
@@ -186,11 +183,13 @@ def sample(
     ----------
     problem : Problem
         What is fitted. Of whole trajectories it is linearised at the mode.
-    method, seed, draws, tune, chains, thin, cores, start, resume, progress
+    method, seed, cores, start, resume, progress
         As of :func:`pbrl_ppl.fit`.
     declared : pymc.Model, optional
         Its pm.Model, which PyMC's samplers take if the problem stays as it is; they make one
         otherwise.
+    **schedule : int, optional
+        ``draws``, ``tune``, ``chains`` and ``thin``, as of :func:`pbrl_ppl.fit`.
 
     Returns
     -------
@@ -204,31 +203,30 @@ def sample(
     # with one set there is no choice to walk over
     walks = library is not None and method in OVER_LIBRARY and len(library.names) > 1
     chosen = OVER_LIBRARY[method] if walks else METHODS[method]
+    if method != "map":
+        asked: dict[str, Any] = {key: n for key, n in schedule.items() if n is not None}
+        chosen = replace(chosen, **asked)
     job = SamplerRun(
         problem=_as_in(problem, resume),
+        method=chosen,
         mode=None,
         resume=resume,
         seed=seed,
-        draws=1 if method == "map" else chosen.draws if draws is None else draws,
-        tune=chosen.tune if tune is None else tune,
-        chains=1 if method == "map" else chosen.chains if chains is None else chains,
-        thin=chosen.thin if thin is None else thin,
         cores=os.cpu_count() or 1 if cores is None else cores,
         progress=progress,
         declared=declared,
     )
     while True:
-        job, trace, point = _drawn(job, chosen, start, walks)
+        job, trace, point = _drawn(job, start, walks)
         # PyMC ends an interrupted run quietly, with fewer draws or with the chains that had most
         sizes = group(trace, "posterior").sizes
-        all_chains = job.chains if resume is None else group(resume, "posterior").sizes["chain"]
-        cut = sizes["draw"] < job.draws or sizes["chain"] < all_chains
+        cut = sizes["draw"] < chosen.draws or sizes["chain"] < job.chains
         joined = job.problem if cut else _joined(job.problem, *parameter_draws(job.problem, trace))
         if joined is job.problem:
             break
         job, start, resume = replace(job, problem=joined, resume=None), None, None
     if resume is not None:
-        if sizes["chain"] < all_chains:
+        if sizes["chain"] < job.chains:
             raise KeyboardInterrupt  # some chains have nothing new, and resume= has all of them
         trace = _appended(resume, trace)
     posterior = complete(
@@ -236,37 +234,37 @@ def sample(
         trace,
         seed=seed,
         method=method if library is None or walks else "exact sum over the library",
-        asked=(job.draws, all_chains) if cut else None,
+        asked=(chosen.draws, job.chains) if cut else None,
         mode=point,
     )
     return Fit(job.problem, posterior)
 
 
-def _drawn(
-    job: SamplerRun, chosen: Method, start: Mode | None, walks: bool
-) -> tuple[SamplerRun, Idata, Point]:
+def _drawn(job: SamplerRun, start: Mode | None, walks: bool) -> tuple[SamplerRun, Idata, Point]:
     """Return the job on the problem that was sampled, its draws, and its mode."""
-    problem = job.problem
+    problem, method = job.problem, job.method
     if walks:
-        trace = _run(chosen, job)
+        trace = _run(job)
         return job, trace, most_frequent(problem, trace)
     if problem.library is not None:
-        return job, *summed(problem, job.draws, job.chains, job.seed)
+        return job, *summed(problem, method.draws, method.chains, job.seed)
     if problem.layout.discrete.any():
         weighed = weigh(problem, seed=job.seed, progress=job.progress)
 
         def of_configuration(mode: Mode) -> Idata:
-            return _run(chosen, replace(job, problem=mode.problem, mode=mode))
+            return _run(replace(job, problem=mode.problem, mode=mode))
 
         trace = mix(
-            problem, weighed, of_configuration, draws=job.draws, chains=job.chains, seed=job.seed
-        )
+            problem, weighed, of_configuration, draws=method.draws, chains=method.chains,
+            seed=job.seed,
+        )  # fmt: skip
         return job, trace, most_probable(problem, weighed)
     if job.resume is not None:
-        return job, _run(chosen, job), stored_mode(problem, job.resume)
+        return job, _run(job), stored_mode(problem, job.resume)
     job = _at_mode(job, start)
-    trace = _run(chosen, job)
-    if problem.likelihood.simulated and chosen not in (METHODS["laplace"], METHODS["map"]):
+    trace = _run(job)
+    gaussian = (METHODS["laplace"].run, METHODS["map"].run)
+    if problem.likelihood.simulated and method.run not in gaussian:
         trace = _with_robust_width(job, trace)
     return job, trace, Point(job.at_mode.phi, job.at_mode.sigma)
 
@@ -312,13 +310,13 @@ def _with_robust_width(job: SamplerRun, trace: Idata) -> Idata:
 
 
 @one_blas_thread
-def _run(chosen: Method, job: SamplerRun) -> Idata:
+def _run(job: SamplerRun) -> Idata:
     """Return draws by a method, without what its processes warn of."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*fork.*", category=DeprecationWarning)
         # draws from the prior, of which SMC needs some, are not compiled on the newer stack
         warnings.filterwarnings("ignore", message="Numba will use object mode")
-        return chosen.run(job)
+        return job.method.run(job)
 
 
 def _check(problem: Problem, method: str, start: Any, resume: Idata | None) -> None:

@@ -7,47 +7,15 @@ resampled and moved from the Gaussians to the engine's posterior.
 from __future__ import annotations
 
 import zlib
-from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.modes import adaptive_importance, systematic
 from pbrl_ppl.posterior import MAX_PARETO_K, smoothed
-from pbrl_ppl.sampling.ensemble import Ensemble, Posterior, Reference, anneal, log_densities
+from pbrl_ppl.sampling.ensemble import Ensemble, Posterior, Proposals, Reference, anneal
 from pbrl_ppl.state import Floats
-
-
-class Proposals(NamedTuple):
-    """Proposals with the logarithm of their importance weights, and what they predict.
-
-    Attributes
-    ----------
-    phi, sigma : ndarray
-        Shapes (proposal, p) and (proposal, parameter).
-    log_weight : ndarray
-        Of the posterior over the density they were drawn from, up to a constant, (proposal,).
-    log_likelihood : ndarray
-        Of each transition, shape (proposal, transition).
-    log_evidence : float
-        Of the model, without what a mode's Gaussian does not reach.
-    rungs : int
-        Rungs at which the engine moved particles.
-    accepted : float
-        Share of those moves that were accepted; 1 without any.
-    kept : float
-        Independent particles over all that the moves left.
-    """
-
-    phi: Floats
-    sigma: Floats
-    log_weight: Floats
-    log_likelihood: Floats
-    log_evidence: float
-    rungs: int = 0
-    accepted: float = 1.0
-    kept: float = 1.0
 
 
 def draw_proposals(
@@ -82,21 +50,15 @@ def draw_proposals(
     rng, batch = np.random.default_rng(seed), -(-n // batches)
     space = reference.space
     most = int(np.clip(numbers // (batch * space.problem.segments.n), batches, most_batches))
-    exact = Posterior(space)
-    proposals, learned = adaptive_importance(
-        reference, partial(log_densities, exact), len(space.loud), rng, batch=batch,
+    points, learned = adaptive_importance(
+        reference, space.log_densities, len(space.loud), rng, batch=batch,
         enough=effective_share * n, smooth=smoothed, most_batches=most, max_pareto_k=MAX_PARETO_K,
     )  # fmt: skip
-    if proposals.good:
-        phi, sigma = space.split(proposals.q)
-        return Proposals(phi, sigma, proposals.log_weight, proposals.values, proposals.log_z)
+    if points.good:
+        return Proposals(points.q, points.log_weight, points.log_z, points.values)
     particles = Ensemble(learned, learned.draw(batch * batches, rng), rng)
-    reached = anneal(particles, learned, exact)
-    q = space.prior_draws(particles.q, rng)
-    return Proposals(
-        *space.split(q), reached.log_weight, log_densities(exact, q)[1], reached.log_z,
-        reached.rungs, reached.accepted, reached.kept,
-    )  # fmt: skip
+    reached = anneal(particles, learned, Posterior(space))
+    return reached._replace(q=space.prior_draws(reached.q, rng))
 
 
 def resample(

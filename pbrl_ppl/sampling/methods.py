@@ -71,24 +71,23 @@ class SamplerRun:
     ----------
     problem : Problem
         What is sampled.
+    method : Method
+        The sampler, with the schedule that was asked for.
     mode : Mode, optional
         Where draws begin, unless they go on from a posterior or walk over a library.
     resume : InferenceData or DataTree, optional
         Posterior to go on from.
-    seed, draws, tune, chains, thin, cores, progress
+    seed, cores, progress
         As of :func:`pbrl_ppl.fit`, with defaults filled in.
     declared : pymc.Model, optional
         Of the problem, or of one that it was made from.
     """
 
     problem: Problem
+    method: Method
     mode: Mode | None
     resume: Idata | None
     seed: int
-    draws: int
-    tune: int
-    chains: int
-    thin: int
     cores: int
     progress: bool
     declared: pm.Model | None = None
@@ -102,6 +101,13 @@ class SamplerRun:
 
         return build_model(self.problem)
 
+    @property
+    def chains(self) -> int:
+        """Chains that are asked for, or those of the posterior to go on from."""
+        if self.resume is None:
+            return self.method.chains
+        return int(group(self.resume, "posterior").sizes["chain"])
+
     def starts(self) -> list[dict[str, Any]]:
         """Return starts of PyMC's chains, and of the stream of random numbers."""
         rng = np.random.default_rng(self.seed)
@@ -109,8 +115,8 @@ class SamplerRun:
             draws = zip(*last_draws(self.problem, self.resume), strict=True)
             return [self.problem.named(*draw) for draw in draws]
         if self.mode is None:
-            return prior_starts(self.problem, rng, self.chains)
-        return dispersed(self.mode, rng, self.chains)
+            return prior_starts(self.problem, rng, self.method.chains)
+        return dispersed(self.mode, rng, self.method.chains)
 
     def reference(self) -> Reference:
         """Return Gaussians about the modes, or of the draws of the posterior to go on from."""
@@ -135,14 +141,14 @@ class SamplerRun:
             raise FitError("fit: this method begins at a mode, and there is none")
         return self.mode
 
-    def sample(self, step: Any, steps_a_draw: int = 1) -> Idata:
+    def sample(self, step: Any) -> Idata:
         """Run ``pm.sample`` from the starts, without its checks of convergence."""
         import pymc as pm
 
-        starts = self.starts()
+        starts, thin = self.starts(), self.method.thin
         try:
             trace: Idata = pm.sample(
-                draws=self.draws * steps_a_draw, tune=self.tune, chains=len(starts),
+                draws=self.method.draws * thin, tune=self.method.tune, chains=len(starts),
                 cores=min(self.cores, len(starts)), step=step, initvals=starts,
                 random_seed=self.seed, progressbar=self.progress, quiet=not self.progress,
                 compute_convergence_checks=False, discard_tuned_samples=True, model=self.model,
@@ -151,11 +157,9 @@ class SamplerRun:
             if "Not enough samples" in str(error):  # PyMC's answer to an early interrupt
                 raise KeyboardInterrupt from error
             raise
-        if steps_a_draw == 1:
-            return trace
         data = groups(trace)
         for name in ("posterior", "sample_stats"):
-            data[name] = data[name].isel(draw=slice(steps_a_draw - 1, None, steps_a_draw))
+            data[name] = data[name].isel(draw=slice(thin - 1, None, thin))
         return from_groups(data, {})
 
 
@@ -164,18 +168,19 @@ def _importance(job: SamplerRun, *, proposals: float = 1.4) -> Idata:
 
     ``proposals``: weighted proposals a draw.
     """
-    chains = job.chains if job.resume is None else group(job.resume, "posterior").sizes["chain"]
-    shape, seed = (chains, job.draws), stream(job.seed, job.starts())
-    n = chains * job.draws
-    pool = draw_proposals(job.reference(), int(proposals * n), seed)
+    shape, seed = (job.chains, job.method.draws), stream(job.seed, job.starts())
+    n = job.chains * job.method.draws
+    reference = job.reference()
+    pool = draw_proposals(reference, int(proposals * n), seed)
     chosen, k, size = resample(pool.log_weight, n, np.random.default_rng([*seed, 1]))
-    phi, sigma = pool.phi[chosen], pool.sigma[chosen]
+    phi, sigma = reference.space.split(pool.q[chosen])
+    known = pool.log_likelihood
     values = job.problem.named(phi.reshape(*shape, -1), sigma.reshape(*shape, -1))
     trace = as_trace(job.problem, values, {"log_weight": pool.log_weight[chosen].reshape(shape)})
     trace.attrs |= {
-        PARETO_K: k, SIZE: pool.kept * size, LIKELIHOOD: pool.log_likelihood[chosen],
+        PARETO_K: k, SIZE: pool.kept * size, LIKELIHOOD: known if known is None else known[chosen],
         "proposals": "Gaussians at the modes", "rungs": pool.rungs, "acceptance": pool.accepted,
-        "log_evidence": pool.log_evidence,
+        "log_evidence": pool.log_z,
     }  # fmt: skip
     return trace
 
@@ -186,17 +191,16 @@ def _metropolis(job: SamplerRun, *, most_walkers: int = 20) -> Idata:
     ``most_walkers``: walkers of a chain of the ensemble.
     """
     reference, rng = job.reference(), np.random.default_rng(stream(job.seed, job.starts()))
-    walkers = min(most_walkers, job.draws)
-    per_walker = -(-job.draws // walkers)
-    chains = job.chains
+    method, chains = job.method, job.chains
+    walkers = min(most_walkers, method.draws)
+    per_walker = -(-method.draws // walkers)
     if job.resume is None:
         q = reference.draw(chains * walkers, rng)
     else:
         phi, sigma = last_draws(job.problem, job.resume, walkers)
-        chains = len(phi) // walkers
         q = reference.space.at(nearest(job.problem.layout, phi, any_prior=True), sigma)
     ensemble, exact = Ensemble(reference, q, rng), Posterior(reference.space)
-    tune = -(-job.tune // walkers) * job.thin
+    tune = -(-method.tune // walkers) * method.thin
     kept, rates = [], []
     steps = track(
         range(tune + per_walker), "sampling", console=Console(stderr=True),
@@ -204,7 +208,7 @@ def _metropolis(job: SamplerRun, *, most_walkers: int = 20) -> Idata:
     )  # fmt: skip
     try:
         for i in steps:
-            sweeps = 1 if i < tune else job.thin
+            sweeps = 1 if i < tune else method.thin
             rate = ensemble.move(exact, sweeps, adapt=i < tune)
             ensemble.q = reference.space.prior_draws(ensemble.q, rng)
             if i < tune:
@@ -219,7 +223,7 @@ def _metropolis(job: SamplerRun, *, most_walkers: int = 20) -> Idata:
 
     def chained(values: Floats) -> Floats:
         values = np.moveaxis(values, 0, 1).reshape(chains, walkers * len(kept), -1)
-        return values[:, -job.draws :]
+        return values[:, -method.draws :]
 
     values = job.problem.named(chained(phi), chained(sigma))
     accept = np.repeat(np.array(rates)[:, None], chains * walkers, axis=1)
@@ -240,7 +244,7 @@ def _paper(job: SamplerRun) -> Idata:
         else pm.Metropolis([variable], model=job.model)
         for variable in job.model.free_RVs
     ]
-    return job.sample(steps, job.thin)
+    return job.sample(steps)
 
 
 def _pymc(step: str, job: SamplerRun) -> Idata:
@@ -251,7 +255,7 @@ def _pymc(step: str, job: SamplerRun) -> Idata:
     """
     import pymc as pm
 
-    return job.sample(getattr(pm, step)(job.model.free_RVs, model=job.model), job.thin)
+    return job.sample(getattr(pm, step)(job.model.free_RVs, model=job.model))
 
 
 def _smc(job: SamplerRun) -> Idata:
@@ -259,7 +263,7 @@ def _smc(job: SamplerRun) -> Idata:
     import pymc as pm
 
     trace: Idata = pm.sample_smc(
-        draws=job.draws, chains=job.chains, cores=job.cores, random_seed=job.seed,
+        draws=job.method.draws, chains=job.chains, cores=job.cores, random_seed=job.seed,
         progressbar=job.progress, compute_convergence_checks=False, model=job.model,
     )  # fmt: skip
     return trace
@@ -276,8 +280,8 @@ def _map(job: SamplerRun) -> Idata:
 def _laplace(job: SamplerRun) -> Idata:
     """Draw independently from the Gaussian at the mode; that of the noise is of its logarithm."""
     rng, mode = np.random.default_rng(job.seed), job.at_mode
-    shape = job.chains, job.draws
-    phi = mode.draws(rng, job.chains * job.draws)
+    shape = job.chains, job.method.draws
+    phi = mode.draws(rng, shape[0] * shape[1])
     centre, covariance = mode.noise_gaussian()
     noise = rng.standard_normal((len(phi), len(centre))) @ np.linalg.cholesky(covariance).T
     sigma = np.exp(centre + noise)
@@ -341,7 +345,7 @@ METHODS: Mapping[str, Method] = {
     "smc": Method(_smc, draws=1000, tune=0, thin=1),
     "nuts": Method(partial(_pymc, "NUTS"), draws=500, tune=500, thin=1),
     "laplace": Method(_laplace, draws=250, tune=0, thin=1),
-    "map": Method(_map, draws=1, tune=0, thin=1),
+    "map": Method(_map, draws=1, tune=0, thin=1, chains=1),
 }
 
 #: Table 2's schedule for the apartment, whose prior is a library: one chain of 5,000 iterations.

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import (
     Mode,
@@ -16,10 +15,11 @@ from pbrl_ppl.modes import (
     Weighed,
     choose_from_library,
     index_law,
+    library_of,
     profile_sigma,
     stored,
 )
-from pbrl_ppl.parameters import JOINT_ANCHORS, JOINT_INDICES, ParameterLibrary
+from pbrl_ppl.parameters import JOINT_ANCHORS, JOINT_INDICES
 from pbrl_ppl.posterior import Idata, Point, from_groups, group, groups
 from pbrl_ppl.sampling.methods import as_trace, posterior_dataset
 from pbrl_ppl.state import Bools, Floats, Ints
@@ -201,10 +201,8 @@ def _stats(traces: Mapping[int, Idata], label: Ints) -> xr.Dataset:
     first = next(iter(records.values()))
     mixed = {}
     for name, variable in first.data_vars.items():
-        same = [
-            record[name].sizes == variable.sizes for record in records.values() if name in record
-        ]
-        if len(same) < len(records) or not all(same) or variable.dims[:2] != ("chain", "draw"):
+        sizes = [record[name].sizes for record in records.values() if name in record]
+        if sizes != [variable.sizes] * len(records) or variable.dims[:2] != ("chain", "draw"):
             continue
         values = variable.to_numpy().copy()
         for i, record in records.items():
@@ -223,10 +221,10 @@ def summed(problem: Problem, draws: int, chains: int, seed: int) -> tuple[Idata,
     draws, chains, seed : int
         As for :func:`pbrl_ppl.fit`.
     """
-    phi, sigma, index, accepted, best = choose_from_library(problem, draws, chains, seed)
+    phi, sigma, index, best = choose_from_library(problem, draws, chains, seed)
     values: dict[str, Any] = problem.layout.to_dict(phi)
     values |= {"library_index": index, "sigma": sigma[..., 0] if problem.scalar_sigma else sigma}
-    return as_trace(problem, values, {"accept": accepted}), _point(problem, best)
+    return as_trace(problem, values, {"accept": np.ones((chains, draws))}), _point(problem, best)
 
 
 def most_frequent(problem: Problem, trace: Idata) -> Point:
@@ -252,14 +250,8 @@ def most_frequent(problem: Problem, trace: Idata) -> Point:
 
 def _point(problem: Problem, choice: Ints) -> Point:
     """Return the parameters of a choice (owner,), with the most probable sigma."""
-    table = _library(problem).table(problem.layout, problem.scene)
+    table = library_of(problem).table(problem.layout, problem.scene)
     names = list(problem.scene.owners)
     owners = [owner for block in problem.layout.blocks for owner in block.owners]
     phi = table[np.arange(len(owners)), choice[[names.index(owner) for owner in owners]]]
     return Point(phi, profile_sigma(problem, problem.residual(phi), phi), choice)
-
-
-def _library(problem: Problem) -> ParameterLibrary:
-    if problem.library is None:
-        raise FitError("fit: the model has no library to choose from")
-    return problem.library

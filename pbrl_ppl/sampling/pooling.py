@@ -374,48 +374,35 @@ def _moments(prior: Prior, draws: Floats) -> tuple[float, float]:
 def _pooled(
     priors: list[Prior], draws: list[Floats], spread: float, free: bool
 ) -> tuple[Population, float]:
-    """Return the population of a parameter, and the angle that its scale is about."""
-    matched = [moment_matched(prior, x) for prior, x in zip(priors, draws, strict=True)]
-    if priors[0].family == "von_mises":
-        return _pooled_angles(priors, matched, spread, free)
-    before = np.array([prior.sigma**-2.0 for prior in priors])
-    after = np.array([match.sigma**-2.0 for match in matched])
-    # precisions of a product of normals add up: the data's is the difference
-    precision = after - before
-    informed = precision > _INFORMS * before
-    weighted = np.array([match.mu for match in matched]) * after
-    weighted -= np.array([prior.mu for prior in priors]) * before
-    safe = np.where(informed, precision, 1.0)
-    sd = np.where(informed, safe**-0.5, np.inf)
-    widest = priors[int(before.argmin())]
-    pooled = population(
-        weighted / safe, sd, centre=widest.mu, width=widest.sigma, spread=spread * widest.sigma
-    )
-    return pooled, 0.0
+    """Return the population of a parameter, and the angle that its scale is about.
 
-
-def _pooled_angles(
-    priors: list[Prior], matched: list[Prior], spread: float, free: bool
-) -> tuple[Population, float]:
-    """Pool angles as normal about their mean direction, as they are where the data inform.
-
-    A ``free`` angle is uniform a priori: what its prior has of concentration is from the choice
-    among a wheel's equal descriptions, and about the angle itself.
+    Natural parameters of a product of normals add up: the data's are differences. Angles are normal
+    about their mean direction, as they are where the data inform. A ``free`` angle is uniform a
+    priori: what its prior has of concentration is from the choice among a wheel's equal
+    descriptions, and about the angle itself.
     """
-    towards = np.array([match.mu for match in matched])
-    about = towards if free else np.array([prior.mu for prior in priors])
-    before = np.array([prior.kappa for prior in priors]) * np.exp(1j * about)
-    said = np.array([match.kappa for match in matched]) * np.exp(1j * towards) - before
-    kappa = np.abs(said)
-    informed = kappa > np.maximum(1.0, _INFORMS * np.abs(before))
-    reference = float(np.angle((said * informed).sum())) if informed.any() else 0.0
-    least = priors[int(np.abs(before).argmin())]
-    width = _ANY_ANGLE if free else min(_ANY_ANGLE, max(least.kappa, 1e-9) ** -0.5)
-    sd = np.where(informed, np.where(informed, kappa, 1.0) ** -0.5, np.inf)
-    pooled = population(
-        wrapped(np.angle(said) - reference), sd, width=width, spread=spread * width,
-        centre=0.0 if free else float(wrapped(least.mu - reference)),
-    )  # fmt: skip
+    matched = [moment_matched(prior, x) for prior, x in zip(priors, draws, strict=True)]
+    towards, about = (np.array([one.mu for one in of]) for of in (matched, priors))
+    if priors[0].family == "von_mises":
+        before, after = (np.array([one.kappa for one in of]) for of in (priors, matched))
+        about = towards if free else about
+        said = after * np.exp(1j * towards) - before * np.exp(1j * about)
+        precision = np.abs(said)
+        informed = precision > np.maximum(1.0, _INFORMS * np.abs(before))
+        reference = float(np.angle((said * informed).sum())) if informed.any() else 0.0
+        estimate = wrapped(np.angle(said) - reference)
+        least = priors[int(np.abs(before).argmin())]
+        width = _ANY_ANGLE if free else min(_ANY_ANGLE, max(least.kappa, 1e-9) ** -0.5)
+        centre = 0.0 if free else float(wrapped(least.mu - reference))
+    else:
+        before, after = (np.array([one.sigma**-2.0 for one in of]) for of in (priors, matched))
+        precision = after - before
+        informed, reference = precision > _INFORMS * before, 0.0
+        estimate = (towards * after - about * before) / np.where(informed, precision, 1.0)
+        least = priors[int(before.argmin())]
+        centre, width = least.mu, least.sigma
+    sd = np.where(informed, np.where(informed, precision, 1.0) ** -0.5, np.inf)
+    pooled = population(estimate, sd, centre=centre, width=width, spread=spread * width)
     return pooled, reference
 
 

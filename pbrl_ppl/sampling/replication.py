@@ -10,14 +10,7 @@ import numpy as np
 import xarray as xr
 from scipy.signal import lfilter
 
-from pbrl_ppl.errors import (
-    BoundWarning,
-    ConvergenceWarning,
-    FitError,
-    LinearisationWarning,
-    MeetingWarning,
-    UninformedWarning,
-)
+from pbrl_ppl.errors import FitError
 from pbrl_ppl.history import History, from_segments
 from pbrl_ppl.likelihood import (
     Problem,
@@ -41,12 +34,6 @@ from pbrl_ppl.state import STATE, Floats
 
 #: One replication's numbers, by name, each a list over the parameters.
 Record = dict[str, list[float]]
-
-
-#: Warnings of a fit that are ignored in replications.
-_KNOWN = (
-    ConvergenceWarning, BoundWarning, LinearisationWarning, MeetingWarning, UninformedWarning,
-)  # fmt: skip
 
 
 class Truth(NamedTuple):
@@ -238,8 +225,7 @@ def replicate(
     for again in range(most_repeats + 1):
         with warnings.catch_warnings():
             # convergence is in the result; the other warnings are about simulated data
-            for kind in _KNOWN:
-                warnings.simplefilter("ignore", kind)
+            warnings.simplefilter("ignore", UserWarning)
             idata = sample(problem, seed=seed, **settings).posterior
         if PosteriorRecord.of(idata).interrupted:
             raise KeyboardInterrupt

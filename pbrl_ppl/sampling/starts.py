@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import Problem
-from pbrl_ppl.modes import Mode, Space
+from pbrl_ppl.modes import Mode, Space, library_of
 from pbrl_ppl.posterior import Idata, group, parameter_draws
 from pbrl_ppl.state import Floats
 
@@ -41,11 +40,10 @@ def last_draws(problem: Problem, idata: Idata, walkers: int = 1) -> tuple[Floats
 
 def prior_starts(problem: Problem, rng: np.random.Generator, chains: int) -> list[dict[str, Any]]:
     """Draw starts of chains over a library: each owner's set from the prior, the median sigma."""
-    if problem.library is None:
-        raise FitError("fit: the model has no library to choose from")
+    library = library_of(problem)
     median = problem.noise_prior[0]
     sigma = np.exp(np.log(median).mean()) if problem.scalar_sigma else median
-    laws = [problem.library.prior(owner) for owner in problem.scene.owners]
+    laws = [library.prior(owner) for owner in problem.scene.owners]
     return [
         {"library_index": np.array([rng.choice(len(p), p=p) for p in laws]), "sigma": sigma}
         for _ in range(chains)

@@ -84,8 +84,8 @@ def test_proposals_along_trajectories_are_annealed(monkeypatch) -> None:
     model = physics_model(scene, pushed(scene, trajectories=3, intervals=8), substeps=4)
     mode = trajectory_mode(model.problem, model.problem.layout.to_vector(TRUTH))
     pool = draw_proposals(Reference.about(Space.of(mode), mode), 400, 1)
-    assert len(np.unique(pool.phi, axis=0)) > 200
-    assert np.isfinite(pool.log_evidence)
+    assert len(np.unique(pool.q, axis=0)) > 200
+    assert np.isfinite(pool.log_z)
 
 
 @pytest.fixture(scope="module")
@@ -173,12 +173,12 @@ def test_draws_have_the_moments_of_the_posterior(simple, monkeypatch, way) -> No
         assert (pool.rungs > 0) == way.endswith("engine moves")
         chosen, k, size = resample(pool.log_weight, 500, np.random.default_rng(seed))
         assert k < MAX_PARETO_K
-        prior = problem.layout.priors[0]
-        first = unconstrain(prior, pool.phi[chosen, 0])[0]
-        q = np.stack([first, np.log(pool.sigma[chosen, 0])], axis=1)
+        phi, sigma = reference.space.split(pool.q[chosen])
+        first = unconstrain(problem.layout.priors[0], phi[:, 0])[0]
+        q = np.stack([first, np.log(sigma[:, 0])], axis=1)
         errors.append((q.mean(axis=0) - mean) / sd * np.sqrt(pool.kept * size))
         widths.append(q.std(axis=0) / sd)
-        evidences.append(pool.log_evidence)
+        evidences.append(pool.log_z)
     assert (np.square(errors).sum(axis=0) < 35.6).all(), errors
     np.testing.assert_allclose(np.mean(widths, axis=0), 1.0, atol=0.05)
     error = np.std(evidences, ddof=1) / np.sqrt(10)
