@@ -251,6 +251,21 @@ class Space:
         there = np.isfinite(phi).all(axis=-1, keepdims=True)
         return inside(self.problem.layout.priors, np.where(there, phi, self.centre))
 
+    def look(self, q: Floats) -> Floats:
+        """Return residuals, which do not depend on the noise, as an array of their own."""
+        return np.array(self.residual(q), dtype=float)
+
+    def columns(self, q: Floats, look: Floats) -> Floats:
+        """Return the log-posterior of each part and of the noise at residuals, (n, part + 1).
+
+        Up to the evidence; see :meth:`look`.
+        """
+        total = self.log_priors(q)
+        there = np.isfinite(total).all(axis=1, keepdims=True)
+        likelihood = self.log_likelihoods(q, look)
+        total[:, :-1] = np.where(there, total[:, :-1] + likelihood, -np.inf)
+        return total
+
     def log_densities(self, q: Floats, *, numbers: int = 4_000_000) -> tuple[Floats, Floats]:
         """Return the log-posterior up to the evidence at points (n, d), and the log-likelihoods.
 

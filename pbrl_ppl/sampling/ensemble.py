@@ -30,38 +30,16 @@ _LOOKS = 5
 
 
 class Target(Protocol):
-    """A log-density of particles, in columns: one a part of the scene, the last of the noise."""
+    """A log-density of particles, in columns: one a part of the scene, the last of the noise.
+
+    A space is one, of its problem's posterior.
+    """
 
     def look(self, q: Floats) -> Any:
         """Return what is dear at particles (n, d), and does not depend on the noise."""
 
     def columns(self, q: Floats, look: Any) -> Floats:
         """Return the log-density of each part and of the noise, shape (n, part + 1)."""
-
-
-class Posterior:
-    """Log-posterior of a problem, up to the evidence.
-
-    Parameters
-    ----------
-    space : Space
-        Of the particles.
-    """
-
-    def __init__(self, space: Space) -> None:
-        self.space = space
-
-    def look(self, q: Floats) -> Floats:
-        """Return residuals, shape (n, transition, H, body, state)."""
-        return np.array(self.space.residual(q), dtype=float)
-
-    def columns(self, q: Floats, look: Floats) -> Floats:
-        """Return log-priors and log-likelihoods, shape (n, part + 1)."""
-        total = self.space.log_priors(q)
-        likelihood = self.space.log_likelihoods(q, look)
-        there = np.isfinite(total).all(axis=1, keepdims=True)
-        total[:, :-1] = np.where(there, total[:, :-1] + likelihood, -np.inf)
-        return total
 
 
 class Path:

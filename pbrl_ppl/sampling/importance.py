@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.modes import adaptive_importance, systematic
 from pbrl_ppl.posterior import MAX_PARETO_K, smoothed
-from pbrl_ppl.sampling.ensemble import Ensemble, Posterior, Proposals, Reference, anneal
+from pbrl_ppl.sampling.ensemble import Ensemble, Proposals, Reference, anneal
 from pbrl_ppl.state import Floats
 
 
@@ -57,7 +57,7 @@ def draw_proposals(
     if points.good:
         return Proposals(points.q, points.log_weight, points.log_z, points.values)
     particles = Ensemble(learned, learned.draw(batch * batches, rng), rng)
-    reached = anneal(particles, learned, Posterior(space))
+    reached = anneal(particles, learned, space)
     return reached._replace(q=space.prior_draws(reached.q, rng))
 
 

@@ -33,7 +33,7 @@ from pbrl_ppl.posterior import (
     groups,
     parameter_draws,
 )
-from pbrl_ppl.sampling.ensemble import Ensemble, Posterior, Reference
+from pbrl_ppl.sampling.ensemble import Ensemble, Reference
 from pbrl_ppl.sampling.importance import draw_proposals, resample, stream
 from pbrl_ppl.sampling.starts import dispersed, last_draws, prior_starts
 from pbrl_ppl.state import Floats
@@ -199,7 +199,7 @@ def _metropolis(job: SamplerRun, *, most_walkers: int = 20) -> Idata:
     else:
         phi, sigma = last_draws(job.problem, job.resume, walkers)
         q = reference.space.at(nearest(job.problem.layout, phi, any_prior=True), sigma)
-    ensemble, exact = Ensemble(reference, q, rng), Posterior(reference.space)
+    ensemble = Ensemble(reference, q, rng)
     tune = -(-method.tune // walkers) * method.thin
     kept, rates = [], []
     steps = track(
@@ -209,7 +209,7 @@ def _metropolis(job: SamplerRun, *, most_walkers: int = 20) -> Idata:
     try:
         for i in steps:
             sweeps = 1 if i < tune else method.thin
-            rate = ensemble.move(exact, sweeps, adapt=i < tune)
+            rate = ensemble.move(reference.space, sweeps, adapt=i < tune)
             ensemble.q = reference.space.prior_draws(ensemble.q, rng)
             if i < tune:
                 ensemble.learn()
