@@ -64,43 +64,47 @@ class OutputError(PbrlError, OSError):
     """An output that cannot be written, or that exists already."""
 
 
-class ConvergenceWarning(UserWarning):
+class PbrlWarning(UserWarning):
+    """Base of the warnings below."""
+
+
+class ConvergenceWarning(PbrlWarning):
     """A fit whose R-hat or effective sample size is not good enough to rely on."""
 
 
-class BoundWarning(UserWarning):
+class BoundWarning(PbrlWarning):
     """A fit with a parameter at a bound of its support."""
 
 
-class LinearisationWarning(UserWarning):
+class LinearisationWarning(PbrlWarning):
     """A fit of whole trajectories whose linearised likelihood differs from the engine's."""
 
 
-class UninformedWarning(UserWarning):
+class UninformedWarning(PbrlWarning):
     """A fit whose data do not inform a parameter: its posterior is its prior."""
 
 
-class PriorWarning(UserWarning):
+class PriorWarning(PbrlWarning):
     """A recording that is improbable under the prior: check units and hyper-parameters."""
 
 
-class RefitWarning(UserWarning):
+class RefitWarning(PbrlWarning):
     """An update that could not use the earlier draws, so that all data were fitted again."""
 
 
-class MeetingWarning(UserWarning):
+class MeetingWarning(PbrlWarning):
     """A fit that was repeated because bodies that were simulated apart meet."""
 
 
-class RecordingWarning(UserWarning):
+class RecordingWarning(PbrlWarning):
     """A recording that is cut, or of which rows are left out."""
 
 
-class ResamplingWarning(UserWarning):
+class ResamplingWarning(PbrlWarning):
     """A history whose samples were not evenly spaced, and were interpolated."""
 
 
-class ConversionWarning(UserWarning):
+class ConversionWarning(PbrlWarning):
     """A scene of another simulator's model that leaves out what scenes do not have."""
 
 

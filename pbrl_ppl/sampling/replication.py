@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from scipy.signal import lfilter
 
-from pbrl_ppl.errors import FitError
+from pbrl_ppl.errors import FitError, PbrlWarning
 from pbrl_ppl.history import History, from_segments
 from pbrl_ppl.likelihood import (
     Problem,
@@ -225,7 +225,7 @@ def replicate(
     for again in range(most_repeats + 1):
         with warnings.catch_warnings():
             # convergence is in the result; the other warnings are about simulated data
-            warnings.simplefilter("ignore", UserWarning)
+            warnings.simplefilter("ignore", PbrlWarning)
             idata = sample(problem, seed=seed, **settings).posterior
         if PosteriorRecord.of(idata).interrupted:
             raise KeyboardInterrupt
