@@ -112,8 +112,7 @@ def on_one_clock(
         stamps = _seconds(whole, column, layout, source)
         values = pd.to_numeric(whole[value], errors="coerce").to_numpy(float)
         hold = key.rpartition(".")[2] in WRENCH and _holds(layout, stamps, values)
-        frame = frame.assign(**{value: _at_times(time, stamps, values, hold=hold)})
-        say(_offset(str(value), stamps, time, held=hold))
+        frame = _brought(frame, str(value), stamps, values, say, hold=hold)
     if commands is not None:
         frame = _with_commands(frame, layout, commands, source, say)
     first = float(np.nanmin(frame["time"]))
@@ -293,10 +292,15 @@ def _holds(layout: Recording, stamps: Floats, values: Floats) -> bool:
     return bool(np.median(np.abs(np.diff(steps))) > 0.5 * np.median(np.abs(steps)))
 
 
-def _offset(name: str, stamps: Floats, times: Floats, *, held: bool) -> str:
+def _brought(
+    frame: pd.DataFrame, name: str, stamps: Floats, values: Floats, say: Say, *, hold: bool
+) -> pd.DataFrame:
+    """Return a table with a column of another clock at its rows' times."""
+    times = frame["time"].to_numpy(float)
     first = np.nanmin(stamps) - np.nanmin(times)
-    how = "held onto" if held else "interpolated onto"
-    return f"{name}, which begins {first:.4g} s after the rows, is {how} their times"
+    how = "held onto" if hold else "interpolated onto"
+    say(f"{name}, which begins {first:.4g} s after the rows, is {how} their times")
+    return frame.assign(**{name: _at_times(times, stamps, values, hold=hold)})
 
 
 def command_stamps(commands: pd.DataFrame, layout: Recording, source: str = "history") -> Floats:
@@ -356,8 +360,7 @@ def _with_commands(
     for name in dict.fromkeys(wanted.values()):
         values = np.asarray(pd.to_numeric(commands[name], errors="coerce"), dtype=float)
         hold = _holds(layout, stamps, values)
-        frame = frame.assign(**{name: _at_times(rows, stamps, values, hold=hold)})
-        say(_offset(str(name), stamps, rows, held=hold))
+        frame = _brought(frame, str(name), stamps, values, say, hold=hold)
     return frame
 
 

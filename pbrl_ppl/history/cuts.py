@@ -112,24 +112,27 @@ def _at_rest(times: Floats, states: Floats, seconds: float, still: float = 8.0) 
 def _jumps(times: Floats, places: Floats, least: float) -> Bools:
     """Return the rows beside changes of the velocity by more than so many m/s, shape (time,)."""
     beside = np.zeros(len(times), dtype=bool)
-    seen = np.flatnonzero(np.isfinite(places).all(axis=1))
-    for peak in _peaks(_velocity_changes(times[seen], places[seen]), least):
+    seen, changes = _velocity_changes(times, places)
+    for peak in _peaks(changes, least):
         beside[seen[max(peak - 1, 0) : peak + 2]] = True
     return beside
 
 
-def _velocity_changes(times: Floats, places: Floats) -> Floats:
-    """Return how much the velocity after each row differs from that before, shape (row,), m/s.
+def _velocity_changes(times: Floats, places: Floats) -> tuple[Ints, Floats]:
+    """Return the rows with a position, and how much the velocity changes there (m/s).
 
-    Each is the slope of a few rows on that side, so that noise is averaged; zero near the ends.
+    The velocities before and after each are slopes of a few rows on that side, so that noise is
+    averaged; the change is zero near the ends.
 
     Parameters
     ----------
     times : ndarray
         Rising, shape (row,), s.
     places : ndarray
-        Finite positions, shape (row, coordinate), m.
+        Positions, shape (row, coordinate), m; NaN where missing.
     """
+    seen = np.flatnonzero(np.isfinite(places).all(axis=1) & np.isfinite(times))
+    times, places = times[seen], places[seen]
     changes = np.zeros(len(times))
     if len(times) > 2 * _SIDE:
         t = sliding_window_view(times, _SIDE)
@@ -138,7 +141,7 @@ def _velocity_changes(times: Floats, places: Floats) -> Floats:
         slopes = np.einsum("kt,kct->kc", off, p) / (off**2).sum(axis=1)[:, None]
         change = np.linalg.norm(slopes[_SIDE + 1 :] - slopes[: -_SIDE - 1], axis=1)
         changes[_SIDE : len(times) - _SIDE] = change
-    return changes
+    return seen, changes
 
 
 def _peaks(changes: Floats, least: float) -> Ints:
@@ -243,10 +246,7 @@ def _jump(tracks: list[tuple[Floats, Floats]], abrupt: float = 10.0, rare: float
 
     Jumps are ``abrupt`` times the typical change, in the share ``rare`` of rows at most.
     """
-    changes: list[Floats] = []
-    for times, states in tracks:
-        seen = np.isfinite(states).all(axis=1) & np.isfinite(times)
-        changes.append(_velocity_changes(times[seen], states[seen]))
+    changes = [_velocity_changes(times, places)[1] for times, places in tracks]
     every = np.concatenate([np.zeros(0), *changes])
     least = abrupt * float(np.median(every)) if len(every) else 0.0
     jumps = sum(len(_peaks(one, least)) for one in changes) if least > 0 else 0

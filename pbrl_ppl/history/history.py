@@ -231,28 +231,28 @@ class History:
     @classmethod
     def _of_rows(cls, rows: Rows, scene: Scene, *, estimate_velocities: bool) -> History:
         """Return the history of rows at the scene's time step, after checks of all of them."""
-        table = padded(rows, scene)
-        start, assumed = complete_start(table.state, scene)
+        n_rows, clock, state, action = padded(rows, scene)
+        start, assumed = complete_start(state, scene)
         if estimate_velocities:  # of positions that were measured, or that hinges give
             assumed[:, 3:] &= assumed[:, :3]
-        n, k = len(table.n_rows), len(scene.moving)
+        n, k = len(n_rows), len(scene.moving)
         dims = ("trajectory", "time", "body")
         states, wrenches = ({"units": ", ".join(units)} for units in (STATE_UNITS, WRENCH_UNITS))
         before = np.zeros((n, k, len(WRENCH)))
         dataset = xr.Dataset(
             {
-                "observed": ((*dims, "state"), table.state, states),
-                "action": ((*dims, "wrench"), table.action, wrenches),
+                "observed": ((*dims, "state"), state, states),
+                "action": ((*dims, "wrench"), action, wrenches),
                 "start": ((*dims, "state"), start, states),
                 "assumed": (("body", "state"), assumed),
-                "clock": (("trajectory", "time"), table.clock, {"units": "s"}),
-                "n_rows": ("trajectory", table.n_rows),
+                "clock": (("trajectory", "time"), clock, {"units": "s"}),
+                "n_rows": ("trajectory", n_rows),
                 "number": ("trajectory", np.arange(float(n))),
                 "before": (("trajectory", "body", "wrench"), before, wrenches),
             },
             coords={
-                "trajectory": table.labels,
-                "time": np.arange(table.clock.shape[1]),
+                "trajectory": rows.labels,
+                "time": np.arange(clock.shape[1]),
                 "body": [body.name for body in scene.moving],
                 "kinematic": ("body", kinematic_bodies(scene)),
                 "state": list(STATE),
@@ -354,11 +354,9 @@ class History:
         intervals = self.dataset["n_rows"].to_numpy() - 1
         trajectory = np.repeat(np.arange(len(intervals)), intervals)
         step = np.concatenate([np.arange(n) for n in intervals])
-        inputs = self._inputs()[trajectory, step][:, None]
-        observed = states[trajectory, step + 1][:, None].copy()
-        observed[:, :, self.dataset["kinematic"].to_numpy()] = np.nan
-        actions = inputs[..., : len(WRENCH)]
-        return Segments(states[trajectory, step], actions, observed, trajectory, step, inputs)
+        observed = self.dataset["observed"].copy(data=states)
+        between = History(self.dataset.assign(observed=observed))
+        return between._segments(states, trajectory, step, 1)
 
     def _inputs(self) -> Floats:
         """Return all that acts in each interval, shape (trajectory, interval, body, input)."""

@@ -29,14 +29,16 @@ FLAT = 1e-3
 
 @dataclass(frozen=True)
 class _Joint:
-    """A joint's number, kind, axis in the plane's coordinates, and places in qpos and qvel.
+    """A joint's number, kind, direction in the plane, and places in qpos and qvel.
 
-    ``parent`` is the moving body that holds its body, if any.
+    ``direction`` is the change of x, y and theta by which the joint moves, and the force_x, force_y
+    and torque of a motor, each for one unit. ``parent`` is the moving body that holds its body, if
+    any.
     """
 
     number: int
     kind: int
-    axis: Floats
+    direction: Floats
     position: int
     velocity: int
     reference: float
@@ -199,8 +201,9 @@ def _joints(model: mujoco.MjModel, name: str, axes: Floats, reach: float) -> lis
                 " needs; put the frame there"
             )
         place, rate = int(model.jnt_qposadr[number]), int(model.jnt_dofadr[number])
+        direction = axis * ([0.0, 0.0, 1.0] if kind == HINGE else [1.0, 1.0, 0.0])
         reference = float(model.qpos0[place])
-        joints.append(_Joint(number, kind, axis, place, rate, reference, above))
+        joints.append(_Joint(number, kind, direction, place, rate, reference, above))
     slides = [joint for joint in joints if joint.kind == SLIDE]
     turns = np.abs(np.asarray(body.quat)[1:]).max()
     if (len(slides) == 1 and len(joints) > 1) or (
@@ -227,13 +230,13 @@ def _fill(
     reach: float,
 ) -> bool:
     """Fill a body's states (trajectory, row, 6) in place; return whether it stays in the plane."""
-    if any(joint.kind == SLIDE for joint in joints):
+    kinds = [joint.kind for joint in joints]
+    if SLIDE in kinds:
         state[..., :2], state[..., 3:5] = origin, 0.0
-        if len(joints) == 1:  # a slider, which does not turn
-            state[..., [2, 5]] = 0.0
+    if HINGE in kinds or kinds == [SLIDE]:  # a slider alone does not turn
+        state[..., [2, 5]] = 0.0
     for joint in joints:
         at, rate = joint.position, joint.velocity
-        moved = qpos[..., at] - joint.reference
         if joint.kind == FREE:
             place = qpos[..., at : at + 3] @ axes.T
             turn = qpos[..., at + 4 : at + 7] @ axes.T
@@ -244,12 +247,9 @@ def _fill(
             state[..., 2] = 2 * np.arctan2(turn[..., 2], qpos[..., at + 3])
             state[..., 3:5] = (qvel[..., rate : rate + 3] @ axes.T)[..., :2]
             state[..., 5] = (qvel[..., rate + 3 : rate + 6] @ axes.T)[..., 2]
-        elif joint.kind == SLIDE:
-            state[..., :2] += moved[..., None] * joint.axis[:2]
-            state[..., 3:5] += qvel[..., rate, None] * joint.axis[:2]
         else:
-            state[..., 2] = moved * joint.axis[2]
-            state[..., 5] = qvel[..., rate] * joint.axis[2]
+            state[..., :3] += (qpos[..., at, None] - joint.reference) * joint.direction
+            state[..., 3:] += qvel[..., rate, None] * joint.direction
     return True
 
 
@@ -290,16 +290,14 @@ def _motor_wrenches(model: mujoco.MjModel, joints: dict[str, list[_Joint]], ctrl
                 " wrench in place of ctrl"
             )
         force = ctrl[..., number]
-        if model.actuator_ctrllimited[number]:
-            force = np.clip(force, *model.actuator_ctrlrange[number])
-        force = force * model.actuator_gainprm[number, 0]
-        if model.actuator_forcelimited[number]:
-            force = np.clip(force, *model.actuator_forcerange[number])
-        force = force * model.actuator_gear[number, 0]
-        if joint.kind == SLIDE:
-            wrench[:, :, body, :2] += force[..., None] * joint.axis[:2]
-        else:
-            wrench[:, :, body, 2] += force * joint.axis[2]
-            if joint.parent is not None:
-                wrench[:, :, list(joints).index(joint.parent), 2] -= force * joint.axis[2]
+        for limited, limits, gain in (
+            (model.actuator_ctrllimited, model.actuator_ctrlrange, model.actuator_gainprm),
+            (model.actuator_forcelimited, model.actuator_forcerange, model.actuator_gear),
+        ):
+            force = np.clip(force, *limits[number]) if limited[number] else force
+            force = force * gain[number, 0]
+        acts = force[..., None] * joint.direction
+        wrench[:, :, body] += acts
+        if joint.parent is not None:  # of a hinge: slides are in the world
+            wrench[:, :, list(joints).index(joint.parent)] -= acts
     return wrench

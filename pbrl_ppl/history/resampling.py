@@ -186,8 +186,7 @@ def _quotients(tracks: tuple[_Track, ...], near: float = 1e-3) -> Bools:
     """
     computed = np.zeros(len(STATE), dtype=bool)
     for d in range(VELOCITY, len(STATE)):
-        off: list[list[Floats]] = [[], [], []]
-        rates = []
+        off, rates = [], []
         for track in tracks:
             place, rate = track.state[:, d - VELOCITY], track.state[:, d]
             if len(place) < 3 or not np.isfinite([place, rate]).all():
@@ -195,14 +194,11 @@ def _quotients(tracks: tuple[_Track, ...], near: float = 1e-3) -> Bools:
             place = unwrapped(track.time, place, rate) if d - VELOCITY == THETA else place
             one = np.diff(place) / np.diff(track.time)
             two = (place[2:] - place[:-2]) / (track.time[2:] - track.time[:-2])
-            for kind, quotient in enumerate((one[:-1], two, one[1:])):
-                off[kind].append(rate[1:-1] - quotient)
+            off.append(np.abs(rate[1:-1] - [one[:-1], two, one[1:]]))
             rates.append(rate[1:-1])
         if rates and (spread := float(np.concatenate(rates).std())) > 0:
             # at the ends and in gaps they may be anything
-            misfit = min(
-                float(np.quantile(np.abs(np.concatenate(misfits)), 0.95)) for misfits in off
-            )
+            misfit = np.quantile(np.concatenate(off, axis=1), 0.95, axis=1).min()
             computed[d] = misfit < near * spread
     return computed
 

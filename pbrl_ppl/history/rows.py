@@ -272,19 +272,8 @@ def _numbers(column: pd.Series, at: list[str], where: list[str]) -> Floats:
     return values
 
 
-@dataclass(frozen=True)
-class Arrays:
-    """A history as padded arrays: n trajectories, at most T steps, k bodies."""
-
-    labels: Labels
-    n_rows: Ints
-    clock: Floats
-    state: Floats
-    action: Floats
-
-
-def padded(rows: Rows, scene: Scene) -> Arrays:
-    """Return rows as checked arrays.
+def padded(rows: Rows, scene: Scene) -> tuple[Ints, Floats, Floats, Floats]:
+    """Return rows as checked arrays, NaN after a trajectory's end.
 
     Parameters
     ----------
@@ -292,6 +281,12 @@ def padded(rows: Rows, scene: Scene) -> Arrays:
         One for each (trajectory, step, body).
     scene : Scene
         The bodies and the time step that are expected.
+
+    Returns
+    -------
+    n_rows, clock, state, action : ndarray
+        Steps of each trajectory, shape (trajectory,); times, shape (trajectory, time), s; states
+        and wrenches, shape (trajectory, time, body, 6 or 3), SI units.
 
     Raises
     ------
@@ -313,7 +308,7 @@ def padded(rows: Rows, scene: Scene) -> Arrays:
     clock[rows.trajectory[head], position[head]] = rows.time[head]
     # A last row's wrench acts in an interval that was not measured.
     action[np.arange(len(n_rows)), n_rows - 1] = np.nan
-    return Arrays(rows.labels, n_rows, clock, state, action)
+    return n_rows, clock, state, action
 
 
 def _steps(rows: Rows, order: Ints, scene: Scene) -> tuple[Bools, Ints]:

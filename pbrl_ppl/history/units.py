@@ -245,10 +245,10 @@ def _unit_sentence(body: str, d: int, factor: float, near: float = 0.1) -> str:
     """
     place, rate = STATE[d], STATE[d + VELOCITY]
     units = {1000.0: "mm", 100.0: "cm", 9.81: ""}
-    rates = {1000.0: "mm/s", 100.0: "cm/s", 9.81: ""}
     if d == THETA:
         units = {180 / np.pi: "deg", 1000.0: "mrad"}
-        rates = {180 / np.pi: "deg/s", 1000.0: "mrad/s", 30 / np.pi: "rpm"}
+    rates = {size: f"{unit}/s" if unit else "" for size, unit in units.items()}
+    rates |= {30 / np.pi: "rpm"} if d == THETA else {}
     faster = f"{place} of {body} changes {factor:.3g} times as fast as {rate} says"
     larger = f"{rate} of {body} is {1 / factor:.3g} times the rate at which {place} changes"
     for words, column, size, known in (
