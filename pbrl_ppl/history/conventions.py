@@ -7,8 +7,9 @@ import numpy as np
 from pbrl_ppl.history.history import History
 from pbrl_ppl.history.kinematics import hung_bodies
 from pbrl_ppl.history.orientation import zero_angle
+from pbrl_ppl.history.units import rate_factor
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import THETA, VELOCITY, Floats, wrapped
+from pbrl_ppl.state import THETA, Floats, wrapped
 
 
 def angle_doubts(history: History, scene: Scene) -> list[str]:
@@ -39,7 +40,7 @@ def angle_doubts(history: History, scene: Scene) -> list[str]:
             continue
         if sentence := _degrees(angles, hinged=body.name in hung and bool(any(scene.gravity))):
             sentences.append(f"theta of {body.name} {sentence}")
-        elif _clockwise(states):
+        elif (rate_factor(states, THETA, scene.time_step) or 0.0) < 0:
             sentences.append(
                 f"theta of {body.name} falls where omega is positive, and rises where it is"
                 ' negative: one of them is clockwise: theta = "-COLUMN" in columns'
@@ -70,17 +71,6 @@ def _degrees(angles: list[Floats], *, hinged: bool) -> str:
             f'swings to both sides by {size:.2g} rad: looks like deg: units = {{ theta = "deg" }}'
         )
     return ""
-
-
-def _clockwise(states: Floats) -> bool:
-    """Return whether an angle changes against its measured rate, shape (trajectory, time, 6)."""
-    rate = states[..., THETA + VELOCITY]
-    change = wrapped(np.diff(states[..., THETA], axis=1))
-    mean = 0.5 * (rate[:, 1:] + rate[:, :-1])
-    seen = np.isfinite(change) & np.isfinite(mean)
-    if seen.sum() < 20 or not np.any(mean[seen]) or not np.any(change[seen]):
-        return False
-    return bool(np.corrcoef(change[seen], mean[seen])[0, 1] < -0.8)
 
 
 def _rest(angles: list[Floats], quiet: float = 0.05) -> float:

@@ -269,17 +269,19 @@ def _near(scene: Scene, body: int, states: Floats, row: int, slack: float = 0.25
         return False  # a hinged body with a measured angle alone
     reach = (1 + slack) * moving[body].shape.bounding_radius
     reach += 2 * float(np.abs(np.diff(values, axis=0)).max(initial=0.0))
-    far = []
-    for wall in scene.walls:
-        start, way = np.array(wall.start), np.array(wall.end) - np.array(wall.start)
+    # a body is a wall without length, with a radius
+    others = [(places[:, i], other) for i, other in enumerate(moving) if i != body]
+    others += [(np.array(other.pose)[:2], other) for other in scene.bodies if other.static]
+    obstacles = [
+        (np.array(wall.start), np.subtract(wall.end, wall.start), 0.0) for wall in scene.walls
+    ]
+    obstacles += [(place, np.zeros(2), other.shape.bounding_radius) for place, other in others]
+    for start, way, radius in obstacles:
         along = np.clip((values - start) @ way / max(way @ way, np.finfo(float).tiny), 0.0, 1.0)
-        far.append(np.linalg.norm(values - start - along[:, None] * way, axis=1))
-    others = [(other, places[:, i]) for i, other in enumerate(moving) if i != body]
-    others += [(other, np.array(other.pose)[:2]) for other in scene.bodies if other.static]
-    for other, place in others:
-        radius = (1 + slack) * other.shape.bounding_radius
-        far.append(np.linalg.norm(values - place, axis=1) - radius)
-    return not all((distance > reach).all() for distance in far) or any(
+        far = np.linalg.norm(values - start - along[:, None] * way, axis=1) - (1 + slack) * radius
+        if not (far > reach).all():
+            return True
+    return any(
         joint.traits.stops_bodies and moving[body].name in (joint.bodies or ())
         for joint in scene.joints
     )

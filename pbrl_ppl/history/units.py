@@ -195,22 +195,35 @@ def unit_mismatches(history: History) -> tuple[str, ...]:
     sentences = []
     for i, body in enumerate(history.bodies):
         for d in range(3):
-            position, rate = observed[:, :, i, d], observed[:, :, i, d + VELOCITY]
-            dt = float(history.dataset.attrs["time_step"])
-            factor = _unit_factor(position, rate, dt, angle=d == THETA)
+            factor = rate_factor(observed[:, :, i], d, float(history.dataset.attrs["time_step"]))
             if factor is not None and (words := _unit_sentence(body, d, factor)):
                 sentences.append(words)
     return tuple(sentences)
 
 
-def _unit_factor(
-    position: Floats, rate: Floats, dt: float, *, angle: bool, few: int = 8, spread: float = 0.2
+def rate_factor(
+    states: Floats, d: int, dt: float, *, few: int = 8, spread: float = 0.2
 ) -> float | None:
     """Return a position's change over the integral of its rate; None where that varies.
 
     Half of the single factors, of which there are at least ``few``, are within the share ``spread``
     of their median. Changes are taken over more and more intervals: measurement noise counts less.
+
+    Parameters
+    ----------
+    states : ndarray
+        Of a body, shape (trajectory, time, 6), SI units, NaN where missing.
+    d : int
+        The position's column.
+    dt : float
+        Time step (s).
+
+    Returns
+    -------
+    float or None
+        Negative where the position changes against its rate.
     """
+    position, rate = states[..., d], states[..., d + VELOCITY]
     best, least = None, spread
     for span in (1, 4, 16):
         n = (position.shape[1] - 1) // span
@@ -228,11 +241,11 @@ def _unit_factor(
             continue
         # angles may have been wrapped between two rows
         off = np.median(np.abs(wrapped(change - integral)))
-        if angle and off < 0.5 * min(1.0, float(np.median(np.abs(integral)))):
+        if d == THETA and off < 0.5 * min(1.0, float(np.median(np.abs(integral)))):
             return 1.0
         factor = float(np.median(change / integral))
         varies = float(np.median(np.abs(change / integral - factor))) / (abs(factor) or np.inf)
-        if factor > 0 and varies < least:
+        if varies < least:
             best, least = factor, varies
     return best
 
