@@ -11,7 +11,7 @@ from pbrl_ppl.effects.actuators import (
     rate_limit,
     saturation,
 )
-from pbrl_ppl.effects.effect import Effect, EffectParameter, always, is_pivoted
+from pbrl_ppl.effects.effect import SIGNED, SIZE, Effect, EffectParameter, always, is_pivoted
 from pbrl_ppl.effects.stages import Command
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import NUMBERS, Actuator, Scene
@@ -61,37 +61,23 @@ def _scale(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -
     wrench[0] *= parameters[0]
 
 
-# where the law of actuators finds by how much each is turned
-
-
-def _turn_first(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
-    wrench[6] = parameters[0]
-
-
-def _turn_second(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
-    wrench[7] = parameters[0]
-
-
-def _turn_third(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
-    wrench[8] = parameters[0]
-
-
-_TURNS = (_turn_first, _turn_second, _turn_third)
+def _turn(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
+    # where the law of actuators finds by how much each is turned
+    wrench[6 + int(parameters[1])] = parameters[0]
 
 
 #: Prior and natural unit of each number that is inferred.
 _GAIN = Prior("log_normal", mu=0.0, sigma=2.0)
-_LOSS = Prior("half_normal", sigma=1.0)
 _PRIORS = {
     "thruster": {
         "gain": (_GAIN, "force"),
-        "loss": (_LOSS, "force/speed"),
+        "loss": (SIZE, "force/speed"),
         "direction": (Prior("normal", sigma=0.3), ""),
     },
-    "motor": {"gain": (_GAIN, "torque"), "loss": (_LOSS, "torque/turn_rate")},
+    "motor": {"gain": (_GAIN, "torque"), "loss": (SIZE, "torque/turn_rate")},
     "servo": {
         "kp": (_GAIN, "torque"),
-        "kd": (_LOSS, "torque/turn_rate"),
+        "kd": (SIZE, "torque/turn_rate"),
         "limit": (_GAIN, "torque"),
     },
     "wrench": {},
@@ -109,7 +95,7 @@ def _kind(actuator: Actuator) -> int:
 
 def _given(value: float) -> EffectParameter:
     """Return a number that is known."""
-    return EffectParameter("given", "1", Prior("normal", sigma=1.0), value, given=True)
+    return EffectParameter("given", "1", SIGNED, value, given=True)
 
 
 def _numbers(actuator: Actuator) -> list[EffectParameter]:
@@ -231,7 +217,8 @@ def laws_of_actuators(scene: Scene, body: str) -> tuple[Effect, ...]:
                     (EffectParameter("angle", "rad", Prior("normal", sigma=0.3)),),
                     f"{name} points in another direction than declared: it is mounted askew",
                     "rotation of a vector in the plane",
-                    Command(_TURNS[slot], acts=False),
+                    Command(_turn, acts=False),
+                    constants=(float(slot),),
                 )
             )
     return tuple(laws)

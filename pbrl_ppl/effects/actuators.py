@@ -1,12 +1,12 @@
 """Actuators: gains, rotation, delay, dead zone, cut-off and saturation of the command."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from pbrl_ppl.effects.effect import Effect, EffectParameter
+from pbrl_ppl.effects.effect import Effect, EffectParameter, ScanWith
 from pbrl_ppl.effects.stages import Command
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
@@ -21,6 +21,7 @@ _LEVELS, _FEW = 20, 8
 _FORCE = slice(0, 2)
 #: No actuator reaches this force, in typical forces.
 _UNREACHED = 1e9
+_LIMIT = Prior("log_normal", mu=0.0, sigma=1.5)
 #: Intervals by which a push may be late.
 _LATEST = 8
 
@@ -139,9 +140,7 @@ actuator_delay = Effect(
     "actuator_delay",
     (
         EffectParameter(
-            "share",
-            "1",
-            Prior("truncated_normal", mu=0.0, sigma=2.0, lower=0.0, upper=float(_LATEST)),
+            "share", "1", Prior("truncated_normal", sigma=2.0, lower=0.0, upper=float(_LATEST))
         ),
     ),
     "the push arrives late, by so many sampling intervals (actuator_delay), or what is measured"
@@ -253,7 +252,13 @@ actuator_backlash = Effect(
 )
 
 
-def _levels(history: History, body: Body, components: slice, most: int | None = None) -> Floats:
+def _scan_levels(
+    scene: Scene,
+    history: History,
+    body: Body,
+    components: slice = _FORCE,
+    most: int | None = None,
+) -> Floats:
     """Return at most so many sizes between those commanded, shape (level, 1), N or N m."""
     most = most or (_LEVELS if components == _FORCE else _FEW)
     action = history.dataset["action"].sel(body=body.name).to_numpy()[..., components]
@@ -277,7 +282,7 @@ def _scan_dead_zones(
     scene: Scene, history: History, body: Body, components: slice = _FORCE
 ) -> Floats:
     """Return the null value, where the derivative is taken, and thresholds to try."""
-    return np.vstack([[[np.nan]], _levels(history, body, components)])
+    return np.vstack([[[np.nan]], _scan_levels(scene, history, body, components)])
 
 
 dead_zone = Effect(
@@ -305,7 +310,7 @@ def _scan_cutoffs(scene: Scene, history: History, body: Body, *, levels: int = 2
     ``levels``: the likelihood jumps where the cut-off passes a commanded force, and an optimiser
     cannot follow it: many levels.
     """
-    return _levels(history, body, _FORCE, levels)
+    return _scan_levels(scene, history, body, _FORCE, levels)
 
 
 force_cutoff = Effect(
@@ -328,43 +333,17 @@ def _saturate(state: Floats, command: Floats, parameters: Floats, wrench: Floats
         wrench[1] *= parameters[0] / size
 
 
-def _scan_limits(scene: Scene, history: History, body: Body, components: slice = _FORCE) -> Floats:
-    """Return limits to try."""
-    return _levels(history, body, components)
-
-
 saturation = Effect(
     "saturation",
-    (
-        EffectParameter(
-            "limit",
-            "N",
-            Prior("log_normal", mu=0.0, sigma=1.5),
-            null=_UNREACHED,
-            scale="force",
-        ),
-    ),
+    (EffectParameter("limit", "N", _LIMIT, null=_UNREACHED, scale="force"),),
     "a push is never stronger than a limit, whatever is commanded: the actuator saturates",
     "saturation of an actuator",
     Command(_saturate),
-    scan=_scan_limits,
+    scan=_scan_levels,
     log_odds=-2.0,
     family="shape of the command",
     applies=sends_wrenches,
 )
-
-
-@dataclass(frozen=True)
-class _ScanOfComponent:
-    """A scan by one component of the commands; it compares equal in other processes too."""
-
-    scan: Any
-    place: int
-
-    def __call__(self, scene: Scene, history: History, body: Body) -> Floats:
-        """Return the grid; see :data:`pbrl_ppl.effects.effect.Scan`."""
-        grid: Floats = self.scan(scene, history, body, slice(self.place, self.place + 1))
-        return grid
 
 
 def of_component(effect: Effect, name: str, sentence: str, component: str) -> Effect:
@@ -379,7 +358,8 @@ def of_component(effect: Effect, name: str, sentence: str, component: str) -> Ef
     component : str
         One of :data:`pbrl_ppl.state.WRENCH`.
     """
-    scan = effect.scan and _ScanOfComponent(effect.scan, WRENCH.index(component))
+    place = WRENCH.index(component)
+    scan = effect.scan and ScanWith(effect.scan, slice(place, place + 1))
     stage: Any = effect.stage
     stage = replace(stage, alone=component)
     return replace(effect, name=name, sentence=sentence, stage=stage, scan=scan)
@@ -541,15 +521,7 @@ def _scan_powers(scene: Scene, history: History, body: Body, *, most: int = 6) -
 
 power_limit = Effect(
     "power_limit",
-    (
-        EffectParameter(
-            "power",
-            "W",
-            Prior("log_normal", mu=0.0, sigma=1.5),
-            null=_UNREACHED,
-            scale="force speed",
-        ),
-    ),
+    (EffectParameter("power", "W", _LIMIT, null=_UNREACHED, scale="force speed"),),
     "a push never does more work in a second than a limit: the motor's or the supply's power",
     "power limit of an actuator, f . v <= P",
     Command(_limit_power),

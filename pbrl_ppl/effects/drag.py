@@ -4,15 +4,12 @@ import math
 
 import numpy as np
 
-from pbrl_ppl.effects.effect import Effect, EffectParameter, is_unpivoted
+from pbrl_ppl.effects.effect import SIGNED, SIZE, Effect, EffectParameter, is_unpivoted
 from pbrl_ppl.effects.stages import Force
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene
 from pbrl_ppl.state import Floats
-
-#: At the typical motion such a law is of the order of the typical force or torque.
-_TYPICAL = Prior("half_normal", sigma=1.0)
 
 
 def _linear(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
@@ -22,7 +19,7 @@ def _linear(state: Floats, command: Floats, parameters: Floats, wrench: Floats) 
 
 linear_drag = Effect(
     "linear_drag",
-    (EffectParameter("coefficient", "kg/s", _TYPICAL, scale="force/speed"),),
+    (EffectParameter("coefficient", "kg/s", SIZE, scale="force/speed"),),
     "a force against the motion that grows with the speed, as in oil or at low speed in air",
     "Stokes' law, F = -c v",
     Force(_linear),
@@ -38,7 +35,7 @@ def _quadratic(state: Floats, command: Floats, parameters: Floats, wrench: Float
 
 quadratic_drag = Effect(
     "quadratic_drag",
-    (EffectParameter("coefficient", "kg/m", _TYPICAL, scale="force/speed^2"),),
+    (EffectParameter("coefficient", "kg/m", SIZE, scale="force/speed^2"),),
     "a force against the motion that grows with the square of the speed, as in air or water",
     "Rayleigh's drag equation, F = -c |v| v",
     Force(_quadratic),
@@ -52,7 +49,7 @@ def _angular(state: Floats, command: Floats, parameters: Floats, wrench: Floats)
 
 angular_drag = Effect(
     "angular_drag",
-    (EffectParameter("coefficient", "N m s", _TYPICAL, scale="torque/turn_rate"),),
+    (EffectParameter("coefficient", "N m s", SIZE, scale="torque/turn_rate"),),
     "a torque against the rotation that grows with the angular speed",
     "viscous torque, tau = -c omega",
     Force(_angular),
@@ -66,7 +63,7 @@ def _quadratic_angular(state: Floats, command: Floats, parameters: Floats, wrenc
 
 quadratic_angular_drag = Effect(
     "quadratic_angular_drag",
-    (EffectParameter("coefficient", "N m s^2", _TYPICAL, scale="torque/turn_rate^2"),),
+    (EffectParameter("coefficient", "N m s^2", SIZE, scale="torque/turn_rate^2"),),
     "a torque against the rotation that grows with the square of the angular speed: a fan,"
     " a stirrer",
     "drag of a rotor, tau = -c |omega| omega",
@@ -94,7 +91,7 @@ _EXPONENT = EffectParameter(
 
 power_drag = Effect(
     "power_drag",
-    (EffectParameter("force", "N", _TYPICAL, scale="force"), _EXPONENT),
+    (EffectParameter("force", "N", SIZE, scale="force"), _EXPONENT),
     "a force against the motion that grows with a power of the speed, and has this size at the"
     " typical speed",
     "power law, F = -f (|v| / v0)^p, with a typical speed v0",
@@ -114,7 +111,7 @@ def _angular_power(state: Floats, command: Floats, parameters: Floats, wrench: F
 
 power_angular_drag = Effect(
     "power_angular_drag",
-    (EffectParameter("torque", "N m", _TYPICAL, scale="torque"), _EXPONENT),
+    (EffectParameter("torque", "N m", SIZE, scale="torque"), _EXPONENT),
     "a torque against the rotation that grows with a power of the angular speed, and has this size"
     " at the typical one",
     "power law, tau = -t (|omega| / omega0)^p, with a typical angular speed omega0",
@@ -137,8 +134,8 @@ def _linear_by_axis(state: Floats, command: Floats, parameters: Floats, wrench: 
 drag_by_axis = Effect(
     "drag_by_axis",
     (
-        EffectParameter("along", "kg/s", _TYPICAL, scale="force/speed"),
-        EffectParameter("across", "kg/s", _TYPICAL, scale="force/speed"),
+        EffectParameter("along", "kg/s", SIZE, scale="force/speed"),
+        EffectParameter("across", "kg/s", SIZE, scale="force/speed"),
     ),
     "a force against the motion that grows with the speed and is another along the body than across"
     " it: a hull, a skid",
@@ -160,8 +157,8 @@ def _quadratic_by_axis(state: Floats, command: Floats, parameters: Floats, wrenc
 quadratic_drag_by_axis = Effect(
     "quadratic_drag_by_axis",
     (
-        EffectParameter("along", "kg/m", _TYPICAL, scale="force/speed^2"),
-        EffectParameter("across", "kg/m", _TYPICAL, scale="force/speed^2"),
+        EffectParameter("along", "kg/m", SIZE, scale="force/speed^2"),
+        EffectParameter("across", "kg/m", SIZE, scale="force/speed^2"),
     ),
     "a force against the motion that grows with the square of the speed and is another along the"
     " body than across it",
@@ -188,14 +185,12 @@ def _scan_winds(scene: Scene, history: History, body: Body) -> Floats:
     return np.array([(np.nan, *wind) for wind in winds if speed > 0.0]).reshape(-1, 3)
 
 
-_WIND = Prior("normal", sigma=1.0)
-
 wind = Effect(
     "wind",
     (
-        EffectParameter("coefficient", "kg/m", _TYPICAL, scale="force/speed^2"),
-        EffectParameter("wind_x", "m/s", _WIND, scale="speed"),
-        EffectParameter("wind_y", "m/s", _WIND, scale="speed"),
+        EffectParameter("coefficient", "kg/m", SIZE, scale="force/speed^2"),
+        EffectParameter("wind_x", "m/s", SIGNED, scale="speed"),
+        EffectParameter("wind_y", "m/s", SIGNED, scale="speed"),
     ),
     "drag against air or water that moves itself: it grows with the square of the speed through it",
     "Rayleigh's drag equation, F = -c |v - w| (v - w)",
@@ -213,11 +208,7 @@ def _magnus(state: Floats, command: Floats, parameters: Floats, wrench: Floats) 
 
 magnus_force = Effect(
     "magnus_force",
-    (
-        EffectParameter(
-            "coefficient", "kg", Prior("normal", sigma=1.0), scale="force/speed turn_rate"
-        ),
-    ),
+    (EffectParameter("coefficient", "kg", SIGNED, scale="force/speed turn_rate"),),
     "a force across the motion that grows with the speed and the turning: a spinning body is drawn"
     " aside",
     "Magnus force, F = c omega x v",

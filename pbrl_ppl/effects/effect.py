@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import InitVar, dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -27,6 +28,24 @@ from pbrl_ppl.state import Floats
 #: tried if its derivative at the null vanishes. The derivative is taken by parameters that are
 #: NaN, at their null value.
 Scan = Callable[[Scene, History, Body], Floats]
+
+
+@dataclass(frozen=True)
+class ScanWith:
+    """A scan with one more argument; unlike a partial it compares equal in other processes too."""
+
+    scan: Callable[..., Floats]
+    argument: Any
+
+    def __call__(self, scene: Scene, history: History, body: Body) -> Floats:
+        """Return the grid; see :data:`Scan`."""
+        return self.scan(scene, history, body, self.argument)
+
+
+#: Priors of what is positive, or has a sign, in natural units: an effect of this size is of the
+#: order of what else acts on the body. And of an angle that may be any.
+SIZE, SIGNED = Prior("half_normal", sigma=1.0), Prior("normal", sigma=1.0)
+ANY_ANGLE = Prior("von_mises", mu=0.0, kappa=0.0)
 
 
 def always(scene: Scene, body: Body) -> bool:

@@ -4,17 +4,16 @@ import math
 
 import numpy as np
 
-from pbrl_ppl.effects.effect import Effect, EffectParameter, is_unpivoted
+from pbrl_ppl.effects.effect import ANY_ANGLE, SIGNED, Effect, EffectParameter, is_unpivoted
 from pbrl_ppl.effects.stages import Clock, Force, Properties, Values
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene
 from pbrl_ppl.state import Floats
 
-_TYPICAL = Prior("normal", sigma=1.0)
 _FORCES = (
-    EffectParameter("force_x", "N", _TYPICAL, scale="force"),
-    EffectParameter("force_y", "N", _TYPICAL, scale="force"),
+    EffectParameter("force_x", "N", SIGNED, scale="force"),
+    EffectParameter("force_y", "N", SIGNED, scale="force"),
 )
 
 
@@ -76,7 +75,7 @@ def _torque(state: Floats, command: Floats, parameters: Floats, wrench: Floats) 
 
 constant_torque = Effect(
     "constant_torque",
-    (EffectParameter("torque", "N m", _TYPICAL, scale="torque"),),
+    (EffectParameter("torque", "N m", SIGNED, scale="torque"),),
     "a steady twist in one direction, such as a torque sensor that is off zero",
     "Euler's second law with a constant torque",
     Force(_torque),
@@ -94,8 +93,8 @@ def _moment_of_push(state: Floats, command: Floats, parameters: Floats, wrench: 
 push_offset = Effect(
     "push_offset",
     (
-        EffectParameter("offset_x", "m", _TYPICAL, scale="length"),
-        EffectParameter("offset_y", "m", _TYPICAL, scale="length"),
+        EffectParameter("offset_x", "m", SIGNED, scale="length"),
+        EffectParameter("offset_y", "m", SIGNED, scale="length"),
     ),
     "the push acts at a point beside the body's centre, and so turns it as well",
     "moment of a force about a point, tau = r x F",
@@ -119,8 +118,8 @@ def _scan_counts(scene: Scene, history: History, body: Body) -> Floats:
 
 
 _TORQUES = (
-    EffectParameter("cosine", "N m", _TYPICAL, scale="torque"),
-    EffectParameter("sine", "N m", _TYPICAL, scale="torque"),
+    EffectParameter("cosine", "N m", SIGNED, scale="torque"),
+    EffectParameter("sine", "N m", SIGNED, scale="torque"),
 )
 
 cogging = Effect(
@@ -159,12 +158,12 @@ def _scan_waves(scene: Scene, history: History, body: Body) -> Floats:
 ripple = Effect(
     "ripple",
     (
-        EffectParameter("cosine", "N", _TYPICAL, scale="force"),
-        EffectParameter("sine", "N", _TYPICAL, scale="force"),
+        EffectParameter("cosine", "N", SIGNED, scale="force"),
+        EffectParameter("sine", "N", SIGNED, scale="force"),
         EffectParameter(
             "wavelength", "m", Prior("log_normal", mu=-1.0, sigma=1.0), null=0.4, scale="range"
         ),
-        EffectParameter("direction", "rad", Prior("von_mises", mu=0.0, kappa=0.0)),
+        EffectParameter("direction", "rad", ANY_ANGLE),
     ),
     "a force along a line that repeats with the place: a linear motor's magnets, a belt's teeth",
     "force ripple, a cos(2 pi x / l) + b sin(2 pi x / l)",
@@ -203,10 +202,10 @@ _PERIOD = EffectParameter(
 periodic_force = Effect(
     "periodic_force",
     (
-        EffectParameter("cosine", "N", _TYPICAL, scale="force"),
-        EffectParameter("sine", "N", _TYPICAL, scale="force"),
+        EffectParameter("cosine", "N", SIGNED, scale="force"),
+        EffectParameter("sine", "N", SIGNED, scale="force"),
         _PERIOD,
-        EffectParameter("direction", "rad", Prior("von_mises", mu=0.0, kappa=0.0)),
+        EffectParameter("direction", "rad", ANY_ANGLE),
     ),
     "a force along a line that repeats with the time since a trajectory began: a shaken table",
     "harmonic force, a cos(2 pi t / T) + b sin(2 pi t / T)",

@@ -6,8 +6,12 @@ from itertools import product
 import numpy as np
 
 from pbrl_ppl.effects.effect import (
+    ANY_ANGLE,
+    SIGNED,
+    SIZE,
     Effect,
     EffectParameter,
+    ScanWith,
     body_points,
     is_pivoted,
     is_sliding,
@@ -20,16 +24,24 @@ from pbrl_ppl.scene import Body, Scene
 from pbrl_ppl.state import Floats
 
 _FRICTION = Prior("half_normal", sigma=0.5)
-_SHARE = Prior("half_normal", sigma=1.0)
 _DIFFERENCE = Prior("normal", sigma=0.5)
+#: Speeds of turning and of sliding at which Stribeck's curve falls.
+_SLOW = Prior("log_normal", mu=-1.5, sigma=1.0)
+_TURN_RATE = EffectParameter("speed", "rad/s", _SLOW, null=0.2, scale="turn_rate")
+_SPEED = EffectParameter("speed", "m/s", _SLOW, null=0.2, scale="speed")
 
 
-def _speeds(history: History, body: Body, *columns: str) -> Floats:
-    """Return two speeds below the body's usual ones, shape (2,), rad/s or m/s; or none."""
+def _scan_speeds(scene: Scene, history: History, body: Body, columns: tuple[str, ...]) -> Floats:
+    """Return two speeds below the body's usual ones; the derivative is taken by the friction."""
     start = history.dataset["start"].sel(body=body.name, state=list(columns)).to_numpy()
     speed = np.linalg.norm(start, axis=-1)
     speed = speed[speed > 0.0]  # not NaN either
-    return np.quantile(speed, [0.15, 0.45]) if len(speed) else np.empty(0)
+    speeds = np.quantile(speed, [0.15, 0.45]) if len(speed) else ()
+    return np.array([(np.nan, speed) for speed in speeds]).reshape(-1, 2)
+
+
+_SCAN_TURN_RATES = ScanWith(_scan_speeds, ("omega",))
+_SCAN_SPEEDS = ScanWith(_scan_speeds, ("vx", "vy"))
 
 
 def _add_pivot_damping(properties: dict[str, Floats], parameters: Values, clock: Clock) -> None:
@@ -38,11 +50,7 @@ def _add_pivot_damping(properties: dict[str, Floats], parameters: Values, clock:
 
 pivot_damping = Effect(
     "pivot_damping",
-    (
-        EffectParameter(
-            "coefficient", "N m s", Prior("half_normal", sigma=1.0), scale="torque/turn_rate"
-        ),
-    ),
+    (EffectParameter("coefficient", "N m s", SIZE, scale="torque/turn_rate"),),
     "viscous friction in the hinge: a torque against the rotation that grows with its speed",
     "viscous torque on the relative angular velocity, tau = -c omega",
     Properties(_add_pivot_damping),
@@ -56,7 +64,7 @@ def _add_pivot_torque(properties: dict[str, Floats], parameters: Values, clock: 
 
 pivot_friction = Effect(
     "pivot_friction",
-    (EffectParameter("torque", "N m", Prior("half_normal", sigma=1.0), scale="torque"),),
+    (EffectParameter("torque", "N m", SIZE, scale="torque"),),
     "dry friction in the hinge: a steady torque against the rotation that can also hold it still",
     "Coulomb's law of friction",
     Properties(_add_pivot_torque),
@@ -67,11 +75,7 @@ pivot_friction = Effect(
 
 slider_damping = Effect(
     "slider_damping",
-    (
-        EffectParameter(
-            "coefficient", "N s/m", Prior("half_normal", sigma=1.0), scale="force/speed"
-        ),
-    ),
+    (EffectParameter("coefficient", "N s/m", SIZE, scale="force/speed"),),
     "viscous friction in the slider: a force against the sliding that grows with its speed",
     "viscous force on the relative velocity along the axis, F = -c v",
     Properties(_add_pivot_damping),
@@ -85,7 +89,7 @@ def _add_slider_force(properties: dict[str, Floats], parameters: Values, clock: 
 
 slider_friction = Effect(
     "slider_friction",
-    (EffectParameter("force", "N", Prior("half_normal", sigma=1.0), scale="force"),),
+    (EffectParameter("force", "N", SIZE, scale="force"),),
     "dry friction in the slider: a steady force against the sliding that can also hold it still",
     "Coulomb's law of friction",
     Properties(_add_slider_force),
@@ -98,25 +102,18 @@ def _fall_with_speed(state: Floats, load: Floats, parameters: Floats, most: Floa
     most[0] += parameters[0] * math.exp(-((load[2] / parameters[1]) ** 2))
 
 
-def _scan_turn_rates(scene: Scene, history: History, body: Body) -> Floats:
-    """Return speeds to try; the derivative is taken by the torque."""
-    return np.array([(np.nan, speed) for speed in _speeds(history, body, "omega")]).reshape(-1, 2)
-
-
 pivot_stribeck = Effect(
     "pivot_stribeck",
     (
-        EffectParameter("torque", "N m", _SHARE, scale="torque"),
-        EffectParameter(
-            "speed", "rad/s", Prior("log_normal", mu=-1.5, sigma=1.0), null=0.2, scale="turn_rate"
-        ),
+        EffectParameter("torque", "N m", SIZE, scale="torque"),
+        _TURN_RATE,
     ),
     "dry friction in the hinge that is stronger near standstill than in motion: it sticks, then"
     " slips",
     "Stribeck's curve, tau = tau_s exp(-(omega/omega_s)^2) beside Coulomb's",
     Friction(_fall_with_speed),
     applies=is_pivoted,
-    scan=_scan_turn_rates,
+    scan=_SCAN_TURN_RATES,
     log_odds=-2.0,
     family="dry friction",
 )
@@ -128,7 +125,7 @@ def _grow_with_load(state: Floats, load: Floats, parameters: Floats, most: Float
 
 pivot_load_friction = Effect(
     "pivot_load_friction",
-    (EffectParameter("motor", "1", _SHARE), EffectParameter("load", "1", _SHARE)),
+    (EffectParameter("motor", "1", SIZE), EffectParameter("load", "1", SIZE)),
     "dry friction in the hinge that grows with the torque of the motor and of the load: gears that"
     " press harder rub harder",
     "load-dependent friction, tau = a |motor| + b |load| (M. Duclusaud et al., arXiv 2410.08650)",
@@ -165,11 +162,7 @@ def _damp_one_way(state: Floats, command: Floats, parameters: Floats, wrench: Fl
 
 pivot_one_way_damping = Effect(
     "pivot_one_way_damping",
-    (
-        EffectParameter(
-            "coefficient", "N m s", Prior("normal", sigma=1.0), scale="torque/turn_rate"
-        ),
-    ),
+    (EffectParameter("coefficient", "N m s", SIGNED, scale="torque/turn_rate"),),
     "viscous friction in the hinge that is stronger one way than the other",
     "viscous torque by direction, tau = -c |omega| beside -c omega",
     Force(_damp_one_way),
@@ -196,23 +189,18 @@ def _begin_bent(state: Floats, command: Floats, parameters: Floats, memory: Floa
 
 def _scan_bends(scene: Scene, history: History, body: Body) -> Floats:
     """Return angles of bending without and with a rise; the derivative is taken by the torque."""
-    speeds = _speeds(history, body, "omega")
-    return np.array(
-        [(np.nan, bend, rise, speeds[0]) for bend in (0.01, 0.05) for rise in (0.0, 0.5)]
-        if len(speeds)
-        else []
-    ).reshape(-1, 4)
+    slowest = _SCAN_TURN_RATES(scene, history, body)[:1, 1]
+    grid = [(np.nan, *shape) for shape in product((0.01, 0.05), (0.0, 0.5), slowest)]
+    return np.array(grid).reshape(-1, 4)
 
 
 pivot_hysteresis = Effect(
     "pivot_hysteresis",
     (
-        EffectParameter("torque", "N m", _SHARE, scale="torque"),
+        EffectParameter("torque", "N m", SIZE, scale="torque"),
         EffectParameter("angle", "rad", Prior("log_normal", mu=-4.0, sigma=1.0), null=0.02),
-        EffectParameter("rise", "1", _SHARE),
-        EffectParameter(
-            "speed", "rad/s", Prior("log_normal", mu=-1.5, sigma=1.0), null=0.2, scale="turn_rate"
-        ),
+        EffectParameter("rise", "1", SIZE),
+        _TURN_RATE,
     ),
     "dry friction in the hinge that bends before it slips: after a turn it builds up over an angle,"
     " and it may be stronger near standstill by a share",
@@ -235,7 +223,7 @@ def _lies_free(scene: Scene, body: Body) -> bool:
 
 turning_friction = Effect(
     "turning_friction",
-    (EffectParameter("torque", "N m", Prior("half_normal", sigma=1.0), scale="torque"),),
+    (EffectParameter("torque", "N m", SIZE, scale="torque"),),
     "dry friction against turning alone: a steady torque that can also hold it, and that sliding"
     " does not weaken",
     "Coulomb's law for the torque at a single foot",
@@ -270,9 +258,7 @@ sliding_friction = Effect(
     "sliding_friction",
     (
         EffectParameter("mu", "1", _FRICTION),
-        EffectParameter(
-            "radius", "m", Prior("log_normal", mu=-1.5, sigma=1.0), null=0.2, scale="length"
-        ),
+        EffectParameter("radius", "m", _SLOW, null=0.2, scale="length"),
     ),
     "dry friction on the floor: a steady force and torque against any sliding and turning, which"
     " can also hold the body still",
@@ -287,26 +273,17 @@ def _fall_by_share(state: Floats, load: Floats, parameters: Floats, most: Floats
     most[0] *= 1.0 + parameters[0] * math.exp(-((load[2] / parameters[1]) ** 2))
 
 
-def _scan_speeds(scene: Scene, history: History, body: Body) -> Floats:
-    """Return speeds to try; the derivative is taken by the share."""
-    return np.array([(np.nan, speed) for speed in _speeds(history, body, "vx", "vy")]).reshape(
-        -1, 2
-    )
-
-
 sliding_stribeck = Effect(
     "sliding_stribeck",
     (
-        EffectParameter("share", "1", _SHARE),
-        EffectParameter(
-            "speed", "m/s", Prior("log_normal", mu=-1.5, sigma=1.0), null=0.2, scale="speed"
-        ),
+        EffectParameter("share", "1", SIZE),
+        _SPEED,
     ),
     "dry friction on the floor that is stronger near standstill than in motion, by this share",
     "Stribeck's curve, mu (1 + a exp(-(v/v_s)^2))",
     Friction(_fall_by_share, under=True),
     applies=_is_pressed,
-    scan=_scan_speeds,
+    scan=_SCAN_SPEEDS,
     log_odds=-2.0,
 )
 
@@ -314,17 +291,15 @@ sliding_stribeck = Effect(
 slider_stribeck = Effect(
     "slider_stribeck",
     (
-        EffectParameter("force", "N", _SHARE, scale="force"),
-        EffectParameter(
-            "speed", "m/s", Prior("log_normal", mu=-1.5, sigma=1.0), null=0.2, scale="speed"
-        ),
+        EffectParameter("force", "N", SIZE, scale="force"),
+        _SPEED,
     ),
     "dry friction in the slider that is stronger near standstill than in motion: it sticks, then"
     " slips",
     "Stribeck's curve, F = F_s exp(-(v/v_s)^2) beside Coulomb's",
     Friction(_fall_with_speed),
     applies=is_sliding,
-    scan=_scan_speeds,
+    scan=_SCAN_SPEEDS,
     log_odds=-2.0,
     family="dry friction",
 )
@@ -392,9 +367,9 @@ def _scan_wheels(scene: Scene, history: History, body: Body, *, n_turns: int = 3
 wheel = Effect(
     "wheel",
     (
-        EffectParameter("w_x", "m", Prior("normal", sigma=1.0), scale="length"),
-        EffectParameter("w_y", "m", Prior("normal", sigma=1.0), scale="length"),
-        EffectParameter("w_theta", "rad", Prior("von_mises", mu=0.0, kappa=0.0)),
+        EffectParameter("w_x", "m", SIGNED, scale="length"),
+        EffectParameter("w_y", "m", SIGNED, scale="length"),
+        EffectParameter("w_theta", "rad", ANY_ANGLE),
         EffectParameter("mu_x", "1", _FRICTION),
         EffectParameter("mu_y", "1", _FRICTION),
     ),

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from pbrl_ppl.effects.effect import Effect, EffectParameter, is_unpivoted
+from pbrl_ppl.effects.effect import SIZE, Effect, EffectParameter, is_unpivoted
 from pbrl_ppl.effects.stages import Clock, Force, Properties, Values
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
@@ -74,7 +74,7 @@ mass_change = Effect(
     (
         EffectParameter("factor", "1", _SCALE, null=1.0),
         EffectParameter("trajectory", "1", Prior("half_normal", sigma=100.0)),
-        EffectParameter("time", "s", Prior("half_normal", sigma=1.0), scale="time"),
+        EffectParameter("time", "s", SIZE, scale="time"),
     ),
     "the body is heavier or lighter from some trajectory, or some time, on: it carries a load",
     "a change point in the mass",

@@ -4,10 +4,9 @@ from itertools import combinations
 
 import numpy as np
 
-from pbrl_ppl.effects.effect import Effect, EffectParameter, is_pivoted
+from pbrl_ppl.effects.effect import SIGNED, SIZE, Effect, EffectParameter, is_pivoted
 from pbrl_ppl.effects.stages import Disc, Structure, Values
 from pbrl_ppl.history import History
-from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene, Shape
 from pbrl_ppl.state import Floats
 
@@ -129,9 +128,9 @@ def _exit(shape: Shape, direction: Floats, offset: float) -> Floats:
 hidden_obstacle = Effect(
     "hidden_obstacle",
     (
-        EffectParameter("x", "m", Prior("normal", sigma=1.0), scale="range", origin="x"),
-        EffectParameter("y", "m", Prior("normal", sigma=1.0), scale="range", origin="y"),
-        EffectParameter("radius", "m", Prior("half_normal", sigma=1.0), scale="length"),
+        EffectParameter("x", "m", SIGNED, scale="range", origin="x"),
+        EffectParameter("y", "m", SIGNED, scale="range", origin="y"),
+        EffectParameter("radius", "m", SIZE, scale="length"),
     ),
     "the body ran into something that the scene does not show",
     "contact with a static disc",

@@ -6,14 +6,27 @@ from math import floor, pi
 import numpy as np
 from scipy.optimize import least_squares
 
-from pbrl_ppl.effects.effect import Effect, EffectParameter, body_points, is_unjoined, is_unpivoted
+from pbrl_ppl.effects.effect import (
+    ANY_ANGLE,
+    SIGNED,
+    SIZE,
+    Effect,
+    EffectParameter,
+    ScanWith,
+    body_points,
+    is_unjoined,
+    is_unpivoted,
+)
 from pbrl_ppl.effects.stages import Force, Rod, Structure, Values
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene
 from pbrl_ppl.state import Floats, wrapped
 
-_PLACE = Prior("normal", sigma=1.0)
+_ANCHOR = (
+    EffectParameter("anchor_x", "m", SIGNED, scale="range", origin="x"),
+    EffectParameter("anchor_y", "m", SIGNED, scale="range", origin="y"),
+)
 
 
 def _poses(history: History, body: Body, width: int) -> Floats:
@@ -50,9 +63,8 @@ def _scan_anchors(
 spring = Effect(
     "spring",
     (
-        EffectParameter("stiffness", "N/m", Prior("half_normal", sigma=1.0), scale="force/length"),
-        EffectParameter("anchor_x", "m", _PLACE, scale="range", origin="x"),
-        EffectParameter("anchor_y", "m", _PLACE, scale="range", origin="y"),
+        EffectParameter("stiffness", "N/m", SIZE, scale="force/length"),
+        *_ANCHOR,
     ),
     "a pull towards a place that grows with the distance: a cable or a hose drags at the body",
     "Hooke's law",
@@ -90,7 +102,7 @@ torsion_spring = Effect(
     "torsion_spring",
     (
         EffectParameter("stiffness", "N m/rad", Prior("half_normal", sigma=0.5), scale="torque"),
-        EffectParameter("angle", "rad", Prior("von_mises", mu=0.0, kappa=0.0)),
+        EffectParameter("angle", "rad", ANY_ANGLE),
     ),
     "a torque towards an angle that grows with the deflection: a twisted cable or a bent hinge",
     "Hooke's law of torsion",
@@ -111,9 +123,8 @@ def _cubic_spring(state: Floats, command: Floats, parameters: Floats, wrench: Fl
 cubic_spring = Effect(
     "cubic_spring",
     (
-        EffectParameter("stiffness", "N/m^3", Prior("normal", sigma=1.0), scale="force/range^3"),
-        EffectParameter("anchor_x", "m", _PLACE, scale="range", origin="x"),
-        EffectParameter("anchor_y", "m", _PLACE, scale="range", origin="y"),
+        EffectParameter("stiffness", "N/m^3", SIGNED, scale="force/range^3"),
+        *_ANCHOR,
     ),
     "a pull towards a place that grows with the cube of the distance: a spring that hardens",
     "Duffing's spring, F = -k r^3",
@@ -131,33 +142,28 @@ def _cubic_torsion(state: Floats, command: Floats, parameters: Floats, wrench: F
     wrench[2] -= parameters[0] * off * off * off
 
 
-def _scan_middle(scene: Scene, history: History, body: Body) -> Floats:
-    """Return the middle and the ends of the range of the angle; the derivative is by the size."""
-    angles = _angles(history, body, 0.1, 0.5, 0.9)
-    return np.array([(np.nan, angle) for angle in angles]).reshape(-1, 2)
+def _scan_range(scene: Scene, history: History, body: Body, shares: tuple[float, ...]) -> Floats:
+    """Return angles at shares of the range that was measured; none if it turns all the way.
 
-
-def _angles(history: History, body: Body, *shares: float) -> list[float]:
-    """Return angles at shares of the range that was measured; none if it turns all the way."""
+    The derivative is taken by the stiffness.
+    """
     theta = history.dataset["start"].sel(body=body.name, state="theta").to_numpy().ravel()
     theta = theta[np.isfinite(theta)]
     if not len(theta) or not 0.0 < np.ptp(theta) < 2.0 * np.pi:
-        return []
-    return [float(theta.min() + share * np.ptp(theta)) for share in shares]
+        return np.empty((0, 2))
+    return np.array([(np.nan, theta.min() + share * np.ptp(theta)) for share in shares])
 
-
-_ANGLE = Prior("von_mises", mu=0.0, kappa=0.0)
 
 cubic_torsion_spring = Effect(
     "cubic_torsion_spring",
     (
-        EffectParameter("stiffness", "N m/rad^3", Prior("normal", sigma=1.0), scale="torque"),
-        EffectParameter("angle", "rad", _ANGLE),
+        EffectParameter("stiffness", "N m/rad^3", SIGNED, scale="torque"),
+        EffectParameter("angle", "rad", ANY_ANGLE),
     ),
     "a torque towards an angle that grows with the cube of the deflection: a spring that hardens",
     "Duffing's spring, tau = -k theta^3",
     Force(_cubic_torsion),
-    scan=_scan_middle,
+    scan=ScanWith(_scan_range, (0.1, 0.5, 0.9)),
     log_odds=-3.0,
     family="place and angle",
 )
@@ -171,19 +177,9 @@ def _lower_stop(state: Floats, command: Floats, parameters: Floats, wrench: Floa
     wrench[2] += parameters[0] * max(0.0, parameters[1] - state[2])
 
 
-def _scan_upper(scene: Scene, history: History, body: Body) -> Floats:
-    """Return angles near the upper end; the derivative is taken by the stiffness."""
-    return np.array([(np.nan, a) for a in _angles(history, body, 0.7, 0.9)]).reshape(-1, 2)
-
-
-def _scan_lower(scene: Scene, history: History, body: Body) -> Floats:
-    """Return angles near the lower end; the derivative is taken by the stiffness."""
-    return np.array([(np.nan, a) for a in _angles(history, body, 0.3, 0.1)]).reshape(-1, 2)
-
-
 _STOP = (
     EffectParameter("stiffness", "N m/rad", Prior("half_normal", sigma=10.0), scale="torque"),
-    EffectParameter("angle", "rad", _ANGLE),
+    EffectParameter("angle", "rad", ANY_ANGLE),
 )
 
 upper_stop = Effect(
@@ -192,7 +188,7 @@ upper_stop = Effect(
     "a springy stop above an angle: a bumper, a cable that gets tight",
     "one-sided spring, tau = -k max(0, theta - theta0)",
     Force(_upper_stop),
-    scan=_scan_upper,
+    scan=ScanWith(_scan_range, (0.7, 0.9)),
     log_odds=-4.0,
     family="place and angle",
 )
@@ -203,7 +199,7 @@ lower_stop = Effect(
     "a springy stop below an angle: a bumper, a cable that gets tight",
     "one-sided spring, tau = k max(0, theta0 - theta)",
     Force(_lower_stop),
-    scan=_scan_lower,
+    scan=ScanWith(_scan_range, (0.3, 0.1)),
     log_odds=-4.0,
     family="place and angle",
 )
@@ -237,9 +233,8 @@ cable = Effect(
     "cable",
     (
         EffectParameter("stiffness", "N/m", Prior("half_normal", sigma=3.0), scale="force/length"),
-        EffectParameter("anchor_x", "m", _PLACE, scale="range", origin="x"),
-        EffectParameter("anchor_y", "m", _PLACE, scale="range", origin="y"),
-        EffectParameter("length", "m", Prior("half_normal", sigma=1.0), scale="range"),
+        *_ANCHOR,
+        EffectParameter("length", "m", SIZE, scale="range"),
     ),
     "a pull towards a place that begins beyond a distance: a springy cable that gets taut",
     "one-sided spring, F = -k max(0, r - l)",
@@ -286,9 +281,9 @@ def _scan_places(
 point_attractor = Effect(
     "point_attractor",
     (
-        EffectParameter("strength", "N m^2", Prior("normal", sigma=1.0), scale="force length^2"),
-        EffectParameter("x", "m", _PLACE, scale="range", origin="x"),
-        EffectParameter("y", "m", _PLACE, scale="range", origin="y"),
+        EffectParameter("strength", "N m^2", SIGNED, scale="force length^2"),
+        EffectParameter("x", "m", SIGNED, scale="range", origin="x"),
+        EffectParameter("y", "m", SIGNED, scale="range", origin="y"),
         EffectParameter(
             "depth", "m", Prior("log_normal", mu=-1.0, sigma=0.7), null=0.4, scale="length"
         ),
@@ -375,11 +370,11 @@ def _centre(point: Floats, poses: Floats) -> Floats:
 distance_joint = Effect(
     "distance_joint",
     (
-        EffectParameter("a_x", "m", Prior("normal", sigma=1.0), scale="length"),
-        EffectParameter("a_y", "m", Prior("normal", sigma=1.0), scale="length"),
-        EffectParameter("b_x", "m", _PLACE, scale="range", origin="x"),
-        EffectParameter("b_y", "m", _PLACE, scale="range", origin="y"),
-        EffectParameter("length", "m", Prior("half_normal", sigma=1.0), scale="range"),
+        EffectParameter("a_x", "m", SIGNED, scale="length"),
+        EffectParameter("a_y", "m", SIGNED, scale="length"),
+        EffectParameter("b_x", "m", SIGNED, scale="range", origin="x"),
+        EffectParameter("b_y", "m", SIGNED, scale="range", origin="y"),
+        EffectParameter("length", "m", SIZE, scale="range"),
     ),
     "a rod or a taut tether that the scene does not show: it holds a point of the body at a"
     " distance from a place",
