@@ -163,18 +163,37 @@ SETTING = np.dtype(
 )
 
 
-class Pointers(NamedTuple):
-    """Addresses of the C objects of a world, and what else the compiled rollout needs of it."""
+class Still(NamedTuple):
+    """What every compiled rollout needs of a world; discs are moved for each proposal."""
 
+    gravity: NDArray[np.float64]  # (2,), m/s^2
+    normal_gravity: float  # m/s^2
+    length: float  # size of the smallest moving body (m)
+    fastest: float  # speed of divergence (m/s)
+    ring: NDArray[np.float64]  # (point, 2)
+    radii: NDArray[np.float64]  # (body,), m
+    can_touch: NDArray[np.bool_]  # (body, body)
+    obstacles: NDArray[np.float64]  # (obstacle, 5), the discs last
+    watched: bool  # whether there is anything to touch
+
+
+def still(world: World, near: float = 1.0) -> Still:
+    """Return what every compiled rollout needs of a world, with ``near`` times its radii."""
+    return Still(
+        np.array(world.space.gravity, dtype=float), world.scene.normal_gravity, world.size,
+        world.fastest, np.array(RING), near * world.radii, world.can_touch,
+        world.obstacles.copy(), len(world.obstacles) > 0 or np.tril(world.can_touch, -1).any(),
+    )  # fmt: skip
+
+
+class Pointers(NamedTuple):
+    """Addresses of the C objects of a world, and what else its engine's rollout needs of it."""
+
+    still: Still
     space: int
     iterations: int
     chained: NDArray[np.bool_]
     padding: int
-    gravity_x: float  # m/s^2
-    gravity_y: float
-    normal_gravity: float
-    size: float  # m
-    fastest: float  # m/s
     far: float  # m
     bodies: NDArray[np.int64]
     kinematic: NDArray[np.bool_]
@@ -191,10 +210,6 @@ class Pointers(NamedTuple):
     discs: NDArray[np.int64]
     patches: NDArray[np.int64]  # (2, patch, point of the ring): what holds it, the rod
     patch_body: NDArray[np.int64]
-    ring: NDArray[np.float64]
-    radii: NDArray[np.float64]
-    obstacles: NDArray[np.float64]
-    can_touch: NDArray[np.bool_]
 
 
 def pointers(world: World) -> Pointers:
@@ -223,15 +238,11 @@ def pointers(world: World) -> Pointers:
 
     wheels, patches = world.wheels, world.patches
     return Pointers(
+        still=still(world),
         space=int(ffi.cast("intptr_t", world.space._space)),
         iterations=world.iterations,
         chained=world.chained,
         padding=world.padding,
-        gravity_x=world.scene.gravity[0],
-        gravity_y=world.scene.gravity[1],
-        normal_gravity=world.scene.normal_gravity,
-        size=world.size,
-        fastest=world.fastest,
         far=world.far,
         bodies=at(*(body._body for body in world.bodies)),
         kinematic=world.kinematic,
@@ -250,8 +261,4 @@ def pointers(world: World) -> Pointers:
             2, -1, len(RING)
         ),
         patch_body=whole(*(patch.body for patch in patches)),
-        ring=np.array(RING),
-        radii=world.radii,
-        obstacles=world.obstacles,
-        can_touch=world.can_touch,
     )

@@ -19,7 +19,6 @@ from pbrl_ppl.physics.laws import (
     WRENCHES,
     act,
     begin_held,
-    bound,
     laws_of,
     set_memory,
 )
@@ -31,6 +30,7 @@ from pbrl_ppl.physics.setters import (
     place_bodies,
     place_patches,
     place_wheels,
+    set_brakes,
     set_discs,
     set_properties,
     set_strengths,
@@ -84,32 +84,6 @@ def _forget(fn, world, bodies, batch, touched):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def set_brakes(world, laws, bodies, joints, state, acted):  # type: ignore[no-untyped-def]
-    """Set the greatest torque of friction in hinges where laws change it."""
-    for j in range(len(world.strengths)):
-        setting = world.strengths[j]
-        i = setting.row
-        if setting.column != COLUMN.pivot_torque:
-            continue
-        row, rest = bodies[i], 0.0  # of a slider the force that is commanded, and the speed
-        torque = math.sqrt(acted[i, COMMAND] ** 2 + acted[i, COMMAND + 1] ** 2)
-        speed = math.sqrt(state[i, 3] ** 2 + state[i, 4] ** 2)
-        for hinge in world.pivots:
-            if hinge[0] == i:  # body, joint, column of the anchor on the body
-                x, y = row[COLUMN.com_x], row[COLUMN.com_y]
-                x -= joints[hinge[1], hinge[2]]
-                y -= joints[hinge[1], hinge[2] + 1]
-                c, s = math.cos(state[i, 2]), math.sin(state[i, 2])
-                x, y = c * x - s * y, s * x + c * y
-                weight_x = world.gravity_x + row[COLUMN.extra_gravity_x]
-                weight_y = world.gravity_y + row[COLUMN.extra_gravity_y]
-                rest = row[COLUMN.mass] * (x * weight_y - y * weight_x)
-                torque, speed = acted[i, COMMAND + 2], abs(state[i, 5])
-        most = bound(row[COLUMN.pivot_torque], laws, i, 0, state, torque, rest, speed, acted)
-        call1(setting.function, setting.constraint, most)
-
-
-@compiled
 def intervals(bodies, p, t, horizon):  # type: ignore[no-untyped-def]
     """Return the properties in a transition's intervals; one row if they do not change."""
     if bodies.shape[1] > 1:
@@ -141,7 +115,8 @@ def _transition(  # type: ignore[no-untyped-def]
     acting = len(laws.commands) + len(laws.forces) > 0
     sliding = len(world.patch_body) > 0
     braked = len(laws.frictions) > 0
-    watch = len(world.obstacles) > 0 or k > 1
+    still = world.still
+    watch = len(still.obstacles) > 0 or k > 1
     place_bodies(fn, world, bodies, state)
     set_memory(batch, laws, p, t, begin, first, acted, memory, held, at)
     begin_held(state, laws, acted, held)
@@ -191,11 +166,11 @@ def _transition(  # type: ignore[no-untyped-def]
                 x, y = arm(bodies[i], state[i, 2])
                 v_x, v_y = get2(fn.cpBodyGetVelocity, body)
                 state[i, 3], state[i, 4], state[i, 5] = v_x + turn * y, v_y - turn * x, turn
-                speed = abs(state[i, 3]) + abs(state[i, 4]) + world.size * abs(turn)
-                if not speed < world.fastest:  # also true of NaN
+                speed = abs(state[i, 3]) + abs(state[i, 4]) + still.length * abs(turn)
+                if not speed < still.fastest:  # also true of NaN
                     return _LOST, end
             if watch and (touched == _FREE or not whole):
-                near = near_contact(state, world.radii, world.obstacles, world.can_touch)
+                near = near_contact(state, still.radii, still.obstacles, still.can_touch)
                 touched = _TOUCHED if near else touched
         copy(state, out[h])
         if memory.shape[1] > 0:
@@ -246,28 +221,16 @@ def rollout(fn, world, batch, items, begins, whole, out):  # type: ignore[no-unt
             set_properties(fn, world, first, joints[p])
             set_discs(fn, world, discs[p])
             finer = FINER if (discs[p, :, 2] > 0.0).any() else 1
-        if not whole:
-            if timed:
-                set_properties(fn, world, first, joints[p])
-            _forget(fn, world, first, batch, _TOUCHED)
-            substeps = batch.counts[0] * finer
-            outcome, end = _transition(
-                fn, world, batch, laws, p, t, substeps, scratch, states_before, begin, whole,
-                out[item],
-            )  # fmt: skip
-            if outcome == _LOST:
-                return place
-            begins[place] = end
-            continue
-        begins[place] = horizon
         total[:] = 0.0
         for level in range(len(batch.counts)):
             before, substeps = outcome, batch.counts[level]
+            if not whole:  # near others: with the contacts in the order of a new world
+                before, substeps = _TOUCHED, substeps * finer
             for _ in range(2):
                 if timed:
                     set_properties(fn, world, first, joints[p])
                 _forget(fn, world, first, batch, before)
-                outcome, _ = _transition(
+                outcome, end = _transition(
                     fn, world, batch, laws, p, t, substeps, scratch, states_before, begin, whole,
                     states,
                 )  # fmt: skip
@@ -281,12 +244,13 @@ def rollout(fn, world, batch, items, begins, whole, out):  # type: ignore[no-unt
             if outcome == _LOST:
                 return place
             if level == 0:
-                for h in range(horizon):
+                begins[place] = end
+                for h in range(begin, end):
                     copy(states[h], out[item, h])
-            if outcome == _TOUCHED:
+            if outcome == _TOUCHED or not whole:
                 break
             total += batch.weights[level] * states
-        if outcome == _FREE and len(batch.counts) > 1:
+        if whole and outcome == _FREE and len(batch.counts) > 1:
             for i in range(k):
                 if world.kinematic[i]:  # the weights' sum is 1 but for rounding
                     copy(out[item, :, i], total[:, i])

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.errors import SimulationError
 from pbrl_ppl.physics import calls, compiled, flow, lockstep
-from pbrl_ppl.physics.calls import pointers
+from pbrl_ppl.physics.calls import pointers, still
 from pbrl_ppl.physics.motion import work_of
-from pbrl_ppl.physics.tree import tree_of
-from pbrl_ppl.physics.world import RING, World
+from pbrl_ppl.physics.tree import MOST, tree_of
+from pbrl_ppl.physics.world import World
 from pbrl_ppl.state import Floats, Ints
 
 #: Bodies are near each other within this multiple of their radii: a step of half a radius that
@@ -39,29 +39,6 @@ class Batch(NamedTuple):
     counts: NDArray[np.int64]
     weights: Floats
     tolerance: float
-
-
-class Still(NamedTuple):
-    """What contact-free rollouts need of a world; discs are moved for each proposal."""
-
-    gravity: Floats  # (2,), m/s^2
-    normal_gravity: float  # m/s^2
-    length: float  # size of the smallest moving body (m)
-    fastest: float  # speed of divergence (m/s)
-    ring: Floats  # (point, 2)
-    radii: Floats  # (body,), m
-    can_touch: NDArray[np.bool_]  # (body, body)
-    obstacles: Floats  # (obstacle, 5), the discs last
-    watched: bool  # whether there is anything to touch
-
-
-def still(world: World, near: float = 1.0) -> Still:
-    """Return what contact-free rollouts need of a world, with ``near`` times its radii."""
-    return Still(
-        np.array(world.space.gravity, dtype=float), world.scene.normal_gravity, world.size,
-        world.fastest, np.array(RING), near * world.radii, world.can_touch,
-        world.obstacles.copy(), len(world.obstacles) > 0 or np.tril(world.can_touch, -1).any(),
-    )  # fmt: skip
 
 
 class Engine:
@@ -106,11 +83,14 @@ class Engine:
         """
         items, horizon = np.arange(first, last), batch.inputs.shape[1]
         begins = np.zeros(len(items), dtype=np.int64)
-        whole = self._wheels is None and self._tree is None
+        tree = self._tree
+        if tree is not None and tree.size + 1 + batch.held > MOST and batch.held > 0:
+            tree = None  # what laws have of their own would not fit beside the coordinates
+        whole = self._wheels is None and tree is None
         while len(items):
             if self._wheels is not None:
                 lockstep.rollout(self._wheels, self._still, batch, items, begins, out)
-            elif self._tree is not None:
+            elif tree is not None:
                 flow.rollout(self._work, self._still, batch, items, begins, out)
             left = begins < horizon
             items, begins = items[left], begins[left]

@@ -62,20 +62,20 @@ from pbrl_ppl.physics.tree import ALONG, TURNING
 from pbrl_ppl.physics.tree import FIRST as COORDINATE
 from pbrl_ppl.state import Floats
 
-#: Times of the stages, weights of earlier slopes, and those of the error estimate.
+#: Times of the stages; weights of the slopes before each, and in the last row those of the error.
 _TIMES = np.array([0.0, 0.2, 0.3, 0.8, 8 / 9, 1.0, 1.0])
 _WEIGHTS = np.array(
     [
-        [0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
-        [1 / 5, 0.0, 0.0, 0.0, 0.0, 0.0],
-        [3 / 40, 9 / 40, 0.0, 0.0, 0.0, 0.0],
-        [44 / 45, -56 / 15, 32 / 9, 0.0, 0.0, 0.0],
-        [19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0.0, 0.0],
-        [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0.0],
-        [35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84],
+        [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [1 / 5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [3 / 40, 9 / 40, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [44 / 45, -56 / 15, 32 / 9, 0.0, 0.0, 0.0, 0.0],
+        [19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0.0, 0.0, 0.0],
+        [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0.0, 0.0],
+        [35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84, 0.0],
+        [71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40],
     ]
 )
-_ERROR = np.array([71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40])
 #: Steps of an interval, at most: laws that are stiffer, or jump more often, have no prediction.
 MOST_STEPS = 4000
 #: Steps of less than this share of an interval are taken as they are.
@@ -256,6 +256,15 @@ def _margin(work, laws, u):  # type: ignore[no-untyped-def]
 
 
 @compiled
+def _weighted(motion, stage, first, j):  # type: ignore[no-untyped-def]
+    """Return the weighted sum of slopes of a coordinate before a stage, of rows from ``first``."""
+    total = 0.0
+    for k in range(stage):
+        total += _WEIGHTS[stage, k] * motion[first + 2 * k, j]
+    return total
+
+
+@compiled
 def _step(work, laws, inputs, share, low, high, width):  # type: ignore[no-untyped-def]
     """Try a step of a width (share of the interval) from its first slopes.
 
@@ -266,20 +275,15 @@ def _step(work, laws, inputs, share, low, high, width):  # type: ignore[no-untyp
     n, count, seconds, end, way = work.n, work.n_rows, width * laws.time_step, 1.0, 1.0
     ends = n + 1 + laws.held  # after the numbers of laws, which have speeds alone
     for j in range(ends):
-        motion[SLOPES, j] = motion[U, j]
+        if j != n:
+            motion[SLOPES, j] = motion[U, j]
     for stage in range(1, 7):
-        for j in range(n):
-            q, u = 0.0, 0.0
-            for k in range(stage):
-                q += _WEIGHTS[stage, k] * motion[SLOPES + 2 * k, j]
-                u += _WEIGHTS[stage, k] * motion[SLOPES + 2 * k + 1, j]
-            motion[END_Q, j] = motion[Q, j] + seconds * q
-            motion[END_U, j] = motion[SLOPES + 2 * stage, j] = motion[U, j] + seconds * u
-        for j in range(n + 1, ends):
-            q = 0.0
-            for k in range(stage):
-                q += _WEIGHTS[stage, k] * motion[SLOPES + 2 * k, j]
-            motion[END_Q, j] = motion[Q, j] + seconds * q
+        for j in range(ends):
+            if j != n:
+                motion[END_Q, j] = motion[Q, j] + seconds * _weighted(motion, stage, SLOPES, j)
+            if j < n:
+                u = motion[U, j] + seconds * _weighted(motion, stage, SLOPES + 1, j)
+                motion[END_U, j] = motion[SLOPES + 2 * stage, j] = u
         set_places(work, END_Q, END_U)
         at = share + _TIMES[stage] * width
         _slope(work, laws, END_U, SLOPES + 2 * stage + 1, inputs, at, low, high)
@@ -299,21 +303,13 @@ def _step(work, laws, inputs, share, low, high, width):  # type: ignore[no-untyp
                 along += before * rings[r - count, TWIST_END, d]
             end = min(end, along / square if square > 0.0 else 1.0)
     error = 0.0
-    for j in range(n):
-        q, u = 0.0, 0.0
-        for stage in range(7):
-            q += _ERROR[stage] * motion[SLOPES + 2 * stage, j]
-            u += _ERROR[stage] * motion[SLOPES + 2 * stage + 1, j]
-        error = max(error, seconds * (abs(q) + laws.time_step * abs(u)) / motion[SIZE, j])
-        if not math.isfinite(q + u):
-            return np.inf, end, way
-    for j in range(n + 1, ends):
-        q = 0.0
-        for stage in range(7):
-            q += _ERROR[stage] * motion[SLOPES + 2 * stage, j]
-        error = max(error, seconds * abs(q) / motion[SIZE, j])
-        if not math.isfinite(q):
-            return np.inf, end, way
+    for j in range(ends):
+        if j != n:
+            q = _weighted(motion, 7, SLOPES, j)
+            u = _weighted(motion, 7, SLOPES + 1, j) if j < n else 0.0
+            error = max(error, seconds * (abs(q) + laws.time_step * abs(u)) / motion[SIZE, j])
+            if not math.isfinite(q + u):
+                return np.inf, end, way
     return error / laws.tolerance, end, way
 
 

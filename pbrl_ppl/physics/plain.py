@@ -13,9 +13,17 @@ from pbrl_ppl.effects import Attached, Command, Force, Friction, at_stage, holde
 from pbrl_ppl.effects.stages import INTERVAL, MEMORY, MOST_MEMORY, TIME
 from pbrl_ppl.physics.laws import LATE
 from pbrl_ppl.physics.properties import COLUMN, EngineInput
-from pbrl_ppl.physics.setters import glide, iterations, patch_point, wheel_ends
+from pbrl_ppl.physics.setters import (
+    glide,
+    hinge_signal,
+    iterations,
+    patch_point,
+    patch_signal,
+    wheel_ends,
+)
 from pbrl_ppl.physics.solids import near_contact
 from pbrl_ppl.physics.world import RING, World
+from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import WRENCH, Floats
 
 _EXTRA = [COLUMN.extra_gravity_x, COLUMN.extra_gravity_y]
@@ -69,13 +77,9 @@ def rollout(
     set_properties(world, bodies, joints)
     set_discs(world, numbers.discs[proposal])
     _place_bodies(world, start)
-    names = [body.name for body in world.scene.moving]
-    others = {names.index(one.body): holder(world.scene, one) for one in effects}
-    acting = Acting(
-        effects, numbers, proposal, names, others, world.scene.time_step, earlier, start
-    )
+    acting = Acting(world.scene, effects, numbers, proposal, earlier, start)
     step = world.scene.time_step / substeps
-    states = np.empty((len(inputs), len(names), 6))
+    states = np.empty((len(inputs), len(start), 6))
     touched, nearness = False, (world.radii, world.obstacles, world.can_touch)
     for h, interval in enumerate(inputs):
         if timed and h > 0:
@@ -113,18 +117,14 @@ class Acting:
 
     Parameters
     ----------
+    scene : Scene
+        Bodies and their joints, and the sampling interval.
     effects : tuple of Attached
         Effects; those with laws act.
     numbers : EngineInput
         The engine's numbers of all proposals.
     proposal : int
         Index of the proposal.
-    names : list of str
-        The moving bodies.
-    others : dict of int to int
-        What each body hangs on; -1 for nothing that moves.
-    time_step : float
-        Sampling interval (s).
     earlier : ndarray
         Inputs of the intervals of the recording that lead to the first one, (interval, body, 3 or
         more).
@@ -134,15 +134,15 @@ class Acting:
 
     def __init__(
         self,
+        scene: Scene,
         effects: tuple[Attached, ...],
         numbers: EngineInput,
         proposal: int,
-        names: list[str],
-        others: dict[int, int],
-        time_step: float,
         earlier: Floats,
         start: Floats,
     ) -> None:
+        names = [body.name for body in scene.moving]
+
         def laws(kind: type, parameters: Floats) -> list[tuple[int, Any, Floats]]:
             first, rows = 0, []
             for attached in at_stage(effects, kind):
@@ -155,8 +155,9 @@ class Acting:
         self._commands = laws(Command, numbers.commands[proposal])
         self._forces = laws(Force, numbers.forces[proposal])
         self._frictions = laws(Friction, numbers.frictions[proposal])
-        self._others = others
-        self._time_step, self.command = time_step, np.zeros((len(names), 3))
+        #: What each body hangs on; -1 for nothing that moves.
+        self._others = {names.index(one.body): holder(scene, one) for one in effects}
+        self._time_step, self.command = scene.time_step, np.zeros((len(names), 3))
         wide = earlier.shape[-1]
         older = [np.arange(j, j + 3) for j in range(9, wide, 3)]
         past = earlier[0][:, [np.arange(3, 6), *older][-1]] if wide > 3 else self.command
@@ -309,20 +310,14 @@ def _place_constraints(
     world: World, acting: Acting, bodies: Floats, joints: Floats, states: Floats, step: float
 ) -> None:
     """Put the far ends of rods where the substep is predicted to end; set greatest forces."""
+    pivots = np.array(world.pivots, dtype=np.int64).reshape(-1, 3)
+    gravity = np.array(world.scene.gravity, dtype=float)
     for constraint, setting, i, _ in world.body_settings:
         if setting.attribute == "max_force" and setting.columns == (COLUMN.pivot_torque,):
-            row, rest = bodies[i], 0.0  # of a slider the force that is commanded, and the speed
-            torque, speed = math.hypot(*acting.command[i, :2]), math.hypot(*states[i, 3:5])
-            for body, joint, column in world.pivots:
-                if body == i:
-                    arm = row[[COLUMN.com_x, COLUMN.com_y]] - joints[joint, column : column + 2]
-                    c, s = math.cos(states[i, 2]), math.sin(states[i, 2])
-                    x, y = c * arm[0] - s * arm[1], s * arm[0] + c * arm[1]
-                    weight = row[COLUMN.mass] * (np.array(world.scene.gravity) + row[_EXTRA])
-                    rest = x * weight[1] - y * weight[0]
-                    torque, speed = acting.command[i, 2], abs(states[i, 5])
-            signal = torque, rest, speed
-            base = row[COLUMN.pivot_torque]
+            signal = hinge_signal(
+                pivots, gravity, bodies[i], joints, states[i], acting.command[i], i
+            )
+            base = bodies[i, COLUMN.pivot_torque]
             constraint.max_force = acting.bound(base, i, states, False, *signal)
     for i, (along_x,), (along_y,) in world.wheels:
         after, turn = glide(bodies[i], states[i], step), bodies[i, COLUMN.w_theta]
@@ -330,8 +325,7 @@ def _place_constraints(
         along_x.anchor_b, along_y.anchor_b = (x_1, y_1), (x_2, y_2)
     for i, holds, rods in world.patches:
         row, after = bodies[i], glide(bodies[i], states[i], step)
-        speed = math.hypot(*states[i, 3:5], states[i, 5] * row[COLUMN.patch_radius])
-        most = row[COLUMN.patch_mu] * row[COLUMN.mass] * world.scene.normal_gravity
+        most, speed = patch_signal(row, states[i], world.scene.normal_gravity)
         most = acting.bound(most, i, states, True, 0.0, 0.0, speed)
         slowing, most = most / row[COLUMN.mass], most / len(RING)
         for point, hold, rod in zip(RING, holds, rods, strict=True):

@@ -56,8 +56,8 @@ def set_properties(fn, world, bodies, joints):  # type: ignore[no-untyped-def]
         row = bodies[world.shape_body[j]]
         call1(fn.cpShapeSetElasticity, world.shapes[j], row[COLUMN.r])
         call1(fn.cpShapeSetFriction, world.shapes[j], row[COLUMN.mu_c])
-    _apply(world.body_settings, bodies, world.normal_gravity)
-    _apply(world.joint_settings, joints, world.normal_gravity)
+    _apply(world.body_settings, bodies, world.still.normal_gravity)
+    _apply(world.joint_settings, joints, world.still.normal_gravity)
 
 
 @compiled
@@ -68,7 +68,7 @@ def set_strengths(fn, world, bodies, on):  # type: ignore[no-untyped-def]
     for constraint in world.limited:
         call1(fn.cpConstraintSetMaxForce, constraint, 0.0)
     if on:
-        _apply(world.strengths, bodies, world.normal_gravity)
+        _apply(world.strengths, bodies, world.still.normal_gravity)
 
 
 @compiled
@@ -121,6 +121,36 @@ def patch_point(row, after, omega, point, step, most):  # type: ignore[no-untype
 
 
 @compiled
+def hinge_signal(pivots, gravity, row, joints, state, command, i):  # type: ignore[no-untyped-def]
+    """Return what laws of friction see in the hinge or slider of body ``i``, by its row and state.
+
+    The commanded torque, that of the weight, and the speed. Of a slider the commanded force and the
+    speed alone. ``pivots`` have a hinge's body, its joint and the column of its anchor on the body.
+    """
+    torque, rest = math.sqrt(command[0] ** 2 + command[1] ** 2), 0.0
+    speed = math.sqrt(state[3] ** 2 + state[4] ** 2)
+    for hinge in pivots:
+        if hinge[0] == i:
+            x = row[COLUMN.com_x] - joints[hinge[1], hinge[2]]
+            y = row[COLUMN.com_y] - joints[hinge[1], hinge[2] + 1]
+            c, s = math.cos(state[2]), math.sin(state[2])
+            x, y = c * x - s * y, s * x + c * y
+            weight_x = gravity[0] + row[COLUMN.extra_gravity_x]
+            weight_y = gravity[1] + row[COLUMN.extra_gravity_y]
+            rest = row[COLUMN.mass] * (x * weight_y - y * weight_x)
+            torque, speed = command[2], abs(state[5])
+    return torque, rest, speed
+
+
+@compiled
+def patch_signal(row, state, normal_gravity):  # type: ignore[no-untyped-def]
+    """Return the greatest friction under a body but for laws, and the speed that they see."""
+    turned = state[5] * row[COLUMN.patch_radius]
+    speed = math.sqrt(state[3] ** 2 + state[4] ** 2 + turned**2)
+    return row[COLUMN.patch_mu] * row[COLUMN.mass] * normal_gravity, speed
+
+
+@compiled
 def place_bodies(fn, world, bodies, state):  # type: ignore[no-untyped-def]
     """Set the bodies' states; the engine's velocity is that of the centre of mass."""
     for i in range(len(world.bodies)):
@@ -138,7 +168,8 @@ def set_discs(fn, world, discs):  # type: ignore[no-untyped-def]
 
     They are removed and added again, since the order of contacts depends on their earlier places.
     """
-    first = len(world.obstacles) - len(world.discs)
+    obstacles = world.still.obstacles
+    first = len(obstacles) - len(world.discs)
     for j in range(len(world.discs)):
         call_pointer(fn.cpSpaceRemoveShape, world.space, world.discs[j])
     if len(world.discs):
@@ -153,7 +184,7 @@ def set_discs(fn, world, discs):  # type: ignore[no-untyped-def]
         call2(fn.cpCircleShapeSetOffset, world.discs[j], x, y)
         call1(fn.cpCircleShapeSetRadius, world.discs[j], radius)
         call_pointer(fn.cpSpaceAddShape, world.space, world.discs[j])
-        obstacle = world.obstacles[first + j]
+        obstacle = obstacles[first + j]
         obstacle[0] = obstacle[2] = x
         obstacle[1] = obstacle[3] = y
         obstacle[4] = radius
@@ -175,16 +206,30 @@ def place_patches(fn, world, laws, bodies, state, step, acted):  # type: ignore[
     for j in range(len(world.patch_body)):
         k = world.patch_body[j]
         row, body = bodies[k], state[k]
-        turned, after = body[5] * row[COLUMN.patch_radius], glide(row, body, step)
-        speed = math.sqrt(body[3] ** 2 + body[4] ** 2 + turned**2)
-        most = row[COLUMN.patch_mu] * row[COLUMN.mass] * world.normal_gravity
+        after = glide(row, body, step)
+        most, speed = patch_signal(row, body, world.still.normal_gravity)
         most = bound(most, laws, k, 1, state, 0.0, 0.0, speed, acted)
-        slowing, most = most / row[COLUMN.mass], most / len(world.ring)
-        for i in range(len(world.ring)):
-            x, y, share = patch_point(row, after, body[5], world.ring[i], step, slowing)
+        slowing, most = most / row[COLUMN.mass], most / len(world.still.ring)
+        for i in range(len(world.still.ring)):
+            x, y, share = patch_point(row, after, body[5], world.still.ring[i], step, slowing)
             call2(fn.cpPinJointSetAnchorB, world.patches[1, j, i], x, y)
             call1(fn.cpConstraintSetMaxForce, world.patches[0, j, i], (1.0 - share) * most)
             call1(fn.cpConstraintSetMaxForce, world.patches[1, j, i], share * most)
+
+
+@compiled
+def set_brakes(world, laws, bodies, joints, state, acted):  # type: ignore[no-untyped-def]
+    """Set the greatest torque of friction in hinges where laws change it."""
+    for j in range(len(world.strengths)):
+        setting = world.strengths[j]
+        i = setting.row
+        if setting.column == COLUMN.pivot_torque:
+            torque, rest, speed = hinge_signal(
+                world.pivots, world.still.gravity, bodies[i], joints, state[i], acted[i], i
+            )
+            base = bodies[i, COLUMN.pivot_torque]
+            most = bound(base, laws, i, 0, state, torque, rest, speed, acted)
+            call1(setting.function, setting.constraint, most)
 
 
 @compiled

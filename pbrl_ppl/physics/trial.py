@@ -25,7 +25,7 @@ from pbrl_ppl.errors import EffectError
 from pbrl_ppl.history import History
 from pbrl_ppl.physics.physics import Physics
 from pbrl_ppl.physics.properties import COLUMNS, SEEN
-from pbrl_ppl.scene import Body, Scene, Units, units_of
+from pbrl_ppl.scene import Body, Scene, Units, body_sizes, units_of
 from pbrl_ppl.state import STATE, STATE_UNITS, Floats
 
 
@@ -152,7 +152,7 @@ def _check_null(
         for physics in (without, there)
     )
     change = np.nan_to_num(np.abs(after - before))
-    size = np.abs(np.nan_to_num(before)) + _sizes(scene)
+    size = np.abs(np.nan_to_num(before)) + body_sizes(scene)
     relative = (change / size).max(axis=(0, 1))
     if relative.max() > rounding:
         moved, k = np.unravel_index(relative.argmax(), relative.shape)
@@ -162,16 +162,6 @@ def _check_null(
             f" it changes {STATE[k]} of {scene.moving[moved].name} by {most:.3g} {STATE_UNITS[k]}"
             f" in one interval of {scene.time_step:g} s, expected no change; {cure}"
         )
-
-
-def _sizes(scene: Scene) -> Floats:
-    """Return a small size of each coordinate of each moving body, shape (body, 6)."""
-    sizes = []
-    for body in scene.moving:
-        length = body.shape.bounding_radius
-        speed = length / scene.time_step
-        sizes.append([length, length, 1.0, speed, speed, 1.0 / scene.time_step])
-    return np.array(sizes)
 
 
 def _middle(history: History, body: Body) -> Floats:

@@ -57,6 +57,16 @@ class ConstraintKind(NamedTuple):
     joint_settings: tuple[Setting, ...] = ()
 
 
+def _strength(column: int, *, weighted: bool = False) -> tuple[Setting, ...]:
+    """Return the setting of a constraint's greatest force by a column of the body."""
+    return (Setting("max_force", "cpConstraintSetMaxForce", (column,), weighted),)
+
+
+def _motor(column: int) -> ConstraintKind:
+    """Return the kind of friction against turning, by the column of its greatest torque."""
+    return ConstraintKind(lambda a, b: pymunk.SimpleMotor(a, b, 0.0), _strength(column))
+
+
 def _on_line(name: str) -> tuple[Setting, ...]:
     """Return the settings of a constraint along a slider's line, to an end that is far away."""
     return (
@@ -88,33 +98,23 @@ BODY_CONSTRAINTS = {
             ROD.constraint,
             (
                 Setting("anchor_a", "cpPinJointSetAnchorA", (COLUMN.w_x, COLUMN.w_y)),
-                Setting("max_force", "cpConstraintSetMaxForce", (friction,), weighted=True),
+                *_strength(friction, weighted=True),
             ),
         )
         for friction in (COLUMN.mu_x, COLUMN.mu_y)
     ),
     "pivot": (
-        ConstraintKind(
-            lambda a, b: pymunk.SimpleMotor(a, b, 0.0),
-            (Setting("max_force", "cpConstraintSetMaxForce", (COLUMN.pivot_torque,)),),
-        ),
+        _motor(COLUMN.pivot_torque),
         ConstraintKind(
             lambda a, b: pymunk.DampedRotarySpring(a, b, 0.0, 0.0, 0.0),
             (Setting("damping", "cpDampedRotarySpringSetDamping", (COLUMN.pivot_damping,)),),
             limited=False,
         ),
     ),
-    "turning": (
-        ConstraintKind(
-            lambda a, b: pymunk.SimpleMotor(a, b, 0.0),
-            (Setting("max_force", "cpConstraintSetMaxForce", (COLUMN.turn_torque,)),),
-        ),
-    ),
+    "turning": (_motor(COLUMN.turn_torque),),
     "rail": (
         ConstraintKind(
-            ROD.constraint,
-            (Setting("max_force", "cpConstraintSetMaxForce", (COLUMN.pivot_torque,)),),
-            joint_settings=_on_line("cpPinJoint"),
+            ROD.constraint, _strength(COLUMN.pivot_torque), joint_settings=_on_line("cpPinJoint")
         ),
         ConstraintKind(
             lambda a, b: pymunk.DampedSpring(a, b, (0, 0), (0, 0), 0.0, 0.0, 0.0),

@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.special import ellipk
 
-from pbrl_ppl.effects import Effect, EffectParameter, Force
+from pbrl_ppl.effects import Effect, EffectParameter, Force, catalogue
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.physics import Physics, Simulator, calls, compiled
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
@@ -279,6 +279,23 @@ def test_a_ring_holds_up_to_its_friction() -> None:
     pushes[:, 0, 0, 2] = torque * np.array([0.0, 0.0, 0.99, 0.8])
     moved = np.abs(physics.predict(phi, np.zeros((4, 1, 6)), pushes)[:, 0, 0]).max(axis=1) > 1e-9
     assert moved.tolist() == [False, True, False, True]
+
+
+@pytest.mark.parametrize(
+    ("count", "names"), [(8, ("sliding_friction",)), (6, ("sliding_friction", "sloshing"))]
+)
+def test_bodies_far_apart_move_alike_up_to_the_largest_tree(count, names) -> None:
+    """All coordinates that a tree may have, and force laws whose numbers find no place there."""
+    bodies = tuple(Body(f"b{i}", Shape.circle(0.1), pose=(3.0 * i, 0, 0)) for i in range(count))
+    scene = Scene(time_step=0.1, substeps=6, normal_gravity=G, bodies=bodies)
+    physics = Physics.declare(scene, [effect for effect in catalogue if effect.name in names])
+    phi = np.array([prior.centre for prior in physics.layout.priors])
+    start = np.zeros((1, count, 6))
+    start[:, :, 0] = 3.0 * np.arange(count)
+    start[..., 3:5] = 1.0, 0.5
+    out = Simulator(physics)(phi, start, np.zeros((1, 3, count, 3)))[0]
+    out[..., 0] -= start[0, :, 0]
+    np.testing.assert_allclose(out, np.broadcast_to(out[:, -1:], out.shape), atol=1e-6)
 
 
 def test_a_law_that_no_step_follows_ends() -> None:
