@@ -4,13 +4,7 @@ import math
 from dataclasses import replace
 from typing import Any
 
-from pbrl_ppl.effects.actuators import (
-    actuator_backlash,
-    dead_zone,
-    of_component,
-    rate_limit,
-    saturation,
-)
+from pbrl_ppl.effects.actuators import OF_COMPONENTS, of_component
 from pbrl_ppl.effects.effect import SIGNED, SIZE, Effect, EffectParameter, always, is_pivoted
 from pbrl_ppl.effects.stages import Command
 from pbrl_ppl.parameters import Prior
@@ -125,6 +119,9 @@ def _numbers(actuator: Actuator) -> list[EffectParameter]:
 def actuation(scene: Scene, body: str) -> Effect | None:
     """Return the effect of a body's actuators, if it has any: commands become wrenches.
 
+    Where the recording gives forces along the bodies' axes, a body without actuators has three that
+    are its wrench, which does not act back on what the body hangs on.
+
     Parameters
     ----------
     scene : Scene
@@ -132,53 +129,29 @@ def actuation(scene: Scene, body: str) -> Effect | None:
     body : str
         Name of a dynamic body.
     """
-    acting = scene.actuators_of(body)
-    if not acting:
-        return None
+    acting = own = scene.actuators_of(body)
+    name, sentence = ACTUATION, "commands act through "
+    sentence += ", ".join(f"{one.name} ({one.kind})" for one in own)
+    if not own:
+        if scene.recording is None or scene.recording.forces != "body":
+            return None
+        name, sentence = "body_frame", "pushes are given along the body's own axes and turn with it"
+        acting = tuple(Actuator(name=of, kind="wrench", body=body, of=of) for of in WRENCH)
     parameters: list[EffectParameter] = []
     for actuator in acting:
         parameters += _numbers(actuator)
     parameters += [_given(0.0)] * (_SIZE * len(WRENCH) - len(parameters))
     kinds = [float(_kind(actuator)) for actuator in acting]
     return Effect(
-        ACTUATION,
+        name,
         tuple(
             replace(one, name=f"given_{i}") if one.given else one
             for i, one in enumerate(parameters)
         ),
-        "commands act through " + ", ".join(f"{one.name} ({one.kind})" for one in acting),
+        sentence,
         "forces and torques of actuators in the body's frame",
-        Command(_act, reacts=is_pivoted(scene, scene.body(body))),
+        Command(_act, reacts=bool(own) and is_pivoted(scene, scene.body(body))),
         constants=(*kinds, *[float(_NONE)] * (len(WRENCH) - len(kinds))),
-    )
-
-
-#: What may be wrong with the command of any actuator: name and sentence.
-_SHAPES = (
-    (dead_zone, "dead_zone", "acts by what exceeds a threshold of its command alone"),
-    (saturation, "saturation", "acts as if its command were never larger than a limit"),
-    (rate_limit, "rate_limit", "follows its command no faster than at a limit"),
-    (actuator_backlash, "backlash", "lags behind its command after a turn until the play is over"),
-)
-
-
-def _of_command(
-    actuator: Actuator, parameters: tuple[EffectParameter, ...]
-) -> tuple[EffectParameter, ...]:
-    """Return parameters of a force for an actuator's command, whose unit is the column's."""
-    gain = actuator.numbers.get("gain", 1.0 if actuator.kind == "wrench" else None)
-    natural = "torque" if _kind(actuator) == _TORQUE else "force"
-    if not gain or actuator.kind == "servo":  # natural is what the gain's prior or a goal has
-        gain, natural = 1.0, ""
-    return tuple(
-        replace(
-            one,
-            unit=one.unit.replace("N", "1"),
-            prior=one.prior.scaled(1.0 / abs(gain)),
-            null=one.null / abs(gain),
-            scale=one.scale.replace("force", natural),
-        )
-        for one in parameters
     )
 
 
@@ -206,10 +179,13 @@ def laws_of_actuators(scene: Scene, body: str) -> tuple[Effect, ...]:
                     Command(_scale, alone=WRENCH[slot]),
                 )
             )
-        for law, suffix, sentence in _SHAPES:
-            shape = of_component(law, f"{name}_{suffix}", f"{name} {sentence}", WRENCH[slot])
-            parameters = _of_command(actuator, law.parameters)
-            laws.append(replace(shape, parameters=parameters, applies=always))
+        gain = actuator.numbers.get("gain", 1.0 if actuator.kind == "wrench" else None)
+        natural = "torque" if _kind(actuator) == _TORQUE else "force"
+        if not gain or actuator.kind == "servo":  # natural is what the gain's prior or a goal has
+            gain, natural = 1.0, ""
+        for suffix, (law, _, sentence) in OF_COMPONENTS.items():
+            known = f"{name}_{suffix}", f"{name} {sentence}", WRENCH[slot], "1", natural, abs(gain)
+            laws.append(replace(of_component(law, *known), applies=always))
         if force and not dict(actuator.prior).get("direction"):
             laws.append(
                 Effect(

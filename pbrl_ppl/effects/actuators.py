@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -44,23 +43,6 @@ actuator_rotation = Effect(
     "the push points in another direction than commanded: the actuator is mounted askew",
     "rotation of a vector in the plane",
     Command(_rotate),
-)
-
-
-def _turn_with_body(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
-    c, s = math.cos(state[2]), math.sin(state[2])
-    x = wrench[0]
-    wrench[0] = c * x - s * wrench[1]
-    wrench[1] = s * x + c * wrench[1]
-
-
-#: Of scenes whose recording gives forces along the bodies' own axes; no law to be found.
-body_frame = Effect(
-    "body_frame",
-    (),
-    "pushes are given along the body's own axes and turn with it",
-    "rotation of a vector in the plane",
-    Command(_turn_with_body),
 )
 
 
@@ -346,7 +328,15 @@ saturation = Effect(
 )
 
 
-def of_component(effect: Effect, name: str, sentence: str, component: str) -> Effect:
+def of_component(
+    effect: Effect,
+    name: str,
+    sentence: str,
+    component: str,
+    unit: str = "N m",
+    natural: str = "torque",
+    gain: float = 1.0,
+) -> Effect:
     """Return a law of the commanded force for one component of the commands.
 
     Parameters
@@ -357,42 +347,59 @@ def of_component(effect: Effect, name: str, sentence: str, component: str) -> Ef
         Of the new law.
     component : str
         One of :data:`pbrl_ppl.state.WRENCH`.
+    unit, natural : str
+        Unit and natural unit of the component, in place of those of a force.
+    gain : float
+        Forces or torques for each unit of the component.
     """
-    place = WRENCH.index(component)
-    scan = effect.scan and ScanWith(effect.scan, slice(place, place + 1))
-    stage: Any = effect.stage
-    stage = replace(stage, alone=component)
-    return replace(effect, name=name, sentence=sentence, stage=stage, scan=scan)
-
-
-def _of_torque(effect: Effect, name: str, sentence: str) -> Effect:
-    """Return a law of the commanded force for the commanded torque."""
+    place, stage = WRENCH.index(component), effect.stage
     parameters = tuple(
-        replace(p, unit=p.unit.replace("N", "N m"), scale=p.scale.replace("force", "torque"))
-        for p in effect.parameters
+        replace(
+            one,
+            unit=one.unit.replace("N", unit),
+            prior=one.prior.scaled(1.0 / gain),
+            null=one.null / gain,
+            scale=one.scale.replace("force", natural),
+        )
+        for one in effect.parameters
     )
-    return replace(of_component(effect, name, sentence, "torque"), parameters=parameters)
+    return replace(
+        effect,
+        name=name,
+        sentence=sentence,
+        parameters=parameters,
+        stage=replace(stage, alone=component) if isinstance(stage, Command) else stage,
+        scan=effect.scan and ScanWith(effect.scan, slice(place, place + 1)),
+    )
 
 
-torque_dead_zone = _of_torque(
-    dead_zone,
-    "torque_dead_zone",
-    "only what exceeds a threshold of the torque acts: the motor has play or friction",
-)
-torque_saturation = _of_torque(
-    saturation,
-    "torque_saturation",
-    "the torque is never stronger than a limit, whatever is commanded: the motor saturates",
-)
-torque_rate_limit = _of_torque(
-    rate_limit,
-    "torque_rate_limit",
-    "the torque changes no faster than at a limit, whatever is commanded",
-)
-torque_backlash = _of_torque(
-    actuator_backlash,
-    "torque_backlash",
-    "after a turn the torque lags behind the command until the play is taken up",
+#: Laws of the commanded force that a torque and the command of any actuator may have, too: by the
+#: ends of their names, with the sentences for a torque and for an actuator.
+OF_COMPONENTS = {
+    "dead_zone": (
+        dead_zone,
+        "only what exceeds a threshold of the torque acts: the motor has play or friction",
+        "acts by what exceeds a threshold of its command alone",
+    ),
+    "saturation": (
+        saturation,
+        "the torque is never stronger than a limit, whatever is commanded: the motor saturates",
+        "acts as if its command were never larger than a limit",
+    ),
+    "rate_limit": (
+        rate_limit,
+        "the torque changes no faster than at a limit, whatever is commanded",
+        "follows its command no faster than at a limit",
+    ),
+    "backlash": (
+        actuator_backlash,
+        "after a turn the torque lags behind the command until the play is taken up",
+        "lags behind its command after a turn until the play is over",
+    ),
+}
+torque_dead_zone, torque_saturation, torque_rate_limit, torque_backlash = (
+    of_component(law, f"torque_{suffix}", sentence, "torque")
+    for suffix, (law, sentence, _) in OF_COMPONENTS.items()
 )
 
 

@@ -136,10 +136,9 @@ def attach(
     check_names((*effects, *listed))
     by_name = {effect.name: effect for effect in (*effects, *listed)}
     result: list[Attached] = []
-    along_bodies = scene.recording is not None and scene.recording.forces == "body"
     given = {(item.effect.name, item.body) for item in extra if isinstance(item, Attached)}
     for body in scene.dynamic:
-        acting = actuation(scene, body.name) or (actuators.body_frame if along_bodies else None)
+        acting = actuation(scene, body.name)
         if acting is not None:
             own = laws_of_actuators(scene, body.name)
             by_name |= {acting.name: acting} | {effect.name: effect for effect in own}

@@ -4,7 +4,14 @@ import math
 
 import numpy as np
 
-from pbrl_ppl.effects.effect import ANY_ANGLE, SIGNED, Effect, EffectParameter, is_unpivoted
+from pbrl_ppl.effects.effect import (
+    ANY_ANGLE,
+    SIGNED,
+    Effect,
+    EffectParameter,
+    ScanWith,
+    is_unpivoted,
+)
 from pbrl_ppl.effects.stages import Clock, Force, Properties, Values
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
@@ -183,16 +190,17 @@ def _periodic(state: Floats, command: Floats, parameters: Floats, wrench: Floats
         wrench[1] += math.sin(parameters[3]) * force
 
 
-def _periods(scene: Scene, history: History) -> list[float]:
-    """Return periods to try (s): whole trajectories to four intervals."""
+def _scan_periods(
+    scene: Scene, history: History, body: Body, directions: tuple[tuple[float, ...], ...]
+) -> Floats:
+    """Return periods with each direction, of whole trajectories to four intervals (s).
+
+    The derivative is taken by the forces or torques, which come first.
+    """
     longest = float(np.nanmax(history.dataset["clock"].to_numpy(), initial=0.0))
-    return [longest / n for n in (1, 2, 4, 8, 16) if longest / n > 4.0 * scene.time_step]
-
-
-def _scan_periods(scene: Scene, history: History, body: Body) -> Floats:
-    """Return periods and directions; the derivative is taken by the forces."""
-    pairs = [(period, turn) for period in _periods(scene, history) for turn in (0.0, 0.5 * np.pi)]
-    return np.array([(np.nan, np.nan, *pair) for pair in pairs]).reshape(-1, 4)
+    periods = [longest / n for n in (1, 2, 4, 8, 16) if longest / n > 4.0 * scene.time_step]
+    grid = [(np.nan, np.nan, period, *turn) for period in periods for turn in directions]
+    return np.array(grid).reshape(-1, 3 + len(directions[0]))
 
 
 _PERIOD = EffectParameter(
@@ -211,7 +219,7 @@ periodic_force = Effect(
     "harmonic force, a cos(2 pi t / T) + b sin(2 pi t / T)",
     Force(_periodic, timed=True),
     applies=is_unpivoted,
-    scan=_scan_periods,
+    scan=ScanWith(_scan_periods, ((0.0,), (0.5 * np.pi,))),
     log_odds=-6.0,
 )
 
@@ -222,17 +230,12 @@ def _periodic_torque(state: Floats, command: Floats, parameters: Floats, wrench:
         wrench[2] += parameters[0] * math.cos(phase) + parameters[1] * math.sin(phase)
 
 
-def _scan_torque_periods(scene: Scene, history: History, body: Body) -> Floats:
-    """Return periods; the derivative is taken by the torques."""
-    return np.array([(np.nan, np.nan, t) for t in _periods(scene, history)]).reshape(-1, 3)
-
-
 periodic_torque = Effect(
     "periodic_torque",
     (*_TORQUES, _PERIOD),
     "a torque that repeats with the time since a trajectory began",
     "harmonic torque, a cos(2 pi t / T) + b sin(2 pi t / T)",
     Force(_periodic_torque, timed=True),
-    scan=_scan_torque_periods,
+    scan=ScanWith(_scan_periods, ((),)),
     log_odds=-6.0,
 )
