@@ -84,8 +84,8 @@ class Engine:
         items, horizon = np.arange(first, last), batch.inputs.shape[1]
         begins = np.zeros(len(items), dtype=np.int64)
         tree = self._tree
-        if tree is not None and tree.size + 1 + batch.held > MOST and batch.held > 0:
-            tree = None  # what laws have of their own would not fit beside the coordinates
+        if tree is not None and batch.held > max(0, MOST - 1 - tree.size):
+            tree = None  # laws' own numbers have no place beside the coordinates
         whole = self._wheels is None and tree is None
         while len(items):
             if self._wheels is not None:
