@@ -17,7 +17,7 @@ _THRESHOLD = EffectParameter("threshold", "N", Prior("half_normal", sigma=0.5), 
 #: Force levels that a scan tries, and torques.
 _LEVELS, _FEW = 20, 8
 #: The components that are a force.
-_FORCE = slice(0, 2)
+_FORCE = (0, 1)
 #: No actuator reaches this force, in typical forces.
 _UNREACHED = 1e9
 _LIMIT = Prior("log_normal", mu=0.0, sigma=1.5)
@@ -187,7 +187,9 @@ def _remember_ramp(state: Floats, command: Floats, parameters: Floats, memory: F
         memory[i] += min(1.0, most / max(off, 1e-300)) * (command[i] - memory[i])
 
 
-def _scan_rates(scene: Scene, history: History, body: Body, components: slice = _FORCE) -> Floats:
+def _scan_rates(
+    scene: Scene, history: History, body: Body, components: tuple[int, ...] = _FORCE
+) -> Floats:
     """Return rates at which the largest change of a command takes some intervals, (rate, 1)."""
     action = history.dataset["action"].sel(body=body.name).to_numpy()[..., components]
     jumps = np.linalg.norm(np.diff(action, axis=1), axis=-1)
@@ -238,7 +240,7 @@ def _scan_levels(
     scene: Scene,
     history: History,
     body: Body,
-    components: slice = _FORCE,
+    components: tuple[int, ...] = _FORCE,
     most: int | None = None,
 ) -> Floats:
     """Return at most so many sizes between those commanded, shape (level, 1), N or N m."""
@@ -261,7 +263,7 @@ def _subtract_threshold(state: Floats, command: Floats, parameters: Floats, wren
 
 
 def _scan_dead_zones(
-    scene: Scene, history: History, body: Body, components: slice = _FORCE
+    scene: Scene, history: History, body: Body, components: tuple[int, ...] = _FORCE
 ) -> Floats:
     """Return the null value, where the derivative is taken, and thresholds to try."""
     return np.vstack([[[np.nan]], _scan_levels(scene, history, body, components)])
@@ -369,7 +371,7 @@ def of_component(
         sentence=sentence,
         parameters=parameters,
         stage=replace(stage, alone=component) if isinstance(stage, Command) else stage,
-        scan=effect.scan and ScanWith(effect.scan, slice(place, place + 1)),
+        scan=effect.scan and ScanWith(effect.scan, (place,)),
     )
 
 
