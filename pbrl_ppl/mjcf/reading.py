@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,24 +16,13 @@ import numpy as np
 from pbrl_ppl.errors import ConversionWarning, SceneError, warn
 from pbrl_ppl.history.mujoco import FLAT, FREE, HINGE, PLANES, SLIDE
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene, Shape, Wall
-from pbrl_ppl.state import Floats
+from pbrl_ppl.state import Floats, Ints
 
 #: mjtGeom as numbers, as in mjmodel.h.
 _PLANE, _SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX = 0, 2, 3, 4, 5, 6
 _GEOMS = ("plane", "height field", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
 #: mjtJoint in words.
 _JOINTS = ("a free joint", "a ball joint", "a slide", "a hinge")
-#: Effects that a model may declare.
-_EFFECTS = (
-    "inertia_scale",
-    "com_offset",
-    "pivot_damping",
-    "pivot_friction",
-    "slider_damping",
-    "slider_friction",
-    "linear_drag",
-    "angular_drag",
-)
 #: Smaller differences of mass distributions, relative to an even outline's, are none.
 _EVEN = 0.01
 
@@ -97,7 +85,7 @@ def scene_from_mjcf(
     """
     if plane not in PLANES:
         raise SceneError(f"plane is {plane!r}, expected xy (a top view) or xz (a side view)")
-    seen = _View.of(_compiled(source), PLANES[plane], dict(shapes or {}))
+    seen = _View(_compiled(source), PLANES[plane], dict(shapes or {}))
     model = seen.model
     moving = [i for i in range(1, model.nbody) if model.body_weldid[i] == i]
     if lost := sorted({*seen.shapes} - {seen.name(i) for i in moving}):
@@ -128,19 +116,14 @@ def scene_from_mjcf(
     return scene
 
 
-def _mujoco() -> Any:
+def _compiled(source: Any) -> Any:
+    """Return a compiled model of a file, text or model."""
     try:
         import mujoco
     except ImportError:
         raise SceneError(
             "a scene of a MuJoCo model needs MuJoCo: pip install 'pbrl_ppl[mujoco]'"
         ) from None
-    return mujoco
-
-
-def _compiled(source: Any) -> Any:
-    """Return a compiled model of a file, text or model."""
-    mujoco = _mujoco()
     if not isinstance(source, str | Path):
         if not isinstance(source, mujoco.MjModel):
             raise SceneError(f"{source!r} is no MuJoCo model; expected a path, XML text or MjModel")
@@ -173,29 +156,31 @@ def pair(point: Any) -> tuple[float, float]:
     return x, y
 
 
-@dataclass
 class _View:
     """A model in its reference configuration, seen in a plane, with what a scene leaves out.
 
     ``axes`` are the plane's axes and its normal (3, 3).
     """
 
-    model: Any
-    data: Any
-    axes: Floats
-    shapes: dict[str, Shape]
-    left_out: list[str] = field(default_factory=list)
-    poses: dict[int, tuple[Floats, float]] = field(default_factory=dict)
+    def __init__(self, model: Any, axes: Floats, shapes: dict[str, Shape]) -> None:
+        import mujoco
 
-    @classmethod
-    def of(cls, model: Any, axes: Floats, shapes: dict[str, Shape]) -> _View:
-        mujoco = _mujoco()
-        data = mujoco.MjData(model)
-        mujoco.mj_forward(model, data)
-        return cls(model, data, axes, shapes)
+        self.model, self.data, self.axes, self.shapes = model, mujoco.MjData(model), axes, shapes
+        mujoco.mj_forward(model, self.data)
+        self.left_out: list[str] = []
+        self.poses: dict[int, tuple[Floats, float]] = {}
 
     def name(self, i: int) -> str:
         return str(self.model.body(i).name) or f"body{i}"
+
+    def parent(self, i: int) -> int:
+        """Return the moving body that holds a body; 0 is the world."""
+        return int(self.model.body_weldid[self.model.body_parentid[i]])
+
+    def kinds(self, i: int) -> Ints:
+        """Return the kinds of a body's joints."""
+        first = int(self.model.body_jntadr[i])
+        return np.asarray(self.model.jnt_type[first : first + int(self.model.body_jntnum[i])])
 
     def place(self, point: Any) -> Floats:
         """Return a point of MuJoCo's world in the plane (2,)."""
@@ -231,12 +216,13 @@ class _View:
                 f'the frame of body "{name}", which is not at its outline\'s centroid: put it there'
                 " before from_mujoco reads rollouts"
             )
+        effects = [label.rpartition("_")[0] for label in prior if label != "mass"]
         body = Body(
             name,
             shape,
             known={"mass": rounded(mass)} if known_mass else (),  # type: ignore[arg-type]
             prior=prior,  # type: ignore[arg-type]
-            effects=tuple(e for e in _EFFECTS if any(label.startswith(f"{e}_") for label in prior)),
+            effects=tuple(dict.fromkeys(effects)),
             pose=(*pair(origin), rounded(theta)),
         )
         if held is None:
@@ -256,10 +242,9 @@ class _View:
 
         A free body's is that of its frame; of others it is the parent's, and zero on the world.
         """
-        parent = int(self.model.body_weldid[self.model.body_parentid[i]])
-        if parent:
+        if parent := self.parent(i):
             return self.angle(parent)
-        if self.model.jnt_type[self.model.body_jntadr[i]] != FREE:
+        if self.kinds(i)[0] != FREE:
             return 0.0
         frame = self.axes @ self.data.xmat[i].reshape(3, 3) @ self.axes.T
         if frame[2, 2] < 1 - FLAT:
@@ -271,76 +256,66 @@ class _View:
 
     def held(self, i: int) -> tuple[int, Floats, Floats | None] | None:
         """Return parent (0 is the world), place (2,) and a slider's axis (2,); None if free."""
-        model = self.model
-        parent = int(model.body_weldid[model.body_parentid[i]])
-        first, count = int(model.body_jntadr[i]), int(model.body_jntnum[i])
-        kinds = [int(kind) for kind in model.jnt_type[first : first + count]]
-        across = [self.axes @ self.data.xaxis[j] for j in range(first, first + count)]
-        slides = [n for n, kind in enumerate(kinds) if kind == SLIDE]
+        model, kinds = self.model, self.kinds(i).tolist()
+        parent, first = self.parent(i), int(model.body_jntadr[i])
+        joints = range(first, first + len(kinds))
+        across = [self.axes @ self.data.xaxis[j] for j in joints]
         where = f'body "{self.name(i)}"'
         expected = (
             "expected a free joint, two slides in the plane and a hinge about its normal, or one"
             " slide or hinge alone"
         )
-        planar = all(
-            abs(axis[2]) > 1 - FLAT if kind == HINGE else abs(axis[2]) < FLAT
-            for kind, axis in zip(kinds, across, strict=True)
-            if kind in (HINGE, SLIDE)
-        )
-        if not planar:
-            raise SceneError(
-                f"{where}: a joint of it leads out of the plane; {expected}. Choose the other plane"
-                " (xy or xz), or turn the model"
-            )
-        for j in range(first, first + count):
-            self.note_joint(j)
+        for kind, axis in zip(kinds, across, strict=True):
+            flat = abs(axis[2]) > 1 - FLAT if kind == HINGE else abs(axis[2]) < FLAT
+            if kind in (HINGE, SLIDE) and not flat:
+                raise SceneError(
+                    f"{where}: a joint of it leads out of the plane; {expected}. Choose the other"
+                    " plane (xy or xz), or turn the model"
+                )
+        for j in joints:
+            name = str(model.joint(j).name) or f"joint{j}"
+            for there, what in (
+                (model.jnt_limited[j], "limits"),
+                (np.any(model.jnt_stiffness[j]), "spring (see the effect torsion_spring)"),
+                (model.dof_armature[model.jnt_dofadr[j]], "armature"),
+            ):
+                if there:
+                    self.left_out.append(f'the {what} of joint "{name}"')
         if kinds == [FREE]:
             return None
         if parent == 0 and sorted(kinds) == [SLIDE, SLIDE, HINGE]:
-            (a, b) = (across[n][:2] for n in slides)
+            a, b = (axis[:2] for axis, kind in zip(across, kinds, strict=True) if kind == SLIDE)
             if abs(a[0] * b[1] - a[1] * b[0]) > FLAT:
                 return None
-        if kinds == [HINGE]:
-            return parent, self.place(self.data.xanchor[first]), None
-        if kinds == [SLIDE]:
-            return parent, self.place(self.data.xanchor[first]), across[0][:2]
+        if kinds in ([HINGE], [SLIDE]):
+            way = across[0][:2] if kinds == [SLIDE] else None
+            return parent, self.place(self.data.xanchor[first]), way
         names = ", ".join(_JOINTS[kind] for kind in kinds)
         above = f'on body "{self.name(parent)}"' if parent else "in the world"
         raise SceneError(f"{where}: it has {names} {above}; {expected}. Change its joints in MJCF")
 
-    def note_joint(self, j: int) -> None:
-        """List what a joint has that a scene has not."""
-        model = self.model
-        dof, name = int(model.jnt_dofadr[j]), str(model.joint(j).name) or f"joint{j}"
-        for there, what in (
-            (model.jnt_limited[j], "limits"),
-            (np.any(model.jnt_stiffness[j]), "spring (see the effect torsion_spring)"),
-            (model.dof_armature[dof], "armature"),
-        ):
-            if there:
-                self.left_out.append(f'the {what} of joint "{name}"')
-
     def friction(self, i: int, held: bool) -> dict[str, float]:
         """Return the coefficients of effects that the joints' damping and dry friction are."""
         model = self.model
-        first, count = int(model.body_dofadr[i]), int(model.body_dofnum[i])
-        damping = np.array([np.ravel(model.dof_damping[d])[0] for d in range(first, first + count)])
-        dry = np.asarray(model.dof_frictionloss[first : first + count])
-        joints = range(int(model.body_jntadr[i]), int(model.body_jntadr[i] + model.body_jntnum[i]))
-        kinds = np.array([model.jnt_type[j] for j in joints])
-        parameters: dict[str, float] = {}
+        dofs = slice(int(model.body_dofadr[i]), int(model.body_dofadr[i] + model.body_dofnum[i]))
+        damping = np.array([np.ravel(values)[0] for values in model.dof_damping[dofs]])
+        dry = model.dof_frictionloss[dofs]
+        kinds = self.kinds(i)
         if held:
-            use, dry_use = "pivot", "pivot_friction_torque"
-            if kinds[0] == SLIDE:
-                use, dry_use = "slider", "slider_friction_force"
-            parameters[f"{use}_damping_coefficient"], parameters[dry_use] = damping[0], dry[0]
+            use, what = ("slider", "force") if kinds[0] == SLIDE else ("pivot", "torque")
+            parameters = {
+                f"{use}_damping_coefficient": damping[0],
+                f"{use}_friction_{what}": dry[0],
+            }
         else:
-            if FREE in kinds:  # one coefficient for all
-                slide, turn = damping[:3], damping[3:]
-            else:
+            # one coefficient for all slides
+            slide, turn = damping[:3], damping[3:]
+            if FREE not in kinds:
                 slide, turn = damping[kinds == SLIDE], damping[kinds == HINGE]
-            parameters["linear_drag_coefficient"] = slide.mean()
-            parameters["angular_drag_coefficient"] = turn[0]
+            parameters = {
+                "linear_drag_coefficient": slide.mean(),
+                "angular_drag_coefficient": turn[0],
+            }
             if np.ptp(slide) > _EVEN * slide.max():
                 self.left_out.append(f'different damping along the slides of "{self.name(i)}"')
             if dry.any():
@@ -451,6 +426,8 @@ class _View:
             name = f'geom "{self.geom_name(g)}" of the world'
             if not self.meets(g):
                 continue
+            height, shape = self.corners(g) @ self.axes[2], self.flat(g, 0.0)
+            thick = FLAT * np.ptp(height)
             if model.geom_type[g] == _PLANE:
                 turned = self.axes @ self.data.geom_xmat[g].reshape(3, 3)
                 if abs(turned[2, 2]) < FLAT:
@@ -461,22 +438,18 @@ class _View:
                     )
                 else:
                     self.left_out.append(f"{name}, a plane that is tilted against the view")
-                continue
-            height = self.corners(g) @ self.axes[2]
-            thick = FLAT * np.ptp(height)
-            if len(low) and not np.any(
+            elif not len(low) or np.any(
                 (low < height.max() - thick) & (high > height.min() + thick)
             ):
+                if shape is None:
+                    self.left_out.append(f"{name}, which has no outline in this plane")
+                    continue
+                label = self.geom_name(g)
+                label = f"{label} (world)" if label in names else label
+                names.add(label)
+                bodies.append(Body(label, shape[0], static=True, pose=(*pair(shape[1]), 0.0)))
+            else:
                 self.left_out.append(f"{name}, which is above or below all bodies")
-                continue
-            shape = self.flat(g, 0.0)
-            if shape is None:
-                self.left_out.append(f"{name}, which has no outline in this plane")
-                continue
-            label = self.geom_name(g)
-            label = f"{label} (world)" if label in names else label
-            names.add(label)
-            bodies.append(Body(label, shape[0], static=True, pose=(*pair(shape[1]), 0.0)))
         return bodies, walls
 
     def wall(self, g: int, turned: Floats) -> Wall:

@@ -84,7 +84,9 @@ def mjcf_ranges(
     if not 0 < probability < 1:
         raise SceneError(f"probability is {probability!r}, expected between 0 and 1")
     scene, draws = scene_of(idata), labelled_draws(idata)
-    known: dict[str, dict[str, Floats]] = {}
+    tails = (1 - probability) / 2, (1 + probability) / 2
+    ranges: dict[str, dict[str, list[float]]] = {}
+    means: dict[str, dict[str, float]] = {}
     for body in scene.moving:
         values: dict[str, Any] = dict(body.known)
         for block in layout_of(idata, effects).blocks:
@@ -94,20 +96,9 @@ def mjcf_ranges(
         if "mass" in values:
             scale = values.get("inertia_scale_scale", 1.0)
             values["inertia"] = values["mass"] * body.shape.unit_moment * scale
-        known[body.name] = values
-    tails = (1 - probability) / 2, (1 + probability) / 2
-    ranges = {
-        body: {
-            name: [float(end) for end in np.quantile(drawn, tails)]
-            for name, drawn in values.items()
-            if np.size(drawn) > 1
-        }
-        for body, values in known.items()
-    }
-    means = {
-        body: {name: float(np.mean(drawn)) for name, drawn in values.items()}
-        for body, values in known.items()
-    }
+        inferred = {name: drawn for name, drawn in values.items() if np.size(drawn) > 1}
+        ranges[body.name] = {n: np.quantile(x, tails).tolist() for n, x in inferred.items()}
+        means[body.name] = {name: float(np.mean(drawn)) for name, drawn in values.items()}
     text, left_out = _Writer(scene, means, PLANES[plane], depth).write()
     if left_out:
         warn("the MJCF of the scene leaves out: " + "; ".join(left_out), ConversionWarning)
@@ -120,43 +111,41 @@ class _Writer:
     def __init__(
         self, scene: Scene, values: dict[str, dict[str, float]], axes: Floats, depth: float
     ) -> None:
-        self.scene, self.values, self.axes, self.depth = scene, values, axes, depth
+        self.scene, self.values, self.axes, self.half = scene, values, axes, depth / 2
         self.left_out: list[str] = []
         self.root = ET.Element("mujoco", model="scene")
-        step = scene.time_step / scene.substeps
         gravity = axes.T @ (*scene.gravity, -scene.normal_gravity)
-        ET.SubElement(self.root, "option", timestep=f"{step:.9g}", gravity=_text(gravity))
-        self.asset = ET.SubElement(self.root, "asset")
-        self.world = ET.SubElement(self.root, "worldbody")
+        step = scene.time_step / scene.substeps
+        _add(self.root, "option", timestep=step, gravity=gravity)
+        self.asset, world = _add(self.root, "asset"), _add(self.root, "worldbody")
+        #: Elements, and angles in the reference configuration, of the bodies so far.
+        self.elements, self.angles = {WORLD: world}, {WORLD: 0.0}
 
     def write(self) -> tuple[str, list[str]]:
         """Return the text, and what it leaves out."""
         for number, wall in enumerate(self.scene.walls, start=1):
             middle, half = np.add(wall.start, wall.end) / 2, np.subtract(wall.end, wall.start) / 2
-            size = np.hypot(*half), 1e-3 * np.hypot(*half), self.depth / 2
+            size = np.hypot(*half), 1e-3 * np.hypot(*half)
             place = self.placed(middle, math.atan2(half[1], half[0]))
-            self.box(self.world, f"wall{number}", size, place)
-        #: Elements, and angles in the reference configuration, of the bodies so far.
-        self.elements: dict[str, ET.Element] = {WORLD: self.world}
-        self.angles: dict[str, float] = {WORLD: 0.0}
+            self.box(self.elements[WORLD], f"wall{number}", size, place)
         free = [body.name for body in self.scene.dynamic]
         for body in self.scene.bodies:
             if body.name not in free:
                 x, y, theta = body.pose or (0.0, 0.0, 0.0)
                 mocap = {"mocap": "true"} if body.kinematic else {}
-                self.add(body, self.world, self.placed((x, y), theta) | mocap)
+                self.fill(body, self.begin(body, WORLD, (x, y), theta, **mocap))
                 self.angles[body.name] = theta
         joints = self.hinges()
         while free or joints:
             for joint in joints:
                 a, b = joint.bodies or ("", "")
-                if (a in self.elements) != (b in self.elements):
-                    self.hang(joint, *((a, b) if a in self.elements else (b, a)))
-                    free.remove(b if b in free else a)
-                    joints.remove(joint)
-                    break
-                if a in self.elements:
-                    self.connect(joint)
+                if a in self.elements or b in self.elements:
+                    if a in self.elements and b in self.elements:
+                        self.connect(joint)
+                    else:
+                        parent, child = (a, b) if a in self.elements else (b, a)
+                        self.hang(joint, parent, child)
+                        free.remove(child)
                     joints.remove(joint)
                     break
             else:
@@ -168,27 +157,23 @@ class _Writer:
 
     def hinges(self) -> list[Joint]:
         """Return the known hinges and sliders; list other joints as left out."""
-        kept = []
-        for name, joint in zip(self.scene.joint_names, self.scene.joints, strict=True):
-            if joint.traits.hangs and joint.known:
-                kept.append(joint)
-            else:
-                self.left_out.append(
-                    f'joint "{name}", which is not a hinge or slider with known anchors'
-                )
-        return kept
+        named = list(zip(self.scene.joint_names, self.scene.joints, strict=True))
+        self.left_out += [
+            f'joint "{name}", which is not a hinge or slider with known anchors'
+            for name, joint in named
+            if not (joint.traits.hangs and joint.known)
+        ]
+        return [joint for _, joint in named if joint.traits.hangs and joint.known]
 
     def release(self, body: Body) -> None:
         """Add a free body."""
-        x, y, _ = body.pose or (0.0, 0.0, 0.0)
-        element = self.add(body, self.world, self.placed((x, y), 0.0))
-        values = self.values[body.name]
-        drag, turning = (values.get(f"{e}_drag_coefficient", 0.0) for e in ("linear", "angular"))
-        for axis, kind, damping in ((0, "slide", drag), (1, "slide", drag), (2, "hinge", turning)):
-            joint = {"name": f"{body.name}_{('x', 'y', 'theta')[axis]}", "type": kind}
-            attributes = {"axis": _text(self.axes[axis]), "damping": f"{damping:.9g}"}
-            element.insert(axis, ET.Element("joint", joint | attributes))
-        self.list_effects(body, {"linear_drag", "angular_drag"})
+        element = self.begin(body, WORLD, (body.pose or (0.0, 0.0))[:2], 0.0)
+        kinds = ("x", "slide", "linear"), ("y", "slide", "linear"), ("theta", "hinge", "angular")
+        for axis, (name, kind, drag) in zip(self.axes, kinds, strict=True):
+            damping = self.values[body.name].get(f"{drag}_drag_coefficient", 0.0)
+            name = f"{body.name}_{name}"
+            _add(element, "joint", name=name, type=kind, axis=axis, damping=damping)
+        self.fill(body, element, {"linear_drag", "angular_drag"})
 
     def hang(self, joint: Joint, parent: str, name: str) -> None:
         """Add a body that hangs in a hinge or slider on another."""
@@ -196,36 +181,33 @@ class _Writer:
         above, below = joint.anchor_a or (0.0, 0.0), joint.anchor_b or (0.0, 0.0)
         if joint.bodies == (name, parent):
             above, below = below, above
-        slides = joint.traits.slides
-        turn = -self.angles[parent]
-        if slides:
-            turn = self.scene.reference_angle(name) - self.scene.reference_angle(parent)
-        place = np.asarray(above) - rotation(turn) @ below
-        element = self.add(body, self.elements[parent], self.placed(place, turn))
-        self.angles[name] = self.angles[parent] + turn
-        axis, use, drag, dry = self.axes[2], "pivot", "angular_drag", "pivot_friction_torque"
-        if slides:
-            angle = self.scene.direction(joint) - self.scene.reference_angle(name)
+        turn, axis = -self.angles[parent], self.axes[2]
+        use, kind, drag, dry = "pivot", "hinge", "angular_drag", "pivot_friction_torque"
+        if joint.traits.slides:
+            reference = self.scene.reference_angle(name)
+            turn = reference - self.scene.reference_angle(parent)
+            angle = self.scene.direction(joint) - reference
             axis = self.axes[:2].T @ (math.cos(angle), math.sin(angle))
-            use, drag, dry = "slider", "linear_drag", "slider_friction_force"
+            use, kind, drag, dry = "slider", "slide", "linear_drag", "slider_friction_force"
+        place = np.asarray(above) - rotation(turn) @ below
+        element = self.begin(body, parent, place, turn)
+        self.angles[name] = self.angles[parent] + turn
         damping = values.get(f"{use}_damping_coefficient", 0.0)
         known = {f"{use}_damping", f"{use}_friction"}
-        if not self.moves(parent):
+        if parent not in [moving.name for moving in self.scene.moving]:
             damping += values.get(f"{drag}_coefficient", 0.0)
             known |= {drag}
-        attributes = {
-            "name": f"{name}_slide" if slides else f"{name}_theta",
-            "type": "slide" if slides else "hinge",
-            "axis": _text(axis),
-            "pos": _text(self.axes[:2].T @ below),
-            "damping": f"{damping:.9g}",
-            "frictionloss": f"{values.get(dry, 0.0):.9g}",
-        }
-        element.insert(0, ET.Element("joint", attributes))
-        self.list_effects(body, known)
-
-    def moves(self, name: str) -> bool:
-        return any(body.name == name for body in self.scene.moving)
+        _add(
+            element,
+            "joint",
+            name=f"{name}_slide" if joint.traits.slides else f"{name}_theta",
+            type=kind,
+            axis=axis,
+            pos=self.axes[:2].T @ below,
+            damping=damping,
+            frictionloss=values.get(dry, 0.0),
+        )
+        self.fill(body, element, known)
 
     def connect(self, joint: Joint) -> None:
         """Close a loop of hinges."""
@@ -237,65 +219,64 @@ class _Writer:
         second = {"body2": b} if first == a and b != WORLD else {}
         equality = self.root.find("equality")
         if equality is None:
-            equality = ET.SubElement(self.root, "equality")
-        place = _text(self.axes[:2].T @ (anchor or (0.0, 0.0)))
-        ET.SubElement(equality, "connect", {"body1": first, "anchor": place, **second})
+            equality = _add(self.root, "equality")
+        place = self.axes[:2].T @ (anchor or (0.0, 0.0))
+        _add(equality, "connect", body1=first, anchor=place, **second)
 
-    def add(self, body: Body, parent: ET.Element, place: dict[str, str]) -> ET.Element:
-        """Add a body with its inertia and geom."""
-        element = ET.SubElement(parent, "body", {"name": body.name, **place})
+    def begin(self, body: Body, parent: str, place: Any, turn: float, **more: str) -> ET.Element:
+        """Add the element of a body, without content."""
+        where = self.placed(place, turn)
+        element = _add(self.elements[parent], "body", name=body.name, **where, **more)
         self.elements[body.name], self.angles[body.name] = element, 0.0
+        return element
+
+    def fill(self, body: Body, element: ET.Element, effects: set[str] | None = None) -> None:
+        """Add a body's inertia and geom; list what is left out of it, but for these effects."""
         values = self.values.get(body.name, {})
+        more: dict[str, Any] = {}
         if "mass" in values:
             centre = [values.get(f"com_offset_{axis}", 0.0) for axis in "xy"]
             # in the plane, moments about its axes do not matter
-            ET.SubElement(
-                element,
-                "inertial",
-                pos=_text(self.axes[:2].T @ centre),
-                mass=f"{values['mass']:.9g}",
-                diaginertia=_text([values["inertia"]] * 3),
-            )
-        friction = {"friction": f"{values['mu_c']:.9g}"} if "mu_c" in values else {}
-        self.geom(body, element, friction)
-        if body.wheel:
-            self.left_out.append(f'the wheel of body "{body.name}"')
-        return element
-
-    def geom(self, body: Body, element: ET.Element, more: dict[str, str]) -> None:
-        """Add a body's outline, drawn out to its depth."""
-        shape, half = body.shape, self.depth / 2
+            moments = [values["inertia"]] * 3
+            place = self.axes[:2].T @ centre
+            _add(element, "inertial", pos=place, mass=values["mass"], diaginertia=moments)
+        if "mu_c" in values:
+            more["friction"] = values["mu_c"]
+        shape, name, half = body.shape, body.name, self.half
         if shape.size is not None:
-            width, height = shape.size
-            self.box(element, body.name, (width / 2, height / 2, half), more)
+            self.box(element, name, np.array(shape.size) / 2, more)
         elif shape.radius is not None:
-            round_ = {"type": "cylinder", "size": _text((shape.radius, half))}
-            upright = {"zaxis": _text(self.axes[2])}
-            ET.SubElement(element, "geom", {"name": body.name, **round_, **upright, **more})
+            more = {"type": "cylinder", "size": (shape.radius, half), "zaxis": self.axes[2], **more}
+            _add(element, "geom", name=name, **more)
         else:
             corners = [(*p, z) for z in (-half, half) for p in shape.vertices or ()]
-            vertices = _text((np.array(corners) @ self.axes).ravel())
-            ET.SubElement(self.asset, "mesh", name=body.name, vertex=vertices, inertia="convex")
+            vertices = (np.array(corners) @ self.axes).ravel()
+            _add(self.asset, "mesh", name=name, vertex=vertices, inertia="convex")
             # a mesh's geom is about its centre, which is the outline's centroid
-            mesh = {"name": body.name, "type": "mesh", "mesh": body.name}
-            ET.SubElement(element, "geom", {**mesh, **more})
+            _add(element, "geom", name=name, type="mesh", mesh=name, **more)
+        if body.wheel:
+            self.left_out.append(f'the wheel of body "{name}"')
+        if effects is not None:
+            lost = sorted({*body.effects} - effects - {"inertia_scale", "com_offset"})
+            self.left_out += [f'effect {one} of body "{name}"' for one in lost]
 
-    def box(self, parent: ET.Element, name: str, size: Any, more: dict[str, str]) -> None:
-        """Add a box of these half sizes along the plane's axes and across it."""
-        sizes = _text(np.abs(self.axes.T @ np.asarray(size)))
-        ET.SubElement(parent, "geom", {"name": name, "type": "box", "size": sizes, **more})
+    def box(self, parent: ET.Element, name: str, size: Any, more: dict[str, Any]) -> None:
+        """Add a box of these half sizes along the plane's axes."""
+        sizes = np.abs(self.axes.T @ (*size, self.half))
+        _add(parent, "geom", name=name, type="box", size=sizes, **more)
 
-    def placed(self, place: Any, theta: float) -> dict[str, str]:
+    def placed(self, place: Any, theta: float) -> dict[str, Any]:
         """Return the attributes of a place in the plane, and of an angle."""
         turn = (math.cos(theta / 2), *(math.sin(theta / 2) * self.axes[2]))
-        return {"pos": _text(self.axes[:2].T @ np.asarray(place)), "quat": _text(turn)}
-
-    def list_effects(self, body: Body, known: set[str]) -> None:
-        """List effects of a body that the model leaves out."""
-        lost = sorted({*body.effects} - known - {"inertia_scale", "com_offset"})
-        self.left_out += [f'effect {name} of body "{body.name}"' for name in lost]
+        return {"pos": self.axes[:2].T @ np.asarray(place), "quat": turn}
 
 
-def _text(numbers: Any) -> str:
-    """Return numbers as MJCF has them."""
-    return " ".join(f"{rounded(number):.9g}" for number in numbers)
+def _add(parent: ET.Element, tag: str, **attributes: Any) -> ET.Element:
+    """Add an element with attributes of text, a number or several numbers."""
+    element = ET.SubElement(parent, tag)
+    for name, value in attributes.items():
+        if not isinstance(value, str):
+            numbers = map(rounded, value) if np.ndim(value) else [value]
+            value = " ".join(f"{number:.9g}" for number in numbers)
+        element.set(name, value)
+    return element

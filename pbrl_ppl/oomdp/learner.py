@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+import math
+from collections.abc import Sequence
 from typing import Self
 
 import numpy as np
@@ -12,11 +13,12 @@ from pbrl_ppl.errors import FitError, HistoryError, SimulationError
 from pbrl_ppl.history import History, check_start
 from pbrl_ppl.oomdp.contacts import turned
 from pbrl_ppl.oomdp.regression import Experience
+from pbrl_ppl.oomdp.relations import Relation
 from pbrl_ppl.scene import Scene, body_sizes, nearest
 from pbrl_ppl.state import STATE, THETA, WRENCH, Bools, Floats, wrapped
 
 
-class Learner(ABC):
+class Learner:
     """Independent models of transitions of single bodies, learned as they are observed.
 
     A :class:`pbrl_ppl.planning.TransitionModel`: :func:`pbrl_ppl.plan` plans with it.
@@ -38,6 +40,8 @@ class Learner(ABC):
         Whether a body's transitions are learned in its own frame, without its pose.
     share_classes : bool
         Whether bodies of one class share their models.
+    relations : sequence of Relation
+        Predicates that make the conditions; without any there is one condition.
 
     Raises
     ------
@@ -54,12 +58,13 @@ class Learner(ABC):
         self,
         scene: Scene,
         *,
-        neighbours: int,
-        bandwidth: float,
-        ridge: float,
-        standardise: bool,
-        pose_invariant: bool,
-        share_classes: bool,
+        neighbours: int = 1000,
+        bandwidth: float = 1.5,
+        ridge: float = 1e-3,
+        standardise: bool = True,
+        pose_invariant: bool = True,
+        share_classes: bool = False,
+        relations: Sequence[Relation] = (),
     ) -> None:
         if isinstance(neighbours, bool) or not isinstance(neighbours, int) or neighbours < 1:
             raise FitError(f"LWR: neighbours is {neighbours!r}, expected a whole number from 1 up")
@@ -67,7 +72,7 @@ class Learner(ABC):
             raise FitError(f"LWR: bandwidth is {bandwidth!r}, expected a number above 0")
         if not 0 <= ridge < np.inf:
             raise FitError(f"LWR: ridge is {ridge!r}, expected a number from 0 (Eq. 4) up")
-        self.scene, self.pose_invariant = scene, pose_invariant
+        self.scene, self.pose_invariant, self.relations = scene, pose_invariant, tuple(relations)
         options = {"neighbours": neighbours, "bandwidth": bandwidth, "ridge": ridge}
         self._experience: dict[int, Experience] = {}
         of_class: dict[str, Experience] = {}
@@ -81,12 +86,17 @@ class Learner(ABC):
         self.transitions = 0
         self._largest = body_sizes(scene).max(axis=0)  # in each dimension
 
-    @abstractmethod
     def predicates(self, states: Floats, wrenches: Floats) -> Bools:
         """Return predicates of moving bodies in states (n, body, 6) under wrenches (n, body, 3).
 
-        Shape (n, body, predicate).
+        In the order of the relations' labels, shape (n, body, predicate).
         """
+        lead = states.shape[:2]
+        flags = [np.zeros((*lead, 0), dtype=bool)]
+        for relation in self.relations:
+            truths = relation.of(self.scene, states, wrenches)
+            flags.append(truths.reshape(*lead, math.prod(truths.shape[2:])))
+        return np.concatenate(flags, axis=-1)
 
     # -- learning ----------------------------------------------------------------------------------
 

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import final
-
-import numpy as np
+from typing import Any, final
 
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.oomdp.contacts import SectorContacts
 from pbrl_ppl.oomdp.learner import Learner
 from pbrl_ppl.oomdp.relations import Attributes, Condition, Relation, condition
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import Bools, Floats
 
 
 @final
@@ -52,6 +48,7 @@ class LWR(Learner):
 
     Examples
     --------
+    >>> import numpy as np
     >>> from pbrl_ppl.scene import Body, Scene, Shape
     >>> scene = Scene(time_step=0.1, bodies=(Body("puck", Shape.circle(0.2)),))
     >>> model = LWR(scene)
@@ -60,25 +57,6 @@ class LWR(Learner):
     >>> model.step(elsewhere, np.zeros((1, 1, 3))).round(3)
     array([[[[5.   , 3.2  , 1.571, 0.   , 2.   , 0.   ]]]])
     """
-
-    def __init__(
-        self,
-        scene: Scene,
-        *,
-        neighbours: int = 1000,
-        bandwidth: float = 1.5,
-        ridge: float = 1e-3,
-        standardise: bool = True,
-        pose_invariant: bool = True,
-    ) -> None:
-        super().__init__(
-            scene, neighbours=neighbours, bandwidth=bandwidth, ridge=ridge,
-            standardise=standardise, pose_invariant=pose_invariant, share_classes=False,
-        )  # fmt: skip
-
-    def predicates(self, states: Floats, wrenches: Floats) -> Bools:
-        """Return no predicates, shape (n, body, 0)."""
-        return np.zeros((*states.shape[:2], 0), dtype=bool)
 
 
 @final
@@ -116,6 +94,7 @@ class OOLWR(Learner):
 
     Examples
     --------
+    >>> import numpy as np
     >>> from pbrl_ppl.scene import Body, Scene, Shape, Wall
     >>> wall = Wall((0.25, -1.0), (0.25, 1.0))
     >>> scene = Scene(time_step=0.1, bodies=(Body("puck", Shape.circle(0.2)),), walls=(wall,))
@@ -133,19 +112,12 @@ class OOLWR(Learner):
         *,
         relations: Sequence[Relation] | None = None,
         share_classes: bool = True,
-        neighbours: int = 1000,
-        bandwidth: float = 1.5,
-        ridge: float = 1e-3,
-        standardise: bool = True,
+        **options: Any,
     ) -> None:
-        super().__init__(
-            scene, neighbours=neighbours, bandwidth=bandwidth, ridge=ridge,
-            standardise=standardise, pose_invariant=True, share_classes=share_classes,
-        )  # fmt: skip
         if relations is None:
             attributes = (Attributes(),) * any(body.attributes for body in scene.moving)
             relations = (SectorContacts(), *attributes)
-        self.relations = tuple(relations)
+        super().__init__(scene, share_classes=share_classes, relations=relations, **options)
         for relation in self.relations:
             if not isinstance(relation, Relation):
                 raise FitError(
@@ -161,14 +133,6 @@ class OOLWR(Learner):
                     f'OO-LWR: {count} predicates are called "{label}"; drop a relation, or rename'
                     " the attribute"
                 )
-
-    def predicates(self, states: Floats, wrenches: Floats) -> Bools:
-        """Return predicates in the order of :attr:`labels`, shape (n, body, predicate)."""
-        flags = [np.zeros((*states.shape[:2], 0), dtype=bool)]
-        for relation in self.relations:
-            truths = relation.of(self.scene, states, wrenches)
-            flags.append(truths.reshape(*truths.shape[:2], math.prod(truths.shape[2:])))
-        return np.concatenate(flags, axis=-1)
 
     def conditions(self, body: str) -> Mapping[Condition, int]:
         """Return the observed conditions of a body or its class, and their numbers of transitions.

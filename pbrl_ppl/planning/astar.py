@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import heapq
 import time
+from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +22,7 @@ from pbrl_ppl.planning.dynamics import TransitionModel, remembered
 from pbrl_ppl.planning.goals import Goal, Target
 from pbrl_ppl.planning.search import Found, Task, contact_cost, tail_mean
 from pbrl_ppl.scene import Body, Scene, Shape
-from pbrl_ppl.state import Bools, Floats, Ints
+from pbrl_ppl.state import Bools, Floats
 
 #: Cells of the closed set ten tolerances from the goal, in tolerances and, for speeds, tolerances a
 #: sampling interval; further away and nearer they grow and shrink in proportion, between limits.
@@ -119,6 +121,15 @@ class Edge(NamedTuple):
     intervals: int
 
 
+class Node(NamedTuple):
+    """Node of the tree: states (draw, body, 6), wrenches before, cost, and the edge to it."""
+
+    states: Floats
+    last: Floats
+    cost: float
+    edge: Edge
+
+
 class _Search:
     """State of the search: the tree, the open queue and the closed set."""
 
@@ -128,7 +139,8 @@ class _Search:
         self.scene = task.dynamics.scene
         self.counts = task.actions.intervals(self.scene)
         self.to_go = TimeToGo(task.dynamics, task.goal, task.actions, task.start)
-        self.root = np.repeat(task.start[None], task.dynamics.draws, axis=0)[None]
+        root = np.repeat(task.start[None], task.dynamics.draws, axis=0)
+        self.root = Node(root, task.dynamics.before, 0.0, Edge(0, -1, 0))
         self.generated = 1
         reach = [self.scene.body(target.body).shape.bounding_radius for target in self.goal.targets]
         self.near = min(_WIDEST * min(reach), *self.goal.tolerances(self.scene))
@@ -154,20 +166,14 @@ class _Search:
 
     def begin(self) -> None:
         """Reset tree, queue and closed set to the root."""
-        # the tree: arrays with room for more nodes
-        self.states, self.cost = self.root.copy(), np.zeros(1)
-        self.last = self.dynamics.before[None].copy()  # the last wrenches before each node
-        self.edges = np.array([[-1, -1, 0]])
-        self.size = 1
+        self.tree = [self.root]
         self.queue: list[tuple[float, int]] = [(0.0, 0)]
         self.closed: dict[bytes, float] = {}
         self.best: Edge | None = None
         self.least_cost = np.inf
-        self.nearest = Edge(0, -1, 0)
-        self.least_distance = np.inf
-        root = np.moveaxis(self.states, 0, 1)
-        self._note(root, np.zeros(1), np.zeros(1, int), np.zeros(1, int), 0)
-        if self.root[..., 3:].any():
+        self.nearest, self.least_distance = self.root.edge, np.inf
+        self._note(self.root.states[:, None], np.zeros(1), [self.root.edge])
+        if self.root.states[..., 3:].any():
             self.least_distance = np.inf
 
     def expand(self, *, at_once: int = 32) -> None:
@@ -178,90 +184,66 @@ class _Search:
         """
         size = min(max(1, at_once // self.dynamics.draws), len(self.queue))
         batch = [heapq.heappop(self.queue)[1] for _ in range(size)]
-        count = len(self.actions.actions)
-        self._try(np.repeat(batch, count), np.tile(np.arange(count), size))
+        self._try(list(product(batch, range(len(self.actions.actions)))))
 
     def follow(self, steps: list[tuple[int, int]]) -> None:
         """Add the nodes along a path from the root, as far as they are in new cells."""
         for action, intervals in steps:
-            last = self.size - 1
-            self._try(np.array([last]), np.array([action]), intervals)
-            if self.size == last + 1:
+            last = len(self.tree) - 1
+            self._try([(last, action)], intervals)
+            if len(self.tree) == last + 1:
                 break
 
-    def _try(self, parents: Ints, which: Ints, only: int | None = None) -> None:
+    def _try(self, tried: list[tuple[int, int]], only: int | None = None) -> None:
         """Play an action from each of some nodes, for every duration or one alone (intervals)."""
-        states = np.moveaxis(self.states[parents], 0, 1)
-        cost, last = self.cost[parents], self.last[parents]
+        nodes, which = [self.tree[node] for node, _ in tried], np.array([a for _, a in tried])
+        states = np.moveaxis(np.stack([node.states for node in nodes]), 0, 1)
+        cost = np.array([node.cost for node in nodes])
+        last = np.stack([node.last for node in nodes])
         for interval in range(1, (only or self.counts[-1]) + 1):
             wrenches = self.actions.wrenches(self.scene, which, mean_angle(states[..., 2]))
             states = self.dynamics.step(states, wrenches, last)
             last = remembered(wrenches, last)
             if self.rng is not None:
                 states = self.dynamics.noisy(states, self.rng)
-            self.generated += len(parents) * self.dynamics.draws
+            self.generated += len(tried) * self.dynamics.draws
             cost = cost + self.scene.time_step * (1.0 + contact_cost(self.goal, self.scene, states))
-            far = self._note(states, cost, parents, which, interval)
+            edges = [Edge(*each, interval) for each in tried]
+            far = self._note(states, cost, edges)
             if interval == only or (only is None and interval in self.counts):
-                self._add(states, last, cost, far, parents, which, interval)
+                self._add(states, last, cost, far, edges)
 
-    def _note(
-        self, states: Floats, cost: Floats, parents: Ints, which: Ints, interval: int
-    ) -> Floats:
+    def _note(self, states: Floats, cost: Floats, edges: list[Edge]) -> Floats:
         """Keep the cheapest edge to the goal and the nearest one; return L2 distances."""
         possible = np.isfinite(states).all(axis=(0, 2, 3)) & np.isfinite(cost)
         there = tail_mean(self.goal.shortfall(self.scene, states), self.tail) <= 1.0
         there &= possible & (cost < self.least_cost)
         far = tail_mean(self.goal.distance(self.scene, states), self.tail)
         far = np.where(possible, far, np.inf)
-
-        def edge(row: int) -> Edge:
-            return Edge(int(parents.flat[row]), int(which.flat[row]), interval)
-
         if there.any():
             row = int(np.argmin(np.where(there, cost, np.inf)))
-            self.best, self.least_cost = edge(row), float(cost[row])
+            self.best, self.least_cost = edges[row], float(cost[row])
         row = int(np.argmin(far))
         if far[row] < self.least_distance:
-            self.nearest, self.least_distance = edge(row), float(far[row])
+            self.nearest, self.least_distance = edges[row], float(far[row])
         return far
 
     def _add(
-        self,
-        states: Floats,
-        last: Floats,
-        cost: Floats,
-        far: Floats,
-        parents: Ints,
-        which: Ints,
-        interval: int,
+        self, states: Floats, last: Floats, cost: Floats, far: Floats, edges: list[Edge]
     ) -> None:
         """Add nodes that are in a new cell, or are cheaper than the one in it."""
         ahead = tail_mean(self.to_go(states), self.tail)
-        chosen = []
         keys = self._cells(states, far)
         for row in np.flatnonzero(np.isfinite(far) & (cost + ahead < self.least_cost)):
             key = keys[row].tobytes()
             if cost[row] < self.closed.get(key, np.inf):
                 self.closed[key] = cost[row]
-                chosen.append(row)
-        if not chosen:
-            return
-        first, self.size = self.size, self.size + len(chosen)
-        edges = np.stack([parents, which, np.full_like(parents, interval)], axis=1)
-        for name, new in (
-            ("states", np.moveaxis(states, 0, 1)), ("last", last), ("cost", cost),
-            ("edges", edges),
-        ):  # fmt: skip
-            old = getattr(self, name)
-            if len(old) < self.size:
-                room = np.empty((2 * self.size, *old.shape[1:]), old.dtype)
-                room[:first] = old[:first]
-                setattr(self, name, old := room)
-            old[first : self.size] = new[chosen]
-        priority = (cost + self.weight * ahead)[chosen]
-        for node, value in enumerate(priority.tolist(), start=first):
-            heapq.heappush(self.queue, (value, node))
+                priority = float(cost[row] + self.weight * ahead[row])
+                heapq.heappush(self.queue, (priority, len(self.tree)))
+                # copies: a view would keep the states of all rows
+                self.tree.append(
+                    Node(states[:, row].copy(), last[row].copy(), float(cost[row]), edges[row])
+                )
 
     def _cells(
         self,
@@ -290,7 +272,7 @@ class _Search:
         steps, edge = [], last
         while edge.intervals:
             steps.append((edge.action, edge.intervals))
-            edge = Edge(*self.edges[edge.node].tolist())
+            edge = self.tree[edge.node].edge
         return steps[::-1]
 
 
@@ -390,19 +372,6 @@ def _time(way: Floats, speed: Floats, push: Floats) -> Floats:
     return np.asarray(np.where(way > 0, np.sqrt(speed**2 + 2 * push * way) - speed, 0.0) / push)
 
 
-class _Field:
-    """Distance to a target around obstacles, between the centres of a grid's cells."""
-
-    def __init__(self, values: Floats, origin: Floats, cell: float) -> None:
-        self.values, self.origin, self.cell = values, origin, cell
-
-    def __call__(self, places: Floats) -> Floats:
-        at = (places - self.origin) / self.cell
-        return np.asarray(
-            map_coordinates(self.values, np.moveaxis(at, -1, 0), order=1, mode="nearest")
-        )
-
-
 def _distances(
     scene: Scene,
     body: Body,
@@ -411,7 +380,7 @@ def _distances(
     *,
     cells: int = 160,
     margin: float = 4.0,
-) -> _Field | None:
+) -> Callable[[Floats], Floats] | None:
     """Return distances of a body's origin from its target around obstacles; None without any.
 
     ``cells``: cells along the longer side of the grid.
@@ -445,30 +414,30 @@ def _distances(
     if not reached.all():
         nearest = distance_transform_edt(~reached, return_distances=False, return_indices=True)
         values = values[tuple(nearest)]
-    return _Field(values, low, cell)
+
+    def distance(places: Floats) -> Floats:
+        """Return the distances between the centres of the grid's cells, shape (...)."""
+        at = np.moveaxis((places - low) / cell, -1, 0)
+        return np.asarray(map_coordinates(values, at, order=1, mode="nearest"))
+
+    return distance
 
 
 def _graph(free: Bools) -> coo_array:
     """Return the moves between free cells; a knight's passes two others."""
-    number = np.arange(free.size).reshape(free.shape)
+    # in a margin of two cells, which are not free, every move stays on the grid
+    open_, number = (np.pad(a, 2) for a in (free, np.arange(free.size).reshape(free.shape)))
+    cells, width = np.flatnonzero(open_), open_.shape[1]
     rows, columns, lengths = [], [], []
     for dx, dy in _MOVES:
-        between = {
-            (round(dx * t), round(dy * t)) for t in np.linspace(0, 1, 2 * max(dx, abs(dy)) + 1)
-        }
-        # cells from which the move stays on the grid
-        x, y = slice(0, free.shape[0] - dx), slice(max(-dy, 0), free.shape[1] - max(dy, 0))
-        passed = [free[_shift(x, i), _shift(y, j)] for i, j in between]
-        possible = np.logical_and.reduce(passed)
-        rows.append(number[x, y][possible])
-        columns.append(number[_shift(x, dx), _shift(y, dy)][possible])
-        lengths.append(np.full(int(possible.sum()), np.hypot(dx, dy)))
+        passed = np.ones(len(cells), dtype=bool)
+        for t in np.linspace(0, 1, 2 * max(dx, abs(dy)) + 1):
+            passed &= open_.flat[cells + round(dx * t) * width + round(dy * t)]
+        rows.append(number.flat[cells[passed]])
+        columns.append(number.flat[cells[passed] + dx * width + dy])
+        lengths.append(np.full(len(rows[-1]), np.hypot(dx, dy)))
     data = np.concatenate(lengths), (np.concatenate(rows), np.concatenate(columns))
     return coo_array(data, shape=(free.size, free.size)).tocsr()
-
-
-def _shift(span: slice, by: int) -> slice:
-    return slice(span.start + by, span.stop + by)
 
 
 def _inner(shape: Shape) -> float:

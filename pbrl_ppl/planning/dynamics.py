@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol, Self, runtime_checkable
 
 import numpy as np
@@ -107,84 +107,36 @@ def rollout(
     return np.stack(path, axis=2).reshape(model.draws, *lead, len(path), *start.shape)
 
 
-@dataclass(frozen=True, eq=False)
-class StateNoise:
-    """Noise of each state dimension, as in Eq. 11.
+#: Noise of a step under one draw, added to states (n, body, 6) in place.
+StepNoise = Callable[[Floats, np.random.Generator], None]
 
-    Parameters
-    ----------
-    sigma : ndarray
-        Shape (draw, state).
-    columns : tuple of int
-        The state dimensions.
-    nu : float, ndarray or None
-        Degrees of freedom, shape (draw, 1, 1, body, 1) where they are inferred.
+
+def _noise_of_states(
+    states: Floats,
+    rng: np.random.Generator,
+    *,
+    sigma: Floats,
+    columns: tuple[int, ...],
+    nu: float | Floats | None,
+) -> None:
+    """Add noise to each state dimension, as in Eq. 11."""
+    states[..., columns] = next_state_random(states[..., columns], sigma, rng, nu=nu)
+
+
+def _noise_of_accelerations(
+    states: Floats, rng: np.random.Generator, *, sigma: Floats, coordinates: Coordinates
+) -> None:
+    """Add an unexplained acceleration, held over an interval; measurement errors disturb no body.
+
+    Without what a contact adds, which is not predicted.
     """
-
-    sigma: Floats
-    columns: tuple[int, ...]
-    nu: float | Floats | None
-
-    def add(self, states: Floats, rng: np.random.Generator) -> Floats:
-        """Return states (draw, n, body, 6) with noise."""
-        out, columns = states.copy(), self.columns
-        for i, scale in enumerate(self.sigma):
-            nu = self.nu[i][0] if isinstance(self.nu, np.ndarray) else self.nu
-            out[i][..., columns] = next_state_random(states[i][..., columns], scale, rng, nu=nu)
-        return out
-
-    def single(self, draw: int) -> StateNoise:
-        """Return the noise of one draw."""
-        one = slice(draw, draw + 1)
-        nu = self.nu[one] if isinstance(self.nu, np.ndarray) else self.nu
-        return StateNoise(self.sigma[one], self.columns, nu)
-
-
-@dataclass(frozen=True, eq=False)
-class AccelerationNoise:
-    """Unexplained acceleration, held over an interval; measurement errors disturb no body.
-
-    Parameters
-    ----------
-    sigma : ndarray
-        Noise parameters, shape (draw, parameter), m/s^2 and rad/s^2 where they are accelerations.
-    coordinates : Coordinates
-        Coordinates that they move.
-    """
-
-    sigma: Floats
-    coordinates: Coordinates
-
-    def add(self, states: Floats, rng: np.random.Generator) -> Floats:
-        """Return states (draw, n, body, 6) with noise."""
-        out = np.ascontiguousarray(states).copy()
-        # without what a contact adds, which is not predicted
-        apart = np.zeros(states.shape[:2], dtype=bool)
-        flat = out.reshape(*apart.shape, -1)
-        flat[..., self.coordinates.places] += self.coordinates.pushes(
-            self.sigma[:, None], apart, rng
-        )
-        return out
-
-    def single(self, draw: int) -> AccelerationNoise:
-        """Return the noise of one draw."""
-        return AccelerationNoise(self.sigma[draw : draw + 1], self.coordinates)
-
-
-#: Noise that a step adds to states, one distribution a posterior draw.
-StepNoise = StateNoise | AccelerationNoise
+    flat = states.reshape(len(states), -1)
+    apart = np.zeros(len(states), dtype=bool)
+    flat[:, coordinates.places] += coordinates.pushes(sigma, apart, rng)
 
 
 #: Intervals that an actuator with a state of its own is followed back to.
 PAST = 16
-
-
-def _memory(attached: Attached) -> int:
-    """Return how many past wrenches an effect needs."""
-    stage = attached.effect.stage
-    if not isinstance(stage, Command):
-        return 0
-    return stage.memory + (stage.remember is not None)
 
 
 class Dynamics:
@@ -201,8 +153,9 @@ class Dynamics:
         Parameter draws in the layout's order, shape (draw, p).
     effects : iterable of Effect or Attached
         Effects beside those that the scene declares.
-    noise : StepNoise, optional
-        Noise of a step under each draw: then :meth:`noisy` works.
+    noise : sequence of callable, optional
+        For each draw, what adds the noise of a step to states (n, body, 6) in place: then
+        :meth:`noisy` works.
     substeps, threads, tolerance
         Settings of the engine: fields of :class:`pbrl_ppl.Physics`.
     declared : iterable of Effect
@@ -215,7 +168,7 @@ class Dynamics:
         phi: Floats,
         effects: Iterable[Effect | Attached] = (),
         *,
-        noise: StepNoise | None = None,
+        noise: Sequence[StepNoise] | None = None,
         substeps: int | None = None,
         threads: int = 2,
         tolerance: float = Physics.tolerance,
@@ -229,7 +182,8 @@ class Dynamics:
         self._whole = needs_inputs(attached)
         #: Wrenches that acted before the start, shape (body, 3); three more columns for each older
         #: one that an actuator remembers.
-        past = PAST if any(_memory(one) > 1 for one in attached) else 1
+        stages = [one.effect.stage for one in attached if isinstance(one.effect.stage, Command)]
+        past = PAST if any(s.memory + (s.remember is not None) > 1 for s in stages) else 1
         self.before = np.zeros((len(scene.moving), past * len(WRENCH)))
 
     @classmethod
@@ -285,16 +239,23 @@ class Dynamics:
                 )
             chosen = np.random.default_rng(seed).choice(len(phi), draws, replace=False)
             phi, sigma = phi[chosen], sigma[chosen]
-        noise: StepNoise
+        noise: list[StepNoise]
         if record.cells is not None:
-            noise = AccelerationNoise(sigma, record.cells)
+            noise = [
+                partial(_noise_of_accelerations, sigma=one, coordinates=record.cells)
+                for one in sigma
+            ]
         else:
-            nu: float | Floats | None = record.nu
+            columns = tuple(STATE.index(name) for name in record.measured)
+            nu: Iterable[float | Floats | None] = [record.nu] * len(phi)
             if tail_places(physics):
-                nu = degrees_of_freedom(physics, phi, record.nu)
+                nu = degrees_of_freedom(physics, phi, record.nu)[:, 0]
             if record.likelihood == "simulation":  # measurement errors disturb no body
                 sigma = np.zeros_like(sigma)
-            noise = StateNoise(sigma, tuple(STATE.index(name) for name in record.measured), nu)
+            noise = [
+                partial(_noise_of_states, sigma=one, columns=columns, nu=tail)
+                for one, tail in zip(sigma, nu, strict=True)
+            ]
         return cls(
             record.scene,
             phi,
@@ -317,7 +278,7 @@ class Dynamics:
         i = int(np.argmin((offset**2).sum(axis=1)))
         chosen = self.at(self.phi[i : i + 1])
         if self._noise is not None:
-            chosen._noise = self._noise.single(i)
+            chosen._noise = self._noise[i : i + 1]
         return chosen
 
     def at(self, phi: Floats) -> Dynamics:
@@ -397,7 +358,10 @@ class Dynamics:
         """
         if self._noise is None:
             raise PosteriorError("noise: these parameters are known, and have no sigma; leave it")
-        return self._noise.add(states, rng)
+        out = np.ascontiguousarray(states).copy()
+        for under_draw, add in zip(out, self._noise, strict=True):
+            add(under_draw, rng)
+        return out
 
     def rollout(
         self, start: Floats, wrenches: Floats, rng: np.random.Generator | None = None
