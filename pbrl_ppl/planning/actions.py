@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import GoalError
-from pbrl_ppl.planning.goals import read_tables, read_toml
+from pbrl_ppl.planning.dynamics import TransitionModel, remembered
+from pbrl_ppl.planning.goals import check_pushed, read_tables
 from pbrl_ppl.scene import Scene, nearest
 from pbrl_ppl.state import THETA, WRENCH, Floats
 
@@ -48,9 +49,8 @@ class Action:
     frame: str = "body"
 
     def __post_init__(self) -> None:
-        components = np.array([*np.ravel(self.force), self.torque], dtype=object)
         try:
-            numbers = components.astype(float)
+            numbers = np.array([*np.ravel(self.force), self.torque], dtype=float)
         except (TypeError, ValueError):
             numbers = np.full(3, np.nan)
         if numbers.shape != (3,) or not np.isfinite(numbers).all():
@@ -132,9 +132,8 @@ class ActionSet:
         GoalError
             If it is missing, is not TOML, has an unknown key, or no action.
         """
-        table = read_toml(path, "actions", ("durations", "action"))
-        actions = read_tables(path, table.get("action", []), Action)
-        return cls(tuple(actions), table.get("durations"))
+        actions, options = read_tables(path, "actions", Action, ("durations",))
+        return cls(tuple(actions), **options)
 
     @classmethod
     def recorded(
@@ -191,14 +190,10 @@ class ActionSet:
         GoalError
             If not; it names the body or the duration.
         """
-        moving = [body.name for body in scene.dynamic]
-        for action in self.actions:
-            if action.body not in moving:
-                raise GoalError(
-                    f'actions: the scene has no moving body "{action.body}" that can be pushed'
-                    f"{nearest(action.body, moving)} (a kinematic body stays where it starts in a"
-                    " plan; Transition.predict takes its path)"
-                )
+        hint = (
+            " (a kinematic body stays where it starts in a plan; Transition.predict takes its path)"
+        )
+        check_pushed(scene, (action.body for action in self.actions), "actions", hint)
         self.intervals(scene)
 
     def intervals(self, scene: Scene) -> tuple[int, ...]:
@@ -246,10 +241,41 @@ class ActionSet:
         return force, max((abs(action.torque) for action in chosen), default=0.0)
 
 
+def play(
+    dynamics: TransitionModel,
+    start: Floats,
+    actions: ActionSet,
+    which: NDArray[np.intp],
+    heading: Callable[[Floats], Floats],
+) -> Floats:
+    """Return world-frame wrenches of sequences of actions, shape (n, time, body, 3).
+
+    Parameters
+    ----------
+    dynamics : TransitionModel
+        Predicts the path, on which wrenches of the body frame depend.
+    start : ndarray
+        Shape (body, 6).
+    actions : ActionSet
+        Actions that are played.
+    which : ndarray
+        Number of the action in each interval, shape (n, time).
+    heading : callable
+        Heading of each body, shape (n, body), from its angles under all draws.
+    """
+    n, steps = which.shape
+    states = np.tile(start, (dynamics.draws, n, 1, 1))
+    last = np.tile(dynamics.before, (n, 1, 1))
+    out = np.zeros((n, steps, len(start), len(WRENCH)))
+    for t in range(steps):
+        out[:, t] = actions.wrenches(dynamics.scene, which[:, t], heading(states[..., THETA]))
+        states = dynamics.step(states, out[:, t], last)
+        last = remembered(out[:, t], last)
+    return out
+
+
 #: Lowest and highest value of components of the wrench, by body.
 Bounds = Mapping[str, Mapping[str, Sequence[float]]]
-#: Wrenches (n, time, body, 3) to states (n, time + 1, body, 6).
-Predict = Callable[[Floats], Floats]
 
 
 def allowed_wrenches(
@@ -268,15 +294,10 @@ def allowed_wrenches(
         actions.check(scene)
         return _OfActions(scene, actions, steps)
     names = [body.name for body in scene.moving]
-    free = [body.name for body in scene.dynamic]
     low = np.zeros((len(names), len(WRENCH)))
     high = low.copy()
     for body, bounds in actions.items():
-        if body not in free:
-            raise GoalError(
-                f'bounds: the scene has no moving body "{body}" that can be pushed'
-                f"{nearest(body, free)}"
-            )
+        check_pushed(scene, [body], "bounds")
         for component, ends in bounds.items():
             if component not in WRENCH:
                 raise GoalError(
@@ -325,7 +346,7 @@ class _Within:
             [kind == 0, kind == 1], [inner, np.broadcast_to(nothing, inner.shape)], ends
         )
 
-    def wrenches(self, genes: Floats, predict: Predict) -> Floats:
+    def wrenches(self, genes: Floats, dynamics: TransitionModel, start: Floats) -> Floats:
         """Return world-frame wrenches of sequences, shape (n, time, body, 3)."""
         return np.repeat(genes, self.hold, axis=1)[:, : self.steps]
 
@@ -349,21 +370,17 @@ class _OfActions:
     def extreme(self, rng: np.random.Generator, n: int) -> Floats:
         return self.random(rng, n)
 
-    def wrenches(self, genes: Floats, predict: Predict) -> Floats:
+    def wrenches(self, genes: Floats, dynamics: TransitionModel, start: Floats) -> Floats:
         number, length = genes.astype(np.intp).transpose(2, 0, 1)
         ends = np.cumsum(np.array(self.actions.intervals(self.scene))[length], axis=1)
         time = np.arange(self.steps)
         piece = (time[None, :, None] >= ends[:, None, :]).sum(axis=2)
         which = np.take_along_axis(number, piece, axis=1)
-        n, bodies = len(genes), len(self.scene.moving)
-        out = np.zeros((n, self.steps, bodies, len(WRENCH)))
-        turned = any(action.frame == "body" for action in self.actions.actions)
-        heading = np.zeros((n, bodies))
-        for t in range(self.steps):
-            if turned:  # a force in the body frame depends on the path so far
-                heading = np.nan_to_num(predict(out[:, :t])[:, -1, :, THETA])
-            out[:, t] = self.actions.wrenches(self.scene, which[:, t], heading)
-        return out
+
+        def heading(angles: Floats) -> Floats:
+            return np.nan_to_num(angles[0])
+
+        return play(dynamics, start, self.actions, which, heading)
 
 
 #: A set of sequences, each made of pieces.

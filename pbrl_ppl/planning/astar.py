@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from pbrl_ppl.errors import GoalError
 from pbrl_ppl.physics import overlap
-from pbrl_ppl.planning.actions import ActionSet
+from pbrl_ppl.planning.actions import ActionSet, play
 from pbrl_ppl.planning.dynamics import TransitionModel, remembered
 from pbrl_ppl.planning.goals import Goal, Target
 from pbrl_ppl.planning.search import Found, Task, contact_cost, tail_mean
@@ -109,7 +109,9 @@ def astar(
     reached = search.best is not None
     if reached and stopped == "exhausted":
         stopped = "goal"
-    wrenches = played(task, search.path(search.best or search.nearest))
+    path = search.path(search.best or search.nearest)
+    which = np.array([[action for action, n in path for _ in range(n)]], dtype=np.intp)
+    wrenches = play(task.dynamics, task.start, task.actions, which, mean_angle)[0]
     return Found(wrenches, reached, stopped, search.generated, time.monotonic() - begin)
 
 
@@ -279,20 +281,6 @@ class _Search:
 def mean_angle(angle: Floats) -> Floats:
     """Return the mean direction over the first axis (rad)."""
     return np.asarray(np.arctan2(np.sin(angle).mean(axis=0), np.cos(angle).mean(axis=0)))
-
-
-def played(task: Task, steps: list[tuple[int, int]]) -> Floats:
-    """Return world-frame wrenches of actions, one an interval, shape (time, body, 3)."""
-    dynamics, start, actions = task.dynamics, task.start, task.actions
-    scene, states = dynamics.scene, np.repeat(start[None, None], dynamics.draws, axis=0)
-    wrenches = np.zeros((sum(intervals for _, intervals in steps), len(start), 3))
-    last = dynamics.before[None]
-    sequence = [action for action, intervals in steps for _ in range(intervals)]
-    for i, action in enumerate(sequence):
-        wrenches[i] = actions.wrenches(scene, np.array([action]), mean_angle(states[..., 2]))[0]
-        states = dynamics.step(states, wrenches[i : i + 1], last)
-        last = remembered(wrenches[i : i + 1], last)
-    return wrenches
 
 
 #: Least acceleration, in bounding radii (or rad) an interval squared: without a push, the time to

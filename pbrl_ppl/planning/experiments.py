@@ -16,12 +16,11 @@ from threadpoolctl import threadpool_limits
 from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.errors import EffectError, GoalError
 from pbrl_ppl.files import write_atomically
-from pbrl_ppl.history import from_segments
 from pbrl_ppl.parameters import differentiate
 from pbrl_ppl.physics import touching
 from pbrl_ppl.planning.actions import ActionSet, Allowed, Bounds, allowed_wrenches
 from pbrl_ppl.planning.dynamics import Dynamics, remembered, rollout
-from pbrl_ppl.planning.planner import start_state
+from pbrl_ppl.planning.planner import start_state, table_of_plan
 from pbrl_ppl.scene import Scene, body_sizes
 from pbrl_ppl.state import WRENCH, WRENCH_UNITS, Bools, Floats
 
@@ -121,10 +120,6 @@ class Separation:
             ).after(before)
             for rival, physics in zip(rivals, every, strict=True)
         ]  # fmt: skip
-
-    def path(self, wrenches: Floats) -> Floats:
-        """Return the states (n, time + 1, body, 6) that the first rival's mode predicts."""
-        return np.asarray(rollout(self.dynamics[0], self.start, wrenches)[0])
 
     def __call__(self, wrenches: Floats, draws: int) -> tuple[Floats, Bools]:
         """Return the expected log Bayes factors of experiments.
@@ -283,9 +278,7 @@ class Suggestion:
 
     def to_dataframe(self) -> pd.DataFrame:
         """Return the experiment as rows of a history without measurements after the start."""
-        wrenches = self.wrenches.to_numpy()[None]
-        nothing = np.full((1, wrenches.shape[1], *self.start.shape), np.nan)
-        return from_segments(self.scene, self.start[None], wrenches, nothing).to_dataframe()
+        return table_of_plan(self.scene, self.start, self.wrenches.to_numpy())
 
     def to_csv(self, path: str | Path) -> None:
         """Write the experiment as a CSV file that a robot's script can play, whole or not at all.
@@ -409,7 +402,7 @@ def suggest_actions(
         judge = Separation(rivals, first, last)
         genes, at_random = _bred(judge, allowed, np.random.default_rng(seed), progress)
         progress("judging the best sequences")
-        wrenches = allowed.wrenches(genes, judge.path)
+        wrenches = allowed.wrenches(genes, judge.dynamics[0], judge.start)
         separation, meeting = judge(wrenches, draws)
     best = int(np.argmax(_value(separation, meeting)))
     if not np.isfinite(separation[..., best]).all():
@@ -462,7 +455,7 @@ def _bred(
     shape = (population, allowed.pieces, *(1,) * (genes.ndim - 2))
     for generation in range(generations):
         progress(f"looking for actions that tell them apart, {generation + 1} of {generations}")
-        separation, meeting = judge(allowed.wrenches(genes, judge.path), draws)
+        separation, meeting = judge(allowed.wrenches(genes, judge.dynamics[0], judge.start), draws)
         if generation == 0:
             usable = _weakest(separation)
             at_random = float(np.nanmean(usable)) if np.isfinite(usable).any() else np.nan

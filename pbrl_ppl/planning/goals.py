@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -145,8 +145,8 @@ class Goal:
         GoalError
             If it is missing, is not TOML, or has an unknown key.
         """
-        table = read_toml(path, "goal", ("contact_penalty", "target"))
-        return cls(tuple(read_tables(path, table.pop("target", []), Target)), **table)
+        targets, options = read_tables(path, "goal", Target, ("contact_penalty",))
+        return cls(tuple(targets), **options)
 
     def check(self, scene: Scene) -> None:
         """Check that the scene has the bodies, and that they can be pushed.
@@ -156,13 +156,7 @@ class Goal:
         GoalError
             If one cannot; it names the body.
         """
-        moving = [body.name for body in scene.dynamic]
-        for target in self.targets:
-            if target.body not in moving:
-                raise GoalError(
-                    f'goal: the scene has no moving body "{target.body}" that can be pushed'
-                    f"{nearest(target.body, moving)}"
-                )
+        check_pushed(scene, (target.body for target in self.targets), "goal")
 
     def places(self, scene: Scene) -> list[int]:
         """Return the indices of the targets' bodies among the scene's moving bodies."""
@@ -219,43 +213,51 @@ class Goal:
         return worst
 
 
-def read_toml(path: str | Path, what: str, known: Iterable[str]) -> dict[str, Any]:
-    """Read a TOML file that may have these keys.
+def check_pushed(scene: Scene, names: Iterable[str], where: str, hint: str = "") -> None:
+    """Check that the scene has bodies that can be pushed.
 
     Raises
     ------
     GoalError
-        If it is missing, is not TOML, or has another key.
+        If not; it names the body.
+    """
+    free = [body.name for body in scene.dynamic]
+    for name in names:
+        if name not in free:
+            raise GoalError(
+                f'{where}: the scene has no moving body "{name}" that can be pushed'
+                f"{nearest(name, free)}{hint}"
+            )
+
+
+def read_tables(
+    path: str | Path, what: str, kind: Any, options: Iterable[str]
+) -> tuple[list[Any], dict[str, Any]]:
+    """Read a TOML file: a Target or Action for each of its tables, and options.
+
+    Raises
+    ------
+    GoalError
+        If it is missing, is not TOML, has another key, or a table names no body.
     """
     try:
-        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        document = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise GoalError(f"{what} {path}: there is no such file; check the path") from None
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise GoalError(f"{what} {path}: cannot be read as TOML: {error}") from None
-    check_keys(table, known, f"{what} {path}")
-    return table
+    key = kind.__name__.lower()
+    _check_keys(document, [*options, key], f"{what} {path}")
+    tables = document.pop(key, [])
+    for table in tables:
+        _check_keys(table, [field.name for field in fields(kind)], f"{path}: [[{key}]]")
+        if "body" not in table:
+            raise GoalError(f"{path}: one [[{key}]] has no body; name it")
+    return [kind(**table) for table in tables], document
 
 
-def check_keys(table: Mapping[str, Any], known: Iterable[str], where: str) -> None:
+def _check_keys(table: Mapping[str, Any], known: list[str], where: str) -> None:
     """Check the keys of a table; the error for an unknown one names the nearest known one."""
-    known = list(known)
     for key in table:
         if key not in known:
             raise GoalError(f'{where}: unknown key "{key}"{nearest(key, known)}')
-
-
-def read_tables(path: str | Path, tables: Iterable[Mapping[str, Any]], kind: Any) -> Iterator[Any]:
-    """Yield a Target or Action for each table of a file.
-
-    Raises
-    ------
-    GoalError
-        If a key is unknown, or no body is named.
-    """
-    name = f"[[{kind.__name__.lower()}]]"
-    for table in tables:
-        check_keys(table, [field.name for field in fields(kind)], f"{path}: {name}")
-        if "body" not in table:
-            raise GoalError(f"{path}: one {name} has no body; name it")
-        yield kind(**table)

@@ -29,7 +29,7 @@ from pbrl_ppl.state import POSE, STATE, WRENCH, Floats
 if TYPE_CHECKING:
     from pbrl_ppl.posterior import Idata
 
-METHODS = ("astar", "mppi")
+METHODS: dict[str, Callable[..., Found]] = {"astar": astar, "mppi": mppi}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -84,13 +84,7 @@ class Plan:
         DataFrame
             Columns as of :meth:`History.to_dataframe`; state cells after the start are missing.
         """
-        n, bodies = len(self.wrenches), [body.name for body in self.scene.moving]
-        states = np.full((1, n + 1, *self.start.shape), np.nan)
-        states[0, 0] = self.start
-        states, wrenches = with_paths(self.scene, states, self.wrenches[None])
-        wrenches = np.pad(wrenches, ((0, 0), (0, 1), (0, 0), (0, 0)), constant_values=np.nan)
-        clock = self.scene.time_step * np.arange(n + 1.0)[None]
-        return table_of_arrays(np.zeros(1, int), clock, bodies, states, wrenches)
+        return table_of_plan(self.scene, self.start, self.wrenches)
 
     def save(self, path: str | Path) -> None:
         """Write the plan as a CSV file, whole or not at all.
@@ -141,6 +135,17 @@ class Plan:
             f"the goal is not reached: {why.get(self.stopped, self.stopped)}; the best plan found"
             f" ({size}) ends {self.distance:.3g} m from it"
         )
+
+
+def table_of_plan(scene: Scene, start: Floats, wrenches: Floats) -> pd.DataFrame:
+    """Return wrenches (time, body, 3) as rows of a history that has the start (body, 6) alone."""
+    n, bodies = len(wrenches), [body.name for body in scene.moving]
+    states = np.full((1, n + 1, *start.shape), np.nan)
+    states[0, 0] = start
+    states, played = with_paths(scene, states, wrenches[None])
+    played = np.pad(played, ((0, 0), (0, 1), (0, 0), (0, 0)), constant_values=np.nan)
+    clock = scene.time_step * np.arange(n + 1.0)[None]
+    return table_of_arrays(np.zeros(1, int), clock, bodies, states, played)
 
 
 def plan(
@@ -245,12 +250,11 @@ def plan(
     if before is not None:
         dynamics = dynamics.after(np.asarray(before, dtype=float))
     _check_room(scene, goal)
-    search: Callable[..., Found] = astar if method == "astar" else mppi
     rng = np.random.default_rng(seed)
     limit = np.inf if seconds is None else seconds
     say = progress or (lambda text: None)
     task = Task(dynamics, first, goal, actions, tail, nodes, limit, noise, rng, say)
-    result = search(task, **options)
+    result = METHODS[method](task, **options)
     states = rollout(dynamics, first, result.wrenches)
     distance = float(tail_mean(goal.distance(scene, states[:, -1]), tail))
     if noise:
