@@ -93,12 +93,7 @@ def scene_from_mjcf(
             f"shapes names {', '.join(lost)}, which is no moving body of the MuJoCo model; its"
             f" moving bodies are {', '.join(seen.name(i) for i in moving)}"
         )
-    bodies, joints = [], []
-    for i in moving:
-        body, joint = seen.body(i, known_mass)
-        bodies.append(body)
-        if joint is not None:
-            joints.append(joint)
+    read = [seen.body(i, known_mass) for i in moving]
     static, walls = seen.world(moving)
     seen.list_left_out()
     across = PLANES[plane] @ np.asarray(model.opt.gravity)
@@ -106,9 +101,9 @@ def scene_from_mjcf(
         time_step=float(model.opt.timestep if time_step is None else time_step),
         gravity=(rounded(across[0]), rounded(across[1])),
         normal_gravity=rounded(abs(across[2])),
-        bodies=(*bodies, *static),
+        bodies=(*(body for body, _ in read), *static),
         walls=tuple(walls),
-        joints=tuple(joints),
+        joints=tuple(joint for _, joint in read if joint is not None),
     )
     if seen.left_out:
         left_out = "; ".join(seen.left_out)
@@ -359,12 +354,12 @@ class _View:
                 f'body "{name}" has no geom; give its outline in m about its centre of mass,'
                 f' shapes={{"{name}": Shape.box(0.3, 0.1)}}, or, in a URDF, a <collision>'
             )
+        cure = f'shapes={{"{name}": {self.box_about(geoms, theta)}}}'
         if len(geoms) > 1:
             names = ", ".join(self.geom_name(g) for g in geoms)
             raise SceneError(
                 f'body "{name}" has {len(geoms)} geoms ({names}), and a body of a scene one'
-                f" outline; keep one of them, or give its outline:"
-                f' shapes={{"{name}": {self.box_about(geoms, theta)}}}'
+                f" outline; keep one of them, or give its outline: {cure}"
             )
         shape = self.flat(geoms[0], theta)
         if shape is None:
@@ -372,7 +367,7 @@ class _View:
             raise SceneError(
                 f'body "{name}": its geom "{self.geom_name(geoms[0])}" is a {kind} that has no'
                 " circle or rectangle for an outline in this plane; make it a box or a cylinder, or"
-                f' give its outline: shapes={{"{name}": {self.box_about(geoms, theta)}}}'
+                f" give its outline: {cure}"
             )
         return shape
 
@@ -394,9 +389,7 @@ class _View:
             return None
         angle = math.atan2(along[1], along[0]) - theta
         quarter = round(angle / (math.pi / 2))
-        width, height = (
-            rounded(2 * half_size) for half_size in (half[::-1] if quarter % 2 else half)
-        )
+        width, height = map(rounded, 2 * (half[::-1] if quarter % 2 else half))
         if abs(angle - quarter * math.pi / 2) < FLAT:
             return Shape.box(width, height), centre
         corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * half @ rotation(angle).T

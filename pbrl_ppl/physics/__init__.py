@@ -16,6 +16,7 @@ from .simulator import Simulator as Simulator
 from .simulator import after_recording as after_recording
 from .solids import Scenery as Scenery
 from .solids import circles as circles
+from .solids import depth_of as depth_of
 from .solids import scenery as scenery
 from .solids import touching as touching
 from .table1 import build_layout as build_layout

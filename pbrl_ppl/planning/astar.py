@@ -16,7 +16,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from pbrl_ppl.errors import GoalError
-from pbrl_ppl.physics import overlap
+from pbrl_ppl.physics import depth_of, overlap
 from pbrl_ppl.planning.actions import ActionSet, play
 from pbrl_ppl.planning.dynamics import TransitionModel, remembered
 from pbrl_ppl.planning.goals import Goal, Target
@@ -432,10 +432,6 @@ def _inner(shape: Shape) -> float:
     """Return the radius of the largest circle about the origin inside the shape, or 0."""
     if shape.kind == "circle":
         return float(shape.radius or 0.0)
-    corners = np.array(shape.outline)
-    after = np.roll(corners, -1, axis=0)
-    edge, arm = after - corners, -corners
-    share = np.clip((arm * edge).sum(1) / (edge**2).sum(1), 0, 1)
-    if (edge[:, 0] * arm[:, 1] - edge[:, 1] * arm[:, 0] < 0).any():
-        return 0.0
-    return float(np.hypot(*(arm - share[:, None] * edge).T).min())
+    here = np.zeros((1, 3))
+    inside = depth_of((here[:, :2], 0.0), here, (np.array(shape.outline), 0.0), here)
+    return max(float(inside[0]), 0.0)

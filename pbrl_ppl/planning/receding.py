@@ -93,12 +93,6 @@ class Horizon:
             weight = np.exp(-(cost - few[0]) / max(few[-1] - few[0], least))
             self.mean = np.tensordot(weight / weight.sum(), tried, axes=1)
 
-    def advance(self) -> Floats:
-        """Return the first wrench, shape (body, 3); the others move up."""
-        first: Floats = self.mean[0].copy()
-        self.mean = np.concatenate([self.mean[1:], self.mean[-1:]])
-        return first
-
     def _cost(self, start: Floats, tried: Floats, before: Floats, *, at_end: float = 0.8) -> Floats:
         """Return L2 distance from the goal (mean and last), last speed, and contacts.
 
@@ -179,9 +173,11 @@ def mppi(
                 break
             task.progress(f"interval {len(wrenches)}, {far:.3g} m from the goal")
             ahead.improve(states[:, 0], last)
-            wrenches.append(ahead.advance())
-            states = dynamics.step(states, wrenches[-1][None], last[None])
-            last = remembered(wrenches[-1], last)
+            wrench = ahead.mean[0]
+            ahead.mean = np.concatenate([ahead.mean[1:], ahead.mean[-1:]])  # the others move up
+            wrenches.append(wrench)
+            states = dynamics.step(states, wrench[None], last[None])
+            last = remembered(wrench, last)
     except KeyboardInterrupt:
         stopped = "interrupted"
     chosen = np.array(wrenches[:best]).reshape(-1, len(start), 3)
