@@ -172,10 +172,8 @@ class Learner:
         check_start(history, self.scene)
         every = history.transitions(history.dataset["start"].to_numpy())
         state, action, after = every.start, every.actions[:, 0], every.observed[:, 0]
-        learned = list(self._experience)
-        whole = np.asarray(np.isfinite(state).all(axis=(1, 2)))
-        for values in (action, after):
-            whole &= np.isfinite(values[:, learned]).all(axis=(1, 2))
+        moved = np.concatenate([action, after], axis=-1)[:, list(self._experience)]
+        whole = np.isfinite(state).all(axis=(1, 2)) & np.isfinite(moved).all(axis=(1, 2))
         if not whole.any():
             raise HistoryError(
                 f"learn: none of {len(whole)} transitions was measured whole; have velocities"
@@ -283,9 +281,9 @@ class Learner:
                 out[rows, i] = np.hstack([state[:, :3] + self.scene.time_step * push, push])
                 continue
             added = self._experience[i].predict(self._inputs(state, push), flags[:, i])
-            out[rows, i] = state + (
-                _turned(added, state[:, THETA]) if self.pose_invariant else added
-            )
+            if self.pose_invariant:
+                added = _turned(added, state[:, THETA])
+            out[rows, i] = state + added
         out[abs(out) > diverged * self._largest] = np.nan
         return np.asarray(out[None])
 

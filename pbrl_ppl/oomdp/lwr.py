@@ -117,7 +117,9 @@ class OOLWR(Learner):
         if relations is None:
             attributes = (Attributes(),) * any(body.attributes for body in scene.moving)
             relations = (SectorContacts(), *attributes)
-        super().__init__(scene, share_classes=share_classes, relations=relations, **options)
+        super().__init__(
+            scene, pose_invariant=True, share_classes=share_classes, relations=relations, **options
+        )
         for relation in self.relations:
             if not isinstance(relation, Relation):
                 raise FitError(

@@ -378,7 +378,7 @@ class _OfActions:
         which = np.take_along_axis(number, piece, axis=1)
 
         def heading(angles: Floats) -> Floats:
-            return np.nan_to_num(angles[0])
+            return np.asarray(np.nan_to_num(angles[0]))
 
         return play(dynamics, start, self.actions, which, heading)
 

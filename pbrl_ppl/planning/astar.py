@@ -317,32 +317,30 @@ class TimeToGo:
         scene = dynamics.scene
         self.goal, self.scene = goal, scene
         anyone = max(actions.strongest(body.name)[0] for body in scene.dynamic)
-        self._bodies = goal.places(scene)
-        self._fields, self._push, self._turn = [], [], []
-        for target, i in zip(goal.targets, self._bodies, strict=True):
+        self._bounds = []
+        places, tolerances = goal.places(scene), goal.tolerances(scene)
+        for target, i, tolerance in zip(goal.targets, places, tolerances, strict=True):
             force, torque = actions.strongest(target.body)
             push, turn = dynamics.acceleration(target.body, force or anyone, torque)
             body, least = scene.body(target.body), _LEAST / scene.time_step**2
-            self._push.append(np.maximum(push, least * body.shape.bounding_radius))
-            self._turn.append(np.maximum(turn, least))
-            self._fields.append(_distances(scene, body, target, start[i]))
+            push = np.maximum(push, least * body.shape.bounding_radius)[:, None]
+            turn = np.maximum(turn, least)[:, None]
+            around = _distances(scene, body, target, start[i])
+            self._bounds.append((target, i, tolerance, push, turn, around))
 
     def __call__(self, states: Floats) -> Floats:
         """Return seconds, shape (draw, n), from states of shape (draw, n, body, 6)."""
         offset = self.goal.errors(self.scene, states)
         least = np.zeros(states.shape[:2])
-        tolerances = self.goal.tolerances(self.scene)
-        for j, (target, i) in enumerate(zip(self.goal.targets, self._bodies, strict=True)):
+        for j, (target, i, tolerance, push, turn, around) in enumerate(self._bounds):
             body = states[:, :, i]
-            push, turn = self._push[j][:, None], self._turn[j][:, None]
             far = np.hypot(offset[..., j, 0], offset[..., j, 1])
             towards = -(offset[..., j, :2] * body[..., 3:5]).sum(axis=-1)
             towards = towards / np.maximum(far, np.finfo(float).tiny)
-            time = _time(far - tolerances[j], towards, push)
-            field = self._fields[j]
-            if field is not None:
-                around = field(body[..., :2]) - tolerances[j]
-                time = np.maximum(time, _time(around, np.hypot(body[..., 3], body[..., 4]), push))
+            time = _time(far - tolerance, towards, push)
+            if around is not None:
+                speed = np.hypot(body[..., 3], body[..., 4])
+                time = np.maximum(time, _time(around(body[..., :2]) - tolerance, speed, push))
             angle = offset[..., j, 2]
             towards = -np.sign(angle) * body[..., 5]
             # either way round
