@@ -5,6 +5,7 @@ from .actuators import Actuator as Actuator
 from .bodies import Body as Body
 from .bodies import Wall as Wall
 from .checks import CONTACT_NAMES as CONTACT_NAMES
+from .checks import PLACES as PLACES
 from .checks import Point as Point
 from .checks import nearest as nearest
 from .joints import WORLD as WORLD
@@ -15,7 +16,6 @@ from .recording import column_of as column_of
 from .scene import Scene as Scene
 from .shape import Shape as Shape
 from .units import MASS_PRIOR as MASS_PRIOR
-from .units import PLACES as PLACES
 from .units import Units as Units
 from .units import body_sizes as body_sizes
 from .units import check_product as check_product

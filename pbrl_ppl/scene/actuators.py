@@ -4,17 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from pbrl_ppl.errors import SceneError
-from pbrl_ppl.scene.checks import (
-    Named,
-    Point,
-    finite,
-    label,
-    nearest,
-    not_negative,
-    positive,
-    table,
-    vector,
-)
+from pbrl_ppl.scene import checks
+from pbrl_ppl.scene.checks import Named, Point
 from pbrl_ppl.state import WRENCH
 
 #: What each kind takes: a number's unit, and its value where it is left out (None: inferred).
@@ -84,43 +75,29 @@ class Actuator:
     prior: tuple[tuple[str, Named], ...] = ()
 
     def __post_init__(self) -> None:
-        label(self.name, "actuator: name")
+        checks.label(self.name, "actuator: name")
         where = f'actuator "{self.name}"'
         if not self.name.isidentifier():
             raise SceneError(f"{where}: the name is part of parameters' names; use letters and _")
-        if self.kind not in NUMBERS:
-            raise SceneError(
-                f"{where}: kind is {self.kind!r}, expected {', '.join(NUMBERS)}"
-                f"{nearest(self.kind, NUMBERS)}"
-            )
-        object.__setattr__(self, "at", vector(self.at, 2, f"{where}: at"))
+        checks.choice(self.kind, f"{where}: kind", NUMBERS, ", ".join(NUMBERS))
+        checks.settle(self, where, at=checks.vector)
         choices = {"servo": ("angle", "speed"), "wrench": WRENCH}.get(self.kind, ("",))
         object.__setattr__(self, "of", self.of or choices[0])
-        for key, allowed in (("of", choices), ("frame", ("body", "world"))):
-            if getattr(self, key) not in allowed:
-                raise SceneError(
-                    f"{where}: {key} is {getattr(self, key)!r}, expected {' or '.join(allowed)}"
-                )
-        names = (*NUMBERS[self.kind], *(_ELECTRIC if self.kind == "motor" else ()))
-        checks = dict.fromkeys(_ELECTRIC, positive) | {"limit": not_negative}
-        known = table(
-            self.known, f"known of {where}", names,
-            lambda name, item, at: checks.get(name, finite)(item, at), "number",
-        )  # fmt: skip
-        object.__setattr__(self, "known", known)
-        hyper = {"mu": finite, "sigma": positive, "kappa": not_negative}
-        prior = table(
-            self.prior, f"prior of {where}", names[: len(NUMBERS[self.kind])],
-            lambda _, item, at: table(item, at, hyper, lambda k, x, place: hyper[k](x, place)),
-            "number",
-        )  # fmt: skip
-        object.__setattr__(self, "prior", prior)
-        for name in dict(known).keys() & dict(prior).keys():
-            raise SceneError(f"{where}: {name} is in both known and prior; drop one of them")
-        electric = [name for name in _ELECTRIC if name in dict(known)]
-        if electric and (len(electric) < 3 or {"gain", "loss"} & dict(known).keys()):
+        checks.choice(self.of, f"{where}: of", choices, " or ".join(choices))
+        checks.choice(self.frame, f"{where}: frame", ("body", "world"), "body or world")
+        allowed = dict.fromkeys(NUMBERS[self.kind], checks.finite)
+        if "limit" in allowed:
+            allowed["limit"] = checks.not_negative
+        electric = dict.fromkeys(_ELECTRIC if self.kind == "motor" else (), checks.positive)
+        checks.settle_table(self, where, "known", allowed | electric, "number")
+        priors = dict.fromkeys(NUMBERS[self.kind], checks.hyper_parameters)
+        checks.settle_table(self, where, "prior", priors, "number")
+        checks.not_both(self.known, self.prior, where)
+        known = dict(self.known)
+        given = [name for name in _ELECTRIC if name in known]
+        if given and (len(given) < 3 or {"gain", "loss"} & known.keys()):
             raise SceneError(
-                f"{where}: known has {', '.join(dict(known))}, expected {', '.join(_ELECTRIC)}, or"
+                f"{where}: known has {', '.join(known)}, expected {', '.join(_ELECTRIC)}, or"
                 " gain and loss"
             )
 
@@ -154,15 +131,13 @@ def check_actuators(actuators: tuple[Actuator, ...], bodies: list[str]) -> None:
     SceneError
         If a body is unknown or has more than three, or two have one name.
     """
-    names = [actuator.name for actuator in actuators]
+    checks.different([actuator.name for actuator in actuators], "actuators")
     for actuator in actuators:
         where = f'actuator "{actuator.name}"'
-        if names.count(actuator.name) > 1:
-            raise SceneError(f'scene: two actuators are called "{actuator.name}"; rename one')
         if actuator.body not in bodies:
             raise SceneError(
                 f'{where}: "{actuator.body}" is no body that moves freely'
-                f"{nearest(actuator.body, bodies)}"
+                f"{checks.nearest(actuator.body, bodies)}"
             )
         mine = [other.name for other in actuators if other.body == actuator.body]
         if len(mine) > len(WRENCH):

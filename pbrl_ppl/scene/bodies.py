@@ -2,23 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from pbrl_ppl.errors import SceneError
-from pbrl_ppl.scene.checks import (
-    CONTACT_NAMES,
-    PARAMETER_NAMES,
-    Named,
-    Point,
-    flag,
-    hyper_parameters,
-    known_parameters,
-    label,
-    names,
-    vector,
-)
+from pbrl_ppl.scene import checks
+from pbrl_ppl.scene.checks import Named, Point
 from pbrl_ppl.scene.joints import WORLD
 from pbrl_ppl.scene.shape import Shape
-from pbrl_ppl.scene.units import typical_sizes
 
 
 @dataclass(frozen=True)
@@ -84,25 +74,18 @@ class Body:
     typical: Named = ()
 
     def __post_init__(self) -> None:
-        label(self.name, "body: name")
+        checks.label(self.name, "body: name")
         where = f'body "{self.name}"'
         if self.name == WORLD:
             raise SceneError(f'{where}: "world" is the name of the ground; choose another name')
         if not isinstance(self.shape, Shape):
             raise SceneError(f"{where}: shape is {self.shape!r}, expected a Shape")
-        for key in ("wheel", "static", "kinematic"):
-            flag(getattr(self, key), f"{where}: {key}")
-        object.__setattr__(self, "known", known_parameters(self.known, where))
-        for key in ("effects", "attributes"):
-            object.__setattr__(self, key, names(getattr(self, key), f"{where}: {key}"))
-        object.__setattr__(self, "prior", hyper_parameters(self.prior, where, self.effects))
-        object.__setattr__(self, "typical", typical_sizes(self.typical, where))
+        checks.settle(self, where, wheel=checks.flag, static=checks.flag, kinematic=checks.flag)
+        pose = partial(checks.vector, length=3)
+        checks.settle(self, where, effects=checks.names, attributes=checks.names, pose=pose)
+        self._settle_tables(where)
         if self.object_class is not None:
-            label(self.object_class, f"{where}: class")
-        for name in dict(self.known).keys() & dict(self.prior).keys():
-            raise SceneError(f"{where}: {name} is in both known and prior; drop one of them")
-        if self.pose is not None:
-            object.__setattr__(self, "pose", vector(self.pose, 3, f"{where}: pose"))
+            checks.label(self.object_class, f"{where}: class")
         if self.static and self.pose is None:
             raise SceneError(f"{where}: it is static and has no pose; add pose = [x, y, theta]")
         if self.static and self.wheel:
@@ -118,6 +101,22 @@ class Body:
         listed = ", ".join(sorted(self.attributes))
         return f"{self.object_class} ({listed})" if listed else self.object_class
 
+    def _settle_tables(self, where: str) -> None:
+        """Bring ``known``, ``prior`` and ``typical`` into canonical form."""
+        # which parameters an effect has is known where the catalogue is: `prior.build_layout`
+        beginnings = tuple(f"{effect}_" for effect in self.effects)
+        others = sorted(
+            name
+            for name in checks.items(self.prior, f"prior of {where}")
+            if name not in checks.PARAMETERS and str(name).startswith(beginnings)
+        )
+        hint = " (an effect's parameter needs the effect among the body's effects)"
+        priors = dict.fromkeys((*checks.PARAMETERS, *others), checks.hyper_parameters)
+        checks.settle_table(self, where, "known", checks.PARAMETERS, "parameter")
+        checks.settle_table(self, where, "prior", priors, "parameter", hint)
+        checks.settle_table(self, where, "typical", checks.UNITS, "size")
+        checks.not_both(self.known, self.prior, where)
+
     def _check_kinematic(self, where: str) -> None:
         """Raise `SceneError` where a kinematic body is given what only dynamic bodies have."""
         for name in ("static", "wheel", "effects"):
@@ -126,12 +125,12 @@ class Body:
                     f"{where}: it is kinematic, follows its recorded path, and has {name} ="
                     f" {getattr(self, name)!r}; drop one of the two"
                 )
-        for table in ("known", "prior"):
-            for name, _ in getattr(self, table):
-                if name not in CONTACT_NAMES:
+        for key in ("known", "prior"):
+            for name, _ in getattr(self, key):
+                if name not in checks.CONTACT_NAMES:
                     raise SceneError(
-                        f"{where}: it is kinematic and {table} has {name}, which does not matter"
-                        f" then; expected {' or '.join(CONTACT_NAMES)}; drop it"
+                        f"{where}: it is kinematic and {key} has {name}, which does not matter"
+                        f" then; expected {' or '.join(checks.CONTACT_NAMES)}; drop it"
                     )
 
 
@@ -143,8 +142,8 @@ class Wall:
     end: Point
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "start", vector(self.start, 2, "wall: from"))
-        object.__setattr__(self, "end", vector(self.end, 2, "wall: to"))
+        object.__setattr__(self, "start", checks.vector(self.start, "wall: from"))
+        object.__setattr__(self, "end", checks.vector(self.end, "wall: to"))
         if self.start == self.end:
             raise SceneError(f"wall: from and to are both {list(self.start)}; its length is zero")
 
@@ -191,7 +190,7 @@ def _differing(body: Body, other: Body) -> list[tuple[str, object, object]]:
 
     def shaping(one: Body) -> dict[str, object]:
         # an effect's parameters belong to each body alone
-        prior = {name: dict(hyper) for name, hyper in one.prior if name in PARAMETER_NAMES}
+        prior = {name: dict(hyper) for name, hyper in one.prior if name in checks.PARAMETERS}
         return {
             **{key: getattr(one, key) for key in ("object_class", "wheel", "kinematic")},
             "known": dict(one.known),

@@ -2,20 +2,19 @@
 
 import difflib
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from numbers import Real
 from typing import Any
 
 from pbrl_ppl.errors import SceneError
-from pbrl_ppl.state import STATE
 
 Point = tuple[float, float]
 Named = tuple[tuple[str, float], ...]
+#: Takes a value and where it is; returns the value in canonical form.
+Check = Callable[[Any, str], Any]
 
-#: The parameters of a body, in the order of Table 1.
-PARAMETER_NAMES = ("mass", "r", "mu_c", "w_x", "w_y", "w_theta", "mu_x", "mu_y")
-#: Those of them that a contact needs: all that a kinematic body has.
+#: The parameters of Table 1 that a contact needs: all that a kinematic body has.
 CONTACT_NAMES = ("r", "mu_c")
 #: Largest absolute value of a number and smallest positive one, in SI units: their products, such
 #: as inertias, stay far from the limits of floating-point numbers.
@@ -85,10 +84,24 @@ def unit_interval(value: object, where: str) -> float:
     return number
 
 
-def flag(value: object, where: str) -> None:
-    """Refuse what is not a boolean."""
+def flag(value: object, where: str) -> bool:
+    """Return a boolean."""
     if not isinstance(value, bool):
         raise SceneError(f"{where} is {value!r}, expected true or false")
+    return value
+
+
+def choice(value: object, where: str, known: Iterable[str], expected: str) -> None:
+    """Refuse what is not one of the known names, which ``expected`` lists in words."""
+    if value not in (names := tuple(known)):
+        raise SceneError(f"{where} is {value!r}, expected {expected}{nearest(value, names)}")
+
+
+def different(labels: Sequence[str], what: str) -> None:
+    """Refuse a name that two parts of a scene have."""
+    for name in labels:
+        if labels.count(name) > 1:
+            raise SceneError(f'scene: two {what} are called "{name}"; rename one')
 
 
 def label(value: object, where: str) -> str:
@@ -110,7 +123,7 @@ def names(value: object, where: str) -> tuple[str, ...]:
     return labels
 
 
-def vector(value: object, length: int, where: str) -> Any:
+def vector(value: object, where: str, length: int = 2) -> Any:
     """Return a tuple of this many finite numbers."""
     if isinstance(value, str | Mapping) or not isinstance(value, Iterable):
         raise SceneError(f"{where} is {value!r}, expected {length} numbers")
@@ -120,7 +133,7 @@ def vector(value: object, length: int, where: str) -> Any:
     return numbers
 
 
-def _items(value: object, where: str) -> dict[Any, Any]:
+def items(value: object, where: str) -> dict[Any, Any]:
     """Return a mapping, or a tuple of pairs without repeated names, as a dict."""
     if isinstance(value, Mapping):
         return dict(value)
@@ -134,12 +147,7 @@ def _items(value: object, where: str) -> dict[Any, Any]:
 
 
 def table(
-    value: object,
-    where: str,
-    known: Iterable[str],
-    check: Callable[[str, object, str], Any],
-    what: str = "key",
-    hint: str = "",
+    value: object, where: str, checks: Mapping[str, Check], what: str = "key", hint: str = ""
 ) -> tuple[tuple[str, Any], ...]:
     """Return the entries of a table in the order of the known names, each checked.
 
@@ -149,65 +157,73 @@ def table(
         A mapping, or pairs.
     where : str
         Name of the table, for messages.
-    known : iterable of str
-        Names that it may have.
-    check : callable
-        Takes the name, the value and where it is; returns the value in canonical form.
+    checks : mapping of str to callable
+        The check of each name that it may have.
     what, hint : str
         What a name is, and an addition to the message about an unknown one.
     """
-    items, known = _items(value, where), tuple(known)
-    for name in items:
-        if name not in known:
-            raise SceneError(f'unknown {what} "{name}" in {where}{nearest(name, known)}{hint}')
+    entries = items(value, where)
+    for name in entries:
+        if name not in checks:
+            raise SceneError(f'unknown {what} "{name}" in {where}{nearest(name, checks)}{hint}')
     return tuple(
-        (name, check(name, items[name], f"{where}: {name}")) for name in known if name in items
+        (name, check(entries[name], f"{where}: {name}"))
+        for name, check in checks.items()
+        if name in entries
     )
 
 
-def known_parameters(value: object, where: str) -> Named:
-    """Return the known parameters of a body in Table 1's order."""
+def settle(part: object, where: str, **checks: Check) -> None:
+    """Replace attributes of a frozen part of a scene by their canonical form.
 
-    def check(name: str, item: object, at: str) -> float:
-        if name.startswith("mu_"):
-            return unit_interval(item, at)
-        return {"mass": positive, "r": not_negative}.get(name, finite)(item, at)
-
-    return table(value, f"known of {where}", PARAMETER_NAMES, check, "parameter")
-
-
-def stated_noise(value: object) -> Named:
-    """Return the known standard deviations of measurement noise, in the order of the state."""
-    return table(value, "[noise]", STATE, lambda _, item, at: positive(item, at))
+    One that is None by default may be None.
+    """
+    for key, check in checks.items():
+        value = getattr(part, key)
+        if value is not None or getattr(type(part), key, ...) is not None:
+            object.__setattr__(part, key, check(value, f"{where}: {key}"))
 
 
-def index_probabilities(value: object, where: str) -> tuple[tuple[str, Named], ...]:
-    """Return the probabilities of a joint's first and second body by name."""
-
-    def check(_: str, item: object, at: str) -> Named:
-        probabilities = {
-            label(n, at): not_negative(p, f"{at} {n}") for n, p in _items(item, at).items()
-        }
-        if not sum(probabilities.values()) > 0:
-            raise SceneError(f"{at} has no name of a probability above 0; add one")
-        return tuple(probabilities.items())
-
-    return table(value, f"prior of {where}", ("i_a", "i_b"), check, "index")
+def settle_table(
+    part: object, where: str, key: str, checks: Mapping[str, Check], what: str, hint: str = ""
+) -> None:
+    """Replace an attribute of a frozen part of a scene by its canonical form; see `table`."""
+    entries = table(getattr(part, key), f"{key} of {where}", checks, what, hint)
+    object.__setattr__(part, key, entries)
 
 
-def hyper_parameters(
-    value: object, where: str, effects: tuple[str, ...]
-) -> tuple[tuple[str, Named], ...]:
-    """Return the priors' hyper-parameters of a body: in Table 1's order, then its effects'."""
-    checks = {"mu": finite, "sigma": positive, "kappa": not_negative}
+def not_both(known: Named, prior: Iterable[tuple[str, Named]], where: str) -> None:
+    """Refuse a number that is known and has a prior."""
+    for name in dict(known).keys() & dict(prior).keys():
+        raise SceneError(f"{where}: {name} is in both known and prior; drop one of them")
 
-    def check(_: str, item: object, at: str) -> Named:
-        return table(item, at, checks, lambda key, number, place: checks[key](number, place))
 
-    # which parameters an effect has is known where the catalogue is: `prior.build_layout`
-    unknown = {str(name) for name in _items(value, f"prior of {where}")} - set(PARAMETER_NAMES)
-    declared = sorted(name for name in unknown if name.startswith(tuple(f"{e}_" for e in effects)))
-    hint = " (an effect's parameter needs the effect among the body's effects)"
-    return table(
-        value, f"prior of {where}", (*PARAMETER_NAMES, *declared), check, "parameter", hint
-    )
+def hyper_parameters(value: object, where: str) -> Named:
+    """Return the hyper-parameters of a prior."""
+    return table(value, where, {"mu": finite, "sigma": positive, "kappa": not_negative})
+
+
+def index_probabilities(value: object, where: str) -> Named:
+    """Return the probabilities of a joint's first or second body by name."""
+    probabilities = {
+        label(n, where): not_negative(p, f"{where} {n}") for n, p in items(value, where).items()
+    }
+    if not sum(probabilities.values()) > 0:
+        raise SceneError(f"{where} has no name of a probability above 0; add one")
+    return tuple(probabilities.items())
+
+
+#: The parameters of a body, in the order of Table 1, and the checks of known ones.
+PARAMETERS: Mapping[str, Check] = {
+    **{"mass": positive, "r": not_negative, "mu_c": unit_interval},
+    **dict.fromkeys(("w_x", "w_y", "w_theta"), finite),
+    **dict.fromkeys(("mu_x", "mu_y"), unit_interval),
+}
+#: Names of a body's mean position.
+PLACES = ("x", "y")
+#: Names of the natural units of a body, and of its mean position, with their checks.
+UNITS: Mapping[str, Check] = {
+    **dict.fromkeys(("mass", "length", "time", "force", "torque", "speed"), positive),
+    **dict.fromkeys(("turn_rate", "range", "interval"), positive),
+    **dict.fromkeys(PLACES, finite),
+}

@@ -5,7 +5,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from pbrl_ppl.errors import SceneError
-from pbrl_ppl.scene.checks import Named, Point, flag, index_probabilities, label, nearest, vector
+from pbrl_ppl.scene import checks
+from pbrl_ppl.scene.checks import Named, Point
 
 #: The name of the ground in a joint.
 WORLD = "world"
@@ -95,37 +96,27 @@ class Joint:
     axis: Point | None = None
 
     def __post_init__(self) -> None:
-        if self.name is not None:
-            label(self.name, "joint: name")
-        if self.kind not in JOINT_KINDS:
-            expected = " or ".join(f'"{kind}"' for kind in JOINT_KINDS)
-            raise SceneError(
-                f"joint: kind is {self.kind!r}, expected {expected}"
-                f"{nearest(self.kind, JOINT_KINDS)}"
-            )
-        flag(self.known, "joint: known")
+        kinds = " or ".join(f'"{kind}"' for kind in JOINT_KINDS)
+        checks.choice(self.kind, "joint: kind", JOINT_KINDS, kinds)
+        checks.settle(self, "joint", name=checks.label, known=checks.flag)
         if self.known and None in (self.bodies, self.anchor_a, self.anchor_b):
             raise SceneError(
                 "joint: it lacks bodies, anchor_a or anchor_b; add them, or set known = false to"
                 " infer what is left out"
             )
-        where = "joint"
-        if self.bodies is not None:
-            bodies = _two_names(self.bodies)
-            object.__setattr__(self, "bodies", bodies)
-            where = f"joint of {bodies[0]} and {bodies[1]}"
-        object.__setattr__(self, "prior", index_probabilities(self.prior, where))
+        checks.settle(self, "joint", bodies=_two_names)
+        where = f"joint of {' and '.join(self.bodies)}" if self.bodies else "joint"
+        allowed = dict.fromkeys(("i_a", "i_b"), checks.index_probabilities)
+        checks.settle_table(self, where, "prior", allowed, "index")
         if self.prior and self.bodies is not None:
             raise SceneError(f"{where}: it has bodies and a prior of them; drop one of the two")
         for key in ("anchor_a", "anchor_b"):
-            anchor = getattr(self, key)
-            if anchor is not None and self.bodies is None:
+            if getattr(self, key) is not None and self.bodies is None:
                 raise SceneError(
                     f"{where}: it has {key} and no bodies; in which body's frame is the anchor? Add"
                     f" bodies, or drop {key}"
                 )
-            if anchor is not None:
-                object.__setattr__(self, key, vector(anchor, 2, f"{where}: {key}"))
+        checks.settle(self, where, anchor_a=checks.vector, anchor_b=checks.vector)
         if self.axis is not None or self.traits.slides:
             self._check_axis(where)
 
@@ -143,7 +134,7 @@ class Joint:
                 f"{where}: it is a slider without an axis; add axis = [x, y], a direction in the"
                 f" frame of {self.bodies[1]}"
             )
-        object.__setattr__(self, "axis", vector(self.axis, 2, f"{where}: axis"))
+        checks.settle(self, where, axis=checks.vector)
         if not math.hypot(*self.axis) > 0:
             raise SceneError(
                 f"{where}: axis is {list(self.axis)}, expected a direction; give two numbers that"
@@ -156,13 +147,13 @@ class Joint:
         return JOINT_KINDS[self.kind]
 
 
-def _two_names(value: object) -> tuple[str, ...]:
+def _two_names(value: object, where: str) -> tuple[str, ...]:
     """Return the names of a joint's bodies."""
     if isinstance(value, str) or not isinstance(value, Iterable):
-        raise SceneError(f"joint: bodies is {value!r}, expected two names")
-    bodies = tuple(label(name, "joint: bodies") for name in value)
+        raise SceneError(f"{where} is {value!r}, expected two names")
+    bodies = tuple(checks.label(name, where) for name in value)
     if len(bodies) != 2:
-        raise SceneError(f"joint: bodies is {list(bodies)}, expected two names")
+        raise SceneError(f"{where} is {list(bodies)}, expected two names")
     if bodies[0] == bodies[1]:
         raise SceneError(f'joint: it joins "{bodies[0]}" with itself; name two bodies')
     return bodies

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from pbrl_ppl.errors import SceneError
-from pbrl_ppl.scene.checks import finite, flag, nearest, positive
+from pbrl_ppl.scene.checks import choice, finite, flag, nearest, positive, settle
 
 #: Separators by name; others are a single character.
 SEPARATORS = {"blank": r"\s+", "tab": "\t", "comma": ",", "semicolon": ";"}
@@ -97,10 +97,8 @@ class Recording:
     topics: Pairs = ()
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            if field.type == "Pairs":
-                pairs = _pairs(getattr(self, field.name), f"[recording]: {field.name}")
-                object.__setattr__(self, field.name, pairs)
+        tables = [field.name for field in fields(self) if field.type == "Pairs"]
+        settle(self, "[recording]", **dict.fromkeys(tables, _pairs))
         for name, column in self.columns:
             if isinstance(column, bool) or not isinstance(column, str | int | float | tuple):
                 raise SceneError(
@@ -129,19 +127,11 @@ class Recording:
                 f"[recording]: separator is {self.separator!r}, expected one of"
                 f" {', '.join(SEPARATORS)} or one character"
             )
-        if self.header is not None:
-            flag(self.header, "[recording]: header")
-        if self.hold is not None:
-            flag(self.hold, "[recording]: hold")
-        flag(self.resample, "[recording]: resample")
-        flag(self.trim, "[recording]: trim")
+        settle(self, "[recording]", header=flag, hold=flag, resample=flag, trim=flag)
         if "rate" in dict(self.time):
             positive(dict(self.time)["rate"], "[recording]: time, rate")
-        if self.velocities not in VELOCITIES:
-            raise SceneError(
-                f"[recording]: velocities is {self.velocities!r}, expected one of"
-                f" {', '.join(VELOCITIES)}{nearest(self.velocities, VELOCITIES)}"
-            )
+        expected = f"one of {', '.join(VELOCITIES)}"
+        choice(self.velocities, "[recording]: velocities", VELOCITIES, expected)
         for name, value in self.not_seen:
             finite(value, f"[recording]: not_seen of {name}")
         cuts = ("every", "gaps", "rests", "jumps")
@@ -151,17 +141,6 @@ class Recording:
                     f'[recording]: cut has no "{name}", only {", ".join(cuts)}{nearest(name, cuts)}'
                 )
             positive(value, f"[recording]: cut, {name}")
-
-    def table(self) -> dict[str, Any]:
-        """Return the entries of the TOML table: those that are not the defaults."""
-        table: dict[str, Any] = {}
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if value != field.default:
-                table[field.name] = value
-                if field.type == "Pairs":
-                    table[field.name] = {name: _thawed(item) for name, item in value}
-        return table
 
     def with_entries(self, **entries: Mapping[str, Any]) -> Recording:
         """Return the layout with more entries in tables, which go before those that it has."""
@@ -179,12 +158,6 @@ def _pairs(value: object, where: str) -> Pairs:
     if isinstance(value, tuple) and all(isinstance(e, tuple) and len(e) == 2 for e in value):
         return value
     raise SceneError(f"{where} is {value!r}, expected a table such as {{ x = ... }}")
-
-
-def _thawed(value: object) -> object:
-    """Return a table of pairs as a dict, and other values as they are."""
-    is_table = isinstance(value, tuple) and value and isinstance(value[0], tuple)
-    return dict(value) if is_table else value  # type: ignore[call-overload]
 
 
 def column_of(entry: object) -> str:

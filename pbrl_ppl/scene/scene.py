@@ -16,23 +16,14 @@ from typing import Any
 import numpy as np
 
 from pbrl_ppl.errors import SceneError
+from pbrl_ppl.scene import checks
 from pbrl_ppl.scene import toml as scene_toml
 from pbrl_ppl.scene.actuators import Actuator, check_actuators
 from pbrl_ppl.scene.bodies import Body, Wall, check_classes
-from pbrl_ppl.scene.checks import (
-    Named,
-    Point,
-    flag,
-    located,
-    nearest,
-    not_negative,
-    positive,
-    stated_noise,
-    vector,
-)
+from pbrl_ppl.scene.checks import Named, Point
 from pbrl_ppl.scene.joints import WORLD, Joint
 from pbrl_ppl.scene.recording import Recording
-from pbrl_ppl.scene.shape import Shape
+from pbrl_ppl.state import STATE
 
 #: Engine steps a sample, at most: twice what `close_loop` goes to where data are that exact.
 MOST_SUBSTEPS = 1280
@@ -77,6 +68,7 @@ class Scene:
 
     Examples
     --------
+    >>> from pbrl_ppl.scene import Shape
     >>> scene = Scene(time_step=0.1, bodies=(Body("puck", Shape.circle(0.1)),))
     >>> Scene.from_toml(scene.to_toml()) == scene
     True
@@ -95,28 +87,17 @@ class Scene:
     recording: Recording | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "gravity", vector(self.gravity, 2, "[world]: gravity"))
-        normal = not_negative(self.normal_gravity, "[world]: normal_gravity")
-        object.__setattr__(self, "normal_gravity", normal)
-        object.__setattr__(self, "time_step", positive(self.time_step, "[world]: time_step"))
-        steps: Any = self.substeps
-        if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 1:
-            raise SceneError(f"[world]: substeps is {steps!r}, expected a whole number from 1 up")
-        if steps > MOST_SUBSTEPS:
-            raise SceneError(
-                f"[world]: substeps is {steps}, expected at most {MOST_SUBSTEPS}: more change no"
-                " prediction and take long; use fewer, or record with a shorter time_step"
-            )
-        object.__setattr__(self, "substeps", int(steps))
-        flag(self.test_is_later, "[world]: test_is_later")
-        kinds = {"bodies": Body, "walls": Wall, "joints": Joint, "actuators": Actuator}
-        for key, kind in kinds.items():
+        checks.settle(self, "[world]", gravity=checks.vector, normal_gravity=checks.not_negative)
+        checks.settle(self, "[world]", time_step=checks.positive, substeps=_substeps)
+        checks.settle(self, "[world]", test_is_later=checks.flag)
+        for key, (_, kind) in scene_toml.PARTS.items():
             parts = tuple(getattr(self, key))
             for part in parts:
                 if not isinstance(part, kind):
                     raise SceneError(f"scene: {key} holds {part!r}, expected a {kind.__name__}")
             object.__setattr__(self, key, parts)
-        object.__setattr__(self, "noise", stated_noise(self.noise))
+        noise = checks.table(self.noise, "[noise]", dict.fromkeys(STATE, checks.positive))
+        object.__setattr__(self, "noise", noise)
         if self.recording is not None and not isinstance(self.recording, Recording):
             raise SceneError(f"scene: recording is {self.recording!r}, expected a Recording")
         self._check_bodies()
@@ -124,10 +105,7 @@ class Scene:
         check_actuators(self.actuators, [body.name for body in self.dynamic])
 
     def _check_bodies(self) -> None:
-        names = [body.name for body in self.bodies]
-        for name in names:
-            if names.count(name) > 1:
-                raise SceneError(f'scene: {names.count(name)} bodies are called "{name}"; rename')
+        checks.different([body.name for body in self.bodies], "bodies")
         if not self.dynamic:
             raise SceneError(
                 "scene: it has no body that moves freely; add a [[body]] that is neither static nor"
@@ -143,20 +121,20 @@ class Scene:
 
     def _check_joints(self) -> None:
         names = [WORLD, *(body.name for body in self.bodies)]
-        for name in self.joint_names:
-            if self.joint_names.count(name) > 1:
-                raise SceneError(f'scene: two joints are called "{name}"; rename one')
+        checks.different(self.joint_names, "joints")
         for position, joint in enumerate(self.joints, start=1):
             where = f"[[joint]] number {position}"
             for name in joint.bodies or ():
                 if name not in names:
-                    raise SceneError(f'{where}: there is no body "{name}"{nearest(name, names)}')
-            for index, table in joint.prior:
-                for name, _ in table:
+                    raise SceneError(
+                        f'{where}: there is no body "{name}"{checks.nearest(name, names)}'
+                    )
+            for index, probabilities in joint.prior:
+                for name, _ in probabilities:
                     if name not in self.joinable:
                         raise SceneError(
                             f'{where}: prior {index} names "{name}", which is no moving body or'
-                            f" the world{nearest(name, self.joinable)}"
+                            f" the world{checks.nearest(name, self.joinable)}"
                         )
             could = joint.bodies or names
             if not any(body.name in could for body in self.dynamic):
@@ -189,7 +167,7 @@ class Scene:
             raise SceneError(f"scene {path}: there is no such file; check the path") from None
         except (OSError, UnicodeDecodeError) as error:
             raise SceneError(f"scene {path}: cannot be read as UTF-8 text: {error}") from None
-        with located(f"scene {path}"):
+        with checks.located(f"scene {path}"):
             return cls.from_toml(text)
 
     @classmethod
@@ -201,57 +179,13 @@ class Scene:
         SceneError
             As `load`; an unknown key is named with its table and the nearest known key.
         """
-        world, arrays = scene_toml.read(text)
-        bodies, walls, joints = [], [], []
-        for where, table in arrays["body"]:
-            with located(where):
-                entries = {("object_class" if k == "class" else k): v for k, v in table.items()}
-                bodies.append(Body(**entries | {"shape": Shape(**table["shape"])}))
-        for where, table in arrays["wall"]:
-            with located(where):
-                walls.append(Wall(table["from"], table["to"]))
-        for where, table in arrays["joint"]:
-            with located(where):
-                joints.append(Joint(**table))
-        actuators = []
-        for where, table in arrays["actuator"]:
-            with located(where):
-                actuators.append(Actuator(**table))
-        if (layout := world["recording"]) is not None:
-            world["recording"] = Recording(**layout)
-        any_joints = world.pop("joints", None) == "any"
-        world |= {"walls": tuple(walls), "joints": tuple(joints), "actuators": tuple(actuators)}
-        scene = cls(bodies=tuple(bodies), **world)
+        entries, any_joints = scene_toml.read(text)
+        scene = cls(**entries)
         return scene.with_any_joints() if any_joints else scene
 
     def to_toml(self) -> str:
         """Return TOML text from which `from_toml` builds an equal scene."""
-        world = ("gravity", "normal_gravity", "time_step", "substeps")
-        table: dict[str, Any] = {key: getattr(self, key) for key in world}
-        table["test_is_later"] = None if self.test_is_later else False
-        sections = [("[world]", table)]
-        if self.noise:
-            sections.append(("[noise]", dict(self.noise)))
-        if self.recording is not None:
-            sections.append(("[recording]", self.recording.table()))
-        for body in self.bodies:
-            table = dict(vars(body), shape=vars(body.shape), known=dict(body.known))
-            table["prior"] = {name: dict(hyper) for name, hyper in body.prior}
-            table["class"] = table.pop("object_class")
-            table["attributes"] = body.attributes or None
-            table["typical"] = dict(body.typical) or None
-            sections.append(("[[body]]", table))
-        sections += [("[[wall]]", {"from": w.start, "to": w.end}) for w in self.walls]
-        for joint in self.joints:
-            indices = {index: dict(p) for index, p in joint.prior}
-            sections.append(("[[joint]]", dict(vars(joint), prior=indices or None)))
-        for actuator in self.actuators:
-            prior = {name: dict(hyper) for name, hyper in actuator.prior}
-            table = dict(vars(actuator), known=dict(actuator.known) or None, prior=prior or None)
-            for name in ("column", "of"):
-                table[name] = table[name] or None
-            sections.append(("[[actuator]]", table))
-        return scene_toml.write(sections)
+        return scene_toml.write(scene_toml.sections(vars(self)))
 
     @property
     def moving(self) -> tuple[Body, ...]:
@@ -314,7 +248,7 @@ class Scene:
             if body.name == name:
                 return body
         names = [body.name for body in self.bodies]
-        raise SceneError(f'scene: there is no body "{name}"{nearest(name, names)}')
+        raise SceneError(f'scene: there is no body "{name}"{checks.nearest(name, names)}')
 
     def reference_angle(self, name: str) -> float:
         """Return the angle in a body's reference pose (rad): 0 without one, and of the world."""
@@ -362,6 +296,7 @@ class Scene:
 
         Examples
         --------
+        >>> from pbrl_ppl.scene import Shape
         >>> disc = Shape.circle(0.1)
         >>> pucks = Body("a", disc, pose=(0, 0, 0)), Body("b", disc, pose=(1, 0, 0))
         >>> Scene(time_step=0.1, bodies=pucks).with_any_joints().joint_names
@@ -382,3 +317,15 @@ class Scene:
         effects = tuple(dict.fromkeys((*body.effects, *names)))
         changed = dataclasses.replace(body, effects=effects)
         return self.replace(bodies=tuple(changed if b is body else b for b in self.bodies))
+
+
+def _substeps(value: object, where: str) -> int:
+    """Return a number of engine steps a sample."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+        raise SceneError(f"{where} is {value!r}, expected a whole number from 1 up")
+    if value > MOST_SUBSTEPS:
+        raise SceneError(
+            f"{where} is {value}, expected at most {MOST_SUBSTEPS}: more change no"
+            " prediction and take long; use fewer, or record with a shorter time_step"
+        )
+    return int(value)

@@ -10,7 +10,7 @@ from itertools import combinations
 import numpy as np
 
 from pbrl_ppl.errors import SceneError
-from pbrl_ppl.scene.checks import Point, nearest, positive, vector
+from pbrl_ppl.scene.checks import Point, choice, positive, settle, vector
 from pbrl_ppl.state import Floats
 
 
@@ -47,24 +47,14 @@ class Shape:
 
     def __post_init__(self) -> None:
         needs = {"box": "size", "circle": "radius", "polygon": "vertices"}
-        if self.kind not in needs:
-            raise SceneError(
-                f'shape: kind is {self.kind!r}, expected "box", "circle" or "polygon"'
-                f"{nearest(self.kind, needs)}"
-            )
+        choice(self.kind, "shape: kind", needs, '"box", "circle" or "polygon"')
         for kind, key in needs.items():
             present = getattr(self, key) is not None
             if present and kind != self.kind:
                 raise SceneError(f'shape: a {self.kind} has no "{key}"; drop it')
             if not present and kind == self.kind:
                 raise SceneError(f'shape: a {self.kind} needs "{key}"; add it')
-        if self.size is not None:
-            size = vector(self.size, 2, "shape: size")
-            object.__setattr__(self, "size", tuple(positive(s, "shape: size") for s in size))
-        if self.radius is not None:
-            object.__setattr__(self, "radius", positive(self.radius, "shape: radius"))
-        if self.vertices is not None:
-            object.__setattr__(self, "vertices", _check_polygon(self.vertices))
+        settle(self, "shape", size=_size, radius=positive, vertices=_polygon)
 
     @classmethod
     def box(cls, width: float, height: float) -> Shape:
@@ -141,12 +131,16 @@ def _moments(vertices: tuple[Point, ...]) -> tuple[float, Floats, float]:
     return area, corners[0] + centroid, float(second / area - centroid @ centroid)
 
 
-def _check_polygon(value: object) -> tuple[Point, ...]:
+def _size(value: object, where: str) -> tuple[float, ...]:
+    """Return the width and the height of a box."""
+    return tuple(positive(side, where) for side in vector(value, where))
+
+
+def _polygon(value: object, where: str) -> tuple[Point, ...]:
     """Return a polygon's corners as given, or raise."""
-    where = "shape: vertices"
     if isinstance(value, str) or not isinstance(value, Iterable):
         raise SceneError(f"{where} is {value!r}, expected a list of points")
-    vertices: tuple[Point, ...] = tuple(vector(point, 2, where) for point in value)
+    vertices: tuple[Point, ...] = tuple(vector(point, where) for point in value)
     if len(vertices) < 3:
         raise SceneError(f"{where} has {len(vertices)} points, expected at least 3")
     for number, point in enumerate(vertices, start=1):

@@ -3,70 +3,90 @@
 import json
 import re
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import fields
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import MISSING, fields
 from typing import Any
 
 from pbrl_ppl.errors import SceneError
-from pbrl_ppl.scene.checks import nearest
+from pbrl_ppl.scene.actuators import Actuator
+from pbrl_ppl.scene.bodies import Body, Wall
+from pbrl_ppl.scene.checks import located, nearest
+from pbrl_ppl.scene.joints import Joint
 from pbrl_ppl.scene.recording import Recording
+from pbrl_ppl.scene.shape import Shape
 from pbrl_ppl.state import STATE
 
 Table = dict[str, Any]
 
-#: Required and optional keys of each table.
-KEYS: dict[str, tuple[str, str]] = {
-    "the file": ("world", "noise recording body wall joint actuator"),
-    "[world]": ("time_step", "gravity normal_gravity substeps test_is_later joints"),
-    "[noise]": ("", " ".join(STATE)),
-    "[recording]": ("", " ".join(field.name for field in fields(Recording))),
-    "body": (
-        "name shape",
-        "wheel static kinematic known prior effects pose class attributes typical",
-    ),
-    "shape": ("kind", "size radius vertices"),
-    "wall": ("from to", ""),
-    "joint": ("kind", "bodies anchor_a anchor_b axis known name prior"),
-    "actuator": ("name kind body", "column at of frame known prior"),
+#: Fields of a scene that are arrays of tables, with the key and the class of each.
+PARTS: Mapping[str, tuple[str, type]] = {
+    "bodies": ("body", Body),
+    "walls": ("wall", Wall),
+    "joints": ("joint", Joint),
+    "actuators": ("actuator", Actuator),
 }
+#: Keys that are not the names of the fields that they set.
+_RENAMED = {"object_class": "class", "start": "from", "end": "to"}
+#: Keys of ``[world]`` that are always written.
+_WORLD = ("gravity", "normal_gravity", "time_step", "substeps")
+#: Values that are written of a body though they are empty.
+_EMPTY: Table = {"known": {}, "prior": {}, "effects": ()}
 
 
-def read(text: str) -> tuple[Table, dict[str, list[tuple[str, Table]]]]:
-    """Return ``[world]`` with noise and recording, and the tables of each array with their places.
+def read(text: str) -> tuple[Table, bool]:
+    """Return the fields of a scene, and whether any of its bodies may be joined.
 
     Raises
     ------
     SceneError
-        If the text is not TOML (says the line), or a key is unknown or missing, or ``joints`` of
-        ``[world]`` is not ``any``.
+        If the text is not TOML (says the line), a key is unknown or missing, ``joints`` of
+        ``[world]`` is not ``any``, or a part of the scene is impossible.
     """
     try:
         document = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise SceneError(f"not TOML: {error}") from None
-    _check_keys(document, "the file")
-    _check_keys(document["world"], "[world]")
-    if (joints := document["world"].get("joints", "any")) != "any":
+    arrays = [key for key, _ in PARTS.values()]
+    _checked(document, "the file", ["world"], ["noise", "recording", *arrays])
+    optional = ["gravity", "normal_gravity", "substeps", "test_is_later", "joints"]
+    world = _checked(document["world"], "[world]", ["time_step"], optional)
+    if (joints := world.pop("joints", None)) not in ("any", None):
         raise SceneError(
             f'[world]: joints is {joints!r}, expected "any" (any two bodies, or a body and the'
             " world, may be joined by a rod); declare those that are there as [[joint]]"
         )
-    noise = document.get("noise", {})
-    _check_keys(noise, "[noise]")
-    recording = document.get("recording")
-    if recording is not None:
-        _check_keys(recording, "[recording]")
-    arrays: dict[str, list[tuple[str, Table]]] = {}
-    for key in ("body", "wall", "joint", "actuator"):
-        arrays[key] = list(_tables(document, key))
-        for where, table in arrays[key]:
-            _check_keys(table, where, key)
-            if key == "body":
-                _check_keys(table["shape"], f"shape of {where}", "shape")
-    return {**document["world"], "noise": noise, "recording": recording}, arrays
+    world["noise"] = _checked(document.get("noise", {}), "[noise]", [], STATE)
+    if "recording" in document:
+        entries = _entries(Recording, document["recording"], "[recording]")
+        world["recording"] = Recording(**entries)
+    for field, (key, kind) in PARTS.items():
+        world[field] = tuple(_part(kind, *place) for place in _tables(document, key))
+    return world, joints == "any"
 
 
-def write(sections: Sequence[tuple[str, Mapping[str, Any]]]) -> str:
+def sections(scene: Mapping[str, Any]) -> Iterator[tuple[str, Table]]:
+    """Yield the header and the table of each section of a scene's file, from its fields."""
+    world = {key: scene[key] for key in _WORLD}
+    yield "[world]", world if scene["test_is_later"] else {**world, "test_is_later": False}
+    if scene["noise"]:
+        yield "[noise]", dict(scene["noise"])
+    if (recording := scene["recording"]) is not None:
+        values = ((field, getattr(recording, field.name)) for field in fields(recording))
+        table = {field.name: value for field, value in values if value != field.default}
+        yield "[recording]", table
+    for field, (key, kind) in PARTS.items():
+        empty = _EMPTY if kind is Body else {}
+        for part in scene[field]:
+            table = {
+                name: empty.get(name) if value in ((), "") else value
+                for name, value in vars(part).items()
+            }
+            for name in filter(table.__contains__, _RENAMED):
+                table[_RENAMED[name]] = table.pop(name)
+            yield f"[[{key}]]", table
+
+
+def write(sections: Iterable[tuple[str, Mapping[str, Any]]]) -> str:
     """Return TOML text of tables with these headers; entries that are None are left out."""
     parts = []
     for header, table in sections:
@@ -75,10 +95,29 @@ def write(sections: Sequence[tuple[str, Mapping[str, Any]]]) -> str:
     return "\n".join(parts)
 
 
-def _check_keys(table: object, where: str, kind: str = "") -> None:
-    """Refuse a table with unknown keys or without the required ones of its kind."""
-    required, optional = (keys.split() for keys in KEYS[kind or where])
-    known = required + optional
+def _part(kind: type, where: str, table: object) -> Any:
+    """Return a body, wall, joint or actuator from its table."""
+    entries = _entries(kind, table, where)
+    if kind is not Body:
+        with located(where):
+            return kind(**entries)
+    shape = _entries(Shape, entries.pop("shape"), f"shape of {where}")
+    with located(where):
+        return Body(shape=Shape(**shape), **entries)
+
+
+def _entries(kind: Any, table: object, where: str) -> Table:
+    """Return values of a class's fields from a table whose keys are checked."""
+    names = {_RENAMED.get(field.name, field.name): field for field in fields(kind)}
+    required = [key for key, field in names.items() if field.default is MISSING]
+    optional = [key for key in names if key not in required]
+    checked = _checked(table, where, required, optional)
+    return {names[key].name: value for key, value in checked.items()}
+
+
+def _checked(table: object, where: str, required: Iterable[str], optional: Iterable[str]) -> Table:
+    """Return a table; refuse one with unknown keys or without the required ones."""
+    known = [*required, *optional]
     if not isinstance(table, Mapping):
         raise SceneError(f"{where} is {table!r}, expected a table of {', '.join(known)}")
     for key in table:
@@ -87,6 +126,7 @@ def _check_keys(table: object, where: str, kind: str = "") -> None:
     for key in required:
         if key not in table:
             raise SceneError(f'{where} has no "{key}"; add it')
+    return dict(table)
 
 
 def _tables(document: Table, key: str) -> Iterator[tuple[str, Table]]:
@@ -108,6 +148,10 @@ def _value(item: Any) -> str:
     if isinstance(item, str):
         # TOML's basic strings take JSON's escapes, except that DEL must be escaped in TOML.
         return json.dumps(item, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(item, Shape):
+        item = vars(item)
+    if isinstance(item, tuple) and item and all(map(_is_entry, item)):
+        item = dict(item)
     if isinstance(item, Mapping):
         pairs = [
             f"{_key(key)} = {_value(value)}" for key, value in item.items() if value is not None
@@ -116,6 +160,11 @@ def _value(item: Any) -> str:
     if isinstance(item, tuple | list):
         return "[" + ", ".join(_value(part) for part in item) + "]"
     return repr(item)
+
+
+def _is_entry(item: object) -> bool:
+    """Return whether this is an entry of a table: a name and a value."""
+    return isinstance(item, tuple) and len(item) == 2 and isinstance(item[0], str)
 
 
 def _key(name: str) -> str:

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import SceneError
-from pbrl_ppl.scene.checks import Named, finite, nearest, positive, table
-
-if TYPE_CHECKING:
-    from pbrl_ppl.scene.scene import Scene
+from pbrl_ppl.scene.checks import PLACES, UNITS, nearest
+from pbrl_ppl.scene.scene import Scene
 
 #: Location and scale of the logarithm of a mass (kg) under Table 1, uninformative by default.
 MASS_PRIOR = 1.0, 1.5
@@ -89,11 +86,6 @@ class Units:
         return value
 
 
-#: Names of the natural units, and of the mean position.
-UNITS = tuple(field.name for field in fields(Units))
-PLACES = ("x", "y")
-
-
 def _factor(factor: str) -> tuple[str, int]:
     """Return the name and the power of a factor such as ``speed^2``."""
     match = re.fullmatch(r"([a-z_]+)(?:\^(\d+))?", factor)
@@ -110,15 +102,6 @@ def check_product(product: str) -> None:
     """Raise `SceneError` where a product of natural units cannot be read."""
     for factor in product.replace("/", " ").split():
         _factor(factor)
-
-
-def typical_sizes(value: object, where: str) -> Named:
-    """Return the natural units that are given for a body, in the order of :class:`Units`."""
-
-    def check(name: str, item: object, at: str) -> float:
-        return (finite if name in PLACES else positive)(item, at)
-
-    return table(value, f"typical of {where}", UNITS, check, "size")
 
 
 def units_of(scene: Scene, name: str) -> Units:
