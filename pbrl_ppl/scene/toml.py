@@ -70,10 +70,8 @@ def sections(scene: Mapping[str, Any]) -> Iterator[tuple[str, Table]]:
     yield "[world]", world if scene["test_is_later"] else {**world, "test_is_later": False}
     if scene["noise"]:
         yield "[noise]", dict(scene["noise"])
-    if (recording := scene["recording"]) is not None:
-        values = ((field, getattr(recording, field.name)) for field in fields(recording))
-        table = {field.name: value for field, value in values if value != field.default}
-        yield "[recording]", table
+    if scene["recording"] is not None:
+        yield "[recording]", scene["recording"].table()
     for field, (key, kind) in PARTS.items():
         empty = _EMPTY if kind is Body else {}
         for part in scene[field]:
