@@ -38,9 +38,9 @@ class Wheel:
         Of the same.
     """
 
-    labels: tuple[str, str, str]
-    places: tuple[int, int, int]
-    priors: tuple[Prior, Prior, Prior]
+    labels: tuple[str, ...]
+    places: tuple[int, ...]
+    priors: tuple[Prior, ...]
 
     @property
     def period(self) -> int:
@@ -74,16 +74,14 @@ class Wheel:
 
 def wheels(layout: Layout) -> tuple[Wheel, ...]:
     """Return the wheels that have four descriptions of equal likelihood."""
-    places = {label: i for i, label in enumerate(layout.labels)}
-    priors, wheels_found = layout.priors, []
+    found, known = [], set(layout.labels)
     owners = {owner: None for b in layout.blocks if b.of == "body" for owner in b.owners}
     for begin, owner in product(_BEGINNINGS, owners):
-        one, two, three = (f"{begin}{name}[{owner}]" for name in MIXED)
-        at = places.get(one, -1), places.get(two, -1), places.get(three, -1)
-        if min(at) >= 0:
-            angle, x, y = at
-            wheels_found.append(Wheel((one, two, three), at, (priors[angle], priors[x], priors[y])))
-    return tuple(wheels_found)
+        labels = tuple(f"{begin}{name}[{owner}]" for name in MIXED)
+        if known.issuperset(labels):
+            places = tuple(layout.places(labels))
+            found.append(Wheel(labels, places, tuple(layout.priors[i] for i in places)))
+    return tuple(found)
 
 
 def nearest(

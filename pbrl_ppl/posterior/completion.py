@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -49,6 +50,12 @@ MAX_RHAT, MIN_ESS = 1.01, 400
 #: Standard deviation of the differences (nats) above which the linearisation does not hold:
 #: draws weighted by exp(difference) would be worth exp(-4), 2 %, of their number.
 MOST = 2.0
+#: Draws are simulated in groups of this many, or of more with at most so many transitions.
+_GROUP, _GROUP_TRANSITIONS = 64, 20_000
+#: Predicted numbers that are stored, and least and most draws with predictions, which come first.
+_MOST_NUMBERS, _PREDICTED = 2_000_000, (50, 200)
+#: Fewest draws a chain for which R-hat is defined.
+_LEAST_DRAWS = 4
 #: Category and text of a warning.
 _Warned = tuple[type[Warning], str]
 
@@ -135,9 +142,6 @@ def evaluate(
     rows: Any,
     rng: np.random.Generator,
     known: Floats | None = None,
-    *,
-    group_size: int = 64,
-    group_transitions: int = 20_000,
 ) -> tuple[Floats, Floats]:
     """Return log-likelihoods of the transitions at draws, and next states drawn from some of them.
 
@@ -153,8 +157,6 @@ def evaluate(
         Of the predictions.
     known : ndarray, optional
         Log-likelihoods where the sampler has them already.
-    group_size, group_transitions : int
-        Draws are simulated in groups of this many, or of more with at most so many transitions.
 
     Returns
     -------
@@ -167,7 +169,7 @@ def evaluate(
     predictive = []
     wide = problem.with_physics(threads=max(problem.physics.threads, 2))
     rows = np.asarray(rows, dtype=int)
-    size = max(group_size, group_transitions // problem.segments.n)
+    size = max(_GROUP, _GROUP_TRANSITIONS // problem.segments.n)
     for begin in range(0, len(phi), size):
         part = slice(begin, begin + size)
         if known is None:
@@ -187,15 +189,7 @@ def parameter_draws(problem: Problem, trace: Idata) -> tuple[Floats, Floats]:
     return vectors(trace, problem.layout, problem.noise_variables)
 
 
-def predictive_rows(
-    chains: int,
-    draws: int,
-    cells: int,
-    *,
-    most: int = 200,
-    least: int = 50,
-    most_numbers: int = 2_000_000,
-) -> Ints:
+def predictive_rows(chains: int, draws: int, cells: int) -> Ints:
     """Return draws to predict with: equally many of each chain, evenly spread, the last included.
 
     Parameters
@@ -204,17 +198,13 @@ def predictive_rows(
         Of the posterior; draws of each chain.
     cells : int
         Numbers that one prediction has.
-    most, least : int
-        Draws with stored predictions.
-    most_numbers : int
-        Predicted numbers in all, unless that leaves fewer than ``least`` draws.
 
     Returns
     -------
     ndarray
         Shape (chain, draw): indices of the draws, chains joined.
     """
-    wanted = int(np.clip(most_numbers // max(cells, 1), least, most))
+    wanted = int(np.clip(_MOST_NUMBERS // max(cells, 1), *_PREDICTED))
     a_chain = min(draws, -(-wanted // chains))
     chosen = np.linspace(draws - 1, 0, a_chain).astype(int)[::-1]
     return np.asarray(draws * np.arange(chains)[:, None] + chosen)
@@ -300,10 +290,8 @@ def linearisation_errors(problem: Problem, phi: Floats, sigma: Floats) -> Floats
     return errors
 
 
-def linearisation(
-    problem: Problem, phi: Floats, sigma: Floats, *, most_draws: int = 16
-) -> Linearisation:
-    """Return a summary of :func:`linearisation_errors` at some of a posterior's draws.
+def linearisation(problem: Problem, phi: Floats, sigma: Floats) -> Linearisation:
+    """Return a summary of :func:`linearisation_errors` at up to 16 of a posterior's draws.
 
     Parameters
     ----------
@@ -311,10 +299,8 @@ def linearisation(
         Of whole trajectories.
     phi, sigma : ndarray
         All draws, at least two, shapes (draw, p) and (draw, parameter).
-    most_draws : int
-        Draws to smooth the states at, at most.
     """
-    rows = np.unique(np.linspace(0, len(phi) - 1, most_draws).astype(int))
+    rows = np.unique(np.linspace(0, len(phi) - 1, 16).astype(int))
     errors = linearisation_errors(problem, phi[rows], sigma[rows])
     total = errors.sum(axis=1)
     sd, largest = float(total.std(ddof=1)), float(np.abs(total - total.mean()).max())
@@ -322,12 +308,7 @@ def linearisation(
 
 
 def checked(
-    problem: Problem,
-    record: PosteriorRecord,
-    idata: Idata,
-    asked: tuple[int, int] | None = None,
-    *,
-    least_draws: int = 4,
+    problem: Problem, record: PosteriorRecord, idata: Idata, asked: tuple[int, int] | None = None
 ) -> Idata:
     """Enter convergence and warnings in a posterior's record, and issue the warnings.
 
@@ -341,8 +322,6 @@ def checked(
         The posterior, with the record in its attributes.
     asked : tuple of int, optional
         Draws a chain, and chains, that were asked for, where an interrupt left fewer.
-    least_draws : int
-        Fewest draws a chain for which R-hat is defined.
     """
     sizes = group(idata, "posterior").sizes
     on = "resume this posterior"
@@ -361,18 +340,17 @@ def checked(
         )
         warnings.append((ConvergenceWarning, text))
     warnings += _of_approximations(record)
-    if sizes["draw"] >= least_draws:
+    if sizes["draw"] >= _LEAST_DRAWS:
         r_hat, ess = convergence(idata)
-        worst = max(r_hat, key=lambda k: r_hat[k]), min(ess, key=lambda k: ess[k])
+        worst = max(r_hat, key=r_hat.__getitem__), min(ess, key=ess.__getitem__)
         record = replace(record, max_rhat=r_hat[worst[0]], min_ess=ess[worst[1]])
-        if short := _unconverged(record, sizes["chain"], worst, more):
-            warnings.append((ConvergenceWarning, short))
+        warnings += _unconverged(record, sizes["chain"], worst, more)
         if problem.library is None:  # what follows compares with Table 1
             warnings += _of_parameters(problem, idata)
     elif record.method != "map":  # a mode alone is one draw
         text = (
             f"with {sizes['draw']} draws a chain there is no R-hat (it takes at least"
-            f" {least_draws}), so whether the chains have converged is not known; {more}"
+            f" {_LEAST_DRAWS}), so whether the chains have converged is not known; {more}"
         )
         warnings.append((ConvergenceWarning, text))
     replace(record, warnings=tuple(text for _, text in warnings)).write(idata)
@@ -381,10 +359,9 @@ def checked(
     return idata
 
 
-def _of_approximations(record: PosteriorRecord) -> list[_Warned]:
-    """Return warnings on linearised states, importance weights and evidences."""
-    warned: list[_Warned] = []
-    linearisation = record.linearisation
+def _of_approximations(record: PosteriorRecord) -> Iterator[_Warned]:
+    """Yield warnings on linearised states, importance weights and evidences."""
+    linearisation, k = record.linearisation, record.pareto_k
     if linearisation is not None and not linearisation.sd <= MOST:
         text = (
             f"the likelihood is linearised where it does not hold: at {linearisation.draws} draws"
@@ -393,28 +370,21 @@ def _of_approximations(record: PosteriorRecord) -> list[_Warned]:
             " that where bodies meet or wheels begin to slip, or compare with a fit of single"
             " transitions"
         )
-        warned.append((LinearisationWarning, text))
-    k = record.pareto_k
+        yield LinearisationWarning, text
     if k is not None and not k <= MAX_PARETO_K:
         text = (
             f"Pareto k of the proposals' weights is {k:.2g} (want <= {MAX_PARETO_K}): they may miss"
             " a part of the posterior; raise draws, or compare with the method 'metropolis'"
         )
-        warned.append((ConvergenceWarning, text))
+        yield ConvergenceWarning, text
     if rough := doubts(record.configurations or ()):
-        warned.append((ConvergenceWarning, rough))
-    return warned
+        yield ConvergenceWarning, rough
 
 
 def _unconverged(
     record: PosteriorRecord, chains: int, worst: tuple[str, str], more: str
-) -> str | None:
-    """Return a warning on the chains; ``worst`` names the parameters of R-hat and ESS."""
-    if chains == 1:
-        return (
-            "one chain alone cannot show whether it has converged: R-hat compares chains; raise"
-            " chains to 4"
-        )
+) -> Iterator[_Warned]:
+    """Yield a warning on the chains; ``worst`` names the parameters of R-hat and ESS."""
     weighted, short = record.importance_ess is not None, []
     # rounded as in the message: 1.0104 passes; weighted draws are independent, and that of few
     # of them is often above the limit
@@ -424,31 +394,35 @@ def _unconverged(
         size = f"{np.floor(record.min_ess or 0.0):.0f} for {worst[1]} (want >= {MIN_ESS})"
         short.append(f"effective sample size is {size}")
     failed = "the draws are too few" if weighted else "the chains have not converged"
-    return f"{failed}: {', '.join(short)}; {more}" if short else None
+    if chains == 1:
+        text = (
+            "one chain alone cannot show whether it has converged: R-hat compares chains; raise"
+            " chains to 4"
+        )
+        yield ConvergenceWarning, text
+    elif short:
+        yield ConvergenceWarning, f"{failed}: {', '.join(short)}; {more}"
 
 
-def _of_parameters(
-    problem: Problem, idata: Idata, *, stuck: float = 0.5, near: float = 0.01
-) -> list[_Warned]:
-    """Return warnings on parameters at a bound, and on those that the data say nothing about.
+def _of_parameters(problem: Problem, idata: Idata) -> Iterator[_Warned]:
+    """Yield warnings on parameters at a bound, and on those that the data say nothing about.
 
-    A parameter is at its bound if a share ``stuck`` of its draws is within a share ``near`` of its
-    support from there.
+    A parameter is at its bound if more than half of its draws are within 1 % of its support from
+    there.
     """
-    warned: list[_Warned] = []
     phi, _ = parameter_draws(problem, idata)
     ends = problem.layout.supports(phi)
-    margin = near * (ends[1] - ends[0])
+    margin = 0.01 * (ends[1] - ends[0])
     watched = np.isfinite(margin).all(axis=0) & ~problem.layout.discrete
     for bound in ends:
         share = (np.abs(phi - bound) < margin).mean(axis=0)
-        for i in np.flatnonzero(watched & (share > stuck)):
+        for i in np.flatnonzero(watched & (share > 0.5)):
             text = (
                 f"{problem.layout.labels[i]} is at its bound,"
                 f" {np.median(bound[:, i]):g}: {share[i]:.0%} of the draws are there; check the"
                 " shape and the frame of the body; an effect that the model lacks may press too"
             )
-            warned.append((BoundWarning, text))
+            yield BoundWarning, text
     effects = {attached.effect for attached in problem.physics.effects}
     silent = list(uninformed(idata, effects=effects))
     scene = problem.scene
@@ -461,8 +435,7 @@ def _of_parameters(
             f"the data say nothing about {', '.join(silent)}: the posterior is the prior; record"
             " motions that depend on it, or give it in the scene (known = ...)"
         )
-        warned.append((UninformedWarning, text))
-    return warned
+        yield UninformedWarning, text
 
 
 def _folded(problem: Problem, trace: Idata, seed: int | None) -> xr.Dataset:

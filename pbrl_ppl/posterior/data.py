@@ -49,12 +49,8 @@ def record_of(problem: Problem, seed: int, method: str) -> PosteriorRecord:
     """Return the record of a fit of a problem: scene, effects, settings, data and versions."""
     scene, attached, likelihood = problem.scene, problem.physics.effects, problem.likelihood
     for body in scene.dynamic:
-        new = [
-            law.effect.name
-            for law in attached
-            if law.body == body.name and law.effect.name not in body.effects
-        ]
-        scene = scene.with_effects(body.name, *new)
+        laws = (law.effect.name for law in attached if law.body == body.name)
+        scene = scene.with_effects(body.name, *laws)
     median, spread = problem.noise_prior
     tables = [e.effect.table for e in attached if isinstance(e.effect, LearnedRemainder)]
     return PosteriorRecord(
@@ -242,13 +238,9 @@ def with_recording(problem: Problem, constants: xr.Dataset, data_sha256: str) ->
 
 def recorded(scene: Scene, constants: xr.Dataset, data_sha256: str = "") -> History:
     """Return the history that a posterior's constant data hold."""
-    names = [str(name) for name in constants.data_vars if str(name).startswith(_PREFIX)]
-    back = {
-        name: str(name).removeprefix(_PREFIX)
-        for name in (*names, *constants.dims)
-        if str(name).startswith(_PREFIX)
-    }
-    dataset = constants[names].rename(back)
+    dataset = constants[[name for name in constants.data_vars if str(name).startswith(_PREFIX)]]
+    names = (*dataset.data_vars, *dataset.dims)
+    dataset = dataset.rename({name: str(name).removeprefix(_PREFIX) for name in names})
     dataset = dataset.assign_coords(
         kinematic=("body", [body.kinematic for body in scene.moving])
     ).assign_attrs(time_step=scene.time_step, data_sha256=data_sha256)

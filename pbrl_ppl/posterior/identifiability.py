@@ -250,25 +250,16 @@ def _spread(prior: Prior, draws: Floats) -> float:
     return float(_natural(prior, draws).std())
 
 
-def _width(
-    label: str,
-    prior_sd: float,
-    posterior_sd: float,
-    moved: float,
-    *,
-    clearly: float = 0.5,
-    hardly: float = 0.85,
-    far: float = 0.3,
-) -> Width:
+def _width(label: str, prior_sd: float, posterior_sd: float, moved: float) -> Width:
     """Return how much narrower a parameter's posterior is than its prior, and the verdict.
 
-    Below the ratio ``clearly`` of their sds the data inform; above ``hardly``, which allows for the
-    error of an sd from a hundred effective draws (7 %), they do not, unless the mean has moved by
-    ``far`` prior sds.
+    Below the ratio 0.5 of their sds the data inform; above 0.85, which allows for the error of an
+    sd from a hundred effective draws (7 %), they do not, unless the mean has moved by 0.3 prior
+    sds.
     """
     ratio = posterior_sd / prior_sd
-    verdict = INFORMED if ratio < clearly else WEAK
-    if ratio >= hardly and moved < far:
+    verdict = INFORMED if ratio < 0.5 else WEAK
+    if ratio >= 0.85 and moved < 0.3:
         verdict = PRIOR_ONLY
     return Width(label, prior_sd, posterior_sd, ratio, verdict)
 

@@ -37,18 +37,12 @@ class Point:
 
 
 def packed_mode(
-    problem: Problem,
-    mode: Point,
-    phi: Floats,
-    sigma: Floats,
-    likelihood: Floats,
-    *,
-    higher: float = 0.1,
+    problem: Problem, mode: Point, phi: Floats, sigma: Floats, likelihood: Floats
 ) -> StoredMode:
     """Return a posterior's mode for its record.
 
-    Where a draw is higher, the mode is climbed to again from that draw. Wheels are described as in
-    the draws.
+    Where a draw is higher by 0.1 nats, the mode is climbed to again from that draw. Wheels are
+    described as in the draws.
 
     Parameters
     ----------
@@ -60,15 +54,12 @@ def packed_mode(
         Posterior draws, shapes (draw, p) and (draw, state).
     likelihood : ndarray
         Log-likelihood of each draw, shape (draw,).
-    higher : float
-        Log-posterior of a draw above that of the mode from which the mode is climbed to again
-        (nats).
     """
     height = float(log_posterior(problem, mode.phi, mode.sigma, mode.choice))
     if problem.library is None and not problem.layout.discrete.any():
         draws = log_posterior(problem, phi, sigma, log_likelihood=likelihood)
         best = int(np.argmax(draws))
-        if draws[best] > height + higher:
+        if draws[best] > height + 0.1:
             climbed = find_mode(problem, initial=phi[best], rounds=_CLIMB)
             if climbed.log_posterior > height:
                 mode, height = Point(climbed.phi, climbed.sigma), climbed.log_posterior

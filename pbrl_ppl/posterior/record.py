@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from functools import cache
 from typing import Any, get_args, get_origin, get_type_hints
@@ -197,8 +197,11 @@ class PosteriorRecord:
 
     def attributes(self) -> dict[str, Any]:
         """Return the attributes of the file: plain text, numbers and JSON."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
-        written = {name: _written(value) for name, value in values.items() if value is not None}
+        written = {
+            name: _written(kind, value)
+            for name, kind in _kinds(PosteriorRecord).items()
+            if (value := getattr(self, name)) is not None
+        }
         return {"pbrl_ppl": "posterior", "schema": SCHEMA, **written}
 
     def write(self, idata: Idata) -> None:
@@ -320,15 +323,20 @@ def _kinds(record: type) -> dict[str, Any]:
     }
 
 
+#: How fields of these types are read from an attribute, and written to one.
+_PLAIN: Mapping[type, tuple[Callable[[Any], Any], Callable[[Any], Any]]] = {
+    Scene: (Scene.from_toml, Scene.to_toml),
+    ParameterLibrary: (ParameterLibrary.from_json, ParameterLibrary.to_json),
+    bool: (bool, int),  # NetCDF has no such attribute
+    int: (int, int),
+    float: (float, float),
+    str: (str, str),
+}
+
+
 def _read(kind: Any, value: Any) -> Any:
     """Return a field from its attribute, by its type."""
-    if kind is Scene:
-        return Scene.from_toml(str(value))
-    if kind is ParameterLibrary:
-        return ParameterLibrary.from_json(str(value))
-    if kind in (bool, int, float, str):
-        return kind(value)
-    return _from_json(kind, json.loads(str(value)))
+    return _PLAIN[kind][0](value) if kind in _PLAIN else _from_json(kind, json.loads(str(value)))
 
 
 def _from_json(kind: Any, value: Any) -> Any:
@@ -348,16 +356,10 @@ def _from_json(kind: Any, value: Any) -> Any:
     return value
 
 
-def _written(value: Any) -> Any:
-    """Return a field as an attribute."""
-    if isinstance(value, Scene):
-        return value.to_toml()
-    if isinstance(value, ParameterLibrary):
-        return value.to_json()
-    if isinstance(value, bool):  # NetCDF has no such attribute
-        return int(value)
-    if isinstance(value, int | float | str):
-        return value
+def _written(kind: Any, value: Any) -> Any:
+    """Return a field as an attribute, by its type."""
+    if kind in _PLAIN:
+        return _PLAIN[kind][1](value)
     if is_dataclass(value):
         value = {name: v for name, v in asdict(value).items() if v is not None}  # type: ignore[arg-type]
     return json.dumps(value, default=np.ndarray.tolist)

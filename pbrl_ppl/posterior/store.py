@@ -341,9 +341,7 @@ def _dataset(value: Any) -> xr.Dataset:
 def interval(values: Floats, prob: float = HDI_PROB) -> tuple[float, float]:
     """Return the highest-density interval of draws: the shortest that holds ``prob`` of them."""
     ordered = np.sort(np.asarray(values).ravel())
-    count = max(1, int(np.floor(prob * len(ordered))))
-    if count >= len(ordered):
-        return float(ordered[0]), float(ordered[-1])
+    count = min(max(1, int(np.floor(prob * len(ordered)))), len(ordered) - 1)
     widths = ordered[count:] - ordered[: len(ordered) - count]
     best = int(np.argmin(widths))
     return float(ordered[best]), float(ordered[best + count])
