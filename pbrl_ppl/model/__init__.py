@@ -1,6 +1,5 @@
 """The PyMC model: Table 1, Eqs. 11 and 12, and the engine as a black-box pytensor Op."""
 
-from .declaration import PhysicsModel as PhysicsModel
 from .declaration import build_model as build_model
 from .declaration import prior_predictive_draws as prior_predictive_draws
 from .op import LogLikelihoodOp as LogLikelihoodOp

@@ -14,7 +14,6 @@ from .priors import inside as inside
 from .priors import prior_draws as prior_draws
 from .priors import prior_residual as prior_residual
 from .priors import prior_slopes as prior_slopes
-from .wheel_symmetry import Wheel as Wheel
 from .wheel_symmetry import by_prior as by_prior
 from .wheel_symmetry import change_from as change_from
 from .wheel_symmetry import nearest as nearest

@@ -115,10 +115,9 @@ class Layout:
             Shape (n, p).
         """
         lower, upper = (np.tile(end, (len(phi), 1)) for end in self.bounds)
-        for place, index, conditional in self._conditional():
-            support = np.array([prior.support for prior in conditional])
-            bounds = support[phi[:, index].astype(int)]
-            lower[:, place], upper[:, place] = bounds.T
+        for place, index, number, prior in self._conditional():
+            here = phi[:, index] == number
+            lower[here, place], upper[here, place] = prior.support
         return lower, upper
 
     def log_prior(self, phi: Floats) -> Floats:
@@ -137,28 +136,30 @@ class Layout:
         result = np.empty(np.shape(phi))
         for i, prior in enumerate(self.priors):
             result[..., i] = prior.log_density(phi[..., i])
-        for place, index, conditional in self._conditional():
-            for number, prior in enumerate(conditional):
-                chosen = phi[..., index] == number
-                result[chosen, place] = prior.log_density(phi[chosen, place])
+        for place, index, number, prior in self._conditional():
+            chosen = phi[..., index] == number
+            result[chosen, place] = prior.log_density(phi[chosen, place])
         return result
 
     def prior_draws(self, rng: np.random.Generator, n: int) -> Floats:
         """Return draws from the prior, shape (n, p); an anchor's prior depends on its index."""
         phi = prior_draws(self.priors, rng, n)
-        for place, index, conditional in self._conditional():
-            for number, prior in enumerate(conditional):
-                here = phi[:, index] == number
-                phi[here, place] = prior.sample(rng, int(here.sum()))
+        for place, index, number, prior in self._conditional():
+            here = phi[:, index] == number
+            phi[here, place] = prior.sample(rng, int(here.sum()))
         return phi
 
-    def _conditional(self) -> Iterator[tuple[int, int, tuple[Prior, ...]]]:
-        """Yield the places of each anchor of unknown bodies and of its index, and its priors."""
+    def _conditional(self) -> Iterator[tuple[int, int, int, Prior]]:
+        """Yield the places of each anchor of unknown bodies and of its index, and each prior.
+
+        With the prior comes the value of the index to which it belongs.
+        """
         for block in self.blocks:
             side = f"i_{block.name[0]}"
             for owner, conditional in zip(block.owners, block.conditional, strict=False):
                 if f"{side}[{owner}]" in self.labels:
-                    yield self.index(block.name, owner), self.index(side, owner), conditional
+                    place, index = self.index(block.name, owner), self.index(side, owner)
+                    yield from ((place, index, i, prior) for i, prior in enumerate(conditional))
 
     def scale(self, phi: Floats) -> Floats:
         """Return the scale of each entry of phi for step sizes, shape (p,); 0 if discrete."""

@@ -9,7 +9,6 @@ from .completion import checked as checked
 from .completion import complete as complete
 from .completion import evaluate as evaluate
 from .completion import parameter_draws as parameter_draws
-from .completion import prior_groups as prior_groups
 from .cross_validation import Comparison as Comparison
 from .cross_validation import by_number as by_number
 from .cross_validation import by_trajectory as by_trajectory
@@ -45,7 +44,6 @@ from .store import DATATREE as DATATREE
 from .store import HDI_PROB as HDI_PROB
 from .store import SIZE as SIZE
 from .store import Idata as Idata
-from .store import best_draw as best_draw
 from .store import convergence as convergence
 from .store import draws as draws
 from .store import from_groups as from_groups
