@@ -36,6 +36,7 @@ from .output_error import least_errors as least_errors
 from .output_error import linearised_about as linearised_about
 from .output_error import linearised_pieces as linearised_pieces
 from .output_error import output_error as output_error
+from .output_error import without as without
 from .problem import ACTION_DIMS as ACTION_DIMS
 from .problem import NEXT_STATE_DIMS as NEXT_STATE_DIMS
 from .problem import START_DIMS as START_DIMS

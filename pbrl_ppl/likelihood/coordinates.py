@@ -83,7 +83,9 @@ class Coordinates:
 
         Shape (..., 2, coordinate, coordinate).
         """
-        return step_covariances(self.push, sigma[..., self.pushed], self.always)
+        square = sigma[..., self.pushed] ** 2
+        both = np.stack([np.where(self.always, square, 0.0), square], axis=-2)
+        return np.asarray((self.push.T * both[..., None, :]) @ self.push)
 
     def pushes(self, sigma: Floats, touching: Bools, rng: np.random.Generator) -> Floats:
         """Draw process noise of the coordinates, shape (*touching.shape, coordinate).
@@ -118,6 +120,20 @@ class Coordinates:
             fill_joints(states.reshape(-1, 1, *states.shape[-2:]), scene)
         return states
 
+    def displaced(self, scene: Scene, states: Floats, steps: Floats) -> Floats:
+        """Return states with each coordinate a step ahead, then with each a step behind.
+
+        Shape (2 coordinate, transition, body, 6), from ``states`` (transition, body, 6) and
+        ``steps`` (coordinate,).
+        """
+        d = len(steps)
+        moved = np.tile(states, (2 * d, 1, 1, 1))
+        flat = moved.reshape(2 * d, len(states), -1)
+        for i, place in enumerate(self.places):
+            flat[i, :, place] += steps[i]
+            flat[d + i, :, place] -= steps[i]
+        return self.completed(scene, moved)
+
     def slopes(
         self, scene: Scene, states: Floats, steps: Floats, predict: Callable[[Floats], Floats]
     ) -> Floats:
@@ -140,13 +156,7 @@ class Coordinates:
         ndarray
             Shape (transition, coordinate, coordinate); 0 where the engine diverged.
         """
-        d = len(steps)
-        moved = np.tile(states, (2 * d, 1, 1, 1))
-        flat = moved.reshape(2 * d, len(states), -1)
-        for i, place in enumerate(self.places):
-            flat[i, :, place] += steps[i]
-            flat[d + i, :, place] -= steps[i]
-        after = self.of(predict(self.completed(scene, moved)))
+        d, after = len(steps), self.of(predict(self.displaced(scene, states, steps)))
         with np.errstate(invalid="ignore"):  # a coordinate that never moves has no step
             slopes = (after[:d] - after[d:]) / (2 * steps[:, None, None])
         return np.nan_to_num(slopes).transpose(1, 2, 0)
@@ -166,28 +176,6 @@ class Coordinates:
         """Body and place among the columns of each coordinate."""
         body, dimension = np.divmod(self.places, 6)
         return body, np.searchsorted(self.columns, dimension)
-
-
-def step_covariances(push: Floats, size: Floats, always: Bools) -> Floats:
-    """Return the process noise of a step without and with contact.
-
-    Parameters
-    ----------
-    push : ndarray
-        Change by a unit of each row, shape (push, coordinate).
-    size : ndarray
-        Standard deviation of each row, shape (..., push).
-    always : ndarray of bool
-        Which rows act in every step, shape (push,).
-
-    Returns
-    -------
-    ndarray
-        Shape (..., 2, coordinate, coordinate).
-    """
-    square = size**2
-    both = np.stack([np.where(always, square, 0.0), square], axis=-2)
-    return np.asarray((push.T * both[..., None, :]) @ push)
 
 
 def check_moves(coordinates: Coordinates, scene: Scene) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self, final
+from typing import ClassVar, Self, final
 
 import numpy as np
 from scipy.special import gammaln
@@ -17,6 +17,8 @@ from pbrl_ppl.state import Bools, Floats
 
 #: Medians of the noise parameters' prior, and the standard deviation of their logarithm.
 NoisePrior = tuple[tuple[float, ...], float]
+#: Degrees of freedom of Student-t noise, one for all or an array; None for a Gaussian.
+Nu = float | Floats | None
 
 #: Degrees of freedom from which on a Student-t counts as Gaussian.
 GAUSSIAN = 1e7
@@ -122,12 +124,16 @@ class Likelihood(ABC):
         """
 
     @abstractmethod
-    def whitened_nu(
-        self, nu: float | Floats | None, shape: tuple[int, ...]
-    ) -> float | Floats | None:
-        """Return the degrees of freedom of whitened residuals, from those of this shape."""
+    def in_order(self, values: Floats) -> Floats:
+        """Return values of residuals, shape (..., transition, H, body, state), as whitened ones."""
 
-    def robust(self, residual: Floats, sigma: Floats, nu: float | Floats | None) -> Floats:
+    def whitened_nu(self, nu: Nu, shape: tuple[int, ...]) -> Nu:
+        """Return the degrees of freedom of whitened residuals, from those of this shape."""
+        if not isinstance(nu, np.ndarray) or nu.ndim == 0:
+            return nu
+        return self.in_order(np.broadcast_to(nu, shape))
+
+    def robust(self, residual: Floats, sigma: Floats, nu: Nu) -> Floats:
         """Return least-squares residuals, shape as of :meth:`whiten`; see :func:`robust`."""
         return robust(self.whiten(residual, sigma), self.whitened_nu(nu, residual.shape))
 
@@ -138,9 +144,7 @@ class Likelihood(ABC):
         ``pull`` has the shape of :meth:`whiten`.
         """
 
-    def slope(
-        self, residual: Floats, sigma: Floats, nu: float | Floats | None, weights: Floats
-    ) -> Floats:
+    def slope(self, residual: Floats, sigma: Floats, nu: Nu, weights: Floats) -> Floats:
         """Return the derivative of the sum of weighted log-densities by the residual.
 
         ``weights`` has shape (transition,); the result that of ``residual``.
@@ -155,7 +159,7 @@ class Likelihood(ABC):
 
     @abstractmethod
     def log_density(
-        self, residual: Floats, sigma: Floats, measured: Bools, nu: float | Floats | None = None
+        self, residual: Floats, sigma: Floats, measured: Bools, nu: Nu = None
     ) -> Floats:
         """Return the log-likelihood of each transition, shape (..., transition).
 
@@ -165,12 +169,7 @@ class Likelihood(ABC):
 
     @abstractmethod
     def random(
-        self,
-        predicted: Floats,
-        linearised: Floats,
-        sigma: Floats,
-        rng: np.random.Generator,
-        nu: float | Floats | None = None,
+        self, predicted: Floats, linearised: Floats, sigma: Floats, rng: np.random.Generator, nu: Nu
     ) -> Floats:
         """Draw measured next states by Eq. 13, shape of ``predicted``.
 
@@ -182,7 +181,7 @@ class Likelihood(ABC):
             Shape (parameter,).
         rng : Generator
             Source of randomness.
-        nu : float or ndarray, optional
+        nu : float, ndarray or None
             Degrees of freedom.
         """
 
@@ -241,23 +240,18 @@ class TransitionLikelihood(Likelihood):
 
     def whiten(self, residual: Floats, sigma: Floats) -> Floats:
         """Return residuals over sigma, shape (..., transition, H * body * state)."""
-        scaled = residual / np.asarray(sigma)[..., None, None, None, :]
-        return np.asarray(scaled.reshape(*scaled.shape[:-3], -1))
+        return self.in_order(residual / np.asarray(sigma)[..., None, None, None, :])
 
     def unwhitened_slope(self, pull: Floats, sigma: Floats, shape: tuple[int, ...]) -> Floats:
         """Return minus the pull over sigma."""
         return -pull.reshape(shape) / sigma
 
-    def whitened_nu(
-        self, nu: float | Floats | None, shape: tuple[int, ...]
-    ) -> float | Floats | None:
-        """Return one number for all, or one a residual, shape (..., transition, coordinate)."""
-        if not isinstance(nu, np.ndarray) or nu.ndim == 0:
-            return nu
-        return np.broadcast_to(nu, shape).reshape(*shape[:-3], -1)
+    def in_order(self, values: Floats) -> Floats:
+        """Return one value a residual, shape (..., transition, H * body * state)."""
+        return values.reshape(*values.shape[:-3], -1)
 
     def log_density(
-        self, residual: Floats, sigma: Floats, measured: Bools, nu: float | Floats | None = None
+        self, residual: Floats, sigma: Floats, measured: Bools, nu: Nu = None
     ) -> Floats:
         """Return the log-likelihood of each transition (Eq. 11)."""
         axes = (-1, -2, -3)
@@ -267,12 +261,7 @@ class TransitionLikelihood(Likelihood):
         return _finite(-0.5 * square - log_sigma + norm)
 
     def random(
-        self,
-        predicted: Floats,
-        linearised: Floats,
-        sigma: Floats,
-        rng: np.random.Generator,
-        nu: float | Floats | None = None,
+        self, predicted: Floats, linearised: Floats, sigma: Floats, rng: np.random.Generator, nu: Nu
     ) -> Floats:
         """Draw next states by Eq. 13."""
         return next_state_random(predicted, sigma, rng, nu=nu)
@@ -331,16 +320,14 @@ class TrajectoryLikelihood(Likelihood):
 
     def whiten(self, residual: Floats, sigma: Floats) -> Floats:
         """Return the innovations over their standard deviations."""
-        return self.noise.whiten(residual, sigma)
+        return self.noise.whitened(residual, sigma)[0]
 
-    def whitened_nu(
-        self, nu: float | Floats | None, shape: tuple[int, ...]
-    ) -> float | Floats | None:
-        """Return one number for all, or one an innovation, shape (..., transition, coordinate)."""
-        return self.noise.of_coordinates(nu, shape)
+    def in_order(self, values: Floats) -> Floats:
+        """Return one value an innovation, shape (..., transition, coordinate)."""
+        return self.noise.coordinates.of_residual(values)
 
     def log_density(
-        self, residual: Floats, sigma: Floats, measured: Bools, nu: float | Floats | None = None
+        self, residual: Floats, sigma: Floats, measured: Bools, nu: Nu = None
     ) -> Floats:
         """Return the log-density of each transition's measurements given those before."""
         z, log_scale = self.noise.whitened(residual, sigma)
@@ -349,12 +336,7 @@ class TrajectoryLikelihood(Likelihood):
         return _finite(norm - 0.5 * (robust(z, nu) ** 2).sum(-1) - log_scale)
 
     def random(
-        self,
-        predicted: Floats,
-        linearised: Floats,
-        sigma: Floats,
-        rng: np.random.Generator,
-        nu: float | Floats | None = None,
+        self, predicted: Floats, linearised: Floats, sigma: Floats, rng: np.random.Generator, nu: Nu
     ) -> Floats:
         """Draw measured next states, given those before."""
         return self.noise.random(predicted, linearised, sigma, rng)
@@ -374,7 +356,7 @@ def _finite(log_density: Floats) -> Floats:
     return np.where(np.isnan(log_density), -np.inf, log_density)
 
 
-def robust(z: Floats, nu: float | Floats | None) -> Floats:
+def robust(z: Floats, nu: Nu) -> Floats:
     """Return residuals whose half squares are the negative log-density up to a constant.
 
     Parameters
@@ -396,7 +378,7 @@ def robust(z: Floats, nu: float | Floats | None) -> Floats:
     return np.asarray(np.where(heavy, np.sign(z) * np.sqrt((nu + 1) * np.log1p(z**2 / nu)), z))
 
 
-def log_norm(nu: float | Floats | None) -> Floats:
+def log_norm(nu: Nu) -> Floats:
     """Return the logarithm of a standard Student-t density (or normal one) at zero."""
     normal = np.asarray(-0.5 * math.log(2 * math.pi))
     if nu is None:
@@ -408,14 +390,9 @@ def log_norm(nu: float | Floats | None) -> Floats:
 
 
 def next_state_random(
-    predicted: Any,
-    sigma: Any,
-    rng: np.random.Generator,
-    size: Any = None,
-    nu: float | Floats | None = None,
+    predicted: Floats, sigma: Floats, rng: np.random.Generator, nu: Nu = None
 ) -> Floats:
     """Draw next states by Eq. 13, shape as ``predicted``: (..., transition, H, body, state)."""
-    predicted = np.asarray(predicted)
     shape = predicted.shape
     if nu is None:
         z = rng.standard_normal(shape)
@@ -425,4 +402,4 @@ def next_state_random(
         heavy = np.less(nu, GAUSSIAN)
         heavy_z = rng.standard_t(np.where(heavy, nu, 1.0), shape)
         z = np.where(heavy, heavy_z, rng.standard_normal(shape))
-    return np.asarray(predicted + z * np.asarray(sigma))
+    return np.asarray(predicted + z * sigma)

@@ -17,7 +17,7 @@ import numpy as np
 
 from pbrl_ppl.likelihood.coordinates import Coordinates, observed_coordinates
 from pbrl_ppl.likelihood.data import Observations, least_noise
-from pbrl_ppl.likelihood.likelihood import Likelihood, log_norm, robust
+from pbrl_ppl.likelihood.likelihood import Likelihood, Nu, log_norm, robust
 from pbrl_ppl.likelihood.problem import Problem
 from pbrl_ppl.physics import Memory
 from pbrl_ppl.state import STATE, THETA, Bools, Floats, Ints, wrapped
@@ -56,10 +56,16 @@ class Starts:
     @cached_property
     def measured(self) -> Floats:
         """Numbers of measurements of each observed dimension, shape (state,)."""
-        counts = self.seen.sum((0, 1, 2)).astype(float)
-        begun = np.isfinite(self.begin).sum(axis=0)
-        np.add.at(counts, self.column[self.column >= 0], begun[self.column >= 0])
-        return np.asarray(counts)
+        return self.totals(self.seen, np.isfinite(self.begin))
+
+    def totals(self, measured: Floats | Bools, begin: Floats | Bools) -> Floats:
+        """Return sums over each observed dimension, its start coordinates among them, (state,).
+
+        Arguments have the shapes (piece, H, body, state) and (piece, coordinate).
+        """
+        total, sensed = measured.sum((0, 1, 2)).astype(float), self.column >= 0
+        np.add.at(total, self.column[sensed], begin.sum(axis=0)[sensed])
+        return np.asarray(total)
 
     @property
     def unknown(self) -> int:
@@ -82,7 +88,7 @@ class Starts:
         ``residual`` has shape (..., piece, H, body, state), ``weight`` (state,).
         """
         z = (residual * weight).reshape(*residual.shape[:-3], -1)
-        begin = np.nan_to_num(self.begin) * self._weights(weight)
+        begin = np.nan_to_num(self.begin) * self.of_coordinates(weight)
         return np.concatenate([z, np.broadcast_to(begin, (*z.shape[:-1], begin.shape[-1]))], -1)
 
     def series(self, rows: Floats) -> Floats:
@@ -124,7 +130,7 @@ class Starts:
         pieces, coordinates = self.begin.shape
         moved = np.where(self.seen[..., None], self.slope, 0.0) * weight[:, None]
         moved = moved.reshape(pieces, -1, coordinates)
-        diagonal = np.isfinite(self.begin) * self._weights(weight)
+        diagonal = np.isfinite(self.begin) * self.of_coordinates(weight)
         diagonal += self.given * firm * np.linalg.norm(moved, axis=1)
         rows = np.concatenate([moved, diagonal[:, :, None] * np.eye(coordinates)], axis=1)
         scale = np.linalg.norm(rows, axis=1)
@@ -135,9 +141,9 @@ class Starts:
         inverse = np.where(kept, 1.0 / np.sqrt(np.where(kept, square, 1.0)), 0.0)
         return rows @ v * inverse[:, None], v * inverse[:, None] / scale[:, :, None]
 
-    def _weights(self, weight: Floats) -> Floats:
-        """Return the weight of each coordinate, 0 where it is not observed, shape (coordinate,)."""
-        return np.where(self.column >= 0, weight[self.column], 0.0)
+    def of_coordinates(self, values: Floats) -> Floats:
+        """Return a dimension's value for each coordinate, 0 if not observed, (coordinate,)."""
+        return np.where(self.column >= 0, values[self.column], 0.0)
 
 
 @final
@@ -168,9 +174,13 @@ class OutputErrorLikelihood(Likelihood):
         """Return the degrees of freedom over the autocorrelation times, shape (state,)."""
         return np.asarray(self.starts.counts / np.array(self.tau))
 
+    def weight(self, sigma: Floats) -> Floats:
+        """Return one over sigma and the root of tau, shape (..., state)."""
+        return np.asarray(1.0 / (sigma * np.sqrt(self.tau)))
+
     def whiten(self, residual: Floats, sigma: Floats) -> Floats:
         """Return residuals over sigma and the root of tau, without what start states take up."""
-        weight = 1.0 / (np.asarray(sigma) * np.sqrt(self.tau))
+        weight = self.weight(sigma)
         if weight.ndim > 1:
             flat = weight.reshape(-1, weight.shape[-1])
             flattened = residual.reshape(len(flat), *residual.shape[weight.ndim - 1 :])
@@ -183,18 +193,14 @@ class OutputErrorLikelihood(Likelihood):
         taken = np.matmul(np.matmul(z[..., None, :], u), np.swapaxes(u, 1, 2))[..., 0, :]
         return np.asarray(z - taken)
 
-    def whitened_nu(
-        self, nu: float | Floats | None, shape: tuple[int, ...]
-    ) -> float | Floats | None:
-        """Return one number for all; that of a body's coordinates, shape (..., piece, row)."""
-        if not isinstance(nu, np.ndarray) or nu.ndim == 0:
-            return nu
-        rows = np.broadcast_to(nu, shape).reshape(*shape[:-3], -1)
+    def in_order(self, values: Floats) -> Floats:
+        """Return one value a residual, and infinity for the starts, shape (..., piece, row)."""
+        rows = values.reshape(*values.shape[:-3], -1)
         begin = np.full((*rows.shape[:-1], len(self.starts.column)), np.inf)
         return np.concatenate([rows, begin], axis=-1)
 
     def log_density(
-        self, residual: Floats, sigma: Floats, measured: Bools, nu: float | Floats | None = None
+        self, residual: Floats, sigma: Floats, measured: Bools, nu: Nu = None
     ) -> Floats:
         """Return the tempered log-likelihood of each piece, shape (..., piece)."""
         z = robust(self.whiten(residual, sigma), self.whitened_nu(nu, residual.shape))
@@ -203,19 +209,14 @@ class OutputErrorLikelihood(Likelihood):
         return np.where(np.isnan(z).any(axis=-1), -np.inf, norm - 0.5 * (z**2).sum(axis=-1))
 
     def random(
-        self,
-        predicted: Floats,
-        linearised: Floats,
-        sigma: Floats,
-        rng: np.random.Generator,
-        nu: float | Floats | None = None,
+        self, predicted: Floats, linearised: Floats, sigma: Floats, rng: np.random.Generator, nu: Nu
     ) -> Floats:
         """Draw measurements with white errors about states from the most probable starts."""
         starts = self.starts
         residual = np.where(starts.seen, linearised - predicted, 0.0)
         angle = starts.column[starts.coordinates.places % len(STATE) == THETA]
         residual[..., angle[angle >= 0]] = wrapped(residual[..., angle[angle >= 0]])
-        weight = 1.0 / (np.asarray(sigma) * np.sqrt(self.tau))
+        weight = self.weight(sigma)
         u, back = starts.basis(weight)
         change = back @ (np.swapaxes(u, 1, 2) @ starts.rows(residual, weight)[..., None])
         moved = np.einsum("phkdc,pc->phkd", starts.slope, change[..., 0])
@@ -223,9 +224,8 @@ class OutputErrorLikelihood(Likelihood):
 
     def unwhitened_slope(self, pull: Floats, sigma: Floats, shape: tuple[int, ...]) -> Floats:
         """Return what start states do not take up, over minus sigma and the root of tau."""
-        weight = 1.0 / (np.asarray(sigma) * np.sqrt(self.tau))
-        u, _ = self.starts.basis(weight)
-        kept = pull - (u @ (np.swapaxes(u, 1, 2) @ pull[..., None]))[..., 0]
+        weight = self.weight(sigma)
+        kept = without(self.starts.basis(weight)[0], pull)
         kept = kept[:, : kept.shape[1] - len(self.starts.column)]
         return -kept.reshape(shape) * weight
 
@@ -237,9 +237,7 @@ class OutputErrorLikelihood(Likelihood):
         z = self._projected(residual, 1.0 / np.asarray(sigma))
         cut = z.shape[-1] - len(self.starts.column)
         rows = z[..., :cut].reshape(residual.shape) * sigma
-        return rows, z[..., cut:] * np.where(
-            self.starts.column >= 0, sigma[self.starts.column], 0.0
-        )
+        return rows, z[..., cut:] * self.starts.of_coordinates(sigma)
 
     def profile(self, residual: Floats, least: Floats, *, rounds: int = 6) -> Floats:
         """Return the restricted-likelihood sigma of each dimension, shape (state,).
@@ -250,9 +248,7 @@ class OutputErrorLikelihood(Likelihood):
         sigma = np.maximum(np.sqrt((residual**2).sum((0, 1, 2)) / self.starts.counts), least)
         for _ in range(rounds):
             rows, begin = self.unwhitened(residual, sigma)
-            square = (rows**2).sum((0, 1, 2))
-            seen = self.starts.column >= 0
-            np.add.at(square, self.starts.column[seen], (begin**2).sum(axis=0)[seen])
+            square = self.starts.totals(rows**2, begin**2)
             better = np.maximum(np.sqrt(square / self.starts.counts), least)
             done = np.all(abs(better - sigma) < 1e-3 * sigma)
             sigma = better
@@ -284,6 +280,11 @@ class OutputErrorLikelihood(Likelihood):
                     break
                 tau[d] += 2 * correlation
         return tau
+
+
+def without(u: Floats, rows: Floats) -> Floats:
+    """Return rows (piece, row) without what orthonormal columns (piece, row, direction) explain."""
+    return np.asarray(rows - (u @ (np.swapaxes(u, 1, 2) @ rows[..., None]))[..., 0])
 
 
 def in_pieces(problem: Problem, length: int, states: Floats) -> Problem:

@@ -97,8 +97,8 @@ class TrajectoryNoise:
         """1 where bodies touch in a transition and 0 elsewhere, shape (transition,)."""
         return self.touching.astype(np.int64)
 
-    def whiten(self, residual: Floats, sigma: Floats) -> Floats:
-        """Return the whitened innovations.
+    def whitened(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
+        """Return whitened innovations with the log of their standard deviations.
 
         Parameters
         ----------
@@ -109,15 +109,10 @@ class TrajectoryNoise:
 
         Returns
         -------
-        ndarray
+        white : ndarray
             Shape (..., transition, coordinate), dimensionless; 0 where nothing was measured.
-        """
-        return self.whitened(residual, sigma)[0]
-
-    def whitened(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
-        """Return whitened innovations with the log of their standard deviations.
-
-        The latter is summed over the coordinates, shape (..., transition) as that of sigma leads.
+        log_scale : ndarray
+            Summed over the coordinates, shape (..., transition) as that of sigma leads.
         """
         coordinates = self.coordinates.of_residual(residual)
         lead = coordinates.shape[:-2]
@@ -157,18 +152,10 @@ class TrajectoryNoise:
         """Return whitened innovations and filtered deviations of residuals."""
         gain, scale, *_ = self._gains(sigma)
         rows = np.ascontiguousarray(residual)  # another layout would be compiled, too
-        white, state = innovations(
+        filtered: tuple[Floats, Floats] = innovations(
             self.slope, self.first, self.seen, gain, scale, rows, self.begin, self.measured
         )
-        return white, state
-
-    def of_coordinates(
-        self, nu: float | Floats | None, shape: tuple[int, ...]
-    ) -> float | Floats | None:
-        """Return the degrees of freedom of each innovation, from those of residuals."""
-        if not isinstance(nu, np.ndarray) or nu.ndim == 0:
-            return nu
-        return self.coordinates.of_residual(np.broadcast_to(nu, shape))
+        return filtered
 
     def log_scale(self, sigma: Floats) -> Floats:
         """Return the summed log standard deviations of innovations, shape (transition,)."""
@@ -287,8 +274,8 @@ class TrajectoryNoise:
         factor = np.linalg.cholesky(covariance)
         drawn = mean + np.einsum("kab,kb->ka", factor, rng.standard_normal(mean.shape))
         result = linearised.copy()
-        body, dimension = np.divmod(self.coordinates.places, 6)
-        result[:, 0, body, np.searchsorted(self.coordinates.columns, dimension)] += drawn
+        body, place = self.coordinates.in_residual
+        result[:, 0, body, place] += drawn
         return result
 
     def _begin(self, sigma: Floats) -> Floats:

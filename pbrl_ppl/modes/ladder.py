@@ -22,6 +22,7 @@ from pbrl_ppl.likelihood import (
     linearised_about,
     linearised_pieces,
     output_error,
+    without,
 )
 from pbrl_ppl.modes.laplace import Mode, covariance_of
 from pbrl_ppl.modes.noise import finite
@@ -131,7 +132,7 @@ def with_robust_covariance(mode: Mode, *, many: int = 8) -> Mode:
     problem, likelihood, p = mode.problem, output_error(mode.problem), len(mode.phi)
     if not p:
         return mode
-    starts, weight = likelihood.starts, 1.0 / (mode.sigma * np.sqrt(likelihood.tau))
+    starts, weight = likelihood.starts, likelihood.weight(mode.sigma)
     slopes = prior_slopes(problem.layout.priors, mode.phi)
     jacobian = mode.jacobian.reshape(*mode.whitened_residual.shape, p)
     u = starts.basis(weight)[0]
@@ -261,11 +262,10 @@ def fit_pieces(
         linear = _linearise(problem, phi, start, steps)
     problem, sigma = _with_noise(problem, start, linear)
     step = _Step(problem, linear, sigma, phi, start)
-    problem = linearised_pieces(problem, start, linear.by_start, _tau(problem))
-    return Mode(
-        problem, phi, sigma, step.jacobian, step.covariance,
-        -_cost(problem, sigma, phi),
-    )  # fmt: skip
+    tau = np.array(output_error(problem).tau)
+    problem = linearised_pieces(problem, start, linear.by_start, tau)
+    height = -_cost(problem, sigma, phi)
+    return Mode(problem, phi, sigma, step.jacobian, step.covariance, height)
 
 
 @one_blas_thread
@@ -300,11 +300,6 @@ def corrected(mode: Mode) -> Mode:
     return replace(mode, problem=problem.coarse.corrected_to(problem.rough, mode.phi))
 
 
-def _tau(problem: Problem) -> Floats:
-    """Return the integrated autocorrelation times, shape (state,)."""
-    return np.array(output_error(problem).tau)
-
-
 def _residual(problem: Problem, points: Floats, starts: Floats) -> Floats:
     """Return residuals at points (n, p) and starts (n, piece, body, 6)."""
     engine = problem.rough if problem.defect is None else problem
@@ -334,12 +329,10 @@ def _linearise(
     np.fill_diagonal(points[1 : 1 + p], ahead)
     if not one_sided:
         np.fill_diagonal(points[1 + p : 1 + 2 * p], behind)
-    starts = np.tile(start, (len(points), 1, 1, 1))
-    flat = starts.reshape(len(points), len(start), -1)
-    for i, place in enumerate(coordinates.places[:c]):
-        flat[i - 2 * c, :, place] += steps[1][i]
-        flat[i - c, :, place] -= steps[1][i]
-    residual = _residual(problem, points, coordinates.completed(problem.scene, starts))
+    held = coordinates.completed(problem.scene, start.copy())
+    displaced = coordinates.displaced(problem.scene, start, steps[1])
+    starts = np.concatenate([np.tile(held, (len(points) - 2 * c, 1, 1, 1)), displaced])
+    residual = _residual(problem, points, starts)
     width = np.where(ahead == behind, 1e-300, ahead - behind)
     before = residual[:1] if one_sided else residual[1 + p : 1 + 2 * p]
     by_phi = np.moveaxis(residual[1 : 1 + p] - before, 0, -1) / -width
@@ -359,8 +352,7 @@ def _with_noise(problem: Problem, start: Floats, linear: Linear) -> tuple[Proble
 
 def _cost(problem: Problem, sigma: Floats, phi: Floats) -> float:
     """Return the negative log-posterior, the noise at its profile, up to a constant."""
-    likelihood = output_error(problem)
-    weight = likelihood.starts.counts / np.array(likelihood.tau)
+    weight = problem.likelihood.counts(problem.observations)
     prior = 0.5 * (prior_residual(problem.layout.priors, phi) ** 2).sum()
     return float((weight * np.log(sigma)).sum() + prior)
 
@@ -372,9 +364,8 @@ class _Step:
         self, problem: Problem, linear: Linear, sigma: Floats, phi: Floats, start: Floats
     ) -> None:
         likelihood = output_error(problem)
-        self.problem, self.starts, self.tau = problem, likelihood.starts, likelihood.tau
-        self.least, self.by_start = least_errors(problem), linear.by_start
-        self.weight = 1.0 / (sigma * np.sqrt(likelihood.tau))
+        self.problem, self.starts, self.by_start = problem, likelihood.starts, linear.by_start
+        self.least, self.weight = least_errors(problem), likelihood.weight(sigma)
         self.u, self.back = self.starts.basis(self.weight)
         by_phi = np.moveaxis(linear.by_phi, -1, 0) * self.weight
         pieces, rows = len(linear.residual), linear.residual[0].size
@@ -389,7 +380,7 @@ class _Step:
     def _move(self, phi: Floats, start: Floats, residual: Floats) -> None:
         self.phi, self.start, self.residual = phi, start, residual
         self.rows = self._rows(start, residual)
-        left = self._left(self.rows)
+        left = without(self.u, self.rows)
         priors = self.problem.layout.priors
         slopes = prior_slopes(priors, phi) if priors else np.zeros(0)
         self.gradient = self.jacobian.T @ left.ravel() - slopes * prior_residual(priors, phi)
@@ -409,18 +400,12 @@ class _Step:
 
     def cost(self, phi: Floats, start: Floats, residual: Floats) -> float:
         """Return the negative log-posterior at a point, the noise at its profile."""
-        return self._profiled(self._left(self._rows(start, residual)), residual, phi)
-
-    def _left(self, rows: Floats) -> Floats:
-        """Return rows without what start states take up, shape (piece, row)."""
-        return np.asarray(rows - (self.u @ (np.swapaxes(self.u, 1, 2) @ rows[..., None]))[..., 0])
+        return self._profiled(without(self.u, self._rows(start, residual)), residual, phi)
 
     def _profiled(self, left: Floats, residual: Floats, phi: Floats) -> float:
         """Return the cost of projected rows; ``residual`` has their shape before."""
         cut = residual[0].size
-        square = (left[:, :cut].reshape(residual.shape) ** 2).sum((0, 1, 2))
-        seen = self.starts.column >= 0
-        np.add.at(square, self.starts.column[seen], (left[:, cut:] ** 2).sum(axis=0)[seen])
+        square = self.starts.totals(left[:, :cut].reshape(residual.shape) ** 2, left[:, cut:] ** 2)
         sigma = np.sqrt(square / self.starts.counts) / self.weight
         return _cost(self.problem, np.maximum(sigma, self.least), phi)
 
@@ -445,12 +430,9 @@ class _Step:
         width = np.where(
             self.problem.layout.discrete, 0.0, np.clip(width, _LEAST * scale, _MOST * scale)
         )
-        begun = self.starts.column >= 0
         by_start = np.where(self.starts.seen[..., None], self.by_start, 0.0)
         of_start = ((by_start * self.weight[:, None]) ** 2).sum((1, 2, 3))
-        of_start += np.isfinite(self.starts.begin) * np.where(
-            begun, self.weight[self.starts.column], 0.0
-        ) ** 2  # fmt: skip
+        of_start += np.isfinite(self.starts.begin) * self.starts.of_coordinates(self.weight) ** 2
         begin = of_start_sd / np.sqrt(np.maximum(np.median(of_start, axis=0), 1e-300))
         return width, np.clip(begin, _LEAST * sizes, _MOST * sizes)
 

@@ -11,7 +11,6 @@ from scipy.special import wrightomega
 
 from pbrl_ppl.likelihood import (
     Problem,
-    TrajectoryNoise,
     exponential,
     least_errors,
     least_noise,
@@ -57,64 +56,42 @@ def profile_sigma(
     fixed : dict of int to float, optional
         Noise parameters of whole trajectories that are given.
     """
-    if problem.likelihood.filtered:
-        return _of_trajectories(problem, problem.trajectory_noise, residual, phi, fixed or {})
-    residual = finite(problem, residual)
-    ones = np.ones(residual.shape[-1])
-    if problem.likelihood.simulated:
+    residual, medians = finite(problem, residual), problem.noise_prior[0]
+    filtered, gaussian = problem.likelihood.filtered, problem.nu(phi) is None
+    if filtered:
+        begin = np.log(problem.trajectory_noise.sigma)
+    elif problem.likelihood.simulated:
         begin = np.log(output_error(problem).profile(residual, least_errors(problem)))
     else:
         begin = gaussian_log_sigma(problem, (residual**2).sum((0, 1, 2)))
-        if problem.nu(phi) is None:
-            return np.asarray(np.exp(begin) * ones)
-
-    bounds = [(b - 6, b + 6) for b in begin]
-    result = minimize(
-        partial(_cost, problem, residual, phi), begin, method="L-BFGS-B", bounds=bounds
-    )
-    return np.asarray(np.exp(result.x) * ones)
-
-
-def _of_trajectories(
-    problem: Problem,
-    noise: TrajectoryNoise,
-    residual: Floats,
-    phi: Floats | None,
-    fixed: Mapping[int, float],
-) -> Floats:
-    """Return the noise parameters of highest posterior density along trajectories."""
-    residual = finite(problem, residual)
-    gaussian = problem.nu(phi) is None
-    begin = np.log(noise.sigma)
+        if gaussian:
+            return np.asarray(np.exp(begin) * np.ones(len(medians)))
     bounds = [(b - _FAR, b + _FAR) for b in begin]
     for place in np.flatnonzero(exponential(problem)).tolist():
-        least = np.log(NOTHING * problem.noise_prior[0][place])
+        least = np.log(NOTHING * medians[place])
         begin[place] = max(begin[place], least)
         bounds[place] = (least, max(bounds[place][1], least + _FAR))
-    for place, value in fixed.items():
+    for place, value in (fixed or {}).items():
         begin[place] = np.log(value)
         bounds[place] = (begin[place], begin[place])
-    cost = (
-        partial(_cost_and_slope, problem, noise, residual)
-        if gaussian
-        else partial(_cost, problem, residual, phi)
+    sloped = filtered and gaussian
+    cost = _cost_and_slope if sloped else partial(_cost, phi=phi)
+    result = minimize(
+        cost, begin, (problem, residual), jac=sloped, method="L-BFGS-B", bounds=bounds
     )
-    result = minimize(cost, begin, jac=gaussian, method="L-BFGS-B", bounds=bounds)
-    return np.asarray(np.exp(result.x))
+    return np.asarray(np.exp(result.x) * np.ones(len(medians)))
 
 
-def _cost(problem: Problem, residual: Floats, phi: Floats | None, log_sigma: Floats) -> float:
+def _cost(log_sigma: Floats, problem: Problem, residual: Floats, phi: Floats | None) -> float:
     """Return the negative log-density of data and log noise parameters."""
     sigma = np.exp(log_sigma) * np.ones(len(problem.noise_prior[0]))
     likelihood = problem.log_density(residual, sigma, phi).sum()
     return float(log_sigma.sum() - log_noise_prior(problem, log_sigma) - likelihood)
 
 
-def _cost_and_slope(
-    problem: Problem, noise: TrajectoryNoise, residual: Floats, log_sigma: Floats
-) -> tuple[float, Floats]:
+def _cost_and_slope(log_sigma: Floats, problem: Problem, residual: Floats) -> tuple[float, Floats]:
     """Return the negative log-density for Gaussian noise, and its derivative by log sigma."""
-    likelihood, slope = noise.score(residual, np.exp(log_sigma))
+    likelihood, slope = problem.trajectory_noise.score(residual, np.exp(log_sigma))
     cost = float(log_sigma.sum() - log_noise_prior(problem, log_sigma) - likelihood)
     return cost, 1.0 - noise_prior_slope(problem, log_sigma) - slope
 
@@ -188,7 +165,7 @@ def noise_gaussian(
     begin = np.where(exponential(problem), np.maximum(begin, floor), begin)
 
     def cost(at: Floats) -> float:
-        return _cost(problem, residual, phi, at) - float(at.sum())
+        return _cost(at, problem, residual, phi) - float(at.sum())
 
     at = minimize(cost, begin, method="L-BFGS-B", bounds=[(b - _FAR, b + _FAR) for b in begin]).x
 
