@@ -48,15 +48,11 @@ def noise_medians(
         for rows in (real, shown)
     )
     dt = float(history.dataset.attrs["time_step"])
-    sensors = sensor_share * seen[list(coordinates.sensors)]
+    sensors, contacts = list(coordinates.sensors), list(coordinates.contacts)
     steps = acceleration_share * _MEDIAN * _vectors(typical, coordinates.rates) / dt
-    contacts = contact_share * typical[list(coordinates.contacts)] / dt
-    medians = [
-        np.maximum(sensors, least[list(coordinates.sensors)]),
-        np.maximum(steps, least[list(coordinates.rates)] / dt),
-        np.maximum(contacts, least[list(coordinates.contacts)] / dt),
-    ]
-    return np.concatenate(medians)
+    medians = sensor_share * seen[sensors], steps, contact_share * typical[contacts] / dt
+    floors = least[sensors], least[list(coordinates.rates)] / dt, least[contacts] / dt
+    return np.asarray(np.maximum(np.concatenate(medians), np.concatenate(floors)))
 
 
 def _typical(coordinates: Coordinates, changes: list[Floats]) -> Floats:

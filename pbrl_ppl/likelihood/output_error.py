@@ -335,8 +335,7 @@ def linearised_pieces(problem: Problem, start: Floats, slope: Floats, tau: Float
     segments, states = problem.segments, problem.data.smoothed_states.copy()
     states[segments.trajectory, segments.step] = start
     problem = linearised_about(problem, start, slope)
-    problem = problem.with_likelihood(tau=tuple(np.asarray(tau).tolist()))
-    return replace(problem, data=replace(problem.data, states=states))
+    return problem.with_likelihood(tau=tuple(np.asarray(tau).tolist())).with_states(states)
 
 
 def linearised_about(problem: Problem, start: Floats, slope: Floats) -> Problem:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -97,6 +97,10 @@ class Problem:
         likelihood = self.likelihood.of_data()
         return replace(self, data=data, physics=physics, likelihood=likelihood, defect=None)
 
+    def with_states(self, states: Floats) -> Problem:
+        """Return the same problem with other smoothed states; the likelihood stays."""
+        return replace(self, data=replace(self.data, states=states))
+
     def with_physics(self, **changes: Any) -> Problem:
         """Return the same problem with other physics; arguments are fields of :class:`Physics`."""
         physics, likelihood = self.physics.changed(**changes), self.likelihood
@@ -169,18 +173,13 @@ class Problem:
         apart = self.simulator(phi, segments.start, self.inputs)
         off = abs(self.observations.wrapped((states - apart)[..., columns]))
         if isinstance(self.likelihood, TrajectoryLikelihood):  # errors of measurement alone
-            sensors, every = self.likelihood.noise.coordinates.sensors, sigma
-            stated = dict(self.scene.noise)
-            sigma = np.full((len(phi), len(columns)), np.inf)
-            for i, d in enumerate(columns):
-                sigma[:, i] = stated.get(STATE[d], np.inf)
-                if d in sensors:
-                    sigma[:, i] = every[:, sensors.index(d)]
+            sensors, stated = self.likelihood.noise.coordinates.sensors, dict(self.scene.noise)
+            known = np.tile([stated.get(name, np.inf) for name in STATE], (len(phi), 1))
+            known[:, list(sensors)] = sigma[:, : len(sensors)]
+            sigma = known[:, columns]
         matters = np.any(~(off <= same * sigma[:, None, None, None]), axis=(2, 3, 4))
-        names = [body.name for body in self.scene.moving]
-        meeting = [
-            names[i] for i in np.flatnonzero((met & np.expand_dims(matters, -1)).any(axis=(0, 1)))
-        ]
+        meet = (met & matters[..., None]).any(axis=(0, 1))
+        meeting = [body.name for body, one in zip(self.scene.moving, meet, strict=True) if one]
         if not meeting:
             return self
         return self.with_physics(together=tuple(dict.fromkeys((*self.physics.together, *meeting))))
@@ -288,11 +287,10 @@ class Problem:
 
     def predict(self, phi: Floats, engine: Engine | None = None) -> Floats:
         """Return predicted states, shape (..., transition, H, body, 6), for phi (..., p)."""
-        engine, arguments = engine or self.simulator, (phi, self.segments.start, self.inputs)
-        sensitivity = self.likelihood.sensitivity
-        states = (
-            engine(*arguments) if sensitivity is None else sensitivity.predicted(engine, *arguments)
-        )
+        predict, sensitivity = engine or self.simulator, self.likelihood.sensitivity
+        if sensitivity is not None:
+            predict = partial(sensitivity.predicted, predict)
+        states = predict(phi, self.segments.start, self.inputs)
         return states if self.defect is None else states + self.defect
 
     def residual(self, phi: Floats, engine: Engine | None = None) -> Floats:

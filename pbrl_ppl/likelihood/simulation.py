@@ -64,10 +64,9 @@ def with_measurements(problem: Problem, observed: Floats) -> Problem:
     """
     noise = problem.trajectory_noise
     dataset = problem.data.history.dataset.copy()
-    start = dataset["start"].to_numpy()
-    dataset["observed"] = dataset["observed"].copy(data=observed)
-    known = np.where(np.isfinite(observed), observed, start)
-    dataset["start"] = dataset["start"].copy(data=known)
+    start = np.where(np.isfinite(observed), observed, dataset["start"])
+    for name, values in (("observed", observed), ("start", start)):
+        dataset[name] = dataset[name].copy(data=values)
     history = History(dataset)
     centre = np.array([prior.centre for prior in problem.layout.priors])
     return along_trajectories(

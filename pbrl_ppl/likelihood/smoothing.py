@@ -59,17 +59,17 @@ def along_trajectories(
         If nothing moves.
     """
     history = problem.data.history
-    states = first_states(history)
-    states = with_predicted_gaps(problem.on(replace(problem.data, horizon=1, states=states)), phi)
+    data = replace(problem.data, horizon=1, states=first_states(history))
+    problem = with_predicted_gaps(problem.on(data), phi)
     continued = coordinates is not None
     if coordinates is None:
         coordinates = observed_coordinates(problem.scene, history)
         check_moves(coordinates, problem.scene)
+        states = problem.data.smoothed_states
         medians = tuple(noise_medians(coordinates, problem.scene, history, states).tolist())
         eq_11 = replace(problem.likelihood.of_data(), scalar=False, prior=(medians, SPREAD))
         problem = replace(problem, likelihood=eq_11)
-    data = replace(problem.data, horizon=1, states=states, columns=coordinates.columns)
-    problem = problem.on(data)
+    problem = problem.on(replace(problem.data, columns=coordinates.columns))
     begin = _guess(problem, coordinates, phi)
     sigma = begin if sigma is None else sigma
     noise = _sloped(problem, coordinates, phi, begin, _steps(problem, coordinates, begin))
@@ -118,7 +118,7 @@ def smoothed(
     steps = list(problem.trajectory_noise.coordinates.accelerations)
     sigma = sigma.copy()
     sigma[steps] = np.maximum(sigma[steps], little * problem.noise_prior[0][steps])
-    begun: Floats | None = None  # states at which each transition's slope was taken
+    begun: Floats = np.array(np.inf)  # states at which each transition's slope was taken
     residual = problem.trajectory_noise.coordinates.of_residual(problem.residual(phi))
     for _ in range(rounds):
         noise = problem.trajectory_noise
@@ -128,16 +128,11 @@ def smoothed(
         states = _moved(problem, coordinates, noise.first, before, after)
         if not (np.isfinite(states).all() and np.isfinite(spread).all()):
             break  # diverged: keep the last linearisation
-        moved = replace(problem, data=replace(problem.data, states=states))
-        moved = replace(moved, data=replace(moved.data, states=with_predicted_gaps(moved, phi)))
+        moved = with_predicted_gaps(problem.with_states(states), phi)
         begin = coordinates.of(moved.segments.start)
-        if begun is None:
-            moved = moved.along(_sloped(moved, coordinates, phi, sigma, spread))
-            begun = begin
-        else:
-            far = np.asarray((np.abs(begin - begun) > stale * spread).any(axis=1))
-            moved = moved.along(_sloped(moved, coordinates, phi, sigma, spread, far))
-            begun = np.where(far[:, None], begin, begun)
+        far = np.asarray((np.abs(begin - begun) > stale * spread).any(axis=1))
+        moved = moved.along(_sloped(moved, coordinates, phi, sigma, spread, far))
+        begun = np.where(far[:, None], begin, begun)
         residual = coordinates.of_residual(moved.residual(phi))
         if not np.isfinite(moved.trajectory_noise.filtered(residual[None], sigma)[0]).all():
             break  # diverged: nothing follows from the new one
@@ -177,8 +172,8 @@ def with_sensitivity(problem: Problem, phi: Floats, sigma: Floats) -> Problem:
     return problem.along(replace(noise, sensitivity=follow))
 
 
-def with_predicted_gaps(problem: Problem, phi: Floats) -> Floats:
-    """Return linearised states, with unobserved rows predicted from the row before.
+def with_predicted_gaps(problem: Problem, phi: Floats) -> Problem:
+    """Return the problem with states of unobserved rows predicted from the row before.
 
     Interpolation between rows that are far apart would miss contacts.
 
@@ -188,16 +183,11 @@ def with_predicted_gaps(problem: Problem, phi: Floats) -> Floats:
         Its data hold the states; of horizon 1.
     phi : ndarray
         Parameters to predict with, shape (p,).
-
-    Returns
-    -------
-    ndarray
-        Shape (trajectory, time, body, 6), SI units.
     """
-    history, states = problem.data.history, problem.data.smoothed_states
+    history = problem.data.history
     if longest_gap(history) == 1:
-        return states
-    hidden, states = unseen(history), states.copy()
+        return problem
+    hidden, states = unseen(history), problem.data.smoothed_states.copy()
     segments, inputs = problem.segments, problem.inputs
     for step in np.flatnonzero(hidden.any(axis=(0, 2))):
         now = np.flatnonzero(segments.step == step - 1)
@@ -205,7 +195,7 @@ def with_predicted_gaps(problem: Problem, phi: Floats) -> Floats:
         ends = problem.one_world(phi, states[trajectory, step - 1], inputs[now])[:, 0]
         filled = hidden[trajectory, step] & np.isfinite(ends).all(axis=-1)
         states[trajectory, step] = np.where(filled[..., None], ends, states[trajectory, step])
-    return states
+    return problem.with_states(states)
 
 
 def _steps(problem: Problem, coordinates: Coordinates, sigma: Floats) -> Floats:

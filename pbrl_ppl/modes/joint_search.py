@@ -83,11 +83,12 @@ def weigh(
     tried, worth = tuple(modes), _worth(modes)
     leading = _leading(evidence, _CONTENDERS, at_least=at_least)
     for configuration in track(leading, "looking again", console=console, disable=not progress):
+        mode = modes[configuration]
         if configuration.empty:
-            better = _apart(modes[configuration].problem, seed + 1)
+            better = _apart(mode.problem, seed + 1)
         else:
-            better = _searched_again(modes[configuration], configuration, worth, seed)
-        if better.log_posterior > modes[configuration].log_posterior:
+            better = _searched_again(mode, configuration, worth, seed)
+        if better.log_posterior > mode.log_posterior:
             modes[configuration], evidence[configuration] = better, laplace(better)
     close = _leading(evidence, margin)
     if len(close) > 1:
@@ -123,10 +124,8 @@ def _tried(
             evidence[configuration] = laplace(modes[configuration])
 
     if number(scene) <= MOST:
-        others = [
-            configuration for configuration in configurations(scene) if not configuration.empty
-        ]
-        extend(dict.fromkeys(others, apart), "trying joints")
+        others = {other: apart for other in configurations(scene) if not other.empty}
+        extend(others, "trying joints")
         return modes, evidence
     best, levels = [apart], len(apart.pairs)
     for level in range(levels):
@@ -144,8 +143,8 @@ def _tried(
         least = max(score.values()) - 2 * _CONTENDERS
         best = sorted((e for e in grown if score[e] > least), key=lambda e: -score[e])
         room = (MOST - len(modes)) // max(levels - level - 1, 1)
-        most = max((len(one_more(scene, configuration)) for configuration in best[:1]), default=1)
-        best = best[: int(np.clip(room // max(most, 1), 1, breadth))]
+        most = max([1, *(len(one_more(scene, configuration)) for configuration in best[:1])])
+        best = best[: int(np.clip(room // most, 1, breadth))]
     return modes, evidence
 
 
@@ -176,11 +175,10 @@ def _leading(
     evidence: dict[Configuration, Marginal], within: float, at_least: int = 1
 ) -> list[Configuration]:
     """Return configurations with a log-weight near the best, or among the first."""
-    order = sorted(
-        evidence, key=lambda configuration: -_score(configuration, evidence[configuration])
-    )
-    least = _score(order[0], evidence[order[0]]) - within
-    return [e for i, e in enumerate(order) if i < at_least or _score(e, evidence[e]) > least]
+    score = {each: _score(each, marginal) for each, marginal in evidence.items()}
+    order = sorted(score, key=lambda configuration: -score[configuration])
+    least = score[order[0]] - within
+    return [e for i, e in enumerate(order) if i < at_least or score[e] > least]
 
 
 def _apart(problem: Problem, seed: int) -> Mode:

@@ -25,6 +25,8 @@ from pbrl_ppl.state import Floats
 
 #: Gain in log-posterior below which a climb ends.
 STALLED = 0.02
+#: Rounds of a climb, at most.
+ROUNDS = 40
 #: Precision of a uniform angle: 1 / variance (1/rad^2).
 _CIRCLE = 3.0 / np.pi**2
 
@@ -124,7 +126,7 @@ def posterior_slopes(
 
 
 def climb(
-    problem: Problem, phi: Floats, slope: PartedSimulator, rounds: int = 40, tries: int = 4
+    problem: Problem, phi: Floats, slope: PartedSimulator, rounds: int = ROUNDS, tries: int = 4
 ) -> LocalMode:
     """Return a mode by alternating least squares for phi with the most probable sigma.
 
@@ -140,14 +142,11 @@ def climb(
     scale = np.where(problem.layout.discrete, 1.0, problem.layout.scale(phi))
     ends = (lower - origin) / scale, (upper - origin) / scale
     steps = np.where(problem.layout.discrete, 0.0, 1e-3)
-    tails = list(problem.tails)
 
     def whole(moved: Floats, sigma: Floats, engine: PartedSimulator | None = None) -> Floats:
         points = np.clip(origin + scale * moved, lower, upper)  # rounding leaves no support
-        points[..., tails] = phi[tails]  # no least squares: see `best_tails`
-        z = problem.robust(points, sigma, engine).reshape(*points.shape[:-1], -1)
-        z = np.nan_to_num(z, nan=FAR_OFF, posinf=FAR_OFF, neginf=-FAR_OFF)
-        return np.concatenate([z, prior_residual(priors, points)], axis=-1)
+        z = _least_squares(problem, points, sigma, phi, engine)
+        return np.nan_to_num(z, nan=FAR_OFF, posinf=FAR_OFF, neginf=-FAR_OFF)
 
     for _ in range(rounds):
 
@@ -175,6 +174,19 @@ def climb(
     return LocalMode(phi, sigma, value)
 
 
+def _least_squares(
+    problem: Problem, points: Floats, sigma: Floats, phi: Floats, engine: PartedSimulator | None
+) -> Floats:
+    """Return residuals of the data and the prior at points (..., p), shape (..., residual).
+
+    The tails are those of phi: least squares do not find them, see :func:`best_tails`.
+    """
+    points, tails = points.copy(), list(problem.tails)
+    points[..., tails] = phi[tails]
+    z = problem.robust(points, sigma, engine).reshape(*points.shape[:-1], -1)
+    return np.concatenate([z, prior_residual(problem.layout.priors, points)], axis=-1)
+
+
 def profiled(problem: Problem, phi: Floats) -> tuple[Floats, float]:
     """Return the most probable sigma at phi, and the log-posterior there."""
     residual = problem.residual(phi)
@@ -198,19 +210,16 @@ def finish(problem: Problem, peak: LocalMode) -> Mode:
         cells = problem.observations.values.size
         return Mode(problem, phi, sigma, np.zeros((cells, 0)), np.zeros((0, 0)), log_posterior)
     lower, upper = box(priors)
-    tails = list(problem.tails)
 
     def residual(points: Floats, engine: PartedSimulator | None = None) -> Floats:
-        points = points.copy()
-        points[..., tails] = phi[tails]
-        z = problem.robust(points, sigma, engine).reshape(len(points), -1)
-        return np.concatenate([np.nan_to_num(z), prior_residual(priors, points)], axis=-1)
+        return np.nan_to_num(_least_squares(problem, points, sigma, phi, engine))
 
     begin = 1e-3 * problem.layout.scale(phi)
     rough = partial(residual, engine=problem.coarse.simulator)
     jacobian = posterior_slopes(residual, phi, lower, upper, begin, rough)
     precision = jacobian.T @ jacobian
-    if tails:
+    if problem.tails:
+        tails = list(problem.tails)
         precision[tails, tails] = tail_precision(problem, phi, sigma)
     covariance = laplace_covariance(priors, precision)
     n_cells = len(jacobian) - len(phi)

@@ -10,7 +10,7 @@ from scipy.optimize import differential_evolution
 
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import Problem, estimate_sigma
-from pbrl_ppl.modes.laplace import STALLED, LocalMode, Mode, climb, described, finish
+from pbrl_ppl.modes.laplace import ROUNDS, STALLED, LocalMode, Mode, climb, described, finish
 from pbrl_ppl.modes.noise import FAR_OFF, finite, gaussian_profile
 from pbrl_ppl.parameters import box, by_prior, inside, prior_draws
 from pbrl_ppl.state import Floats
@@ -25,8 +25,6 @@ def find_modes(
     problem: Problem,
     *,
     seed: int | np.random.Generator = 0,
-    starts: int | None = None,
-    screened: int | None = None,
     initial: Floats | None = None,
     rounds: int | None = None,
     n_part: int = 40,
@@ -43,10 +41,6 @@ def find_modes(
         What to fit.
     seed : int or Generator
         Of the draws from the prior.
-    starts, screened : int, optional
-        Local searches, and draws from the prior among which their starts are chosen. With few data
-        there are more by default: they cost little there, and friction makes more modes. So it
-        does that differential evolution looks for the highest too.
     initial : ndarray, optional
         Where to begin, shape (p,); then there is one local search.
     rounds : int, optional
@@ -80,19 +74,15 @@ def find_modes(
             " joint_probabilities says which they are"
         )
     if initial is not None:
-        if rounds is not None:
-            first = climb(problem, inside(priors, initial), problem.coarse.simulator, rounds)
-            return [finish(problem, first)]
-        near = climb(problem, inside(priors, initial), problem.coarse.simulator)
-        return [finish(problem, _polish(problem, near))]
+        near = climb(problem, inside(priors, initial), problem.coarse.simulator, rounds or ROUNDS)
+        return [finish(problem, near if rounds else _polish(problem, near))]
     if not priors:  # everything is known but the noise
         return [finish(problem, climb(problem, np.zeros(0), problem.coarse.simulator))]
     few = problem.segments.n <= n_few
-    starts = (16 if few else 4) if starts is None else starts
-    screened = (1000 if few else 48) if screened is None else screened
+    # more starts with few data: they cost little, and friction makes more modes
+    starts, screened = (16, 1000) if few else (4, 48)
     rng = np.random.default_rng(seed)
-    draws = prior_draws(priors, rng, screened)
-    draws = np.vstack([[prior.centre for prior in priors], draws])
+    draws = np.vstack([[prior.centre for prior in priors], prior_draws(priors, rng, screened)])
     draws = inside(priors, draws)
     # the basins show in a part of the data already, and with few engine steps
     part = problem if few else _part(problem, n_part)
@@ -105,13 +95,9 @@ def find_modes(
     steps = problem.simulator.steps * problem.segments.n * problem.data.horizon
     if few and len(priors) <= most_parameters and steps * _POPULATION * _GENERATIONS < afforded:
         begin = np.vstack([begin, _evolve(problem, rng)])
-    rough = [described(part, climb(part, phi, part.simulator)) for phi in begin]
-    rough.sort(key=lambda peak: -peak.log_posterior)
-    peaks = _distinct(part, rough)
-    if not few:
+    peaks = _distinct(part, [described(part, climb(part, phi, part.simulator)) for phi in begin])
+    if not few:  # all data may join what a part of them told apart
         peaks = [climb(problem, phi, problem.coarse.simulator) for phi, *_ in peaks[:polished]]
-    peaks.sort(key=lambda peak: -peak.log_posterior)
-    if not few and len(peaks) > 1:  # all data may join what a part of them told apart
         peaks = _distinct(problem.coarse, peaks)
     best = _polish(problem, peaks[0])
     return [finish(problem, peak) for peak in (best, *peaks[1:])]
@@ -150,7 +136,7 @@ def _evolve(problem: Problem, rng: np.random.Generator, *, climbed: int = 8) -> 
 def _distinct(
     problem: Problem, peaks: list[LocalMode], *, same_below: float = 10.0, far: float = 100.0
 ) -> list[LocalMode]:
-    """Drop peaks that predict the same as an earlier one and are connected to it.
+    """Return peaks, best first, without those that predict as a better one and are connected to it.
 
     Equivalent wheels and uninformed directions are connected; mirror images are not: they predict
     the same, but points between them do not.
@@ -159,9 +145,11 @@ def _distinct(
     ``far``: parameters whose predictions agree are of different modes if by the derivative they
     should differ by this (sum of squares, in noise units): ten standard deviations.
     """
+    if len(peaks) == 1:
+        return peaks
+    peaks = sorted(peaks, key=lambda peak: -peak.log_posterior)
     folded = by_prior(problem.layout, np.array([peak.phi for peak in peaks]))
-    z = problem.whitened(folded, peaks[0].sigma)
-    z = np.nan_to_num(z, nan=FAR_OFF)
+    z = np.nan_to_num(problem.whitened(folded, peaks[0].sigma), nan=FAR_OFF)
     kept: dict[int, Floats] = {}
     for i in range(len(peaks)):
         same = [j for j in kept if ((z[i] - z[j]) ** 2).sum() < same_below]

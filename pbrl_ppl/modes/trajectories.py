@@ -83,22 +83,22 @@ def trajectory_mode(
     Mode
         Its problem has a :class:`pbrl_ppl.likelihood.TrajectoryLikelihood`.
     """
-    whole = problem.likelihood.filtered
-    if sigma is None or not whole:
-        coordinates = problem.trajectory_noise.coordinates if whole else None
-        rough = along_trajectories(problem.rough, phi, coordinates=coordinates)
-        problem = replace(rough, physics=problem.physics)
+    if sigma is None or not problem.likelihood.filtered:
+        problem = _roughly_smoothed(problem, phi)
         sigma = problem.trajectory_noise.sigma
     mode = nearby_mode(problem, phi, sigma)
     quiet = mode.problem.quiet(mode.sigma, share)
     if not np.array_equal(quiet, mode.sigma):
-        problem = smoothed(mode.problem, mode.phi, quiet)
-        mode = max(
-            mode,
-            nearby_mode(problem, mode.phi, quiet),
-            key=lambda candidate: candidate.log_posterior,
-        )
+        other = nearby_mode(smoothed(mode.problem, mode.phi, quiet), mode.phi, quiet)
+        mode = max(mode, other, key=lambda candidate: candidate.log_posterior)
     return mode
+
+
+def _roughly_smoothed(problem: Problem, phi: Floats) -> Problem:
+    """Return the problem of whole trajectories, smoothed at phi with fewer engine steps."""
+    coordinates = problem.trajectory_noise.coordinates if problem.likelihood.filtered else None
+    rough = along_trajectories(problem.rough, phi, coordinates=coordinates)
+    return replace(rough, physics=problem.physics)
 
 
 @one_blas_thread
@@ -118,10 +118,8 @@ def filtered_mode(mode: Mode, other: Mode, *, share: float = 0.1, rounds: int = 
         Second size of the unexplained acceleration, as a share of its prior's median; rounds.
     """
     physics, phi = other.problem.physics, other.phi
-    coordinates = mode.problem.trajectory_noise.coordinates
     problem = mode.problem.with_physics(effects=physics.effects, substeps=physics.substeps)
-    rough = along_trajectories(problem.rough, phi, coordinates=coordinates)
-    problem = replace(rough, physics=problem.physics)
+    problem = _roughly_smoothed(problem, phi)
     sigma = problem.trajectory_noise.sigma
     ends: list[tuple[Problem, LocalMode]] = []
     for begin in (sigma, problem.quiet(sigma, share)):
