@@ -9,7 +9,6 @@ from .coordinates import first_states as first_states
 from .coordinates import observed_coordinates as observed_coordinates
 from .data import Observations as Observations
 from .data import estimate_sigma as estimate_sigma
-from .data import least_noise as least_noise
 from .data import sigma_prior as sigma_prior
 from .declared import KINDS as KINDS
 from .declared import declared_problem as declared_problem
@@ -32,7 +31,6 @@ from .noise_scales import bodies_acceleration as bodies_acceleration
 from .noise_scales import noise_medians as noise_medians
 from .output_error import OutputErrorLikelihood as OutputErrorLikelihood
 from .output_error import in_pieces as in_pieces
-from .output_error import least_errors as least_errors
 from .output_error import linearised_about as linearised_about
 from .output_error import linearised_pieces as linearised_pieces
 from .output_error import output_error as output_error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 
@@ -86,12 +87,12 @@ class Observations:
         return np.asarray(difference)
 
 
-def least_noise(scene: Scene, *, share: float = 1e-9) -> Floats:
-    """Return the least noise of each coordinate of a state, shape (6,).
+def least_noise(scene: Scene, columns: Sequence[int], *, share: float = 1e-9) -> Floats:
+    """Return the least noise of state dimensions, shape (column,).
 
-    ``share``: share of the coordinate's typical size, for recordings without any noise.
+    ``share``: share of a dimension's typical size, for recordings without any noise.
     """
-    return share * state_sizes(scene)
+    return np.asarray(share * state_sizes(scene)[list(columns)])
 
 
 def sigma_prior(
@@ -106,11 +107,10 @@ def sigma_prior(
     spread : float
         Standard deviation of the logarithm.
     """
-    columns = observations.columns
     change = observations.residual(segments.start[:, None])
     seen = observations.measured
     typical = np.sqrt((change**2).sum((0, 1, 2)) / np.maximum(seen.sum((0, 1, 2)), 1))
-    return np.maximum(0.1 * typical, least_noise(scene)[list(columns)]), 2.0
+    return np.maximum(0.1 * typical, least_noise(scene, observations.columns)), 2.0
 
 
 def estimate_sigma(residual: Floats, observations: Observations, scene: Scene) -> Floats:
@@ -126,7 +126,7 @@ def estimate_sigma(residual: Floats, observations: Observations, scene: Scene) -
         Its sizes give a scale to histories without noise.
     """
     count = np.maximum(observations.measured.sum((0, 1, 2)), 1)
-    least = least_noise(scene)[list(observations.columns)]
+    least = least_noise(scene, observations.columns)
     return np.asarray(np.maximum(np.sqrt((residual**2).sum((0, 1, 2)) / count), least))
 
 

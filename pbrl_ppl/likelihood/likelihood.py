@@ -72,17 +72,26 @@ class Likelihood(ABC):
         """Return the effective number of measurements of each dimension, shape (state,)."""
         return np.asarray(observations.measured.sum((0, 1, 2)), dtype=float)
 
+    @property
+    def scalar(self) -> bool:
+        """Whether one sigma serves all state dimensions."""
+        return False
+
     def free(self, sigma: Floats) -> Floats:
-        """Return the noise parameters that are inferred, shape (..., free)."""
-        return sigma
+        """Return the noise parameters that are inferred, shape (..., free).
+
+        The first of equal ones where sigma is a scalar.
+        """
+        return sigma[..., :1] if self.scalar else sigma
 
     def pooled(self, counts: Floats) -> Floats:
         """Return sums over the dimensions that share a noise parameter, shape (..., free)."""
-        return counts
+        return counts.sum(axis=-1, keepdims=True) if self.scalar else counts
 
     def centre(self, medians: Floats) -> Floats:
-        """Return the logarithm of the prior's medians, shape (free,)."""
-        return np.asarray(np.log(medians))
+        """Return the logarithm of the prior's medians, their mean for a scalar, shape (free,)."""
+        logs = np.log(medians)
+        return np.asarray(logs.mean(keepdims=True) if self.scalar else logs)
 
     def exponential(self, n: int) -> Bools:
         """Return which of n noise parameters have an exponential prior, shape (n,)."""
@@ -91,9 +100,9 @@ class Likelihood(ABC):
     def of_data(self) -> TransitionLikelihood:
         """Return the likelihood for other data, without what was linearised along these.
 
-        Eq. 11 with the same tails and prior, unless it is Eq. 11 already.
+        Eq. 11 with the same tails and prior.
         """
-        return TransitionLikelihood(nu=self.nu, prior=self.prior)
+        return TransitionLikelihood(scalar=self.scalar, nu=self.nu, prior=self.prior)
 
     def of_parameters(self) -> Self:
         """Return the likelihood for other parameters, without what follows from these."""
@@ -221,23 +230,6 @@ class TransitionLikelihood(Likelihood):
             )
         return cls(scalar=sigma == "scalar", nu=nu)
 
-    def free(self, sigma: Floats) -> Floats:
-        """Return the first of equal ones where sigma is a scalar."""
-        return sigma[..., :1] if self.scalar else sigma
-
-    def pooled(self, counts: Floats) -> Floats:
-        """Return the sum over all dimensions where sigma is a scalar."""
-        return counts.sum(axis=-1, keepdims=True) if self.scalar else counts
-
-    def centre(self, medians: Floats) -> Floats:
-        """Return the mean logarithm where sigma is a scalar."""
-        logs = np.log(medians)
-        return np.asarray(logs.mean(keepdims=True) if self.scalar else logs)
-
-    def of_data(self) -> TransitionLikelihood:
-        """Return the same."""
-        return self
-
     def whiten(self, residual: Floats, sigma: Floats) -> Floats:
         """Return residuals over sigma, shape (..., transition, H * body * state)."""
         return self.in_order(residual / np.asarray(sigma)[..., None, None, None, :])
@@ -315,7 +307,7 @@ class TrajectoryLikelihood(Likelihood):
         """Return the adjoint of the filter."""
         result = np.zeros(shape)
         body, place = self.noise.coordinates.in_residual
-        result[:, 0, body, place] = self.noise.pulled(pull, sigma)
+        result[:, 0, body, place] = self.noise.adjoint(pull, sigma)[1]
         return result
 
     def whiten(self, residual: Floats, sigma: Floats) -> Floats:

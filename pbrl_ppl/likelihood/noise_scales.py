@@ -37,7 +37,6 @@ def noise_medians(
     with a probability of 1 %: physics is nearly deterministic, and a random force follows whatever
     is smooth.
     """
-    least = least_noise(scene)
     real = np.isfinite(history.dataset["clock"].to_numpy())
     shown = real & ~unseen(history).any(axis=-1)
     typical, seen = (
@@ -51,7 +50,8 @@ def noise_medians(
     sensors, contacts = list(coordinates.sensors), list(coordinates.contacts)
     steps = acceleration_share * _MEDIAN * _vectors(typical, coordinates.rates) / dt
     medians = sensor_share * seen[sensors], steps, contact_share * typical[contacts] / dt
-    floors = least[sensors], least[list(coordinates.rates)] / dt, least[contacts] / dt
+    rates = least_noise(scene, (*coordinates.rates, *contacts)) / dt
+    floors = least_noise(scene, sensors), rates
     return np.asarray(np.maximum(np.concatenate(medians), np.concatenate(floors)))
 
 

@@ -16,7 +16,7 @@ from typing import ClassVar, final
 import numpy as np
 
 from pbrl_ppl.likelihood.coordinates import Coordinates, observed_coordinates
-from pbrl_ppl.likelihood.data import Observations, least_noise
+from pbrl_ppl.likelihood.data import Observations
 from pbrl_ppl.likelihood.likelihood import Likelihood, Nu, log_norm, robust
 from pbrl_ppl.likelihood.problem import Problem
 from pbrl_ppl.physics import Memory
@@ -372,8 +372,3 @@ def _observed_starts(problem: Problem) -> Floats:
     segments = problem.segments
     observed = problem.data.history.dataset["observed"].to_numpy()
     return np.asarray(observed[segments.trajectory, segments.step])
-
-
-def least_errors(problem: Problem) -> Floats:
-    """Return the least sigma of each observed dimension, shape (state,)."""
-    return least_noise(problem.scene)[list(problem.observations.columns)]

@@ -12,7 +12,7 @@ import numpy as np
 from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.history import History, Segments
 from pbrl_ppl.likelihood.coordinates import ACCELERATION, CONTACT
-from pbrl_ppl.likelihood.data import Data, Observations, sigma_prior
+from pbrl_ppl.likelihood.data import Data, Observations, least_noise, sigma_prior
 from pbrl_ppl.likelihood.likelihood import (
     Likelihood,
     TrajectoryLikelihood,
@@ -224,6 +224,11 @@ class Problem:
         return self.data.observations
 
     @cached_property
+    def least_noise(self) -> Floats:
+        """Least sigma of each observed dimension, shape (state,)."""
+        return least_noise(self.scene, self.observations.columns)
+
+    @cached_property
     def noise_prior(self) -> tuple[Floats, float]:
         """Medians of sigma's prior, shape (parameter,), and its log-scale."""
         if self.likelihood.prior is None:
@@ -268,7 +273,7 @@ class Problem:
     @property
     def scalar_sigma(self) -> bool:
         """Whether one sigma serves all state dimensions."""
-        return isinstance(self.likelihood, TransitionLikelihood) and self.likelihood.scalar
+        return self.likelihood.scalar
 
     @property
     def noise_labels(self) -> tuple[str, ...]:

@@ -72,8 +72,10 @@ def along_trajectories(
     problem = problem.on(replace(problem.data, columns=coordinates.columns))
     begin = _guess(problem, coordinates, phi)
     sigma = begin if sigma is None else sigma
-    noise = _sloped(problem, coordinates, phi, begin, _steps(problem, coordinates, begin))
-    problem = smoothed(problem.along(noise), phi, begin)
+    n, d = problem.segments.n, len(coordinates.places)
+    problem = problem.along(linearised(problem, coordinates, np.zeros((n, d, d)), begin))
+    problem = _sloped(problem, phi, begin, _steps(problem, coordinates, begin), np.full(n, True))
+    problem = smoothed(problem, phi, begin)
     if sigma is not begin:  # the physics alone may diverge from rough states
         for share in shares:
             problem = smoothed(problem, phi, _between(begin, sigma, share, coordinates))
@@ -125,13 +127,13 @@ def smoothed(
         coordinates = noise.coordinates
         before, after = noise.smoothed(residual, sigma)
         spread = np.sqrt(np.median(np.diagonal(noise.covariance(sigma), axis1=1, axis2=2), axis=0))
-        states = _moved(problem, coordinates, noise.first, before, after)
+        states = _moved(problem, before, after)
         if not (np.isfinite(states).all() and np.isfinite(spread).all()):
             break  # diverged: keep the last linearisation
         moved = with_predicted_gaps(problem.with_states(states), phi)
         begin = coordinates.of(moved.segments.start)
         far = np.asarray((np.abs(begin - begun) > stale * spread).any(axis=1))
-        moved = moved.along(_sloped(moved, coordinates, phi, sigma, spread, far))
+        moved = _sloped(moved, phi, sigma, spread, far)
         begun = np.where(far[:, None], begin, begun)
         residual = coordinates.of_residual(moved.residual(phi))
         if not np.isfinite(moved.trajectory_noise.filtered(residual[None], sigma)[0]).all():
@@ -233,11 +235,10 @@ def _guess(problem: Problem, coordinates: Coordinates, phi: Floats) -> Floats:
     return np.maximum(guess, problem.noise_prior[0] * 0.01)
 
 
-def _moved(
-    problem: Problem, coordinates: Coordinates, first: Bools, before: Floats, after: Floats
-) -> Floats:
+def _moved(problem: Problem, before: Floats, after: Floats) -> Floats:
     """Return the states moved by the smoothed deviations."""
-    segments = problem.segments
+    segments, first = problem.segments, problem.trajectory_noise.first
+    coordinates = problem.trajectory_noise.coordinates
     states = problem.data.smoothed_states.copy()
     flat = states.reshape(*states.shape[:2], -1)
     at = segments.trajectory[:, None], segments.step[:, None] + 1, coordinates.places
@@ -247,23 +248,13 @@ def _moved(
     return coordinates.completed(problem.scene, states)
 
 
-def _sloped(
-    problem: Problem,
-    coordinates: Coordinates,
-    phi: Floats,
-    sigma: Floats,
-    steps: Floats,
-    rows: Bools | None = None,
-) -> TrajectoryNoise:
-    """Linearise the transitions about the problem's states by central differences.
+def _sloped(problem: Problem, phi: Floats, sigma: Floats, steps: Floats, rows: Bools) -> Problem:
+    """Return the problem linearised about its states by central differences.
 
     Where ``rows``, shape (transition,), is not set, the slopes are those that the problem has.
     """
-    segments = problem.segments
-    chosen = np.arange(segments.n) if rows is None else np.flatnonzero(rows)
-    if not len(chosen):
-        return linearised(problem, coordinates, problem.trajectory_noise.slope, sigma)
-    inputs = problem.inputs[chosen]
+    coordinates, slope = problem.trajectory_noise.coordinates, problem.trajectory_noise.slope
+    inputs = problem.inputs[rows]
 
     def predict(states: Floats) -> Floats:
         """Return the states after an interval; a coarse engine's slope agrees with a fine one's."""
@@ -271,10 +262,10 @@ def _sloped(
         repeated = np.tile(inputs, (len(states), 1, 1, 1))
         return np.asarray(problem.rough.simulator(phi, begin, repeated)[:, 0]).reshape(states.shape)
 
-    d = len(steps)
-    slope = np.empty((segments.n, d, d)) if rows is None else problem.trajectory_noise.slope.copy()
-    slope[chosen] = coordinates.slopes(problem.scene, segments.start[chosen], steps, predict)
-    return linearised(problem, coordinates, slope, sigma)
+    if rows.any():
+        slope, start = slope.copy(), problem.segments.start[rows]
+        slope[rows] = coordinates.slopes(problem.scene, start, steps, predict)
+    return problem.along(linearised(problem, coordinates, slope, sigma))
 
 
 def linearised(

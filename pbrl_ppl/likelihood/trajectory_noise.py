@@ -164,15 +164,11 @@ class TrajectoryNoise:
     def smoothed(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
         """Return smoothed deviations (transition, coordinate) before and after transitions."""
         white, filtered = self.filtered(residual[None], sigma)
-        before, _, after = self._pulled(white[0], sigma)
+        before, _, after = self.adjoint(white[0], sigma)
         begin = self.begin - self._begin(sigma) * before
         return begin, filtered[0] - np.einsum("kab,kb->ka", self._gains(sigma)[2], after)
 
-    def pulled(self, weighted: Floats, sigma: Floats) -> Floats:
-        """Return the derivative of weighted innovations by predictions (transition, coordinate)."""
-        return self._pulled(weighted, sigma)[1]
-
-    def _pulled(self, weighted: Floats, sigma: Floats) -> tuple[Floats, Floats, Floats]:
+    def adjoint(self, weighted: Floats, sigma: Floats) -> tuple[Floats, Floats, Floats]:
         """Return :func:`kalman.adjoint` of weighted innovations."""
         gain, scale, *_ = self._gains(sigma)
         pulled: tuple[Floats, Floats, Floats] = adjoint(

@@ -18,7 +18,6 @@ from pbrl_ppl.likelihood import (
     Problem,
     autocovariance,
     in_pieces,
-    least_errors,
     linearised_about,
     linearised_pieces,
     output_error,
@@ -139,7 +138,7 @@ def with_robust_covariance(mode: Mode, *, many: int = 8) -> Mode:
     residual, start, by_phi = map(starts.series, (mode.whitened_residual, u, jacobian))
     seen, score = starts.seen_series, np.diag(slopes**2)
     lags = np.abs(np.subtract.outer(np.arange(seen.shape[1]), np.arange(seen.shape[1])))
-    for d, white in enumerate(least_errors(problem) * weight):
+    for d, white in enumerate(problem.least_noise * weight):
         of_dimension = by_phi[..., d, :]
         errors = autocovariance(residual[..., d], seen[..., d], start[..., d, :], of_dimension)
         errors[0] += white**2
@@ -227,8 +226,8 @@ def fit_pieces(
     damping, failed, one_sided = 1e-3, 0, True
     for _ in range(rounds):
         linear = _linearise(problem, phi, start, steps, one_sided)
-        problem, sigma = _with_noise(problem, start, linear)
-        step = _Step(problem, linear, sigma, phi, start)
+        step = _Step(problem, linear, phi, start)
+        problem = step.problem
         if not failed:
             steps = step.differences(scale, sizes)
         gained, promised = 0.0, step.promised
@@ -260,12 +259,11 @@ def fit_pieces(
         damping, failed = 1e-3, failed + 1
     else:
         linear = _linearise(problem, phi, start, steps)
-    problem, sigma = _with_noise(problem, start, linear)
-    step = _Step(problem, linear, sigma, phi, start)
-    tau = np.array(output_error(problem).tau)
-    problem = linearised_pieces(problem, start, linear.by_start, tau)
-    height = -_cost(problem, sigma, phi)
-    return Mode(problem, phi, sigma, step.jacobian, step.covariance, height)
+    step = _Step(problem, linear, phi, start)
+    tau = np.array(output_error(step.problem).tau)
+    problem = linearised_pieces(step.problem, start, linear.by_start, tau)
+    height = -_cost(problem, step.sigma, phi)
+    return Mode(problem, phi, step.sigma, step.jacobian, step.covariance, height)
 
 
 @one_blas_thread
@@ -341,15 +339,6 @@ def _linearise(
     return Linear(residual[0], by_phi, by_start)
 
 
-def _with_noise(problem: Problem, start: Floats, linear: Linear) -> tuple[Problem, Floats]:
-    """Return the problem linearised there, and sigma."""
-    problem = linearised_about(problem, start, linear.by_start)
-    likelihood, least = output_error(problem), least_errors(problem)
-    sigma = likelihood.profile(linear.residual, least)
-    tau = likelihood.correlation_times(linear.residual, sigma)
-    return problem.with_likelihood(tau=tuple(tau.tolist())), sigma
-
-
 def _cost(problem: Problem, sigma: Floats, phi: Floats) -> float:
     """Return the negative log-posterior, the noise at its profile, up to a constant."""
     weight = problem.likelihood.counts(problem.observations)
@@ -358,24 +347,26 @@ def _cost(problem: Problem, sigma: Floats, phi: Floats) -> float:
 
 
 class _Step:
-    """Gauss-Newton steps from one linearisation, with fixed weights and projection."""
+    """Gauss-Newton steps from one linearisation, with fixed noise, weights and projection."""
 
-    def __init__(
-        self, problem: Problem, linear: Linear, sigma: Floats, phi: Floats, start: Floats
-    ) -> None:
-        likelihood = output_error(problem)
-        self.problem, self.starts, self.by_start = problem, likelihood.starts, linear.by_start
-        self.least, self.weight = least_errors(problem), likelihood.weight(sigma)
+    def __init__(self, problem: Problem, linear: Linear, phi: Floats, start: Floats) -> None:
+        problem, residual = linearised_about(problem, start, linear.by_start), linear.residual
+        likelihood, self.by_start = output_error(problem), linear.by_start
+        self.sigma = likelihood.profile(residual, problem.least_noise)
+        tau = likelihood.correlation_times(residual, self.sigma)
+        self.problem = problem.with_likelihood(tau=tuple(tau.tolist()))
+        likelihood = output_error(self.problem)
+        self.starts, self.weight = likelihood.starts, likelihood.weight(self.sigma)
         self.u, self.back = self.starts.basis(self.weight)
         by_phi = np.moveaxis(linear.by_phi, -1, 0) * self.weight
-        pieces, rows = len(linear.residual), linear.residual[0].size
+        pieces, rows = len(residual), residual[0].size
         by_phi = by_phi.reshape(len(phi), pieces, rows)
         n = self.u.shape[1] - rows
         self.by_phi = np.moveaxis(np.pad(by_phi, ((0, 0), (0, 0), (0, n))), 0, -1)
         projected = self.by_phi - self.u @ (np.swapaxes(self.u, 1, 2) @ self.by_phi)
         self.jacobian = projected.reshape(pieces * self.u.shape[1], len(phi))
         self.normal = self.jacobian.T @ self.jacobian
-        self._move(phi, start, linear.residual)
+        self._move(phi, start, residual)
 
     def _move(self, phi: Floats, start: Floats, residual: Floats) -> None:
         self.phi, self.start, self.residual = phi, start, residual
@@ -407,7 +398,7 @@ class _Step:
         cut = residual[0].size
         square = self.starts.totals(left[:, :cut].reshape(residual.shape) ** 2, left[:, cut:] ** 2)
         sigma = np.sqrt(square / self.starts.counts) / self.weight
-        return _cost(self.problem, np.maximum(sigma, self.least), phi)
+        return _cost(self.problem, np.maximum(sigma, self.problem.least_noise), phi)
 
     @property
     def covariance(self) -> Floats:

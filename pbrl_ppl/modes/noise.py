@@ -12,8 +12,6 @@ from scipy.special import wrightomega
 from pbrl_ppl.likelihood import (
     Problem,
     exponential,
-    least_errors,
-    least_noise,
     log_noise_prior,
     noise_law,
     noise_prior_slope,
@@ -61,7 +59,7 @@ def profile_sigma(
     if filtered:
         begin = np.log(problem.trajectory_noise.sigma)
     elif problem.likelihood.simulated:
-        begin = np.log(output_error(problem).profile(residual, least_errors(problem)))
+        begin = np.log(output_error(problem).profile(residual, problem.least_noise))
     else:
         begin = gaussian_log_sigma(problem, (residual**2).sum((0, 1, 2)))
         if gaussian:
@@ -121,7 +119,7 @@ def gaussian_log_sigma(problem: Problem, square: Floats) -> Floats:
     a = spread**2 * (count + 1)
     with np.errstate(divide="ignore"):  # an exact fit
         y = 0.5 * wrightomega(np.log(2 * spread**2 * square) + 2 * (a - centre))
-    least = np.log(least_noise(problem.scene)[list(problem.observations.columns)])
+    least = np.log(problem.least_noise)
     return np.asarray(np.maximum(y - a + centre, least if y.shape[-1] > 1 else least.min()))
 
 
