@@ -59,11 +59,7 @@ class Coordinates:
     @property
     def variables(self) -> dict[str, tuple[str, ...]]:
         """Noise variables with their state dimensions, in the order of sigma."""
-        dimensions = {
-            "sigma": self.sensors,
-            ACCELERATION: self.rates,
-            CONTACT: self.contacts,
-        }
+        dimensions = {"sigma": self.sensors, ACCELERATION: self.rates, CONTACT: self.contacts}
         return {
             name: tuple(STATE[d] for d in places) for name, places in dimensions.items() if places
         }

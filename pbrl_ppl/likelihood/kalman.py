@@ -75,13 +75,7 @@ def _take(p: Floats, i: int, sensor: float, gain: Floats) -> float:
 
 @numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def gains(
-    slope: Floats,
-    first: Ints,
-    seen: Bools,
-    begin: Floats,
-    sensor: Floats,
-    step: Floats,
-    kind: Ints,
+    slope: Floats, first: Ints, seen: Bools, begin: Floats, sensor: Floats, step: Floats, kind: Ints
 ) -> tuple[Floats, Floats, Floats]:
     """Return the gain and standard deviation of every innovation.
 
@@ -297,13 +291,7 @@ def adjoint(
 
 @numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def score(
-    slope: Floats,
-    last: Ints,
-    seen: Bools,
-    gain: Floats,
-    scale: Floats,
-    white: Floats,
-    kind: Ints,
+    slope: Floats, last: Ints, seen: Bools, gain: Floats, scale: Floats, white: Floats, kind: Ints
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Return the derivative of the log-likelihood by the variances.
 

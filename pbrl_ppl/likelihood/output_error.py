@@ -299,23 +299,17 @@ def in_pieces(problem: Problem, length: int, states: Floats) -> Problem:
     states : ndarray
         Start states, shape (trajectory, time, body, 6), SI units.
     """
-    data = replace(problem.data, horizon=length, states=states, columns=None)
-    problem = problem.on(data)
-    coordinates, columns = (
-        observed_coordinates(problem.scene, data.history),
-        problem.observations.columns,
-    )
-    dimension = coordinates.places % len(STATE)
+    problem = problem.on(replace(problem.data, horizon=length, states=states, columns=None))
+    coordinates = observed_coordinates(problem.scene, problem.data.history)
+    columns, dimension = problem.observations.columns, coordinates.places % len(STATE)
     column = np.array([columns.index(d) if d in columns else -1 for d in dimension])
     seen = problem.observations.measured
     slope = np.zeros((*seen.shape, len(coordinates.places)))
     begin = _begin(problem, coordinates, column, problem.segments.start)
     known = (column < 0) & np.isfinite(coordinates.of(_observed_starts(problem)))
-    starts = Starts(coordinates, slope, seen, begin, known, column)
-    tau = (1.0,) * len(columns)
-    return replace(
-        problem, likelihood=OutputErrorLikelihood(starts=starts, tau=tau, nu=problem.likelihood.nu)
-    )
+    starts, tau = Starts(coordinates, slope, seen, begin, known, column), (1.0,) * len(columns)
+    likelihood = OutputErrorLikelihood(starts=starts, tau=tau, nu=problem.likelihood.nu)
+    return replace(problem, likelihood=likelihood)
 
 
 def linearised_pieces(problem: Problem, start: Floats, slope: Floats, tau: Floats) -> Problem:

@@ -187,13 +187,8 @@ class TrajectoryNoise:
             Shape (parameter,).
         """
         coordinates = self.coordinates
-        white = self.filtered(coordinates.of_residual(residual)[None], sigma)[0][0]
-        gain, scale, _, log_scale = self._gains(sigma)
-        sensor, step, begin, _ = score(
-            self.slope, self.last, self.seen, gain, scale, white, self.kind
-        )
-        # measured states begin a trajectory: their error is that of measuring
-        measured = np.where(self.first[:, None] & ~(self.wide > 0), begin, 0.0).sum(axis=0)
+        white, sensor, step, begin, _ = self._score(coordinates.of_residual(residual), sigma)
+        measured = np.where(self._begun, begin, 0.0).sum(axis=0)
         slope = np.zeros(len(sigma))
         free = coordinates.sensor >= 0
         np.add.at(slope, coordinates.sensor[free], (sensor + measured)[free])
@@ -201,7 +196,7 @@ class TrajectoryNoise:
         push = coordinates.push
         np.add.at(slope, coordinates.pushed, np.einsum("ja,jab,jb->j", push, steps, push))
         norm = -0.5 * np.log(2 * np.pi) * self.seen.sum()
-        value = norm - 0.5 * float((white**2).sum()) - float(log_scale.sum())
+        value = norm - 0.5 * float((white**2).sum()) - float(self.log_scale(sigma).sum())
         return value, sigma**2 * slope
 
     def auxiliary(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
@@ -220,10 +215,18 @@ class TrajectoryNoise:
             At a transition's end, and before the first of a trajectory, shape (transition,
             coordinate) each; 0 where nothing was measured.
         """
-        gain, scale, *_ = self._gains(sigma)
-        white = self.filtered(residual[None], sigma)[0][0]
-        end, begin = score(self.slope, self.last, self.seen, gain, scale, white, self.kind)[3]
-        return end, np.where(self.first[:, None] & ~(self.wide > 0), begin, 0.0)
+        end, begin = self._score(residual, sigma)[-1]
+        return end, np.where(self._begun, begin, 0.0)
+
+    @property
+    def _begun(self) -> Bools:
+        """Measured states that begin a trajectory, whose error is that of measuring."""
+        return self.first[:, None] & ~(self.wide > 0)
+
+    def _score(self, residual: Floats, sigma: Floats) -> tuple[Floats, ...]:
+        """Return white innovations of residuals (transition, coordinate), and `kalman.score`."""
+        white, (gain, scale, *_) = self.filtered(residual[None], sigma)[0][0], self._gains(sigma)
+        return white, *score(self.slope, self.last, self.seen, gain, scale, white, self.kind)
 
     def predictive(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
         """Return the one-step predictive mean and covariance of each measurement, as deviations.

@@ -12,14 +12,7 @@ from scipy.optimize import least_squares
 
 from pbrl_ppl.likelihood import Problem, log_posterior
 from pbrl_ppl.modes.noise import FAR_OFF, best_tails, noise_gaussian, profile_sigma, tail_precision
-from pbrl_ppl.parameters import (
-    Prior,
-    box,
-    by_prior,
-    differentiate,
-    inside,
-    prior_residual,
-)
+from pbrl_ppl.parameters import Prior, box, by_prior, differentiate, inside, prior_residual
 from pbrl_ppl.physics import PartedSimulator
 from pbrl_ppl.state import Floats
 
