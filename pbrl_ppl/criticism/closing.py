@@ -44,8 +44,8 @@ from pbrl_ppl.criticism.score import Signature, rank_candidates
 from pbrl_ppl.criticism.search import Search, SearchResult
 from pbrl_ppl.criticism.unexplained import (
     UnexplainedAcceleration,
-    measurement_noise,
     noise_alone,
+    noise_without_unexplained,
     unexplained_acceleration,
 )
 from pbrl_ppl.effects import Attached, Effect, Noise, attach, candidates
@@ -64,7 +64,7 @@ from pbrl_ppl.physics import Physics, try_effect
 from pbrl_ppl.posterior import MAX_PARETO_K, Comparison, Fit, compare, identify, interval, versions
 from pbrl_ppl.posterior import draws as posterior_draws
 from pbrl_ppl.sampling import sample
-from pbrl_ppl.scene import Scene
+from pbrl_ppl.scene import Scene, check_substeps
 from pbrl_ppl.threads import one_blas_thread
 
 #: Draws of each chain by method, then those where that is not enough.
@@ -152,7 +152,7 @@ def close_loop(
         after = float(train.dataset["number"].max()) + 1.0
         numbered = test.numbered(after) if scene.test_is_later else test
     if substeps is not None:
-        scene.replace(substeps=substeps)  # it is checked there
+        check_substeps(substeps)
     cleaned = _cleaned(task, train, numbered)
     task = replace(task, scene=with_units(scene, cleaned.train))
     found = _searched(task, _fitted(task, cleaned))
@@ -496,7 +496,7 @@ def _put_together(task: _Task, judged: _Judged, before: Fit, after: Fit, recorde
     declared, revised, laws = judged.declared, judged.revised, judged.searched.laws
     scene, held_out = task.scene, revised.held_out
     test = held_out.problem.data.history
-    unit = measurement_noise(revised.innovations, revised.excess)
+    unit = noise_without_unexplained(revised.innovations, revised.excess)
     errors = [
         model.held_out.errors(held_out, fit, rollout, task.seed, unit)
         for model, fit in ((declared, before), (revised, after))[revised is declared :]

@@ -17,7 +17,7 @@ from pbrl_ppl.history import History, with_units
 from pbrl_ppl.likelihood import Problem, single_transitions
 from pbrl_ppl.modes import Mode, find_mode, trajectory_mode
 from pbrl_ppl.physics import Physics
-from pbrl_ppl.scene import Scene
+from pbrl_ppl.scene import Scene, check_substeps
 from pbrl_ppl.threads import one_blas_thread
 
 
@@ -122,7 +122,7 @@ def checked_mode(
         If the scene declares an unknown effect.
     """
     if substeps is not None:
-        scene.replace(substeps=substeps)  # it is checked there
+        check_substeps(substeps)
     history, _, unused, bad = checked_histories(scene, history, history)
     for sentence in (*(velocity.sentence for velocity in unused), *bad):
         say(sentence)

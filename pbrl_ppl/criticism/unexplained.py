@@ -111,7 +111,7 @@ def noise_alone(mode: Mode, excess: UnexplainedAcceleration) -> Floats:
     return _without(mode, negligible, mode.problem.residual(mode.phi))
 
 
-def measurement_noise(mode: Mode, excess: UnexplainedAcceleration) -> Floats:
+def noise_without_unexplained(mode: Mode, excess: UnexplainedAcceleration) -> Floats:
     """Return the noise parameters without accelerations that matter, shape (parameter,)."""
     sigma = mode.sigma.copy()
     places = np.array(mode.problem.trajectory_noise.coordinates.accelerations)

@@ -14,6 +14,7 @@ from .recording import SEPARATORS as SEPARATORS
 from .recording import Recording as Recording
 from .recording import column_of as column_of
 from .scene import Scene as Scene
+from .scene import check_substeps as check_substeps
 from .shape import Shape as Shape
 from .units import MASS_PRIOR as MASS_PRIOR
 from .units import Units as Units

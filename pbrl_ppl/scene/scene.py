@@ -88,7 +88,7 @@ class Scene:
 
     def __post_init__(self) -> None:
         checks.settle(self, "[world]", gravity=checks.vector, normal_gravity=checks.not_negative)
-        checks.settle(self, "[world]", time_step=checks.positive, substeps=_substeps)
+        checks.settle(self, "[world]", time_step=checks.positive, substeps=check_substeps)
         checks.settle(self, "[world]", test_is_later=checks.flag)
         for key, (_, kind) in scene_toml.PARTS.items():
             parts = tuple(getattr(self, key))
@@ -319,8 +319,14 @@ class Scene:
         return self.replace(bodies=tuple(changed if b is body else b for b in self.bodies))
 
 
-def _substeps(value: object, where: str) -> int:
-    """Return a number of engine steps a sample."""
+def check_substeps(value: object, where: str = "substeps") -> int:
+    """Return a number of engine steps a sample.
+
+    Raises
+    ------
+    SceneError
+        If it is no whole number from 1 to the most that change a prediction.
+    """
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
         raise SceneError(f"{where} is {value!r}, expected a whole number from 1 up")
     if value > MOST_SUBSTEPS:
