@@ -175,7 +175,7 @@ def configurations(scene: Scene) -> tuple[Configuration, ...]:
 
     Examples
     --------
-    >>> from pbrl_ppl.scene.scene import Body, Joint, Shape
+    >>> from pbrl_ppl.scene import Body, Joint, Shape
     >>> pucks = tuple(Body(name, Shape.circle(0.1)) for name in "ab")
     >>> scene = Scene(time_step=0.1, bodies=pucks, joints=(Joint("hinge", known=False),))
     >>> [configuration.pairs[0][1] for configuration in configurations(scene)]

@@ -64,7 +64,7 @@ def independent_parts(scene: Scene, history: History | None = None) -> Parts:
     Examples
     --------
     >>> import pandas as pd
-    >>> from pbrl_ppl.scene.scene import Body, Shape
+    >>> from pbrl_ppl.scene import Body, Shape
     >>> pucks = tuple(Body(name, Shape.circle(0.1)) for name in "abc")
     >>> scene = Scene(time_step=0.1, bodies=pucks)
     >>> rows = [

@@ -41,7 +41,7 @@ def table1(body: Body) -> dict[str, Prior]:
 
     Examples
     --------
-    >>> from pbrl_ppl.scene.scene import Body, Shape
+    >>> from pbrl_ppl.scene import Body, Shape
     >>> table1(Body("cart", Shape.box(1.0, 0.6)))["w_x"].support
     (-0.5, 0.5)
     """

@@ -47,7 +47,7 @@ class Transition:
 
     Examples
     --------
-    >>> from pbrl_ppl.scene.scene import Body, Shape
+    >>> from pbrl_ppl.scene import Body, Shape
     >>> scene = Scene(time_step=0.5, bodies=(Body("puck", Shape.circle(0.2)),))
     >>> f = Transition(scene, {"mass": 2.0, "r": 0.0, "mu_c": 0.0})
     >>> f([0, 0, 0, 1, 0, 0, 0, 4.0, 0, 0]).round(6)  # 1 m/s, pushed by 4 N

@@ -125,7 +125,7 @@ def physics_model(
     Examples
     --------
     >>> import pandas as pd
-    >>> from pbrl_ppl.scene.scene import Body, Shape
+    >>> from pbrl_ppl.scene import Body, Shape
     >>> scene = Scene(time_step=0.1, bodies=(Body("puck", Shape.circle(0.2)),))
     >>> rows = pd.DataFrame({"trajectory": 0, "time": [0.0, 0.1], "body": "puck", "x": [0.0, 0.1],
     ...     "y": 0.0, "theta": 0.0, "vx": 1.0, "vy": 0.0, "omega": 0.0,

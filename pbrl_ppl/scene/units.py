@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import SceneError
+from pbrl_ppl.scene import Scene
 from pbrl_ppl.scene.checks import PLACES, UNITS, nearest
-from pbrl_ppl.scene.scene import Scene
 
 #: Location and scale of the logarithm of a mass (kg) under Table 1, uninformative by default.
 MASS_PRIOR = 1.0, 1.5
