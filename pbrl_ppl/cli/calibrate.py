@@ -30,7 +30,6 @@ def calibrate(
     reading: options.SceneReading,
     quiet: bool,
     likelihood: str = "transitions",
-    trajectories: options.OldLikelihood = None,
     colour: Annotated[float, typer.Option(min=0.0)] = 0.0,
     replications: Annotated[int, typer.Option(min=2)] = 200,
     seed: options.Seed = 1,
@@ -58,8 +57,6 @@ def calibrate(
     draws
         Posterior draws of each chain.
     """
-    if trajectories is not None:  # older spellings
-        likelihood = "trajectories" if trajectories else "transitions"
     check_can_make(output)
     declared, (design,) = reading.read(scene, [history])
     declared, effects = reading.with_effects(declared)

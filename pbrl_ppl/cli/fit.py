@@ -34,7 +34,6 @@ def fit(
     quiet: bool,
     interrupts: list[int],
     likelihood: str = "trajectories",
-    trajectories: options.OldLikelihood = None,
     horizon: options.Count = 1,
     scalar: Annotated[bool, typer.Option("--scalar-sigma")] = False,
     nu: Annotated[float | None, typer.Option(min=0.1)] = None,
@@ -81,8 +80,6 @@ def fit(
     """
     with terminal.stages(quiet) as progress:
         check_file(output, (".nc",), overwrite)
-        if trajectories is not None:  # older spellings
-            likelihood = "trajectories" if trajectories else "transitions"
         if likelihood != "transitions" and (horizon > 1 or scalar):
             raise FitError(
                 "--horizon and --scalar-sigma are of single transitions: --likelihood transitions"

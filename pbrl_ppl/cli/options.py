@@ -182,7 +182,6 @@ def _documented(docstring: str | None) -> tuple[str, dict[str, tuple[str, str]]]
 
 OutputFile = Annotated[Path, typer.Option("-o", "--output", metavar="FILE")]
 OutputFolder = Annotated[Path, typer.Option("-o", "--output", metavar="DIR")]
-OldLikelihood = Annotated[bool | None, typer.Option("--trajectories/--transitions", hidden=True)]
 Seed = Annotated[int, typer.Option(min=0)]
 Count = Annotated[int, typer.Option(min=1)]
 

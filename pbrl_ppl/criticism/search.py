@@ -529,14 +529,12 @@ class Search:
                 for law, one in worth.items()
             }
             law: Attached | None = min(weak, key=lambda one: weak[one])
-            small = [one for one in worth if one not in main]
-            rare = [one for one in small if one.effect.log_odds <= _RARE]
             if law is not None and weak[law] < least:
                 why = f"longer simulations do not need it ({weak[law]:.1f} nats)"
-            elif rare:
-                law, why = rare[0], "small, and rare"
             else:
-                law, why = self._unconfirmed(whole, model, small)
+                law, why = self._unconfirmed(
+                    whole, model, [one for one in worth if one not in main]
+                )
             if law is None:
                 break
             model, rejected[law] = model.dropped(law).fitted(whole=True), why

@@ -28,7 +28,6 @@ from pbrl_ppl.history import History, with_units
 from pbrl_ppl.likelihood import (
     OutputErrorLikelihood,
     Problem,
-    TrajectoryLikelihood,
     TransitionLikelihood,
     declared_problem,
 )
@@ -57,7 +56,6 @@ def calibrate(
     sigma: str = "per_dimension",
     nu: float | None = None,
     substeps: int | None = None,
-    trajectories: bool = False,
     draws: int = 1500,
     tune: int = 500,
     chains: int = 4,
@@ -101,8 +99,6 @@ def calibrate(
         below 1. Errors are autoregressive, AR(1), with the standard deviation sigma.
     horizon, sigma, nu, substeps : optional
         As of :func:`pbrl_ppl.physics_model`.
-    trajectories : bool
-        True is the same as ``likelihood="trajectories"``.
     draws, tune, chains : int
         As of :func:`pbrl_ppl.fit`. A fit with fewer than 99 effective draws is done again with four
         times the draws, at most twice.
@@ -143,8 +139,6 @@ def calibrate(
     """
     if replications < 2:
         raise ValueError(f"replications is {replications}, expected at least 2, better 200")
-    if trajectories:
-        likelihood = TrajectoryLikelihood.name
     if not 0.0 <= colour < 1.0:
         raise ValueError(f"colour is {colour}, expected a correlation of at least 0 and below 1")
     if colour and likelihood != OutputErrorLikelihood.name:

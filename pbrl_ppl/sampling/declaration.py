@@ -10,7 +10,6 @@ from pbrl_ppl.effects import LEARNED_REMAINDER, Attached, Effect, attach, catalo
 from pbrl_ppl.history import History, with_units
 from pbrl_ppl.likelihood import (
     OutputErrorLikelihood,
-    TrajectoryLikelihood,
     TransitionLikelihood,
     declared_problem,
 )
@@ -43,7 +42,6 @@ def physics_model(
     substeps: int | None = None,
     threads: int = 1,
     library: ParameterLibrary | None = None,
-    trajectories: bool = False,
     around: Any = None,
     seed: int = 0,
 ) -> pm.Model:
@@ -88,8 +86,6 @@ def physics_model(
     library : ParameterLibrary, optional
         Pre-learned parameter sets of which each body has one, in place of Table 1: the variable
         ``library_index`` holds the bodies' choices, and the parameters follow from it.
-    trajectories : bool
-        True is the same as ``likelihood="trajectories"``.
     around : Mode, InferenceData or DataTree, optional
         Where trajectories are linearised in place of a search: a mode of whole trajectories, from
         which the mode is climbed to, or a posterior of the same data and likelihood, whose
@@ -134,8 +130,6 @@ def physics_model(
     >>> [variable.name for variable in model.free_RVs]
     ['mass', 'r', 'mu_c', 'sigma']
     """
-    if trajectories:
-        likelihood = TrajectoryLikelihood.name
     if around is not None and likelihood == TransitionLikelihood.name:
         raise ValueError(
             "around is given with likelihood 'transitions', expected 'trajectories' or 'simulation'"

@@ -399,7 +399,17 @@ def test_an_interrupted_fit_gives_one_answer(
 def test_an_interrupt_of_the_shell_ends_a_fit(seconds: float) -> None:
     """Before and while chains run; the shell interrupts their processes too."""
     code = "import sys; from pbrl_ppl.cli import main; sys.exit(main())"
-    argv = ["fit", "scene.toml", "train.csv", "-o", "puck.nc", "--transitions", "--draws", "100000"]
+    argv = [
+        "fit",
+        "scene.toml",
+        "train.csv",
+        "-o",
+        "puck.nc",
+        "--likelihood",
+        "transitions",
+        "--draws",
+        "100000",
+    ]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     with subprocess.Popen(
         [sys.executable, "-c", code, *argv], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL,
@@ -454,7 +464,7 @@ def test_absurd_options_are_refused(
 
 
 @pytest.mark.usefixtures("puck")
-@pytest.mark.parametrize("options", [[], ["--transitions"]])
+@pytest.mark.parametrize("options", [[], ["--likelihood", "transitions"]])
 def test_the_command_fits_what_python_fits(options: list[str]) -> None:
     """The defaults are alike but for one: the command takes whole trajectories."""
     with warnings.catch_warnings():
@@ -489,7 +499,7 @@ def test_cures_are_options(
         ",".join([*line.split(",")[:7], "", "", "", *line.split(",")[10:]]) for line in text[1:]
     ]
     Path("poses.csv").write_text(HEADER + "\n".join(positions) + "\n")
-    fit = ("fit", "scene.toml", "poses.csv", "-o", "a.nc", "--transitions")
+    fit = ("fit", "scene.toml", "poses.csv", "-o", "a.nc", "--likelihood", "transitions")
     said = message(capsys, *fit)
     assert "fit whole trajectories (the likelihood 'trajectories')" in said
     assert "--estimate-velocities" in said and "=True" not in said
@@ -571,7 +581,7 @@ def test_calibrate_takes_the_likelihood_of_fit(
 
     monkeypatch.setattr(sampling.calibration, "calibrate", take)
     argv = ["calibrate", "scene.toml", "train.csv", "-o", "ranks"]
-    for options in ([], ["--trajectories", "--noise", "x=0.002"]):
+    for options in ([], ["--likelihood", "trajectories", "--noise", "x=0.002"]):
         assert "that is all" in message(capsys, *argv, *options)
     assert seen == [({}, "transitions"), ({"x": 0.002}, "trajectories")]
     assert 'unknown key "z"' in message(capsys, *argv, "--noise", "z=0.1")

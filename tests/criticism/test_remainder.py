@@ -33,7 +33,7 @@ pytestmark = [
 
 def posterior_of(frame):
     """Of the declared model, without drag."""
-    model = pp.physics_model(BOX, pp.History.from_dataframe(frame, BOX), trajectories=True)
+    model = pp.physics_model(BOX, pp.History.from_dataframe(frame, BOX), likelihood="trajectories")
     return pp.fit(model, method="laplace", draws=50, seed=1, progress=False)
 
 

@@ -318,7 +318,7 @@ def test_a_recording_in_which_nothing_moves_is_refused_at_once(clean) -> None:
     assert stages == []
     (history,) = histories([still])
     with pytest.raises(HistoryError, match="nothing moves"):
-        pp.physics_model(BOX, history, trajectories=True)
+        pp.physics_model(BOX, history, likelihood="trajectories")
     pp.physics_model(BOX, history)  # Eq. 11 has a noise of its own
 
 

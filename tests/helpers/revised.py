@@ -34,7 +34,7 @@ def revised() -> Loop:
     """Findings as made up, with the posteriors of a puck without drag and with it."""
     train, test = recordings()
     drag = [effect for effect in catalogue if effect.name == "linear_drag"]
-    models = (physics_model(DISC, train, e, trajectories=True) for e in ((), drag))
+    models = (physics_model(DISC, train, e, likelihood="trajectories") for e in ((), drag))
     before, after = (
         Fit(m.problem, fit(m, method="laplace", seed=1, draws=100, progress=False)) for m in models
     )

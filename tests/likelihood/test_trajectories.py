@@ -291,7 +291,7 @@ def test_what_never_moves_has_no_noise() -> None:
     """A fall seen as x = 0: its error is given, and no noise parameter is inferred from it."""
     history = simulated_history(PUCK, TRUTH, seed=1, trajectories=3, intervals=4, substeps=2)
     frame = history.to_dataframe().assign(x=0.0, vx=0.0)
-    still = physics_model(PUCK, History.from_dataframe(frame, PUCK), trajectories=True)
+    still = physics_model(PUCK, History.from_dataframe(frame, PUCK), likelihood="trajectories")
     noise = still.problem.noise_variables
     assert noise["sigma"] == ("y", "theta", "vy", "omega")
     assert noise["unexplained_acceleration"] == ("vy", "omega")
@@ -301,7 +301,7 @@ def test_what_never_moves_has_no_noise() -> None:
 def test_options_that_do_not_go_together_are_refused(options) -> None:
     history = simulated_history(PUCK, TRUTH, seed=1, trajectories=2, intervals=4, substeps=2)
     with pytest.raises(ValueError, match="trajectories"):
-        physics_model(PUCK, history, trajectories=True, **options)
+        physics_model(PUCK, history, likelihood="trajectories", **options)
 
 
 @pytest.mark.parametrize("stated", [("x", "omega"), ("x", "y", "theta", "vx", "vy", "omega")])

@@ -305,7 +305,7 @@ def test_refused_fits(apartment, monkeypatch) -> None:
     with pytest.raises(FitError, match=r"2 combinations of parameter sets.*give some"):
         quick(model)
     with pytest.raises(ValueError, match="with horizon or library"):
-        physics_model(scene, history, library=library, trajectories=True)
+        physics_model(scene, history, library=library, likelihood="trajectories")
     near = tuple(replace(body, pose=(0.5 * i, 0.0, 0.0)) for i, body in enumerate(scene.bodies))
     jointed = scene.replace(bodies=near, joints=(Joint("distance", ("a", "b"), known=False),))
     with pytest.raises(ParameterError, match="is to be inferred, and a library is of bodies"):

@@ -42,7 +42,9 @@ def selected(frame: pd.DataFrame) -> Law:
 def posterior_of(frame: pd.DataFrame, effect: str):
     """A posterior as the loop leaves it where it added this drag."""
     drag = [one for one in pp.catalogue if one.name == effect]
-    model = pp.physics_model(BOX, pp.History.from_dataframe(frame, BOX), drag, trajectories=True)
+    model = pp.physics_model(
+        BOX, pp.History.from_dataframe(frame, BOX), drag, likelihood="trajectories"
+    )
     idata = pp.fit(model, method="laplace", draws=50, seed=1, progress=False)
     others = tuple(name for name in DRAGS if name != effect)
     keep_groups(idata, [Added(effect, "puck", "a drag", 1.0, 1.0, {}, others, 1.0, 1.0)])

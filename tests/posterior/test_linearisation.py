@@ -22,7 +22,7 @@ def test_linear_motion_has_no_error() -> None:
     puck = Body("puck", Shape.circle(0.2), known={"r": 0.2, "mu_c": 0.3})
     scene = Scene(time_step=0.1, substeps=2, bodies=(puck,))
     history = simulated_history(scene, {"mass": 2.0}, seed=1, trajectories=3, intervals=4)
-    problem = pp.physics_model(scene, history, trajectories=True).problem
+    problem = pp.physics_model(scene, history, likelihood="trajectories").problem
     rng = np.random.default_rng(1)
     sigma = problem.trajectory_noise.sigma * np.exp(0.3 * rng.normal(size=(5, 9)))
     errors = linearisation_errors(problem, rng.uniform(1.9, 2.1, (5, 1)), sigma)
@@ -35,7 +35,7 @@ def test_a_fit_says_where_it_does_not_hold() -> None:
     """A cart linearised at its mode, and at the prior's centre, where the wheel rolls elsewhere."""
     scene = cart_scene(known={"r": 0.2, "mu_c": 0.3})
     history = simulated_history(scene, CART, seed=1, trajectories=6)
-    model = pp.physics_model(scene, history, trajectories=True)
+    model = pp.physics_model(scene, history, likelihood="trajectories")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warnings.simplefilter("error", LinearisationWarning)

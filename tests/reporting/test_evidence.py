@@ -155,7 +155,7 @@ def test_motions_start_from_velocities_fitted_to_the_first_rows() -> None:
     states = disc.frame(rng)
     coarse = states.assign(x=states["x"] + rng.normal(0.0, 0.02, len(states)))
     history = History.from_dataframe(coarse.drop(columns=["vx", "vy", "omega"]), DISC)
-    model = physics_model(DISC, history, (), trajectories=True)
+    model = physics_model(DISC, history, (), likelihood="trajectories")
     fitted = fit(model, method="laplace", seed=1, draws=20, progress=False)
     mode = trajectory_mode(model.problem, *Fit(model.problem, fitted).best)
     findings = replace(unexplained(), innovations=(mode, mode), held_out=history)

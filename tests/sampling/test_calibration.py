@@ -637,8 +637,8 @@ def test_command_s_likelihoods(
     with xr.open_dataset(files / "out" / "ranks.nc", engine="h5netcdf") as data:
         assert json.loads(data.attrs["likelihood"]) == "simulation"
         assert json.loads(data.attrs["colour"]) == 0.8
-    main(["calibrate", "scene.toml", "train.csv", "-o", "old", "-q", "--trajectories",
-          "--replications", "2"])  # fmt: skip
+    main(["calibrate", "scene.toml", "train.csv", "-o", "old", "-q", "--likelihood",
+          "trajectories", "--replications", "2"])  # fmt: skip
     about = json.loads((files / "old" / "design.json").read_text())
     assert about["likelihood"] == "trajectories"
     capsys.readouterr()
@@ -673,7 +673,7 @@ def test_whole_trajectories(monkeypatch: pytest.MonkeyPatch) -> None:
     body = Body("puck", Shape.circle(0.2), known={"r": 0.2, "mu_c": 0.3}, prior=prior)
     scene = Scene(time_step=0.1, substeps=2, bodies=(body,))
     history = simulated_history(scene, {"mass": 2.0}, seed=1, trajectories=3, intervals=3)
-    result = calibrate(scene, history, trajectories=True, replications=2, cores=1, **quick)
+    result = calibrate(scene, history, likelihood="trajectories", replications=2, cores=1, **quick)
     assert not result.failures
     names = [f"sigma[{d}]" for d in ("x", "y", "theta", "vx", "vy", "omega")]
     names += [f"unexplained_acceleration[{d}]" for d in ("vx", "vy", "omega")]

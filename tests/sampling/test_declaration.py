@@ -49,7 +49,7 @@ def history() -> History:
 
 @pytest.fixture(scope="module")
 def model(history) -> pm.Model:
-    return pp.physics_model(SCENE, history, trajectories=True)
+    return pp.physics_model(SCENE, history, likelihood="trajectories")
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +80,7 @@ def test_the_model_is_linearised_at_its_mode() -> None:
     """A cart, whose wheel slips or rolls: linearised elsewhere its mode is improbable."""
     scene = cart_scene(known={"r": 0.2, "mu_c": 0.3})
     history = simulated_history(scene, CART, seed=1, trajectories=6)
-    model = pp.physics_model(scene, history, trajectories=True)
+    model = pp.physics_model(scene, history, likelihood="trajectories")
     mode = model.mode
     found = float(mode.problem.log_density(mode.problem.residual(mode.phi), mode.sigma).sum())
     point = model.initial_point()  # in the sampler's space
@@ -92,7 +92,7 @@ def test_the_model_is_linearised_at_its_mode() -> None:
 
 
 def test_the_same_seed_gives_the_same_model(model, history) -> None:
-    again = pp.physics_model(SCENE, history, trajectories=True, seed=0)
+    again = pp.physics_model(SCENE, history, likelihood="trajectories", seed=0)
     np.testing.assert_array_equal(again.mode.phi, model.mode.phi)
     np.testing.assert_array_equal(
         again.problem.trajectory_noise.slope, model.problem.trajectory_noise.slope
@@ -111,10 +111,10 @@ def test_fit_does_not_search_again(model, monkeypatch) -> None:
 def test_around_a_mode_or_a_posterior(model, half, history, monkeypatch) -> None:
     """Neither is a search."""
     monkeypatch.setattr("pbrl_ppl.sampling.declaration.find_trajectory_mode", None)
-    near = pp.physics_model(SCENE, history, trajectories=True, around=model.mode)
+    near = pp.physics_model(SCENE, history, likelihood="trajectories", around=model.mode)
     sd = np.sqrt(np.diag(model.mode.covariance))
     assert (np.abs(near.mode.phi - model.mode.phi) < sd).all()
-    same = pp.physics_model(SCENE, history, trajectories=True, around=half)
+    same = pp.physics_model(SCENE, history, likelihood="trajectories", around=half)
     phi, sigma = (draws[7] for draws in parameter_draws(same.problem, half))
     assert at(same, phi, sigma) == pytest.approx(at(model, phi, sigma), abs=1e-6)
 
@@ -124,7 +124,7 @@ def test_around_what_is_of_something_else(half, history) -> None:
         pp.physics_model(SCENE, history, around=half)
     other = history.select(range(9))
     with pytest.raises(PosteriorError, match="50 transitions that are not the model's 45"):
-        pp.physics_model(SCENE, other, trajectories=True, around=half)
+        pp.physics_model(SCENE, other, likelihood="trajectories", around=half)
     single = pp.physics_model(SCENE, history)
     with pytest.raises(PosteriorError, match="of trajectories, the model's of transitions"):
         pp.fit(single, resume=half)
@@ -193,7 +193,7 @@ def test_a_fit_in_two_halves_is_one(model, half, history, tmp_path) -> None:
     """
     save_posterior(half, tmp_path / "half.nc")
     stored = load_posterior(tmp_path / "half.nc")
-    new = pp.physics_model(SCENE, history, trajectories=True, seed=5)
+    new = pp.physics_model(SCENE, history, likelihood="trajectories", seed=5)
     gone_on = quiet(pp.fit, new, seed=2, draws=400, resume=stored, **FIT)
     # all draws, old and new, are of one likelihood: that of the first half
     phi, sigma = parameter_draws(model.problem, gone_on)

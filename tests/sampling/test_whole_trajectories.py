@@ -67,14 +67,14 @@ def both() -> History:
 @pytest.fixture(scope="module")
 def first(both):
     """The posterior of the first twelve."""
-    model = physics_model(SCENE, both.select(range(12)), trajectories=True)
+    model = physics_model(SCENE, both.select(range(12)), likelihood="trajectories")
     return quiet(pp.fit, model, seed=3, **QUICK)
 
 
 @pytest.fixture(scope="module")
 def whole(both):
     """The posterior of all."""
-    return quiet(pp.fit, physics_model(SCENE, both, trajectories=True), seed=4, **QUICK)
+    return quiet(pp.fit, physics_model(SCENE, both, likelihood="trajectories"), seed=4, **QUICK)
 
 
 def test_the_truth_is_in_the_posterior(first) -> None:
@@ -179,7 +179,7 @@ def test_a_first_contact_brings_a_noise_of_its_own(monkeypatch) -> None:
     apart = simulated_history(scene, {"mass": [2.0]}, seed=1, **made)
     beside = [(0.0, 0.0, 0.0), (0.61, 0.0, 0.0)]
     together = simulated_history(scene, {"mass": [2.0]}, seed=2, poses=beside, **made)
-    first = quiet(pp.fit, physics_model(scene, apart, trajectories=True), seed=1, **QUICK)
+    first = quiet(pp.fit, physics_model(scene, apart, likelihood="trajectories"), seed=1, **QUICK)
     assert "contact_acceleration" not in group(first, "posterior")
     with pytest.warns(RefitWarning, match=r"contact_acceleration\[vx\].* fitted anew"):
         both = quiet(pp.update, first, together, seed=2, progress=False)
@@ -201,7 +201,7 @@ def test_stated_errors_of_measuring_leave_a_whole_posterior(stated, tmp_path) ->
     scene = Scene(time_step=0.1, substeps=4, bodies=(puck,), noise=noise)
     made = {"trajectories": 3, "intervals": 5, "substeps": 8}
     history = simulated_history(scene, {"mass": [2.0]}, seed=1, **made)
-    model = physics_model(scene, history, trajectories=True)
+    model = physics_model(scene, history, likelihood="trajectories")
     pp.save_posterior(quiet(pp.fit, model, method="laplace", seed=1), tmp_path / "puck.nc")
     loaded = pp.load_posterior(tmp_path / "puck.nc")
     assert ("sigma" in group(loaded, "posterior")) == (stated < 6)
