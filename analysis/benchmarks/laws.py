@@ -323,7 +323,9 @@ def left_out(names: list[str]) -> None:
     said = 0
     for name in names:
         case, begin = CASES[name], time.monotonic()
-        rest = tuple(law for law in pp.catalogue if law.name not in (name, *case.family))
+        declared = {law for body in scene(case.rig).bodies for law in body.effects}
+        gone = {name, *case.family} - declared
+        rest = tuple(law for law in pp.catalogue if law.name not in gone)
         found = looped(case, 1, rest)
         said += found.verdict == "unexplained"
         laws = ", ".join(law.effect for law in found.added) or "nothing"
