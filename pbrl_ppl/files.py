@@ -6,7 +6,7 @@ import contextlib
 import math
 import secrets
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import is_dataclass
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -40,13 +40,19 @@ def write_text(path: Path, text: str) -> None:
     write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
 
 
+def json_fields(value: Any) -> dict[str, Any]:
+    """Return a dataclass's fields by their keys in JSON: ``key`` of their metadata, or names."""
+    keys = {one.name: one.metadata.get("key", one.name) for one in fields(value)}
+    return {keys.get(name, name): item for name, item in vars(value).items()}
+
+
 def json_values(value: Any) -> Any:
     """Return plain values for JSON: arrays as lists, paths as text, non-finite numbers as null.
 
     A dataclass becomes an object of its fields.
     """
     if is_dataclass(value):
-        value = vars(value)
+        value = json_fields(value)
     if isinstance(value, Mapping):
         return {str(key): json_values(item) for key, item in value.items()}
     if isinstance(value, Path):

@@ -145,10 +145,10 @@ def test_scores_by_hand(attribution, row) -> None:
     }  # fmt: skip
 
 
-def test_a_twin_is_a_right_name(attribution, row) -> None:
-    twin = row("catalogued", "effects-added", "frame_rotation", effect="actuator_rotation")
-    assert attribution.scores.outcome(twin) == "named"
-    assert attribution.scores.outcome(replace(twin, body="arm")) == "misnamed"
+def test_an_indistinguishable_effect_is_a_right_name(attribution, row) -> None:
+    equivalent = row("catalogued", "effects-added", "frame_rotation", effect="actuator_rotation")
+    assert attribution.scores.outcome(equivalent) == "named"
+    assert attribution.scores.outcome(replace(equivalent, body="arm")) == "misnamed"
 
 
 def test_excess_and_baselines_by_hand(attribution, row) -> None:
@@ -165,8 +165,8 @@ def test_excess_and_baselines_by_hand(attribution, row) -> None:
     assert scores["naming_correlation"] == scores["baseline_naming"] == pytest.approx(1 / 3)
     assert "naming_sparse_regression" not in scores  # it was not there
     assert "naming_correlation" not in attribution.scores.score([replace(rows[0], body="pair")])
-    twin = replace(rows[0], effect="force_gain", baselines={"correlation": "torque_gain"})
-    assert attribution.scores.score([twin])["baseline_naming"] == 1.0
+    equivalent = replace(rows[0], effect="force_gain", baselines={"correlation": "torque_gain"})
+    assert attribution.scores.score([equivalent])["baseline_naming"] == 1.0
 
 
 def puck(attribution, effect=None, value=None, n_train=12):
@@ -267,8 +267,10 @@ def test_every_effect_of_the_tables_can_be_made_and_known(attribution) -> None:
 def test_a_drawn_body_makes_histories_that_its_scene_explains(attribution, sort) -> None:
     """Without noise, at the true parameters, the package's engine makes the same intervals."""
     body = attribution.bodies.draw_body(sort, np.random.default_rng(2))
-    quiet = tuple(1e-6 * np.array(body.setups[0].noise))
-    first = replace(body.setups[0], n_train=2, n_test=1, n_intervals=6, time_step=0.05, noise=quiet)
+    nearly_none = tuple(1e-6 * np.array(body.setups[0].noise))
+    first = replace(
+        body.setups[0], n_train=2, n_test=1, n_intervals=6, time_step=0.05, noise=nearly_none
+    )
     setups = (first, *(replace(s, time_step=0.05) for s in body.setups[1:]))
     case = attribution.cases.Case("made up", "clean", replace(body, setups=setups))
     train, test = case.histories(seed=0)

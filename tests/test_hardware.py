@@ -269,9 +269,9 @@ def test_a_folder_is_run_once(benchmark, measured, result, folder, tmp_path, mon
     assert runs[1:] == [("disc", 1, "laplace")] * 2
 
 
-def test_forecasts_from_fitted_starts_by_hand(measured) -> None:
+def test_forecasts_from_fitted_initial_states_by_hand(measured) -> None:
     """A fall without drag: a straight line through 7 rows, of what gravity leaves."""
-    from attribution.fitted_starts import forecast_errors
+    from attribution.fitted_initial_states import forecast_errors
 
     history = fall(0, trajectories=3, memory=0.0)
     problem = Problem.of(Physics(BALL, substeps=40), history, horizon=2)
@@ -289,7 +289,7 @@ def test_forecasts_from_fitted_starts_by_hand(measured) -> None:
 
 def test_errors_of_an_independent_fit_are_those_of_its_parameters(measured) -> None:
     """A servo with the friction that another integrator fitted: errors within 3 %."""
-    from attribution.fitted_starts import forecast_errors
+    from attribution.fitted_initial_states import forecast_errors
 
     (recording,) = (each for each in measured.MEASURED if each.name == "bam-xl330")
     if not recording.folder.is_dir():

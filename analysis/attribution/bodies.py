@@ -51,7 +51,7 @@ _HUNG = (
     # to the angle's fourth power, a scaled angle moves as one with a spring does
     ("torsion_spring", "sensor_scale"),
 )
-TWINS = {
+INDISTINGUISHABLE = {
     CART: (_TURNED, _SCALED), PUCK: _FREE, SLED: _FREE, PAIR: _FREE, ARM: _HUNG, LEVER: _HUNG,
     CHAIN: _HUNG[:2],
 }  # fmt: skip
@@ -63,9 +63,9 @@ CONTAIN = {CART: _RICHER, ARM: _ASKEW, LEVER: _ASKEW, CHAIN: ()}
 CONTAIN |= {sort: (*_RICHER, ("anisotropic_gain", "inertia_scale")) for sort in (PUCK, SLED, PAIR)}
 
 
-def twins(sort: str, effect: str | None) -> tuple[str | None, ...]:
+def indistinguishable(sort: str, effect: str | None) -> tuple[str | None, ...]:
     """Return an effect and those equivalent to it on a kind of body."""
-    return next((group for group in TWINS[sort] if effect in group), (effect,))
+    return next((group for group in INDISTINGUISHABLE[sort] if effect in group), (effect,))
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from attribution.bodies import (
     Hidden,
     Rng,
     draw_body,
-    twins,
+    indistinguishable,
 )  # fmt: skip
 from attribution.outside import CONTAINING
 from attribution.sizes import EFFECTS, OUTSIDE_OF, STEPS, STRONGEST, makes_sense, value
@@ -111,7 +111,7 @@ class Case:
         richer = (outer for outer, own in CONTAIN[self.body.sort] if own == self.effect)
         families = {one.family for one in pp.catalogue if one.name == self.effect} - {""}
         family = (one.name for one in pp.catalogue if one.family in families)
-        return (*twins(self.body.sort, self.effect), *richer, *family)
+        return (*indistinguishable(self.body.sort, self.effect), *richer, *family)
 
     @property
     def catalogue(self) -> tuple[pp.Effect, ...]:

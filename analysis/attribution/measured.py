@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from running import sources
 
 import pbrl_ppl as pp
-from attribution.fitted_starts import forecast_errors
+from attribution.fitted_initial_states import forecast_errors
 from pbrl_ppl.criticism import Loop, close_loop
 from pbrl_ppl.criticism.forecast import forecast
 from pbrl_ppl.criticism.held_out import HeldOut
@@ -81,7 +81,7 @@ class Recording:
     ahead : tuple of Ahead
         Forecasts to judge by; without them as far as the loop's own.
     start_rows : int, optional
-        Rows that the start state of a forecast is fitted to; filtered states by default.
+        Rows that the initial state of a forecast is fitted to; filtered states by default.
     laws : tuple of str
         Effects that are physically there.
     also : tuple of str

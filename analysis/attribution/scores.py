@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from attribution.baselines import WAYS
-from attribution.bodies import CHAIN, PAIR, twins
+from attribution.bodies import CHAIN, PAIR, indistinguishable
 from attribution.cases import CATALOGUED, CLEAN, LEFT_OUT, METHODS, NONSENSE, OUTSIDE
 from attribution.one_case import Row
 from attribution.oracle import MATTERS
@@ -47,7 +47,7 @@ def _is_as_good(row: Row) -> bool:
 
 def _is_right(row: Row, one: Mapping[str, Any]) -> bool:
     """Return whether a name, or a group that contains it, is equivalent to the right effect."""
-    same = twins(row.body, row.effect)
+    same = indistinguishable(row.body, row.effect)
     names = (one["effect"], *one["not_separable_from"])
     return row.kind == CATALOGUED and one["body"] == row.on and any(n in same for n in names)
 
@@ -72,9 +72,9 @@ def score(rows: Sequence[Row]) -> dict[str, float | int | None]:
         correctly named effects inside the interval. ``excess``: median, over catalogued cases, of
         by how much the revised model's errors of forecasts exceed the oracle's, a share.
         ``baseline_naming``: the best of the usual ways' shares of names among those of one body,
-        each beside it; a twin is right. ``nonsense_adequate``: number of nonsense cases called
-        adequate. ``detected``, ``cases``, ``failed``, ``not_converged``, ``method_laplace``,
-        ``method_metropolis``: numbers. ``seconds``: sum.
+        each beside it; an indistinguishable effect is right. ``nonsense_adequate``: number of
+        nonsense cases called adequate. ``detected``, ``cases``, ``failed``, ``not_converged``,
+        ``method_laplace``, ``method_metropolis``: numbers. ``seconds``: sum.
     """
     detected = [row for row in rows if row.kind in (CATALOGUED, LEFT_OUT, OUTSIDE) and row.detected]
     hidden = [row for row in detected if outcome(row) not in (NEGLIGIBLE, EQUIVALENT)]
@@ -114,7 +114,9 @@ def _baselines(rows: Sequence[Row]) -> dict[str, float | None]:
     for way in WAYS:
         names = [(row.baselines.get(way), row) for row in rows]
         if any(name is not None for name, _ in names):
-            shares[way] = _share(name in twins(row.body, row.effect) for name, row in names)
+            shares[way] = _share(
+                name in indistinguishable(row.body, row.effect) for name, row in names
+            )
     best = max((share for share in shares.values() if share is not None), default=None)
     return {"baseline_naming": best} | {f"naming_{way}": share for way, share in shares.items()}
 

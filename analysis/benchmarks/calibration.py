@@ -3,7 +3,7 @@
     python analysis/benchmarks/calibration.py FOLDER                  # the cart: Eq. 11
     python analysis/benchmarks/calibration.py FOLDER --case pair      # two discs that collide
 
-Each case is a small design: start states, actions, and which coordinates are measured. Each
+Each case is a small design: initial states, actions, and which coordinates are measured. Each
 replication is kept in the folder, where the same command goes on. ``--json`` prints one object.
 """
 
@@ -160,7 +160,7 @@ def positions() -> Design:
 
 
 def simulated(scene: pp.Scene, truth: Mapping[str, Any], start: Any, actions: Any) -> pp.History:
-    """Return a history from these start states, one trajectory each."""
+    """Return a history from these initial states, one trajectory each."""
     states = Transition(scene, truth).predict(start, actions)
     states += NOISE * np.random.default_rng(5).standard_normal(states.shape)
     return from_segments(scene, start, actions, states)

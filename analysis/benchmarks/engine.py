@@ -93,14 +93,14 @@ def cart_scene(wheel: bool = True, effects: tuple[str, ...] = ()) -> Scene:
 
 
 def cart_data(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return random start states (n, 1, 6) and wrenches (n, 1, 1, 3)."""
+    """Return random initial states (n, 1, 6) and wrenches (n, 1, 1, 3)."""
     rng = np.random.default_rng(1)
     start = rng.normal(0, [3.0, 3.0, 1.5, 1.5, 1.5, 1.0], (n, 1, 6))
     return start, rng.normal(0, [40.0, 40.0, 5.0], (n, 1, 1, 3))
 
 
 def hung(scene: Scene, start: np.ndarray) -> np.ndarray:
-    """Return start states (n, body, 6) that satisfy the hinges."""
+    """Return initial states (n, body, 6) that satisfy the hinges."""
     start = start.copy()
     for i, body in enumerate(scene.dynamic):
         if any(body.name in (joint.bodies or ()) for joint in scene.joints):
@@ -260,7 +260,7 @@ def jacobian_rows() -> list[Row]:
     layout, sigma = problem.layout, problem.noise_prior[0]
     phi = layout.to_vector(CART | SIZES)
     lower, upper = box(layout.priors)
-    steps, rough = 1e-3 * layout.scale(phi), problem.coarse.simulator
+    steps, coarse = 1e-3 * layout.scale(phi), problem.coarse.simulator
 
     def both(engine: PartedSimulator) -> Callable[[], float]:
         """The time of values and derivatives, the latter through an engine."""
@@ -277,7 +277,7 @@ def jacobian_rows() -> list[Row]:
         Row("jacobian_over_value", f"{what} {layout.size} parameters / the residual alone",
             "<= 10", both(problem.simulator), value),
         Row("coarse_jacobian_over_value", "the same, derivatives with few engine steps, as in the"
-            " search for modes", "", both(rough), value),
+            " search for modes", "", both(coarse), value),
     ]  # fmt: skip
 
 

@@ -4,8 +4,8 @@
     python analysis/benchmarks/inference.py --json             # one JSON object
     python analysis/benchmarks/inference.py --only cart map    # some of it
 
-Data are simulated by Eq. 13 from fixed seeds, each transition from its own start state, so that the
-model is true. Seconds are this machine's; the ratios compare both sides in one run.
+Data are simulated by Eq. 13 from fixed seeds, each transition from its own initial state, so that
+the model is true. Seconds are this machine's; the ratios compare both sides in one run.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 from mujoco import rollout, sysid
 
-if not hasattr(sysid, "optimize"):  # mujoco keeps quiet about what its toolbox lacks
+if not hasattr(sysid, "optimize"):  # mujoco does not say that its toolbox is missing
     raise ImportError("mujoco.sysid is there without what it needs")
 
 COMMANDS, STEPS, ROUNDS = 360, 20, 3

@@ -56,7 +56,7 @@ models = {
 # %% [markdown]
 # ## Prior predictive check
 #
-# Parameters are drawn from the prior and simulated from the measured start states. Each panel has
+# Parameters are drawn from the prior and simulated from the measured initial states. Each panel has
 # the changes of one state dimension over one interval: predicted in grey, measured in blue; thin
 # lines hold 94 %, thick ones half. Measured bars outside the predicted ones would mean a prior that
 # cannot have made the data. `pm.sample_prior_predictive(model)` gives such draws too.

@@ -60,9 +60,9 @@ cart
 # few best are refitted.
 
 # %%
-for rung in cart.rungs:
-    print(f"pieces of {rung.seconds:.2g} s: added {', '.join(rung.accepted) or 'nothing'}")
-    for best in rung.path:
+for length in cart.search:
+    print(f"pieces of {length.seconds:.2g} s: added {', '.join(length.accepted) or 'nothing'}")
+    for best in length.path:
         print(f"  {best.nats:8.0f} nats, error x {best.error:.3f}: {', '.join(best.laws)}")
 
 # %% [markdown]

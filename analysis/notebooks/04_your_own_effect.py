@@ -63,7 +63,7 @@ swirl = pp.Effect(
 #
 # A puck that slides without friction is pushed at random. The recording is simulated with a swirl
 # of 0.8 N/m, which the scene does not declare, and with measurement noise. `pp.Transition` is the
-# engine as a function of start states and wrenches.
+# engine as a function of initial states and wrenches.
 
 # %%
 STRENGTH = 0.8

@@ -44,7 +44,7 @@ class Recording:
     time : ndarray
         Times (s), shape (row,).
     start : ndarray
-        True start states, shape (trajectory, state).
+        True initial states, shape (trajectory, state).
     force : ndarray
         Known force along x (N), shape (trajectory, row - 1).
     measured : ndarray

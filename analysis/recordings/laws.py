@@ -1,6 +1,6 @@
 """Laws of motion of a fall, a pendulum and a slider: closed forms, or SciPy's integrator.
 
-No engine of the package is used. Each law takes the body, the effect's coefficient, start states
+No engine of the package is used. Each law takes the body, the effect's coefficient, initial states
 of shape (trajectory, state), times of shape (row,) in s and forces of shape (trajectory, row - 1)
 in N, and returns positions of shape (trajectory, row, coordinate).
 """

@@ -88,7 +88,7 @@ class Row:
         return not self.clean and any(right) and not all(right)
 
     @property
-    def silent(self) -> bool:
+    def names_nothing(self) -> bool:
         """Return whether the loop calls the model adequate and adds nothing."""
         return self.verdict == ADEQUATE and not self.added
 

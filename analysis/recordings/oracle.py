@@ -14,7 +14,7 @@ from recordings.laws import LAWS, Array
 
 #: The effect is detectable at a smaller p-value.
 DETECTS = 1e-4
-#: Step of the derivatives, in units of the coefficient's size and of the start states.
+#: Step of the derivatives, in units of the coefficient's size and of the initial states.
 _STEP = 1e-6
 
 
@@ -47,7 +47,7 @@ class Oracle:
 
 
 def ask(case: Case, recording: Recording) -> Oracle:
-    """Fit the right law with and without the effect, each trajectory's start state being free.
+    """Fit the right law with and without the effect, each trajectory's initial state being free.
 
     Outliers are left out, and quantisation is noise of the variance of a uniform distribution: not
     quite right where a body moves less than a step between samples, as its errors are then
@@ -70,7 +70,7 @@ def _fitted(case: Case, recording: Recording) -> Oracle:
         return ((places - recording.measured)[good] / case.sd).ravel()
 
     def derivative(vector: Array) -> Array:
-        # a start state moves its trajectory alone: the same one of all trajectories at once
+        # an initial state moves its trajectory alone: the same one of all trajectories at once
         middle, found = residual(vector), np.zeros((len(cell), len(vector)))
         found[:, 0] = residual(vector + _STEP * np.eye(len(vector))[0]) - middle
         for state in range(states):

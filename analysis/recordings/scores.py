@@ -40,7 +40,7 @@ def _cell(rows: Sequence[Row]) -> str:
     detectable = [row for row in rows if row.detectable]
     clean = [row for row in rows if row.clean]
     named = sum(row.named for row in detectable)
-    false = sum(not row.silent for row in clean)
+    false = sum(not row.names_nothing for row in clean)
     return f"{named}/{len(detectable)}, {false}/{len(clean)}"
 
 
@@ -79,7 +79,7 @@ def score(rows: Sequence[Row]) -> dict[str, float | int | None]:
             bool(row.added) and not row.named and not row.extra for row in detectable
         ),
         "missed": sum(not row.added for row in detectable),
-        "clean": _share([row.silent for row in clean]),
+        "clean": _share([row.names_nothing for row in clean]),
         "undetectable_named": sum(bool(row.added) for row in hidden),
         "coverage": _share(inside),
         "oracle_false_alarms": sum(row.oracle is not None and row.oracle.detects for row in clean),
@@ -99,7 +99,7 @@ def brief(row: Row) -> str:
     """Return a case in a line: the oracle's p-value, the verdict, names and intervals."""
     if row.oracle is None:
         return f"{row.name}: {row.error}"
-    wrong = (row.detectable and not row.named) or (row.clean and not row.silent)
+    wrong = (row.detectable and not row.named) or (row.clean and not row.names_nothing)
     names = "; ".join(_name(one) for one in row.added) or "nothing"
     hit = "" if not row.inside else f", {sum(row.inside)}/{len(row.inside)} inside"
     return (

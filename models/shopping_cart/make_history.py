@@ -481,7 +481,7 @@ def _trajectory(
 
 
 def tied(rod: tuple[float, ...], start: np.ndarray) -> np.ndarray:
-    """Return the start state that is nearest along a rod, and does not stretch it."""
+    """Return the initial state that is nearest along a rod, and does not stretch it."""
     x, y, theta, vx, vy, omega = start
     arm, place = complex(*rod[:2]) * cmath.exp(1j * theta), complex(*rod[2:4])
     way = complex(x, y) + arm - place

@@ -74,12 +74,12 @@ def check(
     checked = None
     if prior:
         progress("comparing with draws from the prior")
-        from pbrl_ppl.criticism import prior_predictive_check, telling_horizon
+        from pbrl_ppl.criticism import informative_horizon, prior_predictive_check
         from pbrl_ppl.effects import attach
         from pbrl_ppl.likelihood import Problem
 
         physics = Physics(sized, attach(sized, (), catalogue))
-        problem = Problem.of(physics, loaded, horizon=telling_horizon(loaded))
+        problem = Problem.of(physics, loaded, horizon=informative_horizon(loaded))
         checked = prior_predictive_check(problem, draws=draws, seed=seed)
         for sentence in checked.summary:
             console.print(f"prior: {sentence}", soft_wrap=True)
@@ -182,12 +182,13 @@ def criticise(
     catalogue = reading.catalogue()
     progress("loading the model")
     from pbrl_ppl import criticism
+    from pbrl_ppl.files import json_fields
     from pbrl_ppl.physics import check_history
 
     settings: dict[str, Any] = {"catalogue": catalogue, "seed": seed, "progress": progress}
     if simulate:
         attribution = criticism.attribute(declared, loaded, **settings)
-        return Result(vars(attribution), _shown_laws(attribution))
+        return Result(json_fields(attribution), _shown_laws(attribution))
     check_history(declared, loaded, loaded.segments(1))
     ranking = criticism.criticise(declared, loaded, **settings)
     columns = {"effect": "<", "body": "<", "S": ".1f", "dof": "", "p (corrected)": ".2g"}
@@ -210,14 +211,14 @@ def criticise(
 
 def _shown_laws(attribution: Attribution) -> Iterator[str | Table]:
     """Yield the search on each length of pieces, the laws found, and the simulation error."""
-    for rung in attribution.rungs:
+    for length in attribution.search:
         yield table(
-            f"best subsets of laws on pieces of {rung.seconds:.3g} s, intervals: {rung.rows}",
+            f"best subsets of laws on pieces of {length.seconds:.3g} s, intervals: {length.rows}",
             {"laws": "<", "nats": ".1f", "error relative to none": ".3f"},
-            ([", ".join(best.laws), best.nats, best.error] for best in rung.path),
+            ([", ".join(best.laws), best.nats, best.error] for best in length.path),
         )
-        yield f"accepted: {', '.join(rung.accepted) or 'none'}"
-        yield f"dropped: {', '.join(rung.dropped) or 'none'}\n"
+        yield f"accepted: {', '.join(length.accepted) or 'none'}"
+        yield f"dropped: {', '.join(length.dropped) or 'none'}\n"
     columns = {"law": "<", "body": "<", "kind": "<", "nats": ".1f", "share of error": ""}
     yield table(
         "laws that the simulation error of trajectories shows",

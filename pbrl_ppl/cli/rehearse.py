@@ -36,7 +36,7 @@ def rehearse(
     Parameters
     ----------
     commands : COMMANDS
-        Start states and wrenches (.csv, .parquet, .nc), as of simulate; proposed if not given.
+        Initial states and wrenches (.csv, .parquet, .nc), as of simulate; proposed if not given.
     output
         The answer (.json), or the simulated recording with its commands (.csv, .parquet, .nc).
     given : NAME=VALUE

@@ -35,7 +35,7 @@ def simulate(
     seed: options.Seed = 1,
     overwrite: bool = False,
 ) -> Result:
-    """Simulate a recording: its start states and wrenches, under parameters that are given.
+    """Simulate a recording: its initial states and wrenches, under parameters that are given.
 
     Each trajectory is followed from its first complete state to its end. With --noise, measurement
     noise is added; without, the states are the engine's.

@@ -19,8 +19,8 @@ from .misfit import LARGEST_SHARE as LARGEST_SHARE
 from .misfit import acceleration_in_words as acceleration_in_words
 from .misfit import share_in_words as share_in_words
 from .prior_check import PriorCheck as PriorCheck
+from .prior_check import informative_horizon as informative_horizon
 from .prior_check import prior_predictive_check as prior_predictive_check
-from .prior_check import telling_horizon as telling_horizon
 from .ranking import Ranking as Ranking
 from .ranking import criticise as criticise
 from .rehearsal import Rehearsal as Rehearsal

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.ranking import checked_mode
-from pbrl_ppl.criticism.results import ONE_TRAJECTORY, Law, Rung, Stage
+from pbrl_ppl.criticism.results import ONE_TRAJECTORY, Law, SearchLength, Stage
 from pbrl_ppl.criticism.search import Search
 from pbrl_ppl.effects import Attached, Effect, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
@@ -35,7 +35,7 @@ class Attribution:
         Length of the simulated pieces (s).
     trajectories : int
         How many there are.
-    rungs : tuple of Rung
+    search : tuple of SearchLength
         What was found at each length of pieces.
     rejected : dict of str to str
         Why a law that was found on shorter pieces is not among them.
@@ -47,7 +47,7 @@ class Attribution:
     correlated: dict[str, float]
     seconds: float
     trajectories: int
-    rungs: tuple[Rung, ...] = ()
+    search: tuple[SearchLength, ...] = field(default=(), metadata={"key": "rungs"})
     rejected: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -74,7 +74,7 @@ def attribute(
 ) -> Attribution:
     """Name the effects that take the simulation error of whole trajectories away.
 
-    The declared model is simulated from latent start states, without process noise, in pieces of
+    The declared model is simulated from latent initial states, without process noise, in pieces of
     four rows and then of longer ones. On each length one regression proposes which laws are missing
     together; the best proposals are refitted, and one is added if the error's fall is evidence by
     the effective sample size and large enough. A law that longer pieces do not need is dropped.
@@ -105,7 +105,7 @@ def attribute(
     Raises
     ------
     HistoryError
-        If the history does not fit the scene, no trajectory has three rows, or start states can
+        If the history does not fit the scene, no trajectory has three rows, or initial states can
         follow all that was measured.
     EffectError
         If the scene declares an unknown effect.
@@ -134,6 +134,6 @@ def attribute(
         correlated=dict(zip(names, likelihood.tau, strict=True)),
         seconds=problem.data.horizon * problem.scene.time_step,
         trajectories=problem.data.history.n_trajectories,
-        rungs=found.rungs,
+        search=found.lengths,
         rejected={f"{law.effect.name} on {law.body}": why for law, why in found.rejected.items()},
     )

@@ -21,7 +21,7 @@ from pbrl_ppl.criticism.misfit import (
     simulation_test,
     with_negligible_acceleration,
 )
-from pbrl_ppl.criticism.prior_check import prior_predictive_check, telling_horizon
+from pbrl_ppl.criticism.prior_check import informative_horizon, prior_predictive_check
 from pbrl_ppl.criticism.ranking import declared_mode
 from pbrl_ppl.criticism.recordings import checked_histories, outliers
 from pbrl_ppl.criticism.refinement import shift
@@ -312,7 +312,7 @@ def _searched(task: _Task, declared: _Fitted) -> _Searched:
     search, mode = Search(task.missing, task.criteria, task.say), declared.mode
     try:
         found = search(mode)
-    except HistoryError:  # start states could follow all that was measured
+    except HistoryError:  # initial states could follow all that was measured
         found = search(find_mode(single_transitions(mode.problem), initial=mode.phi))
     task.say(Stage.SCORE)
     ranked = rank_candidates(declared.mode, task.missing(declared.mode), task.criteria)
@@ -419,7 +419,7 @@ def _prior_test(
     fixed: Mapping[str, float] | None = None,
 ) -> ResidualTest:
     """Test whether the prior, with some parameters held, could have made the data."""
-    horizon = telling_horizon(train)
+    horizon = informative_horizon(train)
     problem = Problem.of(Physics(task.scene, effects, threads=2), train, horizon=horizon)
     checked = prior_predictive_check(
         problem, seed=task.seed, fixed=fixed, criteria=task.criteria.prior
@@ -556,7 +556,7 @@ def _put_together(task: _Task, judged: _Judged, before: Fit, after: Fit, recorde
         ),
         correlations=misfit.correlations,
         growth=misfit.growth,
-        rungs=judged.searched.found.rungs,
+        search=judged.searched.found.lengths,
         small=judged.small,
         identifiability=identify(after.posterior, mode=revised.mode),
         loo=_compared(declared.mode, revised.mode, before, after),

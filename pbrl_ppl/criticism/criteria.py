@@ -113,8 +113,8 @@ class Criteria:
     worse_forecast : float
         Forecasts may have this many times the error that noise and a negligible acceleration make.
     worst_simulation : float
-        A model that lacks nothing simulates whole held-out trajectories, from start states that are
-        fitted to them, to this many times the measurement noise: errors of a sensor may be
+        A model that lacks nothing simulates whole held-out trajectories, from initial states that
+        are fitted to them, to this many times the measurement noise: errors of a sensor may be
         correlated.
     outlier_deviations : float
         A single measurement is left out if its residual exceeds this many robust standard

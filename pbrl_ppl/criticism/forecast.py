@@ -9,8 +9,8 @@ import numpy as np
 from pbrl_ppl.likelihood import Problem, TrajectoryNoise
 from pbrl_ppl.state import STATE, Bools, Floats, Ints
 
-#: Rows after which a filter's covariance has settled.
-_SETTLED = 5
+#: Rows after which a filter's covariance is in steady state.
+_STEADY_STATE_ROWS = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class Forecast:
 def longest_forecast(problem: Problem) -> int:
     """Return the length of the longest forecasts that all trajectories have, in intervals."""
     shortest = int(problem.data.history.dataset["n_rows"].min()) - 1
-    return max(1, shortest - min(_SETTLED, shortest // 2))
+    return max(1, shortest - min(_STEADY_STATE_ROWS, shortest // 2))
 
 
 def filtered_states(problem: Problem, phi: Floats, sigma: Floats) -> Floats:
@@ -69,8 +69,8 @@ def filtered_states(problem: Problem, phi: Floats, sigma: Floats) -> Floats:
     flat = states.reshape(*states.shape[:2], -1)
     flat[segments.trajectory[:, None], segments.step[:, None] + 1, coordinates.places] += deviation
     # the first row has no earlier one: it is as measured, or as smoothed over the next rows
-    few = replace(noise, seen=noise.seen & (segments.step < _SETTLED)[:, None])
-    hidden = (noise.wide > 0).any(axis=1, keepdims=True)
+    few = replace(noise, seen=noise.seen & (segments.step < _STEADY_STATE_ROWS)[:, None])
+    hidden = (noise.initial_variance > 0).any(axis=1, keepdims=True)
     first = np.where(hidden, few.smoothed(residual, sigma)[0], noise.begin)[noise.first]
     flat[segments.trajectory[noise.first, None], 0, coordinates.places] += first
     return coordinates.completed(problem.scene, states)
@@ -178,7 +178,7 @@ def forecast(
     starts = []
     for begin, length in zip(begins, lengths, strict=True):
         if length >= intervals:
-            first = min(_SETTLED, length - intervals)
+            first = min(_STEADY_STATE_ROWS, length - intervals)
             rows = begin + np.arange(first, length - intervals + 1)
             measured = noise.seen[rows + intervals - 1].any(axis=1)
             starts.append(rows[measured][:: max(1, intervals // 2)])
@@ -227,13 +227,13 @@ def _spread(noise: TrajectoryNoise, sigma: Floats, at: Ints, step: Ints) -> Floa
 def _first_spread(noise: TrajectoryNoise, sigma: Floats, first: int) -> Floats:
     """Return the covariance of a trajectory's first filtered state, shape (cell, cell)."""
     error = noise.coordinates.errors(sigma)
-    wide = noise.wide[first]
-    if not wide.any():
+    initial_variance = noise.initial_variance[first]
+    if not initial_variance.any():
         return np.diag(error**2)
     # the information of the first rows, with no process noise between them
-    scale = np.where(wide > 0, np.sqrt(wide), error)
+    scale = np.where(initial_variance > 0, np.sqrt(initial_variance), error)
     information, way = np.eye(len(scale)), np.diag(scale)
-    for k in range(first, min(first + _SETTLED, len(noise.first))):
+    for k in range(first, min(first + _STEADY_STATE_ROWS, len(noise.first))):
         if k > first and noise.first[k]:
             break
         way = noise.slope[k] @ way

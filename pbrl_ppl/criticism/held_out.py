@@ -131,17 +131,17 @@ class HeldOut:
         )
 
     def simulated(self) -> dict[str, float]:
-        """Return the errors of whole trajectories, simulated from start states fitted to them.
+        """Return the errors of whole trajectories, simulated from initial states fitted to them.
 
         They are root mean squares by measured state dimension, in its unit, less the degrees of
-        freedom of the start states; empty where simulations magnify their start, or trajectories
+        freedom of the initial states; empty where simulations magnify their start, or trajectories
         are too short.
         """
         longest = int(self.problem.data.history.dataset["n_rows"].max()) - 1
         if longest < 3:
             return {}
         pieces = in_pieces(self.problem, longest, self.problem.data.smoothed_states)
-        fitted = fit_pieces(pieces, self.mode.phi, starts_alone=True)
+        fitted = fit_pieces(pieces, self.mode.phi, initial_states_alone=True)
         if growth(fitted.problem) > MOST_GROWTH:
             return {}
         names = fitted.problem.observations.names

@@ -25,13 +25,13 @@ from pbrl_ppl.criticism.results import (
     Numerical,
     ResidualTest,
     Rollout,
-    Rung,
+    SearchLength,
     Unexplained,
 )
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import FitError, OutputError
-from pbrl_ppl.files import json_values
+from pbrl_ppl.files import json_fields, json_values
 from pbrl_ppl.history import History, UnusedVelocity
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.posterior import Comparison, Fit, Idata, Identifiability, save_posterior
@@ -86,7 +86,7 @@ class Loop:
         Correlations of the revised model's innovations.
     growth : Growth
         Growth of the revised model's forecast errors.
-    rungs : tuple of Rung
+    search : tuple of SearchLength
         What the search found on pieces of each length.
     small : tuple of Candidate
         Effect that is significant in the innovations and was not added, if there is one.
@@ -129,7 +129,7 @@ class Loop:
     acceleration: Acceleration
     correlations: Correlations
     growth: Growth
-    rungs: tuple[Rung, ...] = ()
+    search: tuple[SearchLength, ...] = ()
     small: tuple[Candidate, ...] = ()
     identifiability: Identifiability | None = None
     loo: Comparison | None = None
@@ -265,7 +265,7 @@ class Loop:
                 "added": [_fields(added, "sentence") for added in self.added],
                 "candidates": [_fields(item, "sentence", "units") for item in self.candidates],
                 "small": [[candidate.effect, candidate.body] for candidate in self.small],
-                "search": self.rungs,
+                "search": self.search,
                 "tests": self.tests,
                 "unexplained_acceleration": self.acceleration,
                 "unexplained": self.unexplained,
@@ -375,5 +375,5 @@ def check_folder(folder: Path, overwrite: bool) -> Path:
 
 
 def _fields(value: Any, *left_out: str) -> dict[str, Any]:
-    """Return the fields of a dataclass without those named."""
-    return {name: field for name, field in vars(value).items() if name not in left_out}
+    """Return the fields of a dataclass by their keys in JSON, without those named."""
+    return {name: item for name, item in json_fields(value).items() if name not in left_out}

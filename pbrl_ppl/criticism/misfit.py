@@ -195,7 +195,7 @@ def simulation_test(
     seconds: float,
     criteria: Criteria,
 ) -> ResidualTest:
-    """Return the test of held-out trajectories that are simulated from fitted start states.
+    """Return the test of held-out trajectories that are simulated from fitted initial states.
 
     Parameters
     ----------

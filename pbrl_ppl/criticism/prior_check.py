@@ -263,7 +263,7 @@ def _at(states: Floats, step: Ints) -> Floats:
     return np.asarray(np.take_along_axis(states, picked, axis=-3)[..., 0, :, :])
 
 
-def telling_horizon(history: History, signal: float = 5.0) -> int:
+def informative_horizon(history: History, signal: float = 5.0) -> int:
     """Return the intervals in which bodies move well beyond the measurement noise: often one.
 
     In a fast recording an interval shows hardly more than noise, which does not depend on the
@@ -286,11 +286,11 @@ def telling_horizon(history: History, signal: float = 5.0) -> int:
         steps.append(min(2 * steps[-1], longest))
     noise = _mean_square(places, angle, 1, 3) / 20.0
     changes = np.array([_mean_square(places, angle, step, 1) for step in steps])
-    telling = changes >= signal**2 * noise
-    moves = (telling & (changes > 0.0)).any(
+    informative = changes >= signal**2 * noise
+    moves = (informative & (changes > 0.0)).any(
         axis=0
     )  # what never moves beyond its noise does not decide
-    enough = telling[:, moves].all(axis=1) & moves.any()
+    enough = informative[:, moves].all(axis=1) & moves.any()
     return steps[int(enough.argmax())] if enough.any() else steps[-1]
 
 

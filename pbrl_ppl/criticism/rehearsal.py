@@ -109,7 +109,7 @@ def rehearse(
 
     The declared model is simulated once, with measurement noise. There, without a refit, each law
     of the catalogue is linearised as in the search of :func:`pbrl_ppl.attribute`, declared
-    parameters and start states projected out, and the size read off at which its log-evidence and
+    parameters and initial states projected out, and the size read off at which its log-evidence and
     its share of the simulation error pass the thresholds of :class:`SearchCriteria`. The law is
     then added to the residual, and the same regression says which name wins.
 
@@ -119,7 +119,7 @@ def rehearse(
         The declared model; its ``noise`` is that of the sensors, a thousandth of the motion where
         it says nothing.
     commands : History, optional
-        Start states and wrenches. What it measures after the first rows will be measured; if
+        Initial states and wrenches. What it measures after the first rows will be measured; if
         nothing, the dimensions of the scene's ``noise``, or else x, y and theta. By default four
         trajectories of pushes, pauses and pushes back of random sizes are proposed.
     parameters : mapping of str to float, optional
@@ -169,19 +169,21 @@ def rehearse(
         one for one in candidates(problem.scene, physics.effects, catalogue)
         if not isinstance(one.effect.stage, Noise)
     ]  # fmt: skip
-    rungs: list[_Rung] = []
+    regressions: list[_Regression] = []
     for mode in _known_modes(problem, phi, states)[::-1]:
         seconds = mode.problem.data.horizon * scene.time_step
         say(f"linearising {len(tried)} laws on pieces of {seconds:.3g} s")
-        rungs.append(_Rung.of(mode, tried, criteria, rungs[-1] if rungs else None))
+        regressions.append(
+            _Regression.of(mode, tried, criteria, regressions[-1] if regressions else None)
+        )
     say("adding each law to the simulation")
-    laws = in_parallel(partial(_rehearsed, rungs), tried)
+    laws = in_parallel(partial(_rehearsed, regressions), tried)
     return Rehearsal(
         tuple(sorted(laws, key=lambda law: law.share)),
         history,
         dict(zip(physics.layout.labels, phi.tolist(), strict=True)),
         noise,
-        rungs[0].mode.problem.data.horizon * scene.time_step,
+        regressions[0].mode.problem.data.horizon * scene.time_step,
     )
 
 
@@ -200,7 +202,7 @@ def _apart(problem: Problem, states: Floats) -> Problem:
 def _known_modes(problem: Problem, phi: Floats, states: Floats) -> list[Mode]:
     """Return the modes of a simulated recording at its true parameters and states.
 
-    On pieces, the shortest first, up to where a start state is magnified.
+    On pieces, the shortest first, up to where an initial state is magnified.
     """
 
     def at(length: int) -> Mode:
@@ -227,7 +229,7 @@ class _Way(NamedTuple):
         What a unit of it adds to the residual, to first order, in units of noise, shape (n,).
     term : Term
         The grid point.
-    rung : _Rung
+    regression : _Regression
         Pieces of one length.
     """
 
@@ -236,11 +238,11 @@ class _Way(NamedTuple):
     place: int | None
     direction: Floats
     term: Term
-    rung: _Rung
+    regression: _Regression
 
 
 @dataclass(frozen=True, eq=False)
-class _Rung:
+class _Regression:
     """Regression at the true parameters on pieces of one length, and what a law adds to it.
 
     Parameters
@@ -257,7 +259,7 @@ class _Rung:
         Share of the simulation error that a law takes away.
     criteria : Criteria
         Other thresholds.
-    longer : _Rung or None
+    longer : _Regression or None
         That on longer pieces.
     """
 
@@ -267,12 +269,12 @@ class _Rung:
     basis: Floats
     least_share: float
     criteria: Criteria
-    longer: _Rung | None
+    longer: _Regression | None
 
     @classmethod
     def of(
-        cls, mode: Mode, tried: Sequence[Attached], criteria: Criteria, longer: _Rung | None
-    ) -> _Rung:
+        cls, mode: Mode, tried: Sequence[Attached], criteria: Criteria, longer: _Regression | None
+    ) -> _Regression:
         """Linearise candidates at a mode."""
         tests, linear = linearised(mode, tried, criteria)
         visible, width, terms = sum(map(bool, linear.values())), 0, []
@@ -292,7 +294,7 @@ class _Rung:
     @cached_property
     def counts(self) -> Floats:
         """Degrees of freedom of each dimension, shape (state,)."""
-        return np.maximum(output_error(self.mode.problem).starts.counts, 1.0)
+        return np.maximum(output_error(self.mode.problem).initial_states.counts, 1.0)
 
     def ways(self, law: Attached) -> list[_Way]:
         """Return the sizes of a law that pay its price in white noise, the least share first."""
@@ -364,7 +366,7 @@ class _Rung:
         """
         pieces = self.mode.whitened_residual.shape
         shape = self.mode.problem.observations.values.shape
-        column = output_error(self.mode.problem).starts.column
+        column = output_error(self.mode.problem).initial_states.column
         weight = 1.0 / np.sqrt(square)
         begin = np.where(column < 0, 1.0, weight[column])
         rows = np.concatenate([np.tile(weight, shape[1] * shape[2]), begin])
@@ -392,10 +394,10 @@ class _Rung:
         values = way.term.linear.values.astype(float)
         if way.place is not None:
             values[way.place] += -size if null_sides(law)[way.place] < 0 else size
-        wide = problem.with_physics(effects=(*problem.physics.effects, law)).rough
-        phi = np.tile(wide.layout.from_layout(problem.layout, self.mode.phi), (2, 1))
-        phi[:, wide.layout.places(law.labels)] = law.effect.null, values
-        null, there = np.nan_to_num(wide.whitened(phi, self.mode.sigma)).reshape(2, -1)
+        enlarged = problem.with_physics(effects=(*problem.physics.effects, law)).medium
+        phi = np.tile(enlarged.layout.from_layout(problem.layout, self.mode.phi), (2, 1))
+        phi[:, enlarged.layout.places(law.labels)] = law.effect.null, values
+        null, there = np.nan_to_num(enlarged.whitened(phi, self.mode.sigma)).reshape(2, -1)
         return self.tests.left(np.pad(null - there, (0, len(self.mode.phi))))
 
     def named(self, law: Attached, added: Floats) -> tuple[str, tuple[str, ...]]:
@@ -422,7 +424,7 @@ class _Rung:
         return named_beside(first, law), tuple(named_beside(one, law) for one in close)
 
 
-def _rehearsed(rungs: Sequence[_Rung], law: Attached) -> RehearsedLaw:
+def _rehearsed(regressions: Sequence[_Regression], law: Attached) -> RehearsedLaw:
     """Return what is seen of a law on pieces of any length."""
     effect, parameters = law.effect, law.effect.parameters
     names = [parameter.name for parameter in parameters]
@@ -431,17 +433,19 @@ def _rehearsed(rungs: Sequence[_Rung], law: Attached) -> RehearsedLaw:
         {parameter.name: parameter.unit for parameter in parameters}, np.inf, "", (),
         "declared parameters absorb it, or it changes nothing here",
     )  # fmt: skip
-    ways = [way for rung in rungs for way in rung.ways(law)]
+    ways = [way for one in regressions for way in one.ways(law)]
     if not ways:
         return unseen
-    sized = {(id(way.rung), way.place): way for way in reversed(ways) if way.place is not None}
+    sized = {
+        (id(way.regression), way.place): way for way in reversed(ways) if way.place is not None
+    }
     least: dict[tuple[int | None, bytes], _Way] = {}
     for way in sorted(sized.values(), key=lambda way: way.share) or ways:
         # of a whole change, each point
         key = way.place, b"" if way.place is not None else way.term.linear.values.tobytes()
         if key not in least or way.share < least[key].share:  # of white noise, the least
-            one = way.rung.least(way)
-            if one is not None and one.share < way.rung.criteria.far_out:
+            one = way.regression.least(way)
+            if one is not None and one.share < way.regression.criteria.far_out:
                 least[key] = min(one, least.get(key, one), key=lambda way: way.share)
     found = sorted(least.values(), key=lambda way: way.share)
     if not found:
@@ -454,7 +458,9 @@ def _rehearsed(rungs: Sequence[_Rung], law: Attached) -> RehearsedLaw:
         if len(names) == 1:
             seen = [float(way.term.linear.values[0]) for way in found]
             levels[names[0]] = min(seen, key=lambda level: abs(level - effect.null[0]))
-    named, confounded = best.rung.named(law, best.rung.added(best, _WELL_SEEN * best.size))
+    named, confounded = best.regression.named(
+        law, best.regression.added(best, _WELL_SEEN * best.size)
+    )
     return RehearsedLaw(
         effect.name, law.body, effect.sentence, sizes, levels, unseen.null, unseen.units,
         best.share, named, confounded, note,

@@ -39,13 +39,13 @@ class Candidate:
         Unit of each parameter.
     identifiable : float
         Share of the signature (0 to 1) that the declared parameters cannot absorb.
-    looks : int
+    n_grid_points : int
         Number of grid points (places, thresholds or times); the p-value is corrected for them.
     detectable : dict of str to float
         Detection limit of each parameter, the others at their null values: the smallest size that
         reaches a p-value of 0.01 with probability 0.9; infinite where none does. For a scan, at the
         best grid point; empty where there is no size without a place.
-    caps : bool
+    is_upper_limit : bool
         Whether smaller is stronger, as for a limit: larger ones than ``detectable`` are not seen.
     why : str
         Why the loop added it or did not; empty if it did not decide.
@@ -64,9 +64,9 @@ class Candidate:
     estimate: Mapping[str, float]
     units: Mapping[str, str]
     identifiable: float
-    looks: int = 1
+    n_grid_points: int = field(default=1, metadata={"key": "looks"})
     detectable: Mapping[str, float] = field(default_factory=dict)
-    caps: bool = False
+    is_upper_limit: bool = field(default=False, metadata={"key": "caps"})
     why: str = ""
     simulated_nats: float | None = None
     simulated_share: float | None = None
@@ -125,7 +125,7 @@ class LawsOfSize:
 
 
 @dataclass(frozen=True)
-class Rung:
+class SearchLength:
     """A search on pieces of one length.
 
     Parameters
@@ -350,8 +350,8 @@ class Errors:
     elpd : float
         Log predictive density, summed over held-out transitions.
     simulated_rmse : dict of str to float
-        Root mean square error of whole trajectories, simulated from start states that are fitted to
-        them, per measured state dimension; empty where simulations magnify their start.
+        Root mean square error of whole trajectories, simulated from initial states that are fitted
+        to them, per measured state dimension; empty where simulations magnify their start.
     """
 
     one_step_rmse: Mapping[str, float]

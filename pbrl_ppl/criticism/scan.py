@@ -67,26 +67,26 @@ def grid_points(
     if effect.scan is None:
         return []
     body = problem.scene.body(candidate.body)
-    wide = problem.with_physics(effects=(*problem.physics.effects, candidate)).rough
-    coarse = proposed is None
+    enlarged = problem.with_physics(effects=(*problem.physics.effects, candidate)).medium
+    of_scan = proposed is None
     if proposed is None:
-        proposed, wide = effect.scan(problem.scene, problem.data.history, body), wide.coarse
-    declared = wide.layout.places(problem.layout.labels)
-    places = wide.layout.places(candidate.labels)
+        proposed, enlarged = effect.scan(problem.scene, problem.data.history, body), enlarged.coarse
+    declared = enlarged.layout.places(problem.layout.labels)
+    places = enlarged.layout.places(candidate.labels)
     null = np.array(effect.null)
 
     def whitened(points: Floats) -> Floats:
-        phi = np.zeros((len(points), wide.layout.size))
+        phi = np.zeros((len(points), enlarged.layout.size))
         phi[:, declared] = mode.phi
         phi[:, places] = points
-        return -np.nan_to_num(wide.whitened(phi, mode.sigma)).reshape(len(points), -1)
+        return -np.nan_to_num(enlarged.whitened(phi, mode.sigma)).reshape(len(points), -1)
 
     free = np.isnan(proposed)
     steps = 1e-3 * np.array([parameter.prior.scale for parameter in effect.parameters])
     lower, upper = np.array([p.prior.support for p in effect.parameters]).T
     # one-sided where the null is the least that there can be
     ahead, behind = np.minimum(null + steps, upper) - null, np.maximum(null - steps, lower) - null
-    if coarse:  # one side will do to choose from
+    if of_scan:  # one side will do to choose from
         behind = np.where(ahead > 0.0, 0.0, behind)
     nothing = whitened(null[None])
     kept = []
@@ -178,7 +178,7 @@ def detection_limits(
     return limits
 
 
-def caps(effect: Effect, points: Sequence[GridPoint]) -> bool:
+def is_upper_limit(effect: Effect, points: Sequence[GridPoint]) -> bool:
     """Return whether smaller is stronger, as for a limit: grid points below the null value."""
     return bool(points) and all(
         not point.columns and point.values[0] < effect.null[0] for point in points

@@ -13,9 +13,9 @@ from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.results import Candidate
 from pbrl_ppl.criticism.scan import (
     GridPoint,
-    caps,
     detection_limits,
     grid_points,
+    is_upper_limit,
 )
 from pbrl_ppl.effects import Attached, Noise
 from pbrl_ppl.likelihood import Problem
@@ -188,8 +188,8 @@ def _slopes(mode: Mode, attached: Attached | None = None) -> Floats:
     is simulated by itself, for every law costs time in every engine step.
     """
     effects = mode.problem.physics.effects + (() if attached is None else (attached,))
-    wide = mode.problem.with_physics(effects=effects).rough
-    layout = wide.layout
+    enlarged = mode.problem.with_physics(effects=effects).medium
+    layout = enlarged.layout
     null = layout.from_layout(mode.problem.layout, mode.phi)
     labels = mode.problem.layout.labels
     if attached is not None:
@@ -201,13 +201,13 @@ def _slopes(mode: Mode, attached: Attached | None = None) -> Floats:
     lower, upper = (bound[new] for bound in box(layout.priors))  # a mass of 0 is at the end
     begin = 1e-3 * np.array([layout.priors[place].scale for place in new])
 
-    def predict(points: Floats, problem: Problem = wide) -> Floats:
+    def predict(points: Floats, problem: Problem = enlarged) -> Floats:
         phi = np.tile(null, (len(points), 1))
         phi[:, new] = points
         return -np.nan_to_num(problem.whitened(phi, mode.sigma)).reshape(len(points), -1)
 
-    rough = partial(predict, problem=wide.coarse)
-    return posterior_slopes(predict, null[new], lower, upper, begin, rough)
+    coarse = partial(predict, problem=enlarged.coarse)
+    return posterior_slopes(predict, null[new], lower, upper, begin, coarse)
 
 
 @dataclass(frozen=True, eq=False)
@@ -352,9 +352,9 @@ def _signature(
         estimate=dict(zip(names, values.tolist(), strict=True)),
         units={parameter.name: parameter.unit for parameter in effect.parameters},
         identifiable=evidence.share,
-        looks=len(tried),
+        n_grid_points=len(tried),
         detectable=detection_limits(effect, tried, units, test.candidates, test.criteria.residual),
-        caps=caps(effect, tried),
+        is_upper_limit=is_upper_limit(effect, tried),
     )
     return Signature(
         attached, candidate, log_p, evidence.basis, evidence.direction, evidence.absorbed, linear
@@ -408,8 +408,8 @@ def _tail_score(mode: Mode, attached: Attached, test: ScoreTest) -> Signature:
     seen = problem.trajectory_noise.seen if along else problem.observations.measured
     whitened = test.residual[: seen.size].reshape(seen.shape)
     # coordinates that never move have no noise, and would make all others look heavy-tailed
-    loud = seen & (np.abs(whitened).max(axis=0) > VISIBLE)
-    z = whitened[loud] if problem.nu(mode.phi) is None else np.zeros(0)
+    moving = seen & (np.abs(whitened).max(axis=0) > VISIBLE)
+    z = whitened[moving] if problem.nu(mode.phi) is None else np.zeros(0)
     z = z / max(float(np.sqrt(np.mean(z**2))), 1e-300) if len(z) else z
     score, variance = float((z**4 - 6 * z**2 + 3).sum() / 4), 1.5 * max(len(z), 1)
     heavier = score > 0

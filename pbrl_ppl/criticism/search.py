@@ -17,7 +17,7 @@ import numpy as np
 from scipy.stats import norm
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
-from pbrl_ppl.criticism.results import Law, LawsOfSize, Rung
+from pbrl_ppl.criticism.results import Law, LawsOfSize, SearchLength
 from pbrl_ppl.criticism.score import named_beside, rank_candidates
 from pbrl_ppl.criticism.subsets import Regression, Subset, best_subsets, worth
 from pbrl_ppl.effects import Attached, Noise, Structure
@@ -194,7 +194,7 @@ class SearchResult:
         Gain in expected log predictive density by each law, and its standard error (nats).
     confounded : dict of Attached to tuple of Attached
         Effects that explain the data as well as a law.
-    rungs : tuple of Rung
+    lengths : tuple of SearchLength
         What was found at each length of pieces.
     tried : dict of Attached to Evidence
         What each candidate alone is worth to first order, on the shortest pieces.
@@ -207,7 +207,7 @@ class SearchResult:
     laws: Mapping[Attached, Law] = field(default_factory=dict)
     gains: Mapping[Attached, tuple[float, float]] = field(default_factory=dict)
     confounded: Mapping[Attached, tuple[Attached, ...]] = field(default_factory=dict)
-    rungs: tuple[Rung, ...] = ()
+    lengths: tuple[SearchLength, ...] = ()
     tried: Mapping[Attached, Evidence] = field(default_factory=dict)
     rejected: Mapping[Attached, str] = field(default_factory=dict)
 
@@ -319,18 +319,18 @@ class Search:
         Raises
         ------
         HistoryError
-            If no trajectory has three rows, or start states can follow all that was measured.
+            If no trajectory has three rows, or initial states can follow all that was measured.
         """
         if mode.problem.likelihood.independent:
-            model, rung, before, regression = self._at_length(_Model(mode))
-            found = self._judged(mode, mode, model, regression, (rung,), _alone(before))
+            model, here, before, regression = self._at_length(_Model(mode))
+            found = self._judged(mode, mode, model, regression, (here,), _alone(before))
             return replace(found, declared=mode)
         first, *longer = piece_lengths(mode)
         pieces = in_pieces(_apart(mode, first), first, mode.problem.data.smoothed_states)
         model = _Model(fit_pieces(pieces, mode.phi))
         begin = model.mode.phi
-        model, rung, before, regression = self._at_length(model)
-        tried, rungs = _alone(before), [rung]
+        model, here, before, regression = self._at_length(model)
+        tried, lengths = _alone(before), [here]
         for length in longer:
             higher = _carried(model.mode, length)
             if _is_lost(model.mode, higher):
@@ -342,8 +342,8 @@ class Search:
                 if _is_lost(trial.mode, higher):
                     break
                 model = trial
-            model, rung, _, regression = self._at_length(model.at(higher))
-            rungs.append(rung)
+            model, here, _, regression = self._at_length(model.at(higher))
+            lengths.append(here)
         # on the longest pieces, where they add up, small corrections as well, if they are common
         common = tuple(
             one for one in regression.subsets
@@ -354,11 +354,11 @@ class Search:
         if better is not model:
             model, regression = better, self._regression(better.mode)
         declared = _without_all(model, begin)
-        found = self._judged(mode, declared, model, regression, tuple(rungs), tried)
+        found = self._judged(mode, declared, model, regression, tuple(lengths), tried)
         if found.laws:
             found = self._beside(declared, found)
         found = _with_contacts(found, mode, first)
-        named = {law: "" for rung in rungs for law in rung.accepted}
+        named = {law: "" for one in lengths for law in one.accepted}
         named |= {_name(law): f": {why}" for law, why in found.rejected.items()}
         for law, why in named.items():
             if law not in map(_name, found.laws):
@@ -375,12 +375,12 @@ class Search:
         why = f"takes {100 * share:.2g} % off the error of a single trajectory, which is too little"
         rejected = {**found.rejected, **dict.fromkeys(found.laws, why)}
         return SearchResult(
-            declared, declared, rungs=found.rungs, tried=found.tried, rejected=rejected
+            declared, declared, lengths=found.lengths, tried=found.tried, rejected=rejected
         )
 
     def _at_length(
         self, model: _Model, rounds: int = 3
-    ) -> tuple[_Model, Rung, Regression, Regression]:
+    ) -> tuple[_Model, SearchLength, Regression, Regression]:
         """Return the model with laws that one length of pieces shows, without needless ones.
 
         With what was found, and the regressions before and after that.
@@ -399,16 +399,16 @@ class Search:
             regression = self._regression(model.mode)
         data, mode = model.mode.problem.data, model.mode
         times = output_error(mode.problem).tau if mode.problem.likelihood.simulated else ()
-        rung = Rung(
+        here = SearchLength(
             rows=data.horizon,
             seconds=data.horizon * mode.problem.scene.time_step,
             error=error,
-            path=tuple(map(_described, first.path)),
+            path=tuple(map(_laws_of_size, first.path)),
             accepted=tuple(_name(law) for law in model.earlier if law not in before),
             dropped=tuple(_name(law) for law in before if law not in model.earlier),
             correlated=dict(zip(mode.problem.observations.names, times, strict=False)),
         )
-        return model, rung, first, regression
+        return model, here, first, regression
 
     def _regression(
         self, mode: Mode, missing: Sequence[Attached] | None = None, largest: int = 4
@@ -427,7 +427,7 @@ class Search:
             return model
         fits = in_parallel(partial(_with_subset, mode), proposals)
         shares = [Evidence.of(mode, fitted).share for fitted in fits]
-        if not any(map(_keeps_promise, proposals, shares)):
+        if not any(map(_meets_prediction, proposals, shares)):
             again = _with_subset(mode, proposals[0], sizes=_SHORTER)
             fits[0] = max(fits[0], again, key=lambda one: Evidence.of(mode, one).share)
             shares = [Evidence.of(mode, fitted).share for fitted in fits]
@@ -511,7 +511,7 @@ class Search:
         without: Mode,
         model: _Model,
         regression: Regression,
-        rungs: tuple[Rung, ...],
+        lengths: tuple[SearchLength, ...],
         tried: Mapping[Attached, Evidence],
     ) -> SearchResult:
         """Return the laws that are worth it on the longest pieces, and what each is worth.
@@ -548,7 +548,7 @@ class Search:
             for law in sorted(worth, key=lambda law: -worth[law].nats)
         }
         gains = {law: elpd_gain(model.without[law], mode) for law in laws}
-        return SearchResult(mode, mode, laws, gains, confounded, rungs, tried, rejected)
+        return SearchResult(mode, mode, laws, gains, confounded, lengths, tried, rejected)
 
     def _main(self, without: Mode, model: _Model) -> set[Attached]:
         """Return the laws with a large share in what all take off the error of a model without.
@@ -634,10 +634,10 @@ def _apart(mode: Mode, length: int, *, most: float = 0.5) -> Problem:
     states, history = problem.data.smoothed_states, problem.data.history
     breaks = np.zeros(states.shape[:2], dtype=bool)
     breaks[segments.trajectory, segments.step] = touched
-    kept, every = (
+    measured, every = (
         np.isfinite(history.pieces(states, length, one).observed).sum() for one in (breaks, None)
     )
-    if kept < (1.0 - most) * every:
+    if measured < (1.0 - most) * every:
         return problem
     physics = problem.physics
     enough = min(max(physics.scene.substeps, physics.fine_enough), physics.substeps)
@@ -753,12 +753,12 @@ def elpd_gain(before: Mode, after: Mode) -> tuple[float, float]:
         if not problem.likelihood.simulated:
             return np.asarray(problem.log_density(residual, mode.sigma, mode.phi))
         likelihood = output_error(problem)
-        starts, tau = likelihood.starts, np.array(output_error(after.problem).tau)
+        initial, tau = likelihood.initial_states, np.array(output_error(after.problem).tau)
         rows, begin = likelihood.unwhitened(residual, mode.sigma)
-        sensed = starts.column >= 0
-        of_start = np.eye(len(mode.sigma))[starts.column[sensed]]
+        sensed = initial.column >= 0
+        of_start = np.eye(len(mode.sigma))[initial.column[sensed]]
         square = (rows**2).sum((1, 2)) + begin[:, sensed] ** 2 @ of_start
-        count = starts.seen.sum((1, 2)) + np.isfinite(starts.begin)[:, sensed] @ of_start
+        count = initial.seen.sum((1, 2)) + np.isfinite(initial.begin)[:, sensed] @ of_start
         density = count * np.log(mode.sigma) + 0.5 * square / mode.sigma**2
         return np.asarray(-(density / tau).sum(axis=1))
 
@@ -798,9 +798,9 @@ def _with_subset(mode: Mode, subset: Subset, sizes: float = 1.0) -> Mode:
     return refit(mode, (*mode.problem.physics.effects, *subset.laws), begin)
 
 
-def _keeps_promise(subset: Subset, share: float, *, kept: float = 0.5) -> bool:
+def _meets_prediction(subset: Subset, share: float, *, least: float = 0.5) -> bool:
     """Return whether a refit took enough of what the regression says off the squared error."""
-    return 1.0 - (1.0 - share) ** 2 >= kept * subset.share
+    return 1.0 - (1.0 - share) ** 2 >= least * subset.share
 
 
 def _swaps(
@@ -855,13 +855,13 @@ def _rivals(
     def size(one: Attached) -> Floats:
         return np.array(list(scored[one].estimate.values()))
 
-    rivals = {twin: size(twin) for twin in regression.same.get(law, ())}
+    rivals = {one: size(one) for one in regression.same.get(law, ())}
     for alternative in regression.alternatives(subset, law):
         if alternative.evidence <= subset.evidence - within:
             continue
         (other,) = set(alternative.laws) - set(subset.laws)
         rivals.setdefault(other, alternative.sizes[other])
-        rivals |= {twin: size(twin) for twin in regression.same[other] if twin not in rivals}
+        rivals |= {one: size(one) for one in regression.same[other] if one not in rivals}
     return rivals
 
 
@@ -897,7 +897,8 @@ def _alone(regression: Regression) -> dict[Attached, Evidence]:
 def _is_lost(shorter: Mode, mode: Mode) -> bool:
     """Return whether pieces are too long to tell a law from.
 
-    Their starts are magnified, or the error nears the motion's size, where it is out of phase.
+    Their initial states are magnified, or the error nears the motion's size, where it is out of
+    phase.
     """
     values = mode.problem.observations.values
     return growth(mode.problem) > MOST_GROWTH or is_out_of_phase(mode.sigma, shorter.sigma, values)
@@ -931,7 +932,7 @@ def _name(law: Attached) -> str:
     return f"{law.effect.name} on {law.body}"
 
 
-def _described(subset: Subset) -> LawsOfSize:
+def _laws_of_size(subset: Subset) -> LawsOfSize:
     """Return a subset by names."""
     names = tuple(map(_name, subset.laws))
     return LawsOfSize(names, subset.nats, float(np.sqrt(1.0 - subset.share)))

@@ -142,7 +142,7 @@ def best_subsets(
 
     A subset S of laws with q columns is worth ``-n/2 log(1 - |P_S r|^2 / |r|^2) - q/2 log n`` less
     its price, with the whitened residual r, the projection P_S on the laws' signatures, both
-    without what parameters and start states absorb, and n measurements over their autocorrelation
+    without what parameters and initial states absorb, and n measurements over their autocorrelation
     times. Subsets whose least-squares sizes break a sign that a prior sets are left out.
 
     Parameters
@@ -175,7 +175,7 @@ def best_subsets(
     width = 0
     for signature in leading:
         law = signature.attached
-        price = np.log(len(distinct) * signature.candidate.looks) - law.effect.log_odds
+        price = np.log(len(distinct) * signature.candidate.n_grid_points) - law.effect.log_odds
         for linear in signature.linear[:_MOST_POINTS]:
             columns = np.arange(width, width + linear.basis.shape[1])
             terms.append(Term(law, linear, columns, float(price)))

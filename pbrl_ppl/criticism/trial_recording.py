@@ -68,7 +68,7 @@ def simulated(
     for push in (0.25, 1.0, 4.0):
         tried = _proposed(physics.scene, rng, push) if commands is None else commands
         # the engine of the pieces, so that their residual is noise alone
-        (states,) = simulated_recording(physics.rough, phi[None], tried)
+        (states,) = simulated_recording(physics.medium, phi[None], tried)
         x, y, theta = np.ptp(states[..., :3], axis=1).mean(axis=0).T
         bodies = zip(physics.scene.moving, np.hypot(x, y), theta, strict=True)
         if commands is not None or all(

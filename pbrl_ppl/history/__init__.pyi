@@ -6,8 +6,8 @@ from .conversion import as_history as as_history
 from .conversion import is_history as is_history
 from .cuts import propose as propose
 from .ends import End as End
-from .ends import strange_ends as strange_ends
 from .ends import trimmed as trimmed
+from .ends import unmodelled_ends as unmodelled_ends
 from .files import read_commands as read_commands
 from .files import read_table as read_table
 from .files import table_of_arrays as table_of_arrays

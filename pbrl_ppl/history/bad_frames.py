@@ -156,7 +156,7 @@ def without_measurements(history: History, off: Floats) -> tuple[History, list[B
         where = (labels[t], int(i), float(clock[t, i]), history.bodies[body], STATE[d])
         frames.append(BadFrame(*where, float(off[t, i, body, d]), STATE_UNITS[d], rows))
     observed = dataset["observed"].where(~bad)
-    # start states lose what was computed from bad frames
+    # initial states lose what was computed from bad frames
     computed: Bools = ~np.isfinite(observed.to_numpy())
     lost: Bools = computed & bad.any(axis=(2, 3), keepdims=True)
     near = maximum_filter1d(bad.any(axis=-1).astype(np.uint8), 2 * RATE_REACH + 1, axis=1) > 0
@@ -181,9 +181,9 @@ def _deviations(history: History, widths: tuple[int, ...] = (3, 4, 5), longest: 
         for gap, width in product(range(1, longest + 1), widths):
             kept = np.where(np.isfinite(result[:, :, body]), np.nan, observed[:, :, body])
             deviations = [_off(kept[..., d], width, gap, angle=d == THETA) for d in columns]
-            first, rough = (np.stack(one, axis=2) for one in zip(*deviations, strict=True))
+            first, ragged = (np.stack(one, axis=2) for one in zip(*deviations, strict=True))
             # a contact changes several coordinates at once
-            first[rough.sum(axis=2, keepdims=True) > rough] = np.nan
+            first[ragged.sum(axis=2, keepdims=True) > ragged] = np.nan
             off = first[..., 0]
             for k in range(1, gap):
                 off = np.where(np.isfinite(off), off, np.roll(first[..., k], k, axis=1))
@@ -226,17 +226,17 @@ def _off(
     -------
     off : ndarray
         Of each row and those after it, shape (trajectory, time, gap); NaN if one is not bad.
-    rough : ndarray of bool
+    ragged : ndarray of bool
         Shape (trajectory, time).
     """
-    result, rough = np.full((*column.shape, gap), np.nan), np.zeros(column.shape, dtype=bool)
+    result, ragged = np.full((*column.shape, gap), np.nan), np.zeros(column.shape, dtype=bool)
     span, end = 2 * width + gap, width + gap
     if column.shape[1] < span:
-        return result, rough
+        return result, ragged
     windows = np.lib.stride_tricks.sliding_window_view(column, span, axis=1)
     trajectory, first = np.nonzero(np.isfinite(windows).all(axis=-1))
     if not len(first):
-        return result, rough
+        return result, ragged
     rows, middle = windows[trajectory, first], np.arange(width, end)
     if angle:
         sides = np.delete(np.arange(span), middle)
@@ -248,10 +248,10 @@ def _off(
         off_side, far, _, _ = outliers(rows[:, side], each[side], 2, least, angle=angle)
         apart = wrapped(off_side - off) if angle else off_side - off
         good &= ((far > limit_of_side) & (np.abs(apart) <= agreement * np.abs(off))).all(axis=1)
-    ragged = misfit > limit * max(float(np.median(misfit)), least)
+    uneven = misfit > limit * max(float(np.median(misfit)), least)
     result[trajectory[good], first[good] + width] = off[good]
-    rough[trajectory[ragged], first[ragged] + width] = True
-    return result, rough
+    ragged[trajectory[uneven], first[uneven] + width] = True
+    return result, ragged
 
 
 def outliers(

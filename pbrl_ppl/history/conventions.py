@@ -12,7 +12,7 @@ from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import THETA, Floats, wrapped
 
 
-def angle_doubts(history: History, scene: Scene) -> list[str]:
+def angle_warnings(history: History, scene: Scene) -> list[str]:
     """Return a sentence on each body whose angle looks like one of another convention.
 
     Parameters
@@ -26,7 +26,7 @@ def angle_doubts(history: History, scene: Scene) -> list[str]:
     --------
     ::
 
-        angle_doubts(history, scene)
+        angle_warnings(history, scene)
         ["theta of arm swings to both sides by 23 rad: looks like deg: units = { theta = "deg" }"]
     """
     sentences = []
@@ -73,9 +73,9 @@ def _degrees(angles: list[Floats], *, hinged: bool) -> str:
     return ""
 
 
-def _rest(angles: list[Floats], quiet: float = 0.05) -> float:
+def _rest(angles: list[Floats], steady: float = 0.05) -> float:
     """Return the angle that trajectories end at, at rest; NaN where they do not."""
     ends = [run[-max(len(run) // 10, 4) :] for run in angles]
     both = zip(angles, ends, strict=True)
-    places = [float(np.median(end)) for run, end in both if np.ptp(end) < quiet * np.ptp(run)]
+    places = [float(np.median(end)) for run, end in both if np.ptp(end) < steady * np.ptp(run)]
     return float(np.median(places)) if places and np.ptp(places) < 0.3 else float("nan")

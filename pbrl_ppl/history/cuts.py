@@ -101,9 +101,9 @@ def _at_rest(times: Floats, states: Floats, seconds: float, still: float = 8.0) 
     for column in states.T:
         tolerance = max(still * column_noise([column], 2, robust=True), finest_step(column))
         windows = pd.Series(column).rolling(n)
-        quiet = (windows.max() - windows.min() <= tolerance).to_numpy()
+        constant = (windows.max() - windows.min() <= tolerance).to_numpy()
         rest = np.zeros(len(times), dtype=bool)
-        for end in np.flatnonzero(quiet):
+        for end in np.flatnonzero(constant):
             rest[end - n + 1 : end + 1] = True
         rests &= rest
     return rests

@@ -68,7 +68,7 @@ class End:
         return f"{self.body} {said} {self.trajectory} (t = {self.begin:.4g} to {self.end:.4g} s)"
 
 
-def strange_ends(history: History, scene: Scene) -> list[End]:
+def unmodelled_ends(history: History, scene: Scene) -> list[End]:
     """Return the ends of trajectories that neither a command nor the scene explains.
 
     A body is held if it is at rest for three rows or more and then moves off while no command acts
@@ -92,7 +92,7 @@ def strange_ends(history: History, scene: Scene) -> list[End]:
     --------
     ::
 
-        print(*strange_ends(history, scene))
+        print(*unmodelled_ends(history, scene))
     ball is held in the first 6 rows of trajectory 2 (t = 0 to 0.167 s)
     """
     dataset = history.dataset
@@ -192,7 +192,7 @@ def trimmed(history: History, ends: Iterable[End]) -> History:
     history : History
         What was measured.
     ends : iterable of End
-        As of :func:`strange_ends`.
+        As of :func:`unmodelled_ends`.
 
     Raises
     ------
@@ -203,7 +203,7 @@ def trimmed(history: History, ends: Iterable[End]) -> History:
     --------
     ::
 
-        trimmed(history, strange_ends(history, scene)).n_transitions
+        trimmed(history, unmodelled_ends(history, scene)).n_transitions
     38
     """
     dataset = history.dataset

@@ -568,14 +568,14 @@ def with_paths(scene: Scene, states: Floats, wrenches: Floats) -> tuple[Floats, 
 
 
 def from_segments(scene: Scene, start: Floats, actions: Floats, observed: Floats) -> History:
-    """Return a history with one trajectory a segment, each from its start state.
+    """Return a history with one trajectory a segment, each from its initial state.
 
     Parameters
     ----------
     scene : Scene
         Names the bodies and the time step.
     start : ndarray
-        Complete start states, shape (n, body, 6), SI units.
+        Complete initial states, shape (n, body, 6), SI units.
     actions : ndarray
         Wrenches, shape (n, H, body, 3); of a kinematic body its velocities. Inputs as in
         :data:`pbrl_ppl.state.INPUT`, shape (n, H, body, 9), also hold the wrench of the interval

@@ -1,4 +1,4 @@
-"""Kinematics of a history: angles, noise, recorded paths, joints, and complete start states."""
+"""Kinematics of a history: angles, noise, recorded paths, joints, and complete initial states."""
 
 from collections.abc import Iterable
 from math import comb

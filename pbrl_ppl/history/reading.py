@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Unpack
 
 from pbrl_ppl.errors import warn
-from pbrl_ppl.history.conventions import angle_doubts
+from pbrl_ppl.history.conventions import angle_warnings
 from pbrl_ppl.history.conversion import Reading
-from pbrl_ppl.history.ends import strange_ends, trimmed
+from pbrl_ppl.history.ends import trimmed, unmodelled_ends
 from pbrl_ppl.history.history import History
 from pbrl_ppl.history.units import unit_mismatches
 from pbrl_ppl.scene import Scene
@@ -47,9 +47,9 @@ def read_recording(
     these are left out. A warning names ``most_ends`` of them.
     """
     history = History.load(path, scene, estimate_velocities=estimate_velocities, **reading)
-    for sentence in (*unit_mismatches(history), *angle_doubts(history, scene)):
+    for sentence in (*unit_mismatches(history), *angle_warnings(history, scene)):
         warn(f"history {path}: {sentence}", UserWarning)
-    ends = strange_ends(history, scene)
+    ends = unmodelled_ends(history, scene)
     if not ends:
         return history
     trim = trim or (scene.recording is not None and scene.recording.trim)

@@ -1,4 +1,4 @@
-"""Autocovariance of measurement errors, from residuals of fitted start states and parameters.
+"""Autocovariance of measurement errors, from residuals of fitted initial states and parameters.
 
 The fit takes low frequencies out of the residual, so that the residual's own autocovariance is too
 small. Restricted maximum likelihood allows for that: H. D. Patterson and R. Thompson, Recovery of
@@ -36,7 +36,7 @@ def autocovariance(
     seen : ndarray of bool
         What was measured, shape (piece, row, body).
     by_start, by_phi : ndarray
-        Derivatives by the start states and by the parameters, shape (piece, row, body, column).
+        Derivatives by the initial states and by the parameters, shape (piece, row, body, column).
     shortest : float
         Least time constant of correlated errors (rows).
     n_times : int
@@ -87,17 +87,19 @@ def _orthonormal(columns: Floats, *, rank: float = 1e-6) -> Floats:
 
 
 def _restricted(
-    columns: Floats, seen: Bools, starts: int, memory: Floats, share: Floats
+    columns: Floats, seen: Bools, n_initial: int, memory: Floats, share: Floats
 ) -> tuple[Floats, Floats]:
     """Return whitened sums of squares and log-determinants at grid points, shapes (grid,).
 
-    ``columns`` are of start states, ``starts`` many, of parameters, and the residual.
+    ``columns`` are of initial states, ``n_initial`` of them, of parameters, and the residual.
     """
     gram, log_det = _whitened(columns, seen, memory[:, None, None], share[:, None, None])
     spare = 1.0 - (columns**2).sum((1, 2))  # (piece, column)
-    within = gram[..., :starts, :starts] + spare[:, :starts, None] * np.eye(starts)
-    across = gram[..., :starts, starts:]
-    left = gram[..., starts:, starts:] - np.swapaxes(across, 2, 3) @ np.linalg.solve(within, across)
+    within = gram[..., :n_initial, :n_initial] + spare[:, :n_initial, None] * np.eye(n_initial)
+    across = gram[..., :n_initial, n_initial:]
+    left = gram[..., n_initial:, n_initial:] - np.swapaxes(across, 2, 3) @ np.linalg.solve(
+        within, across
+    )
     log_det = log_det + np.linalg.slogdet(within)[1].sum(axis=1)
     left = left.sum(axis=1)
     within, across = left[:, :-1, :-1], left[:, :-1, -1:]

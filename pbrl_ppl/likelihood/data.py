@@ -137,7 +137,7 @@ class Data:
     Parameters
     ----------
     scene : Scene
-        The declared scene; start states that it does not allow are refused.
+        The declared scene; initial states that it does not allow are refused.
     history : History
         Measured transitions.
     horizon : int
@@ -165,7 +165,7 @@ class Data:
 
     @cached_property
     def segments(self) -> Segments:
-        """Measured segments of the horizon's length, with checked start states.
+        """Measured segments of the horizon's length, with checked initial states.
 
         Raises
         ------

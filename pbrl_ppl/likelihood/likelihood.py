@@ -44,8 +44,9 @@ class Likelihood(ABC):
     name : str
         As users choose it; see :func:`pbrl_ppl.physics_model`.
     independent, filtered, simulated : bool
-        Which of the three it is: transitions are independent given measured start states (Eq. 11);
-        trajectories are whitened by a filter; trajectories are simulated from latent start states.
+        Which of the three it is: transitions are independent given measured initial states (Eq.
+        11); trajectories are whitened by a filter; trajectories are simulated from latent initial
+        states.
     """
 
     name: ClassVar[str]
@@ -58,7 +59,7 @@ class Likelihood(ABC):
 
     @property
     def sensitivity(self) -> Sensitivity | None:
-        """Derivative of the start states by phi, where they follow the parameters."""
+        """Derivative of the initial states by phi, where they follow the parameters."""
         return None
 
     def variables(self, observations: Observations) -> dict[str, tuple[str, ...]]:
@@ -198,7 +199,7 @@ class Likelihood(ABC):
 @final
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TransitionLikelihood(Likelihood):
-    """Eq. 11: measured start states are exact, and transitions independent of each other.
+    """Eq. 11: measured initial states are exact, and transitions independent of each other.
 
     Parameters
     ----------
@@ -279,7 +280,7 @@ class TrajectoryLikelihood(Likelihood):
 
     @property
     def sensitivity(self) -> Sensitivity | None:
-        """Derivative of the smoothed start states by phi."""
+        """Derivative of the smoothed initial states by phi."""
         return self.noise.sensitivity
 
     def variables(self, observations: Observations) -> dict[str, tuple[str, ...]]:

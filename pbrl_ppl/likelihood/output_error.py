@@ -1,8 +1,8 @@
-"""Output-error likelihood: pieces of trajectories simulated from latent start states.
+"""Output-error likelihood: pieces of trajectories simulated from latent initial states.
 
 No process noise is assumed: a law that is missing piles up along a piece, and the estimate is
 consistent whatever the correlation of the residual. See L. Ljung, System Identification (2nd ed.,
-1999), section 4.3. The start states are eliminated by projection (G. H. Golub and V. Pereyra, The
+1999), section 4.3. The initial states are eliminated by projection (G. H. Golub and V. Pereyra, The
 differentiation of pseudo-inverses and nonlinear least squares problems whose variables separate,
 1973).
 """
@@ -24,13 +24,13 @@ from pbrl_ppl.state import STATE, THETA, Bools, Floats, Ints, wrapped
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Starts:
-    """Linearisation of pieces about their start states.
+class InitialStates:
+    """Linearisation of pieces about their initial states.
 
     Parameters
     ----------
     coordinates : Coordinates
-        Coordinates of the start states that are inferred.
+        Coordinates of the initial states that are inferred.
     slope : ndarray
         Derivative of the observed states by the start, shape (piece, H, body, state, coordinate).
     seen : ndarray of bool
@@ -111,7 +111,7 @@ class Starts:
         return self.series(np.concatenate([seen, np.isfinite(self.begin)], axis=1)) > 0
 
     def basis(self, weight: Floats) -> tuple[Floats, Floats]:
-        """Return what start states can take up, and how: orthonormal rows and the way back.
+        """Return what initial states can take up, and how: orthonormal rows and the way back.
 
         Shapes (piece, row, direction) and (piece, coordinate, direction).
         """
@@ -149,15 +149,15 @@ class Starts:
 @final
 @dataclass(frozen=True, eq=False, kw_only=True)
 class OutputErrorLikelihood(Likelihood):
-    """Likelihood of simulated pieces, whose latent start states are eliminated.
+    """Likelihood of simulated pieces, whose latent initial states are eliminated.
 
     A residual that is correlated counts as fewer measurements: the log-density of each dimension is
     divided by its integrated autocorrelation time (a composite likelihood's adjustment).
 
     Parameters
     ----------
-    starts : Starts
-        The linearisation about the start states.
+    initial_states : InitialStates
+        The linearisation about the initial states.
     tau : tuple of float
         Integrated autocorrelation time of each observed dimension, in rows.
     nu, prior
@@ -167,19 +167,19 @@ class OutputErrorLikelihood(Likelihood):
     name: ClassVar[str] = "simulation"
     simulated: ClassVar[bool] = True
 
-    starts: Starts
+    initial_states: InitialStates
     tau: tuple[float, ...]
 
     def counts(self, observations: Observations) -> Floats:
         """Return the degrees of freedom over the autocorrelation times, shape (state,)."""
-        return np.asarray(self.starts.counts / np.array(self.tau))
+        return np.asarray(self.initial_states.counts / np.array(self.tau))
 
     def weight(self, sigma: Floats) -> Floats:
         """Return one over sigma and the root of tau, shape (..., state)."""
         return np.asarray(1.0 / (sigma * np.sqrt(self.tau)))
 
     def whiten(self, residual: Floats, sigma: Floats) -> Floats:
-        """Return residuals over sigma and the root of tau, without what start states take up."""
+        """Return residuals over sigma and the root of tau, without what initial states take up."""
         weight = self.weight(sigma)
         if weight.ndim > 1:
             flat = weight.reshape(-1, weight.shape[-1])
@@ -189,14 +189,14 @@ class OutputErrorLikelihood(Likelihood):
         return self._projected(residual, weight)
 
     def _projected(self, residual: Floats, weight: Floats) -> Floats:
-        z, (u, _) = self.starts.rows(residual, weight), self.starts.basis(weight)
+        z, (u, _) = self.initial_states.rows(residual, weight), self.initial_states.basis(weight)
         taken = np.matmul(np.matmul(z[..., None, :], u), np.swapaxes(u, 1, 2))[..., 0, :]
         return np.asarray(z - taken)
 
     def in_order(self, values: Floats) -> Floats:
-        """Return one value a residual, and infinity for the starts, shape (..., piece, row)."""
+        """Return a value per residual, infinity for initial states, shape (..., piece, row)."""
         rows = values.reshape(*values.shape[:-3], -1)
-        begin = np.full((*rows.shape[:-1], len(self.starts.column)), np.inf)
+        begin = np.full((*rows.shape[:-1], len(self.initial_states.column)), np.inf)
         return np.concatenate([rows, begin], axis=-1)
 
     def log_density(
@@ -204,40 +204,40 @@ class OutputErrorLikelihood(Likelihood):
     ) -> Floats:
         """Return the tempered log-likelihood of each piece, shape (..., piece)."""
         z = robust(self.whiten(residual, sigma), self.whitened_nu(nu, residual.shape))
-        share = self.starts.counts / np.array(self.tau) / len(self.starts.begin)
+        share = self.initial_states.counts / np.array(self.tau) / len(self.initial_states.begin)
         norm = (share * (np.max(log_norm(nu)) - np.log(sigma))).sum(axis=-1)[..., None]
         return np.where(np.isnan(z).any(axis=-1), -np.inf, norm - 0.5 * (z**2).sum(axis=-1))
 
     def random(
         self, predicted: Floats, linearised: Floats, sigma: Floats, rng: np.random.Generator, nu: Nu
     ) -> Floats:
-        """Draw measurements with white errors about states from the most probable starts."""
-        starts = self.starts
-        residual = np.where(starts.seen, linearised - predicted, 0.0)
-        angle = starts.column[starts.coordinates.places % len(STATE) == THETA]
+        """Draw measurements with white errors about the most probable trajectories."""
+        initial_states = self.initial_states
+        residual = np.where(initial_states.seen, linearised - predicted, 0.0)
+        angle = initial_states.column[initial_states.coordinates.places % len(STATE) == THETA]
         residual[..., angle[angle >= 0]] = wrapped(residual[..., angle[angle >= 0]])
         weight = self.weight(sigma)
-        u, back = starts.basis(weight)
-        change = back @ (np.swapaxes(u, 1, 2) @ starts.rows(residual, weight)[..., None])
-        moved = np.einsum("phkdc,pc->phkd", starts.slope, change[..., 0])
+        u, back = initial_states.basis(weight)
+        change = back @ (np.swapaxes(u, 1, 2) @ initial_states.rows(residual, weight)[..., None])
+        moved = np.einsum("phkdc,pc->phkd", initial_states.slope, change[..., 0])
         return np.asarray(predicted + moved + sigma * rng.standard_normal(predicted.shape))
 
     def unwhitened_slope(self, pull: Floats, sigma: Floats, shape: tuple[int, ...]) -> Floats:
-        """Return what start states do not take up, over minus sigma and the root of tau."""
+        """Return what initial states do not take up, over minus sigma and the root of tau."""
         weight = self.weight(sigma)
-        kept = without(self.starts.basis(weight)[0], pull)
-        kept = kept[:, : kept.shape[1] - len(self.starts.column)]
+        kept = without(self.initial_states.basis(weight)[0], pull)
+        kept = kept[:, : kept.shape[1] - len(self.initial_states.column)]
         return -kept.reshape(shape) * weight
 
     def unwhitened(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
-        """Return projected residuals of the pieces and of their starts, SI units.
+        """Return projected residuals of the pieces and of their initial states, SI units.
 
         Shapes (piece, H, body, state) and (piece, coordinate).
         """
         z = self._projected(residual, 1.0 / np.asarray(sigma))
-        cut = z.shape[-1] - len(self.starts.column)
+        cut = z.shape[-1] - len(self.initial_states.column)
         rows = z[..., :cut].reshape(residual.shape) * sigma
-        return rows, z[..., cut:] * self.starts.of_coordinates(sigma)
+        return rows, z[..., cut:] * self.initial_states.of_coordinates(sigma)
 
     def profile(self, residual: Floats, least: Floats, *, rounds: int = 6) -> Floats:
         """Return the restricted-likelihood sigma of each dimension, shape (state,).
@@ -245,11 +245,13 @@ class OutputErrorLikelihood(Likelihood):
         ``least`` are the least that they may be, shape (state,), SI units.
         ``rounds``: rounds of sigma and projection, which depend on each other.
         """
-        sigma = np.maximum(np.sqrt((residual**2).sum((0, 1, 2)) / self.starts.counts), least)
+        sigma = np.maximum(
+            np.sqrt((residual**2).sum((0, 1, 2)) / self.initial_states.counts), least
+        )
         for _ in range(rounds):
             rows, begin = self.unwhitened(residual, sigma)
-            square = self.starts.totals(rows**2, begin**2)
-            better = np.maximum(np.sqrt(square / self.starts.counts), least)
+            square = self.initial_states.totals(rows**2, begin**2)
+            better = np.maximum(np.sqrt(square / self.initial_states.counts), least)
             done = np.all(abs(better - sigma) < 1e-3 * sigma)
             sigma = better
             if done:
@@ -267,7 +269,7 @@ class OutputErrorLikelihood(Likelihood):
         ``least_pairs``: pairs of residuals that an autocorrelation is taken over, at least.
         """
         rows, _ = self.unwhitened(residual, sigma)
-        seen, tau = self.starts.seen, np.ones(rows.shape[-1])
+        seen, tau = self.initial_states.seen, np.ones(rows.shape[-1])
         for d in range(len(tau)):
             x, there = rows[..., d], seen[..., d]
             variance = (x**2).sum() / max(there.sum(), 1)
@@ -288,7 +290,7 @@ def without(u: Floats, rows: Floats) -> Floats:
 
 
 def in_pieces(problem: Problem, length: int, states: Floats) -> Problem:
-    """Return the problem of pieces that are simulated from latent start states.
+    """Return the problem of pieces that are simulated from latent initial states.
 
     Parameters
     ----------
@@ -297,7 +299,7 @@ def in_pieces(problem: Problem, length: int, states: Floats) -> Problem:
     length : int
         Intervals of a piece, at least 2.
     states : ndarray
-        Start states, shape (trajectory, time, body, 6), SI units.
+        Initial states, shape (trajectory, time, body, 6), SI units.
     """
     problem = problem.on(replace(problem.data, horizon=length, states=states, columns=None))
     coordinates = observed_coordinates(problem.scene, problem.data.history)
@@ -307,20 +309,25 @@ def in_pieces(problem: Problem, length: int, states: Floats) -> Problem:
     slope = np.zeros((*seen.shape, len(coordinates.places)))
     begin = _begin(problem, coordinates, column, problem.segments.start)
     known = (column < 0) & np.isfinite(coordinates.of(_observed_starts(problem)))
-    starts, tau = Starts(coordinates, slope, seen, begin, known, column), (1.0,) * len(columns)
-    likelihood = OutputErrorLikelihood(starts=starts, tau=tau, nu=problem.likelihood.nu)
+    initial_states, tau = (
+        InitialStates(coordinates, slope, seen, begin, known, column),
+        (1.0,) * len(columns),
+    )
+    likelihood = OutputErrorLikelihood(
+        initial_states=initial_states, tau=tau, nu=problem.likelihood.nu
+    )
     return replace(problem, likelihood=likelihood)
 
 
 def linearised_pieces(problem: Problem, start: Floats, slope: Floats, tau: Floats) -> Problem:
-    """Return the problem of pieces with other start states and what was linearised there.
+    """Return the problem of pieces with other initial states and what was linearised there.
 
     Parameters
     ----------
     problem : Problem
         Result of :func:`in_pieces`.
     start : ndarray
-        Start states, shape (piece, body, 6), SI units.
+        Initial states, shape (piece, body, 6), SI units.
     slope : ndarray
         Derivative of the observed states by them, shape (piece, H, body, state, coordinate).
     tau : ndarray
@@ -333,13 +340,13 @@ def linearised_pieces(problem: Problem, start: Floats, slope: Floats, tau: Float
 
 
 def linearised_about(problem: Problem, start: Floats, slope: Floats) -> Problem:
-    """Return the problem with the likelihood about other start states; its data stay.
+    """Return the problem with the likelihood about other initial states; its data stay.
 
     Arguments are those of :func:`linearised_pieces`.
     """
-    old = output_error(problem).starts
+    old = output_error(problem).initial_states
     begin = _begin(problem, old.coordinates, old.column, start)
-    return problem.with_likelihood(starts=replace(old, slope=slope, begin=begin))
+    return problem.with_likelihood(initial_states=replace(old, slope=slope, begin=begin))
 
 
 def output_error(problem: Problem) -> OutputErrorLikelihood:
@@ -356,7 +363,7 @@ def output_error(problem: Problem) -> OutputErrorLikelihood:
 
 
 def _begin(problem: Problem, coordinates: Coordinates, column: Ints, start: Floats) -> Floats:
-    """Return measured minus latent starts (piece, coordinate); NaN where not measured."""
+    """Return measured minus latent initial states (piece, coordinate); NaN where not measured."""
     off = coordinates.of(_observed_starts(problem)) - coordinates.of(start)
     return np.where(column >= 0, coordinates.wrapped(off), np.nan)
 

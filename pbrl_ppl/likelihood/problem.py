@@ -34,7 +34,7 @@ _NOISE_DIMS = {
 NEXT_STATE_DIMS = ("transition", "step", "body", "state")
 START_DIMS = ("transition", "body", "full_state")
 ACTION_DIMS = ("transition", "step", "body", "wrench")
-#: Phi, start states and wrenches in, next states out.
+#: Phi, initial states and wrenches in, next states out.
 Engine = Callable[[Floats, Floats, Floats], Floats]
 
 
@@ -124,13 +124,13 @@ class Problem:
 
     @property
     def coarse(self) -> Problem:
-        """The same problem with few engine steps."""
+        """The same problem with the fewest engine steps; see ``Physics.coarse``."""
         return replace(self, physics=self.physics.coarse, defect=None)
 
     @property
-    def rough(self) -> Problem:
-        """The same problem with fewer engine steps, for derivatives and changes."""
-        return replace(self, physics=self.physics.rough, defect=None)
+    def medium(self) -> Problem:
+        """The same problem with at most a medium number of engine steps."""
+        return replace(self, physics=self.physics.medium, defect=None)
 
     def corrected(self, phi: Floats, *, worth: int = 3) -> Problem:
         """Return the problem with few engine steps, its predictions corrected at phi, shape (p,).
@@ -141,10 +141,10 @@ class Problem:
 
         ``worth``: ratio of engine steps from which a correction saves time.
         """
-        rough = self.rough
-        if rough.physics.substeps * worth > self.physics.substeps:
+        medium = self.medium
+        if medium.physics.substeps * worth > self.physics.substeps:
             return self
-        return rough.corrected_to(self, phi)
+        return medium.corrected_to(self, phi)
 
     def corrected_to(self, exact: Problem, phi: Floats) -> Problem:
         """Return the problem with predictions corrected to those of more engine steps at phi."""
@@ -251,7 +251,7 @@ class Problem:
             f"the problem's likelihood is of {self.likelihood.name}, expected trajectories"
         )
 
-    def quiet(self, sigma: Floats, share: float) -> Floats:
+    def with_small_process_noise(self, sigma: Floats, share: float) -> Floats:
         """Return sigma with unexplained accelerations of at most a share of their prior median."""
         steps, sigma = self.trajectory_noise.coordinates.accelerations, sigma.copy()
         sigma[steps] = np.minimum(sigma[steps], share * self.noise_prior[0][steps])

@@ -24,13 +24,13 @@ from pbrl_ppl.state import Bools, Floats
 
 #: Larger changes of a state count as divergence, in typical sizes of its coordinates.
 _FAR = 1e6
-#: Predicts next states from phi, start states and inputs, as a simulator does.
+#: Predicts next states from phi, initial states and inputs, as a simulator does.
 Engine = Callable[[Floats, Floats, Floats], Floats]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Sensitivity:
-    """Derivative of the start states of transitions by the parameters.
+    """Derivative of the initial states of transitions by the parameters.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ class Sensitivity:
         return result
 
     def begun(self, moved: Floats, start: Floats) -> Floats:
-        """Return moved start states, shape (..., transition, body, 6)."""
+        """Return moved initial states, shape (..., transition, body, 6)."""
         states = np.broadcast_to(start, (*moved.shape[:-2], *start.shape))
         return self.coordinates.completed(self.scene, self._added(states, moved))
 

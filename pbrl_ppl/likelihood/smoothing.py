@@ -100,7 +100,7 @@ def smoothed(
     phi: Floats,
     sigma: Floats,
     *,
-    settled: float = 0.05,
+    converged: float = 0.05,
     rounds: int = 4,
     stale: float = 0.3,
     little: float = 0.1,
@@ -110,7 +110,7 @@ def smoothed(
     Near-zero unexplained accelerations are raised to a small value: with stick and slip, smoothing
     by the physics alone does not converge.
 
-    ``settled``: largest change of states in the last round (standard deviations).
+    ``converged``: largest change of states in the last round (standard deviations).
     ``rounds``: rounds, at most.
     ``stale``: a slope is taken anew where the state has moved by more than this (standard
     deviations).
@@ -140,7 +140,7 @@ def smoothed(
             break  # diverged: nothing follows from the new one
         problem = moved
         shown = after[noise.seen.any(axis=1)]
-        if (np.sqrt(np.mean(shown**2, axis=0)) < settled * spread).all():
+        if (np.sqrt(np.mean(shown**2, axis=0)) < converged * spread).all():
             break
     return problem
 
@@ -161,7 +161,7 @@ def with_sensitivity(problem: Problem, phi: Floats, sigma: Floats) -> Problem:
         return problem
     noise, segments = problem.trajectory_noise, problem.segments
     coordinates, nothing = noise.coordinates, np.zeros_like(noise.measured)
-    slopes = problem.rough.simulator.jacobian(phi, segments.start, problem.inputs)[:, 0]
+    slopes = problem.medium.simulator.jacobian(phi, segments.start, problem.inputs)[:, 0]
     still = replace(noise, begin=nothing, measured=nothing, sensitivity=None)
     before = np.empty((*nothing.shape, len(phi)))
     for j, slope in enumerate(coordinates.of(np.moveaxis(slopes, -1, 0))):
@@ -260,7 +260,9 @@ def _sloped(problem: Problem, phi: Floats, sigma: Floats, steps: Floats, rows: B
         """Return the states after an interval; a coarse engine's slope agrees with a fine one's."""
         begin = states.reshape(-1, *states.shape[2:])
         repeated = np.tile(inputs, (len(states), 1, 1, 1))
-        return np.asarray(problem.rough.simulator(phi, begin, repeated)[:, 0]).reshape(states.shape)
+        return np.asarray(problem.medium.simulator(phi, begin, repeated)[:, 0]).reshape(
+            states.shape
+        )
 
     if rows.any():
         slope, start = slope.copy(), problem.segments.start[rows]
@@ -304,7 +306,7 @@ def linearised(
         seen=np.isfinite(end),
         measured=np.nan_to_num(end),
         begin=np.nan_to_num(begin),
-        wide=np.where(np.isfinite(begin), 0.0, far**2),
+        initial_variance=np.where(np.isfinite(begin), 0.0, far**2),
         sigma=np.asarray(sigma, dtype=float),
         touching=_touching(problem, coordinates),
     )

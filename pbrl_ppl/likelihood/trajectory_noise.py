@@ -38,7 +38,7 @@ class TrajectoryNoise:
         Measured minus linearised state at the transition's end, shape (transition, coordinate).
     begin : ndarray
         The same before the transition, for the first of a trajectory; 0 where not measured.
-    wide : ndarray
+    initial_variance : ndarray
         Variance of that where it was not measured, 0 elsewhere, shape (transition, coordinate).
     sigma : ndarray
         Noise parameters at which it was linearised, shape (parameter,).
@@ -59,7 +59,7 @@ class TrajectoryNoise:
     seen: Bools
     measured: Floats
     begin: Floats
-    wide: Floats
+    initial_variance: Floats
     sigma: Floats
     touching: Bools
     sensitivity: Sensitivity | None = None
@@ -221,7 +221,7 @@ class TrajectoryNoise:
     @property
     def _begun(self) -> Bools:
         """Measured states that begin a trajectory, whose error is that of measuring."""
-        return self.first[:, None] & ~(self.wide > 0)
+        return self.first[:, None] & ~(self.initial_variance > 0)
 
     def _score(self, residual: Floats, sigma: Floats) -> tuple[Floats, ...]:
         """Return white innovations of residuals (transition, coordinate), and `kalman.score`."""
@@ -283,4 +283,4 @@ class TrajectoryNoise:
         Shape (..., transition, coordinate).
         """
         sensor = self.coordinates.errors(sigma)[..., None, :] ** 2
-        return np.where(self.wide > 0, self.wide, sensor)
+        return np.where(self.initial_variance > 0, self.initial_variance, sensor)

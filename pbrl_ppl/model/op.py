@@ -91,19 +91,19 @@ def _in_object_mode(op: Op, node: Any = None, **kwargs: Any) -> Any:
 class SimulatorOp(_BlackBoxOp):
     """``next_states = f(phi, start, actions)``, the deterministic part of Eq. 7.
 
-    Inputs are phi (p,), start states (transition, body, 6) and wrenches (transition, H, body, 3),
+    Inputs are phi (p,), initial states (transition, body, 6) and wrenches (transition, H, body, 3),
     or all of :data:`pbrl_ppl.state.INPUT` in place of the 3; the output has shape (transition, H,
     body, 6); all float64, in SI units. A transition in which the engine diverges is NaN, and so is
     everything where phi is impossible (a mass that is not positive, say): the likelihood of that is
     zero. The derivative by phi is by finite differences, all columns in one call of the engine. It
-    leaves out that start states follow phi: the correction to the smoothed starts cancels that.
+    leaves out that initial states follow phi: the correction to the smoothed starts cancels that.
 
     Parameters
     ----------
     physics : Physics
         Scene, effects and the engine's settings.
     sensitivity : Sensitivity, optional
-        Derivative of smoothed start states of whole trajectories by phi.
+        Derivative of smoothed initial states of whole trajectories by phi.
     engine : str, optional
         ``chipmunk`` or ``contact-free`` to force one; see :class:`Physics`.
     one_world : bool
@@ -181,7 +181,7 @@ class SimulatorOp(_BlackBoxOp):
         return self.physics.one_world if self.one_world else self.physics.simulator.recall
 
     def _following(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
-        """Return predictions from start states that follow phi."""
+        """Return predictions from initial states that follow phi."""
         return cast(Sensitivity, self.sensitivity).predicted(self._engine, phi, start, actions)
 
     def pulled(

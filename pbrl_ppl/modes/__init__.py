@@ -3,7 +3,7 @@
 from .configurations import NONE as NONE
 from .configurations import Pair as Pair
 from .configurations import Weighed as Weighed
-from .configurations import doubts as doubts
+from .configurations import evidence_warning as evidence_warning
 from .configurations import index_law as index_law
 from .configurations import stored as stored
 from .evidence import trajectory_evidence as trajectory_evidence
@@ -35,6 +35,6 @@ from .space import constrain as constrain
 from .space import unconstrain as unconstrain
 from .trajectories import filtered_mode as filtered_mode
 from .trajectories import find_trajectory_mode as find_trajectory_mode
-from .trajectories import following as following
 from .trajectories import nearby_mode as nearby_mode
 from .trajectories import trajectory_mode as trajectory_mode
+from .trajectories import with_state_sensitivity as with_state_sensitivity

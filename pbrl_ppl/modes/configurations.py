@@ -244,7 +244,7 @@ def stored(configurations: Sequence[Weighed]) -> list[dict[str, Any]]:
     ]
 
 
-def doubts(
+def evidence_warning(
     rows: Iterable[Mapping[str, Any]], *, material: float = 0.02, few: int = 50
 ) -> str | None:
     """Return a warning if the evidences of :func:`stored` rows are too uncertain, or None.
@@ -263,9 +263,9 @@ def doubts(
                 for joint, pair in row["joints"].items()
             )
             return (
-                f"which bodies are joined is rough: the probability {probability:.3g} of {joined}"
-                f" may be off by {max(move, material):.2g} (log-evidence to within {error:.2g},"
-                f" {ess:.0f} effective draws); record motions that load the joint, or give"
-                " parameters that the data say nothing of in the scene (known = ...)"
+                f"which bodies are joined is uncertain: the probability {probability:.3g} of"
+                f" {joined} may be off by {max(move, material):.2g} (log-evidence to within"
+                f" {error:.2g}, {ess:.0f} effective draws); record motions that load the joint, or"
+                " give parameters that the data say nothing of in the scene (known = ...)"
             )
     return None

@@ -44,8 +44,8 @@ def laplace(mode: Mode) -> Marginal:
     """
     space = Space.of(mode)
     centre, covariance = space.laplace(mode)
-    loud = space.loud
-    log_det = np.linalg.slogdet(2 * np.pi * covariance[np.ix_(loud, loud)])[1]
+    informed = space.informed
+    log_det = np.linalg.slogdet(2 * np.pi * covariance[np.ix_(informed, informed)])[1]
     return Marginal(float(space.log_density(centre[None])[0] + 0.5 * log_det))
 
 
@@ -85,22 +85,22 @@ class _StudentT:
         radius = np.sqrt(self.nu / rng.chisquare(self.nu, (n, 1)))
         moved = radius * rng.standard_normal((n, len(self.centre))) @ self.factor.T
         q = self.space.prior_draws(np.zeros((n, self.space.size)), rng)
-        q[:, self.space.loud] = self.centre + moved
+        q[:, self.space.informed] = self.centre + moved
         return q
 
     def log_density(self, q: Floats) -> Floats:
         """Return the log-density at points (n, d), shape (n,)."""
         d, nu = len(self.centre), self.nu
-        off = solve_triangular(self.factor, (q[:, self.space.loud] - self.centre).T, lower=True)
+        off = solve_triangular(self.factor, (q[:, self.space.informed] - self.centre).T, lower=True)
         constant = gammaln((nu + d) / 2) - gammaln(nu / 2) - 0.5 * d * np.log(nu * np.pi)
         log_det = np.log(np.diag(self.factor)).sum()
         return np.asarray(constant - log_det - 0.5 * (nu + d) * np.log1p((off**2).sum(axis=0) / nu))
 
-    def learned(self, q: Floats, kept: float) -> _StudentT:
-        """Return the proposal of points (n, d); a share ``kept`` of the covariance stays."""
-        q = q[:, self.space.loud]
-        covariance = (1.0 - kept) * np.atleast_2d(np.cov(q, rowvar=False))
-        covariance += kept * self.factor @ self.factor.T
+    def learned(self, q: Floats, retained: float) -> _StudentT:
+        """Return the proposal of points (n, d); a share ``retained`` of the covariance stays."""
+        q = q[:, self.space.informed]
+        covariance = (1.0 - retained) * np.atleast_2d(np.cov(q, rowvar=False))
+        covariance += retained * self.factor @ self.factor.T
         factor = np.asarray(np.linalg.cholesky(covariance), dtype=float)
         return replace(self, centre=q.mean(axis=0), factor=factor)
 
@@ -126,14 +126,15 @@ def importance(
     """
     space = Space.of(mode)
     centre, covariance = space.laplace(mode)
-    loud = space.loud
-    factor = np.asarray(np.linalg.cholesky(covariance[np.ix_(loud, loud)]), dtype=float)
+    informed = space.informed
+    factor = np.asarray(np.linalg.cholesky(covariance[np.ix_(informed, informed)]), dtype=float)
 
     def density(q: Floats) -> tuple[Floats, Floats]:
         return space.log_density(q), np.zeros((len(q), 0))
 
     proposals, _ = adaptive_importance(
-        _StudentT(space, centre[loud], factor), density, len(loud), rng, batch=draws, enough=enough,
+        _StudentT(space, centre[informed], factor), density, len(informed), rng, batch=draws,
+        enough=enough,
         most_batches=rounds, trial_batches=rounds,
     )  # fmt: skip
     error = float(np.sqrt(max(1.0 / max(proposals.ess, 1.0) - 1.0 / len(proposals.q), 0.0)))

@@ -28,8 +28,8 @@ class Proposal(Protocol):
     def log_density(self, q: Floats) -> Floats:
         """Return the log-density at points (n, d), shape (n,)."""
 
-    def learned(self: ProposalT, q: Floats, kept: float) -> ProposalT:
-        """Return the proposal of points (n, d); a share ``kept`` of the covariance stays."""
+    def learned(self: ProposalT, q: Floats, retained: float) -> ProposalT:
+        """Return the proposal of points (n, d); a share ``retained`` of the covariance stays."""
 
 
 class WeightedPoints(NamedTuple):
@@ -119,15 +119,15 @@ def adaptive_importance(
         The last proposal.
     """
     proposals, q = [first], np.zeros((0, 0))
-    heights, values, best = [], [], 0.0
+    log_densities, values, best = [], [], 0.0
     for turn in range(1, most_batches + 1):
         drawn = proposals[-1].draw(batch, rng)
-        height, others = density(drawn)
-        heights.append(height)
+        log_density, others = density(drawn)
+        log_densities.append(log_density)
         values.append(others)
         q = drawn if turn == 1 else np.concatenate([q, drawn])
         mixture = logsumexp([proposal.log_density(q) for proposal in proposals], axis=0)
-        log_weight = np.concatenate(heights) - mixture + np.log(turn)
+        log_weight = np.concatenate(log_densities) - mixture + np.log(turn)
         size, good, there = 0.0, False, np.isfinite(log_weight)
         if there.sum() < 3:
             break
@@ -139,7 +139,7 @@ def adaptive_importance(
         if good or (turn >= trial_batches and hopeless):
             break
         chosen = q[there][systematic(weight, len(q), rng)]
-        proposals.append(first.learned(chosen, kept=dimension / (dimension + size)))
+        proposals.append(first.learned(chosen, retained=dimension / (dimension + size)))
     log_z = float(logsumexp(log_weight) - np.log(len(q)))
     points = WeightedPoints(q, log_weight, np.concatenate(values), log_z, size, good)
     return points, proposals[-1]

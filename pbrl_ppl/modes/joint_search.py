@@ -77,7 +77,7 @@ def weigh(
     FitError
         If a single joint may join more pairs than can be tried.
     """
-    problem.segments  # noqa: B018  # checks the start states, once for all
+    problem.segments  # noqa: B018  # checks the initial states, once for all
     console = Console(stderr=True)
     modes, evidence = _tried(problem, seed, console, progress)
     tried, worth = tuple(modes), _worth(modes)
@@ -205,14 +205,14 @@ def _climbed(problem: Problem, starts: list[Floats], rounds: int = 8) -> list[Mo
     return [find_mode(problem.coarse, initial=start, rounds=rounds) for start in starts]
 
 
-def _best(problem: Problem, rough: list[Mode], worth: float, *, rounds: int = 2) -> Mode:
+def _best(problem: Problem, found: list[Mode], worth: float, *, rounds: int = 2) -> Mode:
     """The best of modes that were found with few engine steps, climbed with the exact engine.
 
     One that has not come near the log-posterior ``worth`` by then is climbed no further.
 
     ``rounds``: rounds of the first climb with the exact engine.
     """
-    best = max(rough, key=lambda mode: mode.log_posterior)
+    best = max(found, key=lambda mode: mode.log_posterior)
     first = find_mode(problem, initial=best.phi, rounds=rounds)
     return first if first.log_posterior < worth else find_mode(problem, initial=first.phi)
 
@@ -320,7 +320,7 @@ def _anchors(
 
 
 def _states(problem: Problem, body: str, *, most_rows: int = 500) -> Floats:
-    """Return a body's recorded start states, shape (row, 6); zero for the world.
+    """Return a body's recorded initial states, shape (row, 6); zero for the world.
 
     ``most_rows``: rows of the recording that the geometry is taken from, at most.
     """

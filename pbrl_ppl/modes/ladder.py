@@ -1,8 +1,8 @@
 """Modes of simulated pieces, up a ladder of lengths.
 
 The simulation error of a whole trajectory has false optima; that of pieces of a few rows has not.
-Each length begins at the optimum of the shorter one, its start states on the trajectories that were
-simulated there.
+Each length begins at the optimum of the shorter one, its initial states on the trajectories that
+were simulated there.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from pbrl_ppl.parameters import box, inside, prior_residual, prior_slopes
 from pbrl_ppl.state import Floats
 from pbrl_ppl.threads import one_blas_thread
 
-#: A start state that is magnified by more than this, beyond growth in proportion to time, makes a
-#: piece too long to tell a law from.
+#: An initial state that is magnified by more than this, beyond growth in proportion to time, makes
+#: a piece too long to tell a law from.
 MOST_GROWTH = 30.0
 #: Steps of derivatives, as a share of a posterior standard deviation of phi.
 _OF_PHI = 0.5
@@ -56,7 +56,7 @@ def ladder(mode: Mode) -> list[Mode]:
     Raises
     ------
     HistoryError
-        If no trajectory has three rows, or start states can follow all that was measured.
+        If no trajectory has three rows, or initial states can follow all that was measured.
     """
     modes: list[Mode] = []
     states, phi = mode.problem.data.smoothed_states, mode.phi
@@ -76,7 +76,7 @@ def piece_lengths(mode: Mode) -> list[int]:
     Raises
     ------
     HistoryError
-        If no trajectory has three rows, or start states can follow all that was measured.
+        If no trajectory has three rows, or initial states can follow all that was measured.
     """
     history = mode.problem.data.history
     longest = int(history.dataset["n_rows"].max()) - 1
@@ -85,10 +85,10 @@ def piece_lengths(mode: Mode) -> list[int]:
             f"history: its longest trajectory has {longest + 1} rows, a simulation is judged by at"
             " least 3; record longer trajectories"
         )
-    starts = output_error(
+    initial_states = output_error(
         in_pieces(mode.problem, longest, mode.problem.data.smoothed_states)
-    ).starts
-    measured, unknown = int(starts.measured.sum()), starts.unknown + len(mode.phi)
+    ).initial_states
+    measured, unknown = int(initial_states.measured.sum()), initial_states.unknown + len(mode.phi)
     if measured <= unknown:
         raise HistoryError(
             f"history: it has {measured} measurements, and simulations of its trajectories have"
@@ -131,12 +131,12 @@ def with_robust_covariance(mode: Mode, *, many: int = 8) -> Mode:
     problem, likelihood, p = mode.problem, output_error(mode.problem), len(mode.phi)
     if not p:
         return mode
-    starts, weight = likelihood.starts, likelihood.weight(mode.sigma)
+    initial_states, weight = likelihood.initial_states, likelihood.weight(mode.sigma)
     slopes = prior_slopes(problem.layout.priors, mode.phi)
     jacobian = mode.jacobian.reshape(*mode.whitened_residual.shape, p)
-    u = starts.basis(weight)[0]
-    residual, start, by_phi = map(starts.series, (mode.whitened_residual, u, jacobian))
-    seen, score = starts.seen_series, np.diag(slopes**2)
+    u = initial_states.basis(weight)[0]
+    residual, start, by_phi = map(initial_states.series, (mode.whitened_residual, u, jacobian))
+    seen, score = initial_states.seen_series, np.diag(slopes**2)
     lags = np.abs(np.subtract.outer(np.arange(seen.shape[1]), np.arange(seen.shape[1])))
     for d, white in enumerate(problem.least_noise * weight):
         of_dimension = by_phi[..., d, :]
@@ -161,7 +161,7 @@ def with_robust_covariance(mode: Mode, *, many: int = 8) -> Mode:
 
 @dataclass(frozen=True, eq=False)
 class Linear:
-    """Residual and derivatives of simulated pieces at phi and start states.
+    """Residual and derivatives of simulated pieces at phi and initial states.
 
     Parameters
     ----------
@@ -184,7 +184,7 @@ def fit_pieces(
     rounds: int = 20,
     tolerance: float = 0.1,
     *,
-    starts_alone: bool = False,
+    initial_states_alone: bool = False,
     n_steps: int = 2,
     much: float = 0.2,
     dampings: tuple[float, ...] = (0.03, 0.3, 3.0, 30.0, 300.0, 3e3, 3e4),
@@ -192,7 +192,7 @@ def fit_pieces(
     wider: tuple[float, ...] = (3.0, 0.1),
     first_width: float = 1e-4,
 ) -> Mode:
-    """Return a mode of simulated pieces by Gauss-Newton steps, start states projected out.
+    """Return a mode of simulated pieces by Gauss-Newton steps, initial states projected out.
 
     Parameters
     ----------
@@ -204,8 +204,8 @@ def fit_pieces(
         Linearisations, at most.
     tolerance : float
         Gain in log-posterior (nats) below which it ends.
-    starts_alone : bool
-        Whether phi stays, and the start states alone are fitted.
+    initial_states_alone : bool
+        Whether phi stays, and the initial states alone are fitted.
     n_steps : int
         Steps from one linearisation.
     much : float
@@ -220,7 +220,10 @@ def fit_pieces(
         First steps of derivatives, as shares of each scale.
     """
     priors, layout = problem.layout.priors, problem.layout
-    scale, sizes = layout.scale(phi), output_error(problem).starts.coordinates.sizes(problem.scene)
+    scale, sizes = (
+        layout.scale(phi),
+        output_error(problem).initial_states.coordinates.sizes(problem.scene),
+    )
     phi, start = inside(priors, phi), problem.segments.start
     steps = first_width * np.where(layout.discrete, 0.0, scale), first_width * sizes
     damping, failed, one_sided = 1e-3, 0, True
@@ -230,16 +233,18 @@ def fit_pieces(
         problem = step.problem
         if not failed:
             steps = step.differences(scale, sizes)
-        gained, promised = 0.0, step.promised
+        gained, predicted_gain = 0.0, step.predicted_gain
         for _ in range(n_steps):
-            tried = [step.moved(damping * factor, starts_alone) for factor in dampings]
-            points, starts = (np.array(values) for values in zip(*tried, strict=True))
-            residuals = _residual(problem, points, starts)
-            costs = [step.cost(*trial) for trial in zip(points, starts, residuals, strict=True)]
+            tried = [step.moved(damping * factor, initial_states_alone) for factor in dampings]
+            points, initial_states = (np.array(values) for values in zip(*tried, strict=True))
+            residuals = _residual(problem, points, initial_states)
+            costs = [
+                step.cost(*trial) for trial in zip(points, initial_states, residuals, strict=True)
+            ]
             best = int(np.argmin(costs))
             gain = step.cost_before - costs[best]
             if gain > 0:
-                phi, start = points[best], starts[best]
+                phi, start = points[best], initial_states[best]
                 step = step.at(phi, start, residuals[best])
             gained += max(gain, 0.0)
             if gain <= max(tolerance, much * gained):
@@ -251,7 +256,7 @@ def fit_pieces(
         if one_sided:  # far from the optimum one side will do
             one_sided = False
             continue
-        if failed == len(wider) or promised <= tolerance:
+        if failed == len(wider) or predicted_gain <= tolerance:
             linear = replace(linear, residual=step.residual)
             break
         # friction makes kinks: over another width the derivative sees others
@@ -262,8 +267,8 @@ def fit_pieces(
     step = _Step(problem, linear, phi, start)
     tau = np.array(output_error(step.problem).tau)
     problem = linearised_pieces(step.problem, start, linear.by_start, tau)
-    height = -_cost(problem, step.sigma, phi)
-    return Mode(problem, phi, step.sigma, step.jacobian, step.covariance, height)
+    log_posterior = -_cost(problem, step.sigma, phi)
+    return Mode(problem, phi, step.sigma, step.jacobian, step.covariance, log_posterior)
 
 
 @one_blas_thread
@@ -276,11 +281,11 @@ def fit_pieces_closely(
     repeats: int = 2,
     worth: float = 1.0,
 ) -> Mode:
-    """Return a mode of simulated pieces that climbs from the linearised start states confirm.
+    """Return a mode of simulated pieces that climbs from the linearised initial states confirm.
 
-    Friction makes kinks, at which Gauss-Newton steps of parameters and start states end. Climbs of
-    the parameters alone go on from there, and the start states follow. ``repeats`` of both, until
-    they gain less than ``worth`` (nats); other arguments as of :func:`fit_pieces`.
+    Friction makes kinks, at which Gauss-Newton steps of parameters and initial states end. Climbs
+    of the parameters alone go on from there, and the initial states follow. ``repeats`` of both,
+    until they gain less than ``worth`` (nats); other arguments as of :func:`fit_pieces`.
     """
     mode = fit_pieces(problem, phi, rounds, tolerance)
     for _ in range(repeats):
@@ -295,13 +300,13 @@ def fit_pieces_closely(
 def corrected(mode: Mode) -> Mode:
     """Return a mode of simulated pieces with few engine steps, whose error there is corrected."""
     problem = mode.problem
-    return replace(mode, problem=problem.coarse.corrected_to(problem.rough, mode.phi))
+    return replace(mode, problem=problem.coarse.corrected_to(problem.medium, mode.phi))
 
 
-def _residual(problem: Problem, points: Floats, starts: Floats) -> Floats:
-    """Return residuals at points (n, p) and starts (n, piece, body, 6)."""
-    engine = problem.rough if problem.defect is None else problem
-    states = engine.simulator(points, np.ascontiguousarray(starts), problem.inputs)
+def _residual(problem: Problem, points: Floats, initial_states: Floats) -> Floats:
+    """Return residuals at points (n, p) and initial states (n, piece, body, 6)."""
+    engine = problem.medium if problem.defect is None else problem
+    states = engine.simulator(points, np.ascontiguousarray(initial_states), problem.inputs)
     states = states if problem.defect is None else states + problem.defect
     return finite(problem, problem.observations.residual(states))
 
@@ -317,7 +322,7 @@ def _linearise(
 
     They are central but for those by phi where ``one_sided``.
     """
-    coordinates = output_error(problem).starts.coordinates
+    coordinates = output_error(problem).initial_states.coordinates
     lower, upper = box(problem.layout.priors)
     ahead, behind = np.minimum(phi + steps[0], upper), np.maximum(phi - steps[0], lower)
     if one_sided:
@@ -329,8 +334,8 @@ def _linearise(
         np.fill_diagonal(points[1 + p : 1 + 2 * p], behind)
     held = coordinates.completed(problem.scene, start.copy())
     displaced = coordinates.displaced(problem.scene, start, steps[1])
-    starts = np.concatenate([np.tile(held, (len(points) - 2 * c, 1, 1, 1)), displaced])
-    residual = _residual(problem, points, starts)
+    initial_states = np.concatenate([np.tile(held, (len(points) - 2 * c, 1, 1, 1)), displaced])
+    residual = _residual(problem, points, initial_states)
     width = np.where(ahead == behind, 1e-300, ahead - behind)
     before = residual[:1] if one_sided else residual[1 + p : 1 + 2 * p]
     by_phi = np.moveaxis(residual[1 : 1 + p] - before, 0, -1) / -width
@@ -356,8 +361,8 @@ class _Step:
         tau = likelihood.correlation_times(residual, self.sigma)
         self.problem = problem.with_likelihood(tau=tuple(tau.tolist()))
         likelihood = output_error(self.problem)
-        self.starts, self.weight = likelihood.starts, likelihood.weight(self.sigma)
-        self.u, self.back = self.starts.basis(self.weight)
+        self.initial_states, self.weight = likelihood.initial_states, likelihood.weight(self.sigma)
+        self.u, self.back = self.initial_states.basis(self.weight)
         by_phi = np.moveaxis(linear.by_phi, -1, 0) * self.weight
         pieces, rows = len(residual), residual[0].size
         by_phi = by_phi.reshape(len(phi), pieces, rows)
@@ -385,9 +390,9 @@ class _Step:
         return other
 
     def _rows(self, start: Floats, residual: Floats) -> Floats:
-        """Return weighted residuals with those of the start states, shape (piece, row)."""
+        """Return weighted residuals with those of the initial states, shape (piece, row)."""
         begun = linearised_about(self.problem, start, self.by_start)
-        return output_error(begun).starts.rows(residual, self.weight)
+        return output_error(begun).initial_states.rows(residual, self.weight)
 
     def cost(self, phi: Floats, start: Floats, residual: Floats) -> float:
         """Return the negative log-posterior at a point, the noise at its profile."""
@@ -396,8 +401,10 @@ class _Step:
     def _profiled(self, left: Floats, residual: Floats, phi: Floats) -> float:
         """Return the cost of projected rows; ``residual`` has their shape before."""
         cut = residual[0].size
-        square = self.starts.totals(left[:, :cut].reshape(residual.shape) ** 2, left[:, cut:] ** 2)
-        sigma = np.sqrt(square / self.starts.counts) / self.weight
+        square = self.initial_states.totals(
+            left[:, :cut].reshape(residual.shape) ** 2, left[:, cut:] ** 2
+        )
+        sigma = np.sqrt(square / self.initial_states.counts) / self.weight
         return _cost(self.problem, np.maximum(sigma, self.problem.least_noise), phi)
 
     @property
@@ -406,8 +413,8 @@ class _Step:
         return covariance_of(self.precision)
 
     @property
-    def promised(self) -> float:
-        """Gain that the derivatives promise (nats)."""
+    def predicted_gain(self) -> float:
+        """Gain that the derivatives predict (nats)."""
         return 0.5 * float(self.gradient @ self.covariance @ self.gradient)
 
     def differences(
@@ -421,16 +428,19 @@ class _Step:
         width = np.where(
             self.problem.layout.discrete, 0.0, np.clip(width, _LEAST * scale, _MOST * scale)
         )
-        by_start = np.where(self.starts.seen[..., None], self.by_start, 0.0)
+        by_start = np.where(self.initial_states.seen[..., None], self.by_start, 0.0)
         of_start = ((by_start * self.weight[:, None]) ** 2).sum((1, 2, 3))
-        of_start += np.isfinite(self.starts.begin) * self.starts.of_coordinates(self.weight) ** 2
+        of_start += (
+            np.isfinite(self.initial_states.begin)
+            * self.initial_states.of_coordinates(self.weight) ** 2
+        )
         begin = of_start_sd / np.sqrt(np.maximum(np.median(of_start, axis=0), 1e-300))
         return width, np.clip(begin, _LEAST * sizes, _MOST * sizes)
 
-    def moved(self, damping: float, starts_alone: bool) -> tuple[Floats, Floats]:
-        """Return phi and start states a damped step on, shapes (p,) and (piece, body, 6)."""
-        phi, coordinates = self.phi, self.starts.coordinates
-        if len(phi) and not starts_alone:
+    def moved(self, damping: float, initial_states_alone: bool) -> tuple[Floats, Floats]:
+        """Return phi and initial states a damped step on, shapes (p,) and (piece, body, 6)."""
+        phi, coordinates = self.phi, self.initial_states.coordinates
+        if len(phi) and not initial_states_alone:
             sd = 1.0 / np.sqrt(np.maximum(np.diag(self.precision), 1e-300))
             scaled = self.precision * np.outer(sd, sd) + damping * np.eye(len(sd))
             step = sd * np.linalg.solve(scaled, sd * self.gradient)
@@ -446,7 +456,7 @@ class _Step:
 def simulated_states(mode: Mode) -> Floats:
     """Return the states along the simulated pieces, shape (trajectory, time, body, 6)."""
     problem, segments = mode.problem, mode.problem.segments
-    ends = problem.rough.simulator(mode.phi, segments.start, problem.inputs)
+    ends = problem.medium.simulator(mode.phi, segments.start, problem.inputs)
     states = problem.data.smoothed_states.copy()
     last = problem.data.history.dataset["n_rows"].to_numpy()[segments.trajectory] - 1
     follows = np.flatnonzero(np.diff(segments.trajectory) == 0)
@@ -459,8 +469,8 @@ def simulated_states(mode: Mode) -> Floats:
 
 
 def growth(problem: Problem) -> float:
-    """Return by how much pieces magnify their starts, beyond growth in proportion to time."""
-    slope = np.abs(output_error(problem).starts.slope)
+    """Return how much pieces magnify initial states, beyond growth in proportion to time."""
+    slope = np.abs(output_error(problem).initial_states.slope)
     size = np.sqrt((slope**2).sum(axis=(2, 3)))  # (piece, H, cell)
     first = max(3, min(size.shape[1] // 2, 8))
     begin = size[:, :first].max(axis=1)

@@ -105,15 +105,15 @@ def posterior_slopes(
     lower: Floats,
     upper: Floats,
     begin: Floats,
-    rough: Callable[[Floats], Floats] | None = None,
+    coarse: Callable[[Floats], Floats] | None = None,
 ) -> Floats:
     """Return the derivative with steps of one posterior standard deviation.
 
     Friction makes kinks; a derivative over the posterior's own scale sees their average, one over a
     tiny step sees whichever side it is on. The posterior's scale comes from the derivative over the
-    steps ``begin``, shape (p,), of the function or a cheaper one, ``rough``.
+    steps ``begin``, shape (p,), of the function or a cheaper one, ``coarse``.
     """
-    size = np.sqrt((differentiate(rough or function, phi, begin, lower, upper) ** 2).sum(axis=0))
+    size = np.sqrt((differentiate(coarse or function, phi, begin, lower, upper) ** 2).sum(axis=0))
     steps = np.clip(1.0 / np.maximum(size, 1e-300), 1e-3 * begin, 1e2 * begin)
     return differentiate(function, phi, steps, lower, upper)
 
@@ -188,7 +188,7 @@ def profiled(problem: Problem, phi: Floats) -> tuple[Floats, float]:
     return sigma, float(log_posterior(problem, phi, sigma, log_likelihood=likelihood))
 
 
-def described(problem: Problem, peak: LocalMode) -> LocalMode:
+def canonical_wheels(problem: Problem, peak: LocalMode) -> LocalMode:
     """Return a peak with each wheel in its most probable description; it predicts the same."""
     better = by_prior(problem.layout, peak.phi)
     gain = problem.layout.log_prior(better) - problem.layout.log_prior(peak.phi)
@@ -197,7 +197,7 @@ def described(problem: Problem, peak: LocalMode) -> LocalMode:
 
 def finish(problem: Problem, peak: LocalMode) -> Mode:
     """Return the mode at a peak, with the Jacobian taken at the posterior's scale."""
-    phi, sigma, log_posterior = described(problem, peak)
+    phi, sigma, log_posterior = canonical_wheels(problem, peak)
     priors = problem.layout.priors
     if not priors:
         cells = problem.observations.values.size
@@ -208,8 +208,8 @@ def finish(problem: Problem, peak: LocalMode) -> Mode:
         return np.nan_to_num(_least_squares(problem, points, sigma, phi, engine))
 
     begin = 1e-3 * problem.layout.scale(phi)
-    rough = partial(residual, engine=problem.coarse.simulator)
-    jacobian = posterior_slopes(residual, phi, lower, upper, begin, rough)
+    coarse = partial(residual, engine=problem.coarse.simulator)
+    jacobian = posterior_slopes(residual, phi, lower, upper, begin, coarse)
     precision = jacobian.T @ jacobian
     if problem.tails:
         tails = list(problem.tails)

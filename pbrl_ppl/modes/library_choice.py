@@ -138,7 +138,7 @@ def choose_from_library(
         log_sums = [logsumexp(part.log_joint(sigma, problem.nu()), axis=1) for part in parts]
         return np.asarray(np.sum(log_sums, axis=0) + log_noise_prior(problem, log_sigma))
 
-    begin = problem.likelihood.centre(_rough_sigma(problem, parts, median))
+    begin = problem.likelihood.centre(_estimated_sigma(problem, parts, median))
     top = minimize(lambda x: -float(density(x[None])[0]), begin, method="L-BFGS-B").x
     # log sigma of n residuals has about this precision; wider, for combinations that mix
     variance = wider**2 / (2.0 * counts + spread**-2.0)
@@ -146,8 +146,8 @@ def choose_from_library(
     n = draws * chains
     x = proposal.rvs(proposals * n, random_state=rng).reshape(proposals * n, -1)
     # in parts, for there may be many combinations
-    heights = np.concatenate([density(some) for some in np.array_split(x, 4 * chains)])
-    log_weight = heights - proposal.logpdf(x)
+    log_densities = np.concatenate([density(some) for some in np.array_split(x, 4 * chains)])
+    log_weight = log_densities - proposal.logpdf(x)
     drawn = systematic(np.exp(log_weight - log_weight.max()), n, rng)
     log_sigma = x[rng.permutation(drawn)]
     index = np.zeros((n, len(names)), dtype=np.intp)
@@ -165,7 +165,7 @@ def choose_from_library(
     return phi.reshape(shape), np.exp(log_sigma).reshape(shape), index.reshape(shape), best
 
 
-def _rough_sigma(problem: Problem, parts: list[_Combinations], sigma: Floats) -> Floats:
+def _estimated_sigma(problem: Problem, parts: list[_Combinations], sigma: Floats) -> Floats:
     """Return a fixed-point estimate of sigma under each part's best combination."""
     observations = problem.observations
     residual = np.zeros_like(observations.values)

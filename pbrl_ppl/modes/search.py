@@ -10,7 +10,7 @@ from scipy.optimize import differential_evolution
 
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import Problem, estimate_sigma
-from pbrl_ppl.modes.laplace import ROUNDS, STALLED, LocalMode, Mode, climb, described, finish
+from pbrl_ppl.modes.laplace import ROUNDS, STALLED, LocalMode, Mode, canonical_wheels, climb, finish
 from pbrl_ppl.modes.noise import FAR_OFF, finite, gaussian_profile
 from pbrl_ppl.parameters import box, by_prior, inside, prior_draws
 from pbrl_ppl.state import Floats
@@ -95,7 +95,9 @@ def find_modes(
     steps = problem.simulator.steps * problem.segments.n * problem.data.horizon
     if few and len(priors) <= most_parameters and steps * _POPULATION * _GENERATIONS < afforded:
         begin = np.vstack([begin, _evolve(problem, rng)])
-    peaks = _distinct(part, [described(part, climb(part, phi, part.simulator)) for phi in begin])
+    peaks = _distinct(
+        part, [canonical_wheels(part, climb(part, phi, part.simulator)) for phi in begin]
+    )
     if not few:  # all data may join what a part of them told apart
         peaks = [climb(problem, phi, problem.coarse.simulator) for phi, *_ in peaks[:polished]]
         peaks = _distinct(problem.coarse, peaks)
@@ -197,7 +199,7 @@ def _polish(problem: Problem, start: LocalMode, *, worthwhile: float = 5.0) -> L
     """
     if not problem.layout.size:
         return start
-    start = described(problem, start)
+    start = canonical_wheels(problem, start)
     exact = climb(problem, start.phi, problem.simulator, rounds=1, tries=2)
     if exact.log_posterior < start.log_posterior + worthwhile:
         return max(start, exact, key=lambda peak: peak.log_posterior)

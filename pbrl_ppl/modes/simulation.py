@@ -47,7 +47,7 @@ def simulation_mode(mode: Mode, prior: NoisePrior | None = None, *, rounds: int 
     -------
     Mode
         Its problem has an :class:`pbrl_ppl.likelihood.OutputErrorLikelihood`, linearised at its
-        start states, and the prior of sigma fixed.
+        initial states, and the prior of sigma fixed.
     """
     return tempered_mode(ladder(mode)[-1], prior, rounds=rounds)
 

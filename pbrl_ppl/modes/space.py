@@ -70,23 +70,23 @@ class Space:
         Of continuous parameters.
     centre : ndarray
         Parameters about which circles are cut, shape (p,).
-    silent : ndarray of bool, optional
+    uninformed : ndarray of bool, optional
         Parameters that the data do not inform, shape (p,): their posterior is their prior, and no
         density here includes it.
     """
 
     problem: Problem
     centre: Floats
-    silent: Bools = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    uninformed: Bools = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     def __post_init__(self) -> None:
-        """Take no parameter to be silent by default."""
-        if not len(self.silent):
-            object.__setattr__(self, "silent", np.zeros(len(self.centre), dtype=bool))
+        """Take no parameter to be uninformed by default."""
+        if not len(self.uninformed):
+            object.__setattr__(self, "uninformed", np.zeros(len(self.centre), dtype=bool))
 
     @classmethod
     def of(cls, mode: Mode) -> Space:
-        """Return the space about a mode, with the parameters that its derivative finds silent."""
+        """Return the space about a mode, with the parameters that the data do not inform."""
         centre = mode.phi.copy()
         for i, prior in enumerate(mode.problem.layout.priors):
             if prior.family == "von_mises":  # cut where it is farthest from every mode
@@ -97,7 +97,7 @@ class Space:
                 widest = int(np.argmax(gaps))
                 middle = angles[widest] + 0.5 * gaps[widest] - np.pi
                 centre[i] += wrapped(middle - centre[i])
-        return cls(mode.problem, centre, silent(mode))
+        return cls(mode.problem, centre, uninformed(mode))
 
     @classmethod
     def of_draws(cls, problem: Problem, phi: Floats, sigma: Floats) -> tuple[Space, Floats]:
@@ -135,15 +135,17 @@ class Space:
         parts = self.problem.simulator.parts
         if not self.problem.likelihood.independent:
             bodies = np.arange(len(self.problem.scene.moving))
-            return (Independent(np.flatnonzero(~self.silent), bodies),)
+            return (Independent(np.flatnonzero(~self.uninformed), bodies),)
         return tuple(
-            Independent(part.places[~self.silent[part.places]], part.bodies) for part in parts
+            Independent(part.places[~self.uninformed[part.places]], part.bodies) for part in parts
         )
 
     @property
-    def loud(self) -> Ints:
-        """The coordinates that the data inform, shape (loud,)."""
-        return np.concatenate([np.flatnonzero(~self.silent), np.arange(self.phi_size, self.size)])
+    def informed(self) -> Ints:
+        """The coordinates that the data inform, shape (informed,)."""
+        return np.concatenate(
+            [np.flatnonzero(~self.uninformed), np.arange(self.phi_size, self.size)]
+        )
 
     @cached_property
     def noise_blocks(self) -> tuple[Ints, ...]:
@@ -188,7 +190,7 @@ class Space:
     def log_priors(self, q: Floats) -> Floats:
         """Return the log-prior of each part, then of the noise, shape (..., part + 1).
 
-        Minus infinity outside; without the silent parameters.
+        Minus infinity outside; without the uninformed parameters.
         """
         log_prior, noise = self._of_parameters(q), self._of_noise(q)
         sums = [log_prior[..., part.places].sum(axis=-1) for part in self.parts]
@@ -251,18 +253,18 @@ class Space:
         there = np.isfinite(phi).all(axis=-1, keepdims=True)
         return inside(self.problem.layout.priors, np.where(there, phi, self.centre))
 
-    def look(self, q: Floats) -> Floats:
+    def evaluate(self, q: Floats) -> Floats:
         """Return residuals, which do not depend on the noise, as an array of their own."""
         return np.array(self.residual(q), dtype=float)
 
-    def columns(self, q: Floats, look: Floats) -> Floats:
+    def columns(self, q: Floats, residual: Floats) -> Floats:
         """Return the log-posterior of each part and of the noise at residuals, (n, part + 1).
 
-        Up to the evidence; see :meth:`look`.
+        Up to the evidence; see :meth:`evaluate`.
         """
         total = self.log_priors(q)
         there = np.isfinite(total).all(axis=1, keepdims=True)
-        likelihood = self.log_likelihoods(q, look)
+        likelihood = self.log_likelihoods(q, residual)
         total[:, :-1] = np.where(there, total[:, :-1] + likelihood, -np.inf)
         return total
 
@@ -283,9 +285,9 @@ class Space:
         return self.log_densities(q)[0]
 
     def prior_draws(self, q: Floats, rng: np.random.Generator) -> Floats:
-        """Return points (n, d) with the silent parameters drawn from their prior."""
+        """Return points (n, d) with the uninformed parameters drawn from their prior."""
         q = q.copy()
-        for place in np.flatnonzero(self.silent):
+        for place in np.flatnonzero(self.uninformed):
             prior = self.problem.layout.priors[place]
             drawn = inside([prior], prior.sample(rng, len(q))[:, None])[:, 0]
             q[:, place] = unconstrain(prior, drawn)[0]
@@ -356,26 +358,26 @@ class Space:
         first distance.
         """
         p = self.phi_size
-        loud = np.flatnonzero(~self.silent)
-        if not len(loud):
+        informed = np.flatnonzero(~self.uninformed)
+        if not len(informed):
             return covariance
-        steps = np.sqrt(np.diag(covariance))[loud]
+        steps = np.sqrt(np.diag(covariance))[informed]
         ends = np.array([*distances, *(-far for far in distances)])
-        moves = np.zeros((len(loud), len(ends), len(mean)))
-        moves[np.arange(len(loud)), :, loud] = steps[:, None] * ends
+        moves = np.zeros((len(informed), len(ends), len(mean)))
+        moves[np.arange(len(informed)), :, informed] = steps[:, None] * ends
         points = np.vstack([mean, mean + moves.reshape(-1, len(mean))])
-        top, *heights = self._about(mean).log_density(points)
-        fall = (top - np.array(heights)).reshape(len(loud), 2, -1)
+        top, *log_densities = self._about(mean).log_density(points)
+        fall = (top - np.array(log_densities)).reshape(len(informed), 2, -1)
         # on either side, up to the first point that has fallen
         within = np.nan_to_num(fall, nan=np.inf) < outside
         count = np.logical_and.accumulate(within, axis=2).sum(axis=2)
         stretch = np.array([distances[0], *distances])[count].mean(axis=1) / distances[0]
         extra = np.zeros(len(mean))
-        extra[:p][loud] = steps**2 * (stretch**2 - 1.0)
+        extra[:p][informed] = steps**2 * (stretch**2 - 1.0)
         return np.asarray(covariance + np.diag(extra))
 
 
-def silent(mode: Mode, *, least: float = 1e-3) -> Bools:
+def uninformed(mode: Mode, *, least: float = 1e-3) -> Bools:
     """Return the mask of parameters of which the data say nothing: their posterior is the prior.
 
     A wheel's parameters are never among them, for its prior is not one of independent numbers.

@@ -21,7 +21,7 @@ from pbrl_ppl.state import Floats
 from pbrl_ppl.threads import one_blas_thread
 
 #: Rounds at most; one that moves phi by less than this, in standard deviations, is the last.
-_ROUNDS, _SETTLED = 6, 0.2
+_ROUNDS, _CONVERGED = 6, 0.2
 #: Rounds of a climb between two linearisations.
 _CLIMB = 5
 
@@ -48,13 +48,15 @@ def find_trajectory_mode(
     Returns
     -------
     Mode
-        Result of :func:`following`.
+        Result of :func:`with_state_sensitivity`.
     """
     near = find_mode(single_transitions(problem), seed=seed)
     off = near.draws(np.random.default_rng(seed), starts - 1) - near.phi
     far = inside(problem.layout.priors, near.phi + wider * off)
     there = np.isfinite(near.problem.residual(far)).all(axis=(1, 2, 3, 4))
-    modes = [following(trajectory_mode(problem, phi)) for phi in (near.phi, *far[there])]
+    modes = [
+        with_state_sensitivity(trajectory_mode(problem, phi)) for phi in (near.phi, *far[there])
+    ]
     return max(modes, key=lambda mode: mode.log_posterior)
 
 
@@ -84,21 +86,21 @@ def trajectory_mode(
         Its problem has a :class:`pbrl_ppl.likelihood.TrajectoryLikelihood`.
     """
     if sigma is None or not problem.likelihood.filtered:
-        problem = _roughly_smoothed(problem, phi)
+        problem = _smoothed_cheaply(problem, phi)
         sigma = problem.trajectory_noise.sigma
     mode = nearby_mode(problem, phi, sigma)
-    quiet = mode.problem.quiet(mode.sigma, share)
-    if not np.array_equal(quiet, mode.sigma):
-        other = nearby_mode(smoothed(mode.problem, mode.phi, quiet), mode.phi, quiet)
+    small_noise = mode.problem.with_small_process_noise(mode.sigma, share)
+    if not np.array_equal(small_noise, mode.sigma):
+        other = nearby_mode(smoothed(mode.problem, mode.phi, small_noise), mode.phi, small_noise)
         mode = max(mode, other, key=lambda candidate: candidate.log_posterior)
     return mode
 
 
-def _roughly_smoothed(problem: Problem, phi: Floats) -> Problem:
+def _smoothed_cheaply(problem: Problem, phi: Floats) -> Problem:
     """Return the problem of whole trajectories, smoothed at phi with fewer engine steps."""
     coordinates = problem.trajectory_noise.coordinates if problem.likelihood.filtered else None
-    rough = along_trajectories(problem.rough, phi, coordinates=coordinates)
-    return replace(rough, physics=problem.physics)
+    medium = along_trajectories(problem.medium, phi, coordinates=coordinates)
+    return replace(medium, physics=problem.physics)
 
 
 @one_blas_thread
@@ -119,10 +121,10 @@ def filtered_mode(mode: Mode, other: Mode, *, share: float = 0.1, rounds: int = 
     """
     physics, phi = other.problem.physics, other.phi
     problem = mode.problem.with_physics(effects=physics.effects, substeps=physics.substeps)
-    problem = _roughly_smoothed(problem, phi)
+    problem = _smoothed_cheaply(problem, phi)
     sigma = problem.trajectory_noise.sigma
     ends: list[tuple[Problem, LocalMode]] = []
-    for begin in (sigma, problem.quiet(sigma, share)):
+    for begin in (sigma, problem.with_small_process_noise(sigma, share)):
         sigma, there = begin, problem
         for _ in range(rounds):
             there = smoothed(there, phi, sigma)
@@ -153,19 +155,19 @@ def nearby_mode(
     modes: list[Mode] = []
     for _ in range(corrections):
         cheap = problem.corrected(phi)
-        mode = _settled(cheap, phi, sigma)
+        mode = _alternate_smoothing(cheap, phi, sigma)
         if cheap is problem:
             return mode
         problem = replace(mode.problem, physics=problem.physics, defect=None)
         moved, phi = _change(mode, phi), mode.phi
-        sigma, height = profiled(problem, phi)
-        modes.append(replace(mode, problem=problem, sigma=sigma, log_posterior=height, others=()))
-        if moved < _SETTLED or abs(height - mode.log_posterior) < same:
+        sigma, value = profiled(problem, phi)
+        modes.append(replace(mode, problem=problem, sigma=sigma, log_posterior=value, others=()))
+        if moved < _CONVERGED or abs(value - mode.log_posterior) < same:
             break
     return max(modes, key=lambda candidate: candidate.log_posterior)
 
 
-def _settled(problem: Problem, phi: Floats, sigma: Floats) -> Mode:
+def _alternate_smoothing(problem: Problem, phi: Floats, sigma: Floats) -> Mode:
     """Return the mode of a problem by alternating climbs with smoothing."""
     for i in range(_ROUNDS):
         if i:
@@ -173,12 +175,12 @@ def _settled(problem: Problem, phi: Floats, sigma: Floats) -> Mode:
         mode = find_mode(problem, initial=phi, rounds=_CLIMB)
         change = _change(mode, phi)
         phi, sigma = mode.phi, mode.sigma
-        if i and change < _SETTLED:
+        if i and change < _CONVERGED:
             break
     return mode
 
 
-def following(mode: Mode) -> Mode:
+def with_state_sensitivity(mode: Mode) -> Mode:
     """Return a mode of whole trajectories whose smoothed states follow the parameters.
 
     Parameters
@@ -202,7 +204,7 @@ def following(mode: Mode) -> Mode:
         modes.append((value, find_mode(problem, initial=phi, rounds=_CLIMB)))
         change = _change(modes[-1][1], phi)
         phi, sigma = modes[-1][1].phi, modes[-1][1].sigma
-        if change < _SETTLED:
+        if change < _CONVERGED:
             break
     return max(modes, key=lambda pair: pair[0])[1]
 

@@ -214,7 +214,7 @@ class SceneJoints:
 
 
 def on_rod(states: Floats, rod: Floats, unit_moment: float) -> Floats:
-    """Return start states that satisfy the rod of an effect, with the least correction.
+    """Return initial states that satisfy the rod of an effect, with the least correction.
 
     Measured states violate the rod by the noise. The engine would correct the whole drift in one
     substep: the shorter the substep, the faster the body. The velocity along the rod is removed.

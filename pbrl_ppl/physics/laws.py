@@ -61,7 +61,7 @@ def act(  # type: ignore[no-untyped-def]
     date. ``held`` (2, slot) has the numbers of force laws, and gets their rates of change.
     """
     k, known, data = len(interval), interval.shape[1] > 3, acted.ctypes.data
-    wide = 8 * ACTED
+    stride = 8 * ACTED
     for i in range(k):
         for w in range(3):
             acted[i, COMMAND + w] = interval[i, w]
@@ -80,9 +80,9 @@ def act(  # type: ignore[no-untyped-def]
         acted[k, 6], acted[k, 7] = begin, end
         for s in range(law[SLOTS]):
             acted[k + 1 + s // ACTED, s % ACTED] = memory[law[SLOT] + s]
-        wrench_at = data + wide * i
+        wrench_at = data + stride * i
         if alone >= 0:
-            wrench_at = data + wide * (k + 3)
+            wrench_at = data + stride * (k + 3)
             for w in range(3):
                 acted[k, w] = acted[i, alone] if w == 0 else 0.0
                 acted[k, PREVIOUS + w] = acted[i, PREVIOUS + alone] if w == 0 else 0.0
@@ -92,13 +92,13 @@ def act(  # type: ignore[no-untyped-def]
                 acted[k + 3, 6 + d] = state[i, d]
             acted[k + 3, 8] -= state[law[OTHER], 2]
             acted[k + 3, 11] -= state[law[OTHER], 5]
-            state_at = data + wide * (k + 3) + 48
-        call_law(law[LAW], state_at, data + wide * k, parameters_at, wrench_at)
+            state_at = data + stride * (k + 3) + 48
+        call_law(law[LAW], state_at, data + stride * k, parameters_at, wrench_at)
         if alone >= 0:
             acted[i, alone] = acted[k + 3, 0]
         if after and law[SLOTS] > 0:
             at = memory.ctypes.data + 8 * law[SLOT]
-            call_law(law[REMEMBER], state_at, data + wide * k, parameters_at, at)
+            call_law(law[REMEMBER], state_at, data + stride * k, parameters_at, at)
     for i in range(k):
         for w in range(3):
             acted[i, WRENCHES + w] = acted[i, COMMAND + w]
@@ -107,10 +107,10 @@ def act(  # type: ignore[no-untyped-def]
             acted[laws.commands[e, OTHER], WRENCHES + 2] -= acted[laws.commands[e, ON], COMMAND + 2]
     for e in range(0 if after else len(laws.forces)):
         law = laws.forces[e]
-        at, state_at = data + wide * law[ON], state.ctypes.data + 48 * law[ON]
+        at, state_at = data + stride * law[ON], state.ctypes.data + 48 * law[ON]
         seen, parameters_at = at, laws.force_parameters.ctypes.data + 8 * law[FIRST]
         if law[SLOTS] > 0:
-            seen = data + wide * k
+            seen = data + stride * k
             for w in range(ACTED):
                 acted[k, w] = acted[law[ON], w]
             for s in range(law[SLOTS]):

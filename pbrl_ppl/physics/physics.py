@@ -147,13 +147,16 @@ class Physics:
 
     @cached_property
     def coarse(self) -> Physics:
-        """The same with few substeps: cheap, and its derivative is nearly right."""
+        """The same with the fewest substeps, for scans, screening and first derivatives.
+
+        There are three levels of substeps: ``coarse``, :attr:`medium` and the engine's own.
+        """
         enough = max(4, self._steps_of(0.105))
         return self.changed(substeps=min(enough, self.substeps), extrapolate=False)
 
     @property
-    def rough(self) -> Physics:
-        """The same with few substeps where it has more: for derivatives, and an effect's change."""
+    def medium(self) -> Physics:
+        """The same with at most a medium number of substeps: for derivatives and changes."""
         return self.changed(substeps=min(max(10, self.fine_enough), self.substeps))
 
     @property

@@ -1,4 +1,4 @@
-"""Checks of start states: interpenetrating bodies, and joints whose anchors are apart."""
+"""Checks of initial states: interpenetrating bodies, and joints whose anchors are apart."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _ORIGIN = (0.0, 0.0, 0.0)
 
 
 def check_placement(scene: Scene, start: Floats, where: Callable[[int], str] | None = None) -> None:
-    """Raise an error if bodies overlap deeply, or joints are apart, in start states.
+    """Raise an error if bodies overlap deeply, or joints are apart, in initial states.
 
     The engine would push such bodies apart, and a fit would explain that by physics. Shallow
     overlaps are measurement noise or resting contact. Joined bodies do not collide in the engine,
@@ -32,7 +32,7 @@ def check_placement(scene: Scene, start: Floats, where: Callable[[int], str] | N
     scene : Scene
         Shapes, walls, static bodies and joints.
     start : ndarray
-        Start states, shape (transition, body, 6), bodies in the order of ``scene.moving``:
+        Initial states, shape (transition, body, 6), bodies in the order of ``scene.moving``:
         x, y, theta, vx, vy, omega (m, m, rad, m/s, m/s, rad/s).
     where : callable, optional
         ``where(i)`` names transition ``i`` in a message; ``transition i`` by default.
@@ -78,7 +78,7 @@ def check_placement(scene: Scene, start: Floats, where: Callable[[int], str] | N
 
 
 def check_history(scene: Scene, history: History, segments: Segments) -> None:
-    """Raise an error if start states of a history are impossible; see :func:`check_placement`.
+    """Raise an error if initial states of a history are impossible; see :func:`check_placement`.
 
     Parameters
     ----------

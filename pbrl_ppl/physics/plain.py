@@ -53,7 +53,7 @@ def rollout(
     proposal, item : int
         Indices of the proposal and of the transition.
     start : ndarray
-        Start state, shape (body, 6), SI units.
+        Initial state, shape (body, 6), SI units.
     inputs : ndarray
         Inputs of each interval, shape (H, body, 3 or 9): wrenches in N and N m (of a kinematic
         body, velocities in m/s and rad/s), and the rest as in :data:`pbrl_ppl.state.INPUT`.
@@ -129,7 +129,7 @@ class Acting:
         Inputs of the intervals of the recording that lead to the first one, (interval, body, 3 or
         more).
     start : ndarray
-        Start state, shape (body, 6).
+        Initial state, shape (body, 6).
     """
 
     def __init__(
@@ -158,9 +158,9 @@ class Acting:
         #: What each body hangs on; -1 for nothing that moves.
         self._others = {names.index(one.body): holder(scene, one) for one in effects}
         self._time_step, self.command = scene.time_step, np.zeros((len(names), 3))
-        wide = earlier.shape[-1]
-        older = [np.arange(j, j + 3) for j in range(9, wide, 3)]
-        past = earlier[0][:, [np.arange(3, 6), *older][-1]] if wide > 3 else self.command
+        width = earlier.shape[-1]
+        older = [np.arange(j, j + 3) for j in range(9, width, 3)]
+        past = earlier[0][:, [np.arange(3, 6), *older][-1]] if width > 3 else self.command
         self._memory = []
         for i, stage, parameters in self._commands:
             last = past[i].copy()

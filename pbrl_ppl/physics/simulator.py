@@ -1,4 +1,4 @@
-"""Batched prediction: (parameters, start states, actions) -> next states."""
+"""Batched prediction: (parameters, initial states, actions) -> next states."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class Simulator:
         phi : ndarray
             Unknown parameters in the layout's order, SI units, shape (p,) or (proposal, p).
         start : ndarray
-            Start states, shape (transition, body, 6), or (proposal, transition, body, 6).
+            Initial states, shape (transition, body, 6), or (proposal, transition, body, 6).
         actions : ndarray
             Wrenches, shape (transition, H, body, 3), N and N m; of a kinematic body its velocity
             over the interval, m/s and rad/s. Or all inputs, shape (transition, H, body, 9), as in
@@ -106,7 +106,7 @@ class Simulator:
         Raises
         ------
         SimulationError
-            If the shapes do not fit together, or a start state is not finite.
+            If the shapes do not fit together, or an initial state is not finite.
         ParameterError
             If a parameter is impossible, such as a negative mass.
         """
@@ -195,7 +195,7 @@ class Simulator:
         return states
 
     def _on_rods(self, states: Floats, joints: Floats) -> Floats:
-        """Start states with the bodies that effects tie on their rods."""
+        """Initial states with the bodies that effects tie on their rods."""
         if self._properties.tied:
             states = _each(states, len(joints))
         for i, position in self._properties.tied:
@@ -359,7 +359,7 @@ class Simulator:
 
 
 def _each(states: Floats, proposals: int) -> Floats:
-    """A copy of start states for each proposal, in the layout that the rollouts take."""
+    """A copy of initial states for each proposal, in the layout that the rollouts take."""
     return np.array(np.broadcast_to(states, (proposals, *states.shape[1:])), order="C")
 
 
@@ -405,7 +405,7 @@ def check_shapes(scene: Scene, layout: Layout, phi: Floats, start: Floats, actio
     Raises
     ------
     SimulationError
-        If the shapes do not fit together, or a start state is not finite.
+        If the shapes do not fit together, or an initial state is not finite.
     """
     k, p = len(scene.moving), layout.size
     if phi.ndim not in (1, 2) or phi.shape[-1] != p:
@@ -428,4 +428,4 @@ def check_shapes(scene: Scene, layout: Layout, phi: Floats, start: Floats, actio
             f" {', '.join(INPUT)}"
         )
     if not (np.isfinite(start).all() and np.isfinite(actions[..., :6]).all()):
-        raise SimulationError("start states and actions must be finite; drop the missing rows")
+        raise SimulationError("initial states and actions must be finite; drop the missing rows")

@@ -32,8 +32,8 @@ class Transition:
     threads : int
         Worlds that run side by side.
     check_start : bool
-        Whether start states are refused in which bodies lie deep inside each other or a wall, or a
-        hinge's bodies are apart. Off, one may go on from where the engine left bodies pressed
+        Whether initial states are refused in which bodies lie deep inside each other or a wall, or
+        a hinge's bodies are apart. Off, one may go on from where the engine left bodies pressed
         together.
 
     Raises
@@ -129,7 +129,7 @@ class Transition:
         Parameters
         ----------
         start : array_like
-            Start states, shape (transition, body, 6), SI units.
+            Initial states, shape (transition, body, 6), SI units.
         wrenches : array_like
             Held over each interval, shape (transition, H, body, 3), N and N m. Those of a kinematic
             body are its velocity over the interval (m/s, m/s, rad/s): its path is part of the

@@ -94,7 +94,7 @@ def astar(
             search.generated += guide.generated
         while search.open():
             now = time.monotonic()
-            if search.best and not improve and (weight > 1 or search.settled()):
+            if search.best and not improve and (weight > 1 or search.is_optimal()):
                 break
             if search.generated >= nodes or now - begin > task.seconds:
                 stopped = "nodes" if search.generated >= nodes else "time"
@@ -162,7 +162,7 @@ class _Search:
             self.begin()
         return bool(self.queue)
 
-    def settled(self) -> bool:
+    def is_optimal(self) -> bool:
         """Return whether no node in the queue can lead to a cheaper plan."""
         return self.queue[0][0] >= self.least_cost
 

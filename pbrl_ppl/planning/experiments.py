@@ -189,7 +189,7 @@ class Separation:
             seen=np.tile(problem.trajectory_noise.seen.any(axis=0), (len(residual), 1)),
             measured=nothing,
             begin=nothing,
-            wide=nothing,
+            initial_variance=nothing,
             sigma=rival.sigma,
             touching=met,
             sensitivity=None,
@@ -400,7 +400,7 @@ def suggest_actions(
         progress("fitting each effect to the recording")
         rivals = fit_rivals(posterior, chosen, catalogue, draws, seed)
         judge = Separation(rivals, first, last)
-        genes, at_random = _bred(judge, allowed, np.random.default_rng(seed), progress)
+        genes, at_random = _evolved(judge, allowed, np.random.default_rng(seed), progress)
         progress("judging the best sequences")
         wrenches = allowed.wrenches(genes, judge.dynamics[0], judge.start)
         separation, meeting = judge(wrenches, draws)
@@ -432,7 +432,7 @@ def suggest_actions(
     )  # fmt: skip
 
 
-def _bred(
+def _evolved(
     judge: Separation,
     allowed: Allowed,
     rng: np.random.Generator,

@@ -26,7 +26,7 @@ from pbrl_ppl.likelihood import (
     noise_law,
     smoothed,
 )
-from pbrl_ppl.modes import doubts
+from pbrl_ppl.modes import evidence_warning
 from pbrl_ppl.parameters import Prior, by_prior, nearest, prior_draws
 from pbrl_ppl.posterior.data import placed, places, record_of, recording
 from pbrl_ppl.posterior.identifiability import uninformed
@@ -167,7 +167,7 @@ def evaluate(
     """
     likelihood = np.empty((len(phi), problem.segments.n)) if known is None else known
     predictive = []
-    wide = problem.with_physics(threads=max(problem.physics.threads, 2))
+    parallel = problem.with_physics(threads=max(problem.physics.threads, 2))
     rows = np.asarray(rows, dtype=int)
     size = max(_GROUP, _GROUP_TRANSITIONS // problem.segments.n)
     for begin in range(0, len(phi), size):
@@ -175,11 +175,11 @@ def evaluate(
         if known is None:
             # a chain repeats a draw where it rejects a proposal
             different, which = np.unique(phi[part], axis=0, return_inverse=True)
-            states = wide.predict(different)[which.ravel()]
+            states = parallel.predict(different)[which.ravel()]
             residual = problem.observations.residual(states)
             likelihood[part] = problem.log_density(residual, sigma[part], phi[part])
         for i in rows[(begin <= rows) & (rows < begin + size)]:
-            states = wide.predict(phi[i], wide.one_world)
+            states = parallel.predict(phi[i], parallel.one_world)
             predictive.append(problem.next_states(states, sigma[i], rng, phi[i]))
     return likelihood, np.array(predictive)
 
@@ -377,8 +377,8 @@ def _of_approximations(record: PosteriorRecord) -> Iterator[_Warned]:
             " a part of the posterior; raise draws, or compare with the method 'metropolis'"
         )
         yield ConvergenceWarning, text
-    if rough := doubts(record.configurations or ()):
-        yield ConvergenceWarning, rough
+    if warning := evidence_warning(record.configurations or ()):
+        yield ConvergenceWarning, warning
 
 
 def _unconverged(
@@ -424,15 +424,15 @@ def _of_parameters(problem: Problem, idata: Idata) -> Iterator[_Warned]:
             )
             yield BoundWarning, text
     effects = {attached.effect for attached in problem.physics.effects}
-    silent = list(uninformed(idata, effects=effects))
+    names = list(uninformed(idata, effects=effects))
     scene = problem.scene
     alone = len(scene.bodies) == 1 and not scene.walls
     if alone and not any(isinstance(effect.stage, Structure) for effect in effects):
         # no motion of a body that can touch nothing depends on its contacts
-        silent = [label for label in silent if label.partition("[")[0] not in ("r", "mu_c")]
-    if silent:
+        names = [label for label in names if label.partition("[")[0] not in ("r", "mu_c")]
+    if names:
         text = (
-            f"the data say nothing about {', '.join(silent)}: the posterior is the prior; record"
+            f"the data say nothing about {', '.join(names)}: the posterior is the prior; record"
             " motions that depend on it, or give it in the scene (known = ...)"
         )
         yield UninformedWarning, text

@@ -196,7 +196,10 @@ def recording(problem: Problem) -> xr.Dataset:
     dims = tuple(f"{_PREFIX}{name}" for name in ("trajectory", "time", "body", "state"))
     kept[SMOOTHED] = (dims, problem.data.smoothed_states)
     if problem.likelihood.simulated:
-        kept[_BY_START] = ((*NEXT_STATE_DIMS, "cell_before"), output_error(problem).starts.slope)
+        kept[_BY_START] = (
+            (*NEXT_STATE_DIMS, "cell_before"),
+            output_error(problem).initial_states.slope,
+        )
         kept[_TAU] = (("state",), np.array(output_error(problem).tau), {"units": "rows"})
         return kept.assign_attrs({})
     noise = problem.trajectory_noise

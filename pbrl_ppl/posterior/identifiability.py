@@ -1,4 +1,4 @@
-"""Identifiability: parameters the data inform, silent ones, combinations they cannot tell apart."""
+"""Identifiability: parameters that the data inform or not, combinations they cannot tell apart."""
 
 from __future__ import annotations
 
@@ -83,28 +83,28 @@ class Identifiability:
     ----------
     parameters : tuple of Width
         One for each continuous parameter, in the layout's order.
-    silent : tuple of str
+    uninformed : tuple of str
         Parameters that the data say nothing about: predictions do not depend on them.
     directions : tuple of Direction
         Combinations that the data do not constrain, though each parameter has an effect.
     """
 
     parameters: tuple[Width, ...]
-    silent: tuple[str, ...]
+    uninformed: tuple[str, ...]
     directions: tuple[Direction, ...]
 
     @property
     def sentences(self) -> tuple[str, ...]:
         """Sentences on what the data do not inform; none where they inform all."""
         cures: dict[str, list[str]] = {}
-        for name in self.silent:
+        for name in self.uninformed:
             matching = (cure for words, cure in _CURES if any(word in f" {name}" for word in words))
             cures.setdefault(next(matching, "record motion in which that matters"), []).append(name)
-        silent = (
+        sentences = (
             f"The data say nothing about {_listed(names)}: {cure}, or give the value as known."
             for cure, names in cures.items()
         )
-        return (*silent, *(direction.sentence for direction in self.directions))
+        return (*sentences, *(direction.sentence for direction in self.directions))
 
     def table(self) -> pd.DataFrame:
         """Return one row a parameter: prior_sd, posterior_sd, ratio, verdict."""
@@ -143,7 +143,7 @@ def identify(
         linearised posterior.
     mode : Mode, optional
         Where ``J`` is taken for a posterior. Without it, it is computed at the draw with the
-        highest likelihood, with measured start states taken as exact.
+        highest likelihood, with measured initial states taken as exact.
     effects : iterable of Effect
         Where the names of a posterior's effects are looked up; add your own to the package's.
     no_effect : float
@@ -192,12 +192,12 @@ def identify(
     else:
         widths = _widths(layout, prior, posterior)
     verdicts = {width.parameter: width.verdict for width in widths}
-    silent = tuple(
+    without = tuple(
         label
         for label, information in zip(labels, np.diag(gram), strict=True)
         if information < no_effect and verdicts[label] != INFORMED
     )
-    return Identifiability(widths, silent, _directions(gram, labels))
+    return Identifiability(widths, without, _directions(gram, labels))
 
 
 def uninformed(idata: Idata, *, effects: Iterable[Effect] = catalogue) -> tuple[str, ...]:

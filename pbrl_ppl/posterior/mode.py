@@ -55,15 +55,15 @@ def packed_mode(
     likelihood : ndarray
         Log-likelihood of each draw, shape (draw,).
     """
-    height = float(log_posterior(problem, mode.phi, mode.sigma, mode.choice))
+    value = float(log_posterior(problem, mode.phi, mode.sigma, mode.choice))
     if problem.library is None and not problem.layout.discrete.any():
         draws = log_posterior(problem, phi, sigma, log_likelihood=likelihood)
         best = int(np.argmax(draws))
-        if draws[best] > height + 0.1:
+        if draws[best] > value + 0.1:
             climbed = find_mode(problem, initial=phi[best], rounds=_CLIMB)
-            if climbed.log_posterior > height:
-                mode, height = Point(climbed.phi, climbed.sigma), climbed.log_posterior
-    return _packed(problem, mode, height, phi)
+            if climbed.log_posterior > value:
+                mode, value = Point(climbed.phi, climbed.sigma), climbed.log_posterior
+    return _packed(problem, mode, value, phi)
 
 
 def updated_mode(
@@ -90,15 +90,13 @@ def updated_mode(
     if problem.library is None and not problem.layout.discrete.any():
         mode = find_mode(problem, initial=earlier.phi, rounds=_CLIMB)
         return _packed(problem, Point(mode.phi, mode.sigma), mode.log_posterior, phi)
-    height = log_posterior(problem, phi, sigma, choice, log_likelihood=likelihood)
-    i = int(np.argmax(height))
+    value = log_posterior(problem, phi, sigma, choice, log_likelihood=likelihood)
+    i = int(np.argmax(value))
     best = Point(phi[i], sigma[i], None if choice is None else choice[i])
-    return _packed(problem, best, float(height[i]))
+    return _packed(problem, best, float(value[i]))
 
 
-def _packed(
-    problem: Problem, mode: Point, height: float, draws: Floats | None = None
-) -> StoredMode:
+def _packed(problem: Problem, mode: Point, value: float, draws: Floats | None = None) -> StoredMode:
     """Return a point for a record, its wheels described as in draws (draw, p)."""
     layout, point, sets = problem.layout, mode.phi, None
     if problem.library is None and draws is not None:
@@ -110,7 +108,7 @@ def _packed(
     return StoredMode(
         dict(zip(layout.labels, point.tolist(), strict=True)),
         dict(zip(problem.noise_labels, mode.sigma.tolist(), strict=False)),  # a scalar is repeated
-        height,
+        value,
         sets,
     )
 

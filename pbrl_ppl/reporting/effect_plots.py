@@ -37,7 +37,7 @@ def plot_candidates(loop: Loop, width: float = style.WIDE, level: float = 0.01) 
     figure, (axes,) = style.blank_figure(width, 0.9 + 0.3 * max(len(shown), 3), grid="x")
     several = len({candidate.body for candidate in shown}) > 1
     thresholds = [
-        chi2.isf(level / (len(loop.candidates) * max(candidate.looks, 1)), candidate.dof)
+        chi2.isf(level / (len(loop.candidates) * max(candidate.n_grid_points, 1)), candidate.dof)
         for candidate in shown
     ]
     style.bars(
@@ -68,11 +68,13 @@ def plot_candidates(loop: Loop, width: float = style.WIDE, level: float = 0.01) 
 def plot_search(loop: Loop, width: float = style.WIDE) -> Figure:
     """Plot the simulation error over the number of further laws, one line a length of pieces."""
     figure, (axes,) = style.blank_figure(width, 3.2)
-    shades = colormaps["Blues"](np.linspace(1.0, 0.4, len(loop.rungs)))[::-1]
-    for rung, shade, mark in zip(loop.rungs, shades, cycle("o^sDv"), strict=False):
-        sizes = [0, *(len(best.laws) for best in rung.path)]
-        errors = [1.0, *(best.error for best in rung.path)]
-        name = f"{rung.seconds:.3g} s" + f", {len(rung.accepted)} accepted" * bool(rung.accepted)
+    shades = colormaps["Blues"](np.linspace(1.0, 0.4, len(loop.search)))[::-1]
+    for length, shade, mark in zip(loop.search, shades, cycle("o^sDv"), strict=False):
+        sizes = [0, *(len(best.laws) for best in length.path)]
+        errors = [1.0, *(best.error for best in length.path)]
+        name = f"{length.seconds:.3g} s" + f", {len(length.accepted)} accepted" * bool(
+            length.accepted
+        )
         axes.plot(sizes, errors, color=shade, marker=mark, label=name)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set(xlabel="further laws in the best subset", ylabel="simulation error / error without")

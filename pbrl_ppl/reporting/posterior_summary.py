@@ -37,7 +37,7 @@ from pbrl_ppl.state import Floats, acceleration_unit
 #: Chains are good up to this R-hat and from this effective sample size on.
 GOOD_R_HAT, GOOD_ESS = 1.01, 400.0
 #: Up to these they are good enough for a verdict, and for the first digits of an interval.
-ROUGH_R_HAT, ROUGH_ESS = 1.05, 100.0
+USABLE_R_HAT, USABLE_ESS = 1.05, 100.0
 
 #: Of parameters, by the variable's name.
 PARAMETERS = {
@@ -109,13 +109,13 @@ class Parameters:
         ]
         table["ess"] = ess = table[["ess_bulk", "ess_tail"]].min(axis=1)
         # written so that a value that is not a number counts as bad
-        agree = table["r_hat"] <= (ROUGH_R_HAT if self.weighted else GOOD_R_HAT)
+        agree = table["r_hat"] <= (USABLE_R_HAT if self.weighted else GOOD_R_HAT)
         table["wrong"] = [
             [f"R-hat {number(r_hat, 4)}"] * (self.chains and not fine)
             + [f"effective sample size {number(size)}"] * (self.chains and not size >= GOOD_ESS)
             for r_hat, fine, size in zip(table["r_hat"], agree, ess, strict=True)
         ]
-        good = (table["r_hat"] <= ROUGH_R_HAT) & (ess >= ROUGH_ESS)
+        good = (table["r_hat"] <= USABLE_R_HAT) & (ess >= USABLE_ESS)
         table["failed"] = ~good & self.chains
         return table
 

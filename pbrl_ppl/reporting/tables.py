@@ -104,8 +104,10 @@ def limits_in_words(candidate: Candidate, loop: Loop) -> str:
             continue
         size, unit = candidate.detectable[name], candidate.units[name]
         null = priors[name].null if name in priors else 0.0
-        shown = name not in priors or _plausible(priors[name].prior, null, size, candidate.caps)
-        how = "up to " if candidate.caps else f"{number(null)} ± " if null else ""
+        shown = name not in priors or _plausible(
+            priors[name].prior, null, size, candidate.is_upper_limit
+        )
+        how = "up to " if candidate.is_upper_limit else f"{number(null)} ± " if null else ""
         known = f"{plain(name)} {how}{quantity(size, unit)}"
         limits[name] = known if shown and np.isfinite(size) else ""
     if not any(limits.values()):
@@ -113,13 +115,13 @@ def limits_in_words(candidate: Candidate, loop: Loop) -> str:
     return ", ".join(text or f"{plain(name)} no plausible size" for name, text in limits.items())
 
 
-def _plausible(prior: Prior, null: float, size: float, caps: bool) -> bool:
+def _plausible(prior: Prior, null: float, size: float, is_upper_limit: bool) -> bool:
     """Return whether the prior reaches a size more than once in 1000 draws.
 
     The size is a distance from the null value, or a cap.
     """
     draws = _draws(prior)
-    reached = draws <= size if caps else np.abs(draws - null) >= size
+    reached = draws <= size if is_upper_limit else np.abs(draws - null) >= size
     return bool(reached.mean() > 1e-3)
 
 
@@ -135,7 +137,7 @@ def error_tables(loop: Loop) -> list[Table]:
     titles = {
         "one_step_rmse": f"One interval ahead, {loop.scene.time_step:g} s",
         "rollout_rmse": f"{loop.rollout_horizon} intervals ahead, {number(loop.rollout_seconds)} s",
-        "simulated_rmse": "Whole trajectories, simulated from start states fitted to them",
+        "simulated_rmse": "Whole trajectories, simulated from initial states fitted to them",
     }
     tables = []
     for kind, title in titles.items():
@@ -255,15 +257,15 @@ def search_tables(loop: Loop) -> list[Table]:
     """Tabulate the best subset of laws of each size, one table a length of simulated pieces."""
     return [
         Table(
-            f"Pieces of {rung.rows} interval{'s' * (rung.rows > 1)}, {rung.seconds:.3g} s",
+            f"Pieces of {length.rows} interval{'s' * (length.rows > 1)}, {length.seconds:.3g} s",
             ("Best subset", "Evidence (nats)", "Error relative to none"),
             [
                 (", ".join(map(plain, best.laws)), number(best.nats), number(best.error))
-                for best in rung.path
+                for best in length.path
             ],
-            marks=["added" * ({*best.laws} == {*rung.accepted}) for best in rung.path],
+            marks=["added" * ({*best.laws} == {*length.accepted}) for best in length.path],
         )
-        for rung in loop.rungs
+        for length in loop.search
     ]
 
 

@@ -1,7 +1,7 @@
 """Simulation-based calibration of the whole pipeline (Talts et al., 2018; Modrák et al., 2023).
 
 Parameters are drawn from the model's prior, measurements are simulated with them from the history's
-start states (Eq. 13 of single transitions), and the whole fit is run on these. If prior, engine,
+initial states (Eq. 13 of single transitions), and the whole fit is run on these. If prior, engine,
 likelihood and sampler belong together, the true values' ranks among the posterior draws are
 uniform.
 """
@@ -64,8 +64,8 @@ def calibrate(
 ) -> Calibration:
     """Check prior, engine, likelihood and sampler against each other on simulated data.
 
-    Start states, actions and which cells are measured are the history's; what was measured counts
-    only for the prior of sigma, which stays that of the history. A start state is exact, as
+    Initial states, actions and which cells are measured are the history's; what was measured counts
+    only for the prior of sigma, which stays that of the history. An initial state is exact, as
     in Eq. 11, or measured with an error, of the other likelihoods. A wheel's equal descriptions are
     folded into one, of truth and draws alike. The log-likelihood is ranked too: the parameters'
     ranks alone cannot see a fit that ignores its data.

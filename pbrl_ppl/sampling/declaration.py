@@ -17,9 +17,9 @@ from pbrl_ppl.modes import (
     Mode,
     find_simulation_mode,
     find_trajectory_mode,
-    following,
     simulation_mode,
     trajectory_mode,
+    with_state_sensitivity,
 )
 from pbrl_ppl.parameters import ParameterLibrary
 from pbrl_ppl.physics import Physics, try_effect
@@ -57,13 +57,13 @@ def physics_model(
         Effects beside those that the scene declares. Your own are tried once; see
         :func:`pbrl_ppl.physics.try_effect`.
     likelihood : str
-        ``transitions`` (Eq. 11): measured start states are exact.
+        ``transitions`` (Eq. 11): measured initial states are exact.
 
         ``trajectories``: whole trajectories are whitened together, with two noises: ``sigma``, the
         error of measuring a state, ``unexplained_acceleration``, what a step adds, and where bodies
         touch ``contact_acceleration``, what comes on top of it there.
 
-        ``simulation``: trajectories are simulated from latent start states without process noise
+        ``simulation``: trajectories are simulated from latent initial states without process noise
         (output error), in pieces as long as a simulation does not magnify its start. ``sigma`` is
         the error of measuring a state; the log-likelihood is divided by its autocorrelation time.
 
@@ -105,7 +105,7 @@ def physics_model(
         If an effect is unknown or does not apply, or your own does not vanish at its null value.
     HistoryError
         If the history has nothing to fit at this horizon, or nothing moves in whole trajectories,
-        or start states of simulations can follow all that was measured.
+        or initial states of simulations can follow all that was measured.
     SimulationError
         If bodies start deep inside each other or a wall, or a hinge's bodies apart.
     ValueError
@@ -154,7 +154,7 @@ def physics_model(
         if around is None:
             mode = (find_simulation_mode if simulated else find_trajectory_mode)(problem, seed)
         else:  # the mode that is reached from the given one
-            mode = following(trajectory_mode(problem, around.phi))
+            mode = with_state_sensitivity(trajectory_mode(problem, around.phi))
             mode = simulation_mode(mode) if simulated else mode
         problem = mode.problem
     from pbrl_ppl.model import build_model  # PyMC takes seconds to load

@@ -2,7 +2,8 @@
 
 All particles move together: one engine batch a sweep, accepted for each independent part by itself.
 Annealing is a sequential Monte Carlo sampler (Del Moral, Doucet and Jasra, 2006): particles are
-weighted, resampled and moved along a geometric path whose rungs their effective sample size sets.
+weighted, resampled and rejuvenated by Metropolis moves at temperatures of a geometric path, which
+their effective sample size sets.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ from pbrl_ppl.state import Bools, Floats, Ints
 TARGET_ACCEPTANCE = 0.234
 #: Variance of a Gaussian that draws are proposed from over that of what it stands for.
 _WIDER = 1.3
-#: Tests whether particles have forgotten where they were, at most.
-_LOOKS = 5
+#: Checks of the particles' autocorrelation, at most.
+_MAX_CHECKS = 5
 
 
 class Target(Protocol):
@@ -35,26 +36,26 @@ class Target(Protocol):
     A space is one, of its problem's posterior.
     """
 
-    def look(self, q: Floats) -> Any:
-        """Return what is dear at particles (n, d), and does not depend on the noise."""
+    def evaluate(self, q: Floats) -> Any:
+        """Return what is expensive at particles (n, d), and does not depend on the noise."""
 
-    def columns(self, q: Floats, look: Any) -> Floats:
+    def columns(self, q: Floats, values: Any) -> Floats:
         """Return the log-density of each part and of the noise, shape (n, part + 1)."""
 
 
-class Path:
+class Tempered:
     """Geometric path from Gaussians to a density, at a share ``beta`` of the way, above 0."""
 
     def __init__(self, start: Reference, end: Target, beta: float) -> None:
         self.start, self.end, self.beta = start, end, beta
 
-    def look(self, q: Floats) -> Any:
-        """Return what the end is, at particles (n, d); Gaussians need no look."""
-        return self.end.look(q)
+    def evaluate(self, q: Floats) -> Any:
+        """Evaluate the density at the end of the path; Gaussians need no engine."""
+        return self.end.evaluate(q)
 
-    def columns(self, q: Floats, look: Any) -> Floats:
+    def columns(self, q: Floats, values: Any) -> Floats:
         """Return the weighted mean of both, shape (n, part + 1)."""
-        end = self.end.columns(q, look)
+        end = self.end.columns(q, values)
         if self.beta == 1:
             return end
         with np.errstate(invalid="ignore"):
@@ -143,8 +144,8 @@ class Block:
         if kind == "walk":
             return x + np.exp(self.log_scale) * noise @ self.step.T, np.zeros(len(x))
         mode, beta = self.modes[0], np.exp(self.log_beta)
-        kept = np.sqrt(1 - beta**2) * (x - mode.mean)
-        moved = mode.mean + kept + beta * noise @ mode.factor.T
+        remaining = np.sqrt(1 - beta**2) * (x - mode.mean)
+        moved = mode.mean + remaining + beta * noise @ mode.factor.T
         return moved, mode.log_density(x) - mode.log_density(moved)
 
     def adapt(self, kind: str, rate: float) -> None:
@@ -154,17 +155,17 @@ class Block:
         elif kind == "draw":  # up to draws that forget where they were
             self.log_beta = min(self.log_beta + rate - TARGET_ACCEPTANCE, 0.0)
 
-    def learn(self, x: Floats, wider: float = 1.0, kept: float = 0.0) -> None:
+    def learn(self, x: Floats, wider: float = 1.0, retained: float = 0.0) -> None:
         """Take the particles' mean and covariance; the covariance about modes if several.
 
-        A share ``kept`` of the covariance stays as it was.
+        A share ``retained`` of the covariance stays as it was.
         """
         if not len(self.places) or len(x) < 3:
             return
         if len(self.modes) == 1:
             old = self.modes[0].factor @ self.modes[0].factor.T
             new = np.atleast_2d(wider * np.cov(x, rowvar=False))
-            self.modes = (_gaussian(x.mean(axis=0), (1.0 - kept) * new + kept * old),)
+            self.modes = (_gaussian(x.mean(axis=0), (1.0 - retained) * new + retained * old),)
             self.step = self.modes[0].factor
             return
         nearest = np.argmax([mode.log_density(x) for mode in self.modes], axis=0)
@@ -235,7 +236,7 @@ class Reference:
         return cls.of(space, [(q.mean(axis=0), np.atleast_2d(np.cov(q, rowvar=False)))])
 
     def draw(self, n: int, rng: np.random.Generator) -> Floats:
-        """Draw n particles, silent parameters from their prior, shape (n, d)."""
+        """Draw n particles, uninformed parameters from their prior, shape (n, d)."""
         q = np.tile(self.origin, (n, 1))
         for block in (*self.parts, *self.noise):
             q[:, block.places] = block.draw(n, rng)
@@ -251,16 +252,16 @@ class Reference:
         """Return the log-density of particles (n, d), shape (n,)."""
         return np.asarray(self.columns(q).sum(axis=1))
 
-    def learned(self, q: Floats, kept: float = 0.0) -> Reference:
+    def learned(self, q: Floats, retained: float = 0.0) -> Reference:
         """Return the product of Gaussians of particles; of several modes, this one.
 
-        A share ``kept`` of the covariances stays.
+        A share ``retained`` of the covariances stays.
         """
         parts, noise = (
             [Block(b.places, b.modes) for b in some] for some in (self.parts, self.noise)
         )
         for block in (*parts, *noise):
-            block.learn(q[:, block.places], _WIDER, kept)
+            block.learn(q[:, block.places], _WIDER, retained)
         return replace(self, parts=parts, noise=noise)
 
 
@@ -301,7 +302,7 @@ class Ensemble:
         Parameters
         ----------
         target : Target
-            Density that is kept.
+            Density that the moves leave invariant.
         sweeps : int
             Engine batches of each group.
         adapt : bool
@@ -311,21 +312,21 @@ class Ensemble:
         noise = self.noise * (5 if self.space.problem.likelihood.independent else 1)
         for chosen in groups(self.space, len(self.q)):
             q, of_sweeps = self.q[chosen], []
-            look = target.look(q)
-            here = target.columns(q, look)
+            values = target.evaluate(q)
+            here = target.columns(q, values)
             for _ in range(sweeps):
                 y, gain, kinds = self._proposed(q)
-                seen = target.look(y)
+                seen = target.evaluate(y)
                 there = target.columns(y, seen)
                 accepted, rate = self._accepted(there[:, :-1], here[:, :-1], gain)
                 if adapt:
                     for block, kind, one in zip(self.parts, kinds, rate, strict=True):
                         block.adapt(kind, float(one))
-                q, look = self._chosen(accepted, y, q), self._merged(accepted, seen, look)
+                q, values = self._chosen(accepted, y, q), self._merged(accepted, seen, values)
                 here[:, :-1] = np.where(accepted, there[:, :-1], here[:, :-1])
                 of_sweeps.append(rate.mean() if len(rate) else 1.0)
                 for block in noise:
-                    q, here = self._of_noise(block, q, here, target, look, adapt)
+                    q, here = self._of_noise(block, q, here, target, values, adapt)
             self.q[chosen] = q
             rates.append(np.mean(of_sweeps))
         return float(np.mean(rates))
@@ -371,19 +372,19 @@ class Ensemble:
         return old
 
     def _of_noise(
-        self, block: Block, q: Floats, here: Floats, target: Target, look: Any, adapt: bool
+        self, block: Block, q: Floats, here: Floats, target: Target, values: Any, adapt: bool
     ) -> tuple[Floats, Floats]:
         """Return particles and columns after a move of the noise, for which no engine is needed."""
         y, kind = q.copy(), block.kind(self.rng)
         y[:, block.places], gain = block.propose(q[:, block.places], kind, self.rng)
-        there = target.columns(y, look)
+        there = target.columns(y, values)
         accepted, rate = self._accepted(there.sum(axis=1), here.sum(axis=1), gain)
         if adapt:
             block.adapt(kind, float(rate))
         return np.where(accepted[:, None], y, q), np.where(accepted[:, None], there, here)
 
-    def settle(self, target: Target, looks: int = _LOOKS) -> tuple[float, float]:
-        """Move until particles have decorrelated from where they were, ``looks`` times at most.
+    def settle(self, target: Target, max_checks: int = _MAX_CHECKS) -> tuple[float, float]:
+        """Move until particles have decorrelated from their start, or for ``max_checks`` rounds.
 
         Returns
         -------
@@ -394,7 +395,7 @@ class Ensemble:
         """
         begin, rates = self.q.copy(), []
         places = np.concatenate([block.places for block in self.blocks])
-        for _ in range(looks):
+        for _ in range(max_checks):
             rates.append(self.move(target, 3))
             correlation = _correlation(begin[:, places], self.q[:, places])
             if correlation < 0.5:
@@ -410,10 +411,10 @@ def groups(space: Space, n: int, numbers: int = 8_000_000) -> Iterator[slice]:
         yield slice(first, first + width)
 
 
-def _heights(space: Space, target: Target, q: Floats) -> Floats:
+def _log_densities(space: Space, target: Target, q: Floats) -> Floats:
     """Return the log-density of all particles (n, d), shape (n,)."""
     parts = (q[chosen] for chosen in groups(space, len(q)))
-    return np.concatenate([target.columns(x, target.look(x)).sum(axis=1) for x in parts])
+    return np.concatenate([target.columns(x, target.evaluate(x)).sum(axis=1) for x in parts])
 
 
 class Proposals(NamedTuple):
@@ -430,21 +431,21 @@ class Proposals(NamedTuple):
         reach.
     log_likelihood : ndarray, optional
         Of each transition, shape (n, transition), where it is known.
-    rungs : int
-        Rungs at which the engine moved particles.
+    tempering_steps : int
+        Temperatures at which the engine moved particles.
     accepted : float
         Share of those moves that were accepted; 1 without any.
-    kept : float
-        Independent particles over all that the moves left.
+    independent_share : float
+        Share of the particles that the moves left independent.
     """
 
     q: Floats
     log_weight: Floats
     log_z: float
     log_likelihood: Floats | None = None
-    rungs: int = 0
+    tempering_steps: int = 0
     accepted: float = 1.0
-    kept: float = 1.0
+    independent_share: float = 1.0
 
 
 def anneal(
@@ -465,13 +466,13 @@ def anneal(
     worth : float
         Effective share of the particles that weights must leave to end with them.
     most : int
-        Rungs at most.
+        Tempering steps at most.
     """
-    beta, log_z, kept = 0.0, 0.0, 1.0
+    beta, log_z, independent_share = 0.0, 0.0, 1.0
     rates: list[float] = []
     while True:
         with np.errstate(invalid="ignore"):
-            gap = _heights(ensemble.space, end, ensemble.q) - start.log_density(ensemble.q)
+            gap = _log_densities(ensemble.space, end, ensemble.q) - start.log_density(ensemble.q)
         gap = np.where(np.isnan(gap), -np.inf, gap)
         if np.isneginf(gap).all():
             raise FitError(
@@ -482,7 +483,7 @@ def anneal(
         if beta == 1.0 or len(rates) == most or _suffices(rest, worth):
             log_z += float(logsumexp(rest) - np.log(len(rest)))
             accepted = float(np.mean(rates)) if rates else 1.0
-            return Proposals(ensemble.q, rest, log_z, None, len(rates), accepted, kept)
+            return Proposals(ensemble.q, rest, log_z, None, len(rates), accepted, independent_share)
         step = _step(gap, 1.0 - beta)
         total = logsumexp(step * gap)
         log_z += float(total - np.log(len(gap)))
@@ -490,12 +491,14 @@ def anneal(
         chosen = systematic(np.exp(step * gap - total), len(gap), ensemble.rng)
         ensemble.q = ensemble.q[chosen]
         ensemble.learn()
-        looks = _LOOKS if beta == 1.0 else 1  # the next rung moves on
-        rate, correlation = ensemble.settle(Path(start, end, beta), looks)
+        max_checks = _MAX_CHECKS if beta == 1.0 else 1  # the next step moves on
+        rate, correlation = ensemble.settle(Tempered(start, end, beta), max_checks)
         rates.append(rate)
         # copies of a particle are as alike as each is to where they began, squared
         copies = np.bincount(chosen).astype(float)
-        kept = len(gap) / float((copies + copies * (copies - 1) * correlation**2).sum())
+        independent_share = len(gap) / float(
+            (copies + copies * (copies - 1) * correlation**2).sum()
+        )
 
 
 def _suffices(log_weight: Floats, worth: float) -> bool:
@@ -506,22 +509,22 @@ def _suffices(log_weight: Floats, worth: float) -> bool:
     return bool(k <= MAX_PARETO_K and 1.0 / (weight**2).sum() >= worth * len(log_weight))
 
 
-def _step(gap: Floats, most: float, *, kept: float = 0.5) -> float:
+def _step(gap: Floats, most: float, *, effective_share: float = 0.5) -> float:
     """Return the largest step of a path that leaves enough effective particles.
 
-    ``kept``: effective share of the particles that a rung leaves.
+    ``effective_share``: effective share of the particles that a step leaves.
     """
 
     def share(step: float) -> float:
         weight = np.exp(step * gap - logsumexp(step * gap))
         return float(1.0 / (weight**2).sum() / len(gap))
 
-    if share(most) >= kept:
+    if share(most) >= effective_share:
         return most
     low, high = 0.0, most
     for _ in range(40):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if share(middle) >= kept else (low, middle)
+        low, high = (middle, high) if share(middle) >= effective_share else (low, middle)
     return max(low, 1e-6 * most)
 
 

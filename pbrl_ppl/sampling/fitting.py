@@ -19,8 +19,8 @@ from pbrl_ppl.modes import (
     find_mode,
     find_simulation_mode,
     find_trajectory_mode,
-    following,
     weigh,
+    with_state_sensitivity,
 )
 from pbrl_ppl.parameters import inside, prior_slopes
 from pbrl_ppl.posterior import (
@@ -91,12 +91,12 @@ def fit(
     method : str
         ``importance``: proposals from Gaussians about the modes, weighted by the engine in batches
         of which each teaches the next, and resampled; where the weights do not suffice, particles
-        are moved by the engine in rungs; ``metropolis``: chains of the same moves under the
-        engine's posterior, each of which is many walkers, one after another; ``paper``: one random
-        walk a variable, by default on the schedule of the paper's Table 2 for the cart (30 chains
-        of 20,000 iterations, 1,000 of them burn-in, each tenth kept); with a library, on that for
-        the apartment (``draws=400, tune=1000, thin=10, chains=1``), each body's set proposed
-        uniformly; ``demetropolisz``; ``smc``; ``nuts``, on the finite-difference gradient;
+        are moved by the engine at several temperatures; ``metropolis``: chains of the same moves
+        under the engine's posterior, each of which is many walkers, one after another; ``paper``:
+        one random walk a variable, by default on the schedule of the paper's Table 2 for the cart
+        (30 chains of 20,000 iterations, 1,000 of them burn-in, each tenth kept); with a library, on
+        that for the apartment (``draws=400, tune=1000, thin=10, chains=1``), each body's set
+        proposed uniformly; ``demetropolisz``; ``smc``; ``nuts``, on the finite-difference gradient;
         ``laplace``: independent draws from the Gaussian at the mode, which no chain has checked;
         ``map``: the mode alone, as one draw.
     seed : int
@@ -145,8 +145,8 @@ def fit(
     -----
     ConvergenceWarning
         If an R-hat of chains is over 1.01, a Pareto k over 0.7 or an effective sample size under
-        400, if sampling was interrupted, or if an evidence is too rough for the probability of a
-        joint.
+        400, if sampling was interrupted, or if an evidence is too uncertain for the probability of
+        a joint.
     LinearisationWarning
         If states smoothed anew at draws give another likelihood (``attrs["linearisation"]``, nats).
     MeetingWarning
@@ -277,7 +277,7 @@ def _at_mode(job: SamplerRun, start: Mode | None) -> SamplerRun:
         if not mode.problem.likelihood.independent:
             filtered = mode.problem.likelihood.filtered
             if filtered and mode.problem.trajectory_noise.sensitivity is None:
-                mode = following(mode)
+                mode = with_state_sensitivity(mode)
             problem = mode.problem  # linearised at the mode
         joined = _joined(problem, mode.phi[None], mode.sigma[None])
         if joined is problem:

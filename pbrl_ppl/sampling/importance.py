@@ -51,7 +51,7 @@ def draw_proposals(
     space = reference.space
     most = int(np.clip(numbers // (batch * space.problem.segments.n), batches, most_batches))
     points, learned = adaptive_importance(
-        reference, space.log_densities, len(space.loud), rng, batch=batch,
+        reference, space.log_densities, len(space.informed), rng, batch=batch,
         enough=effective_share * n, smooth=smoothed, most_batches=most, max_pareto_k=MAX_PARETO_K,
     )  # fmt: skip
     if points.good:

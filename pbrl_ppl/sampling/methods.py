@@ -123,7 +123,7 @@ class SamplerRun:
         if self.resume is None:
             problem = self.at_mode.problem.with_physics(threads=self.cores)
             space = Space.of(self.at_mode).on(problem)
-            return Reference.about(space, self.at_mode, space.on(problem.rough))
+            return Reference.about(space, self.at_mode, space.on(problem.medium))
         phi, sigma = parameter_draws(self.problem, self.resume)
         problem = self.problem.with_physics(threads=self.cores)
         return Reference.of_draws(*Space.of_draws(problem, phi, sigma))
@@ -178,9 +178,10 @@ def _importance(job: SamplerRun, *, proposals: float = 1.4) -> Idata:
     values = job.problem.named(phi.reshape(*shape, -1), sigma.reshape(*shape, -1))
     trace = as_trace(job.problem, values, {"log_weight": pool.log_weight[chosen].reshape(shape)})
     trace.attrs |= {
-        PARETO_K: k, SIZE: pool.kept * size, LIKELIHOOD: known if known is None else known[chosen],
-        "proposals": "Gaussians at the modes", "rungs": pool.rungs, "acceptance": pool.accepted,
-        "log_evidence": pool.log_z,
+        PARETO_K: k, SIZE: pool.independent_share * size,
+        LIKELIHOOD: known if known is None else known[chosen],
+        "proposals": "Gaussians at the modes", "rungs": pool.tempering_steps,
+        "acceptance": pool.accepted, "log_evidence": pool.log_z,
     }  # fmt: skip
     return trace
 
@@ -201,7 +202,7 @@ def _metropolis(job: SamplerRun, *, most_walkers: int = 20) -> Idata:
         q = reference.space.at(nearest(job.problem.layout, phi, any_prior=True), sigma)
     ensemble = Ensemble(reference, q, rng)
     tune = -(-method.tune // walkers) * method.thin
-    kept, rates = [], []
+    retained, rates = [], []
     steps = track(
         range(tune + per_walker), "sampling", console=Console(stderr=True),
         disable=not job.progress,
@@ -214,15 +215,15 @@ def _metropolis(job: SamplerRun, *, most_walkers: int = 20) -> Idata:
             if i < tune:
                 ensemble.learn()
                 continue
-            kept.append(ensemble.q.copy())
+            retained.append(ensemble.q.copy())
             rates.append(rate)
     except KeyboardInterrupt:
-        if len(kept) < 2:
+        if len(retained) < 2:
             raise
-    phi, sigma = reference.space.split(np.array(kept))  # (draw, walker of all chains, ...)
+    phi, sigma = reference.space.split(np.array(retained))  # (draw, walker of all chains, ...)
 
     def chained(values: Floats) -> Floats:
-        values = np.moveaxis(values, 0, 1).reshape(chains, walkers * len(kept), -1)
+        values = np.moveaxis(values, 0, 1).reshape(chains, walkers * len(retained), -1)
         return values[:, -method.draws :]
 
     values = job.problem.named(chained(phi), chained(sigma))

@@ -61,12 +61,12 @@ def draw_truths(
     """Draw parameters from the model's prior with PyMC, and what is measured with them.
 
     Next states are drawn by Eq. 13, and whole trajectories with process noise; simulations from the
-    design's start states have errors of measurement alone.
+    design's initial states have errors of measurement alone.
 
     Parameters
     ----------
     design : Problem
-        Says the prior, start states and actions.
+        Says the prior, initial states and actions.
     n : int
         How many; the first of more are the same.
     seed : int
@@ -157,7 +157,7 @@ def simulated(design: Problem, values: Floats) -> Problem:
     Parameters
     ----------
     design : Problem
-        Start states, actions and which cells are measured.
+        Initial states, actions and which cells are measured.
     values : ndarray
         Next states, shape (transition, H, body, state), SI units; of whole trajectories all
         measured states, shape (trajectory, time, body, 6).

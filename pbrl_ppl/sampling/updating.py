@@ -52,7 +52,7 @@ def update(
     Where the weights' Pareto k is above 0.7 or fewer than 400 effective draws are left, all data
     are fitted anew, with the defaults of fit: that takes as long as a fit. So they are where the
     new data have noise that the posterior lacks, and, by the posterior's own method, where the
-    likelihood is of simulations, whose start states are fitted with the parameters.
+    likelihood is of simulations, whose initial states are fitted with the parameters.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def update(
     if record.likelihood == OutputErrorLikelihood.name:
         check_engine(idata, files.problem_of(idata, effects))
         entry |= {"transitions": history.n_transitions, "share": None, "pareto_k": None}
-        why = "start states of simulations are fitted with the parameters, so that all data"
+        why = "initial states of simulations are fitted with the parameters, so that all data"
         advice = ""
         whole = _simulated(idata, record, history, effects)
         options["method"] = record.method

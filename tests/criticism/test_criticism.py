@@ -187,7 +187,7 @@ def test_an_effect_without_a_trace_is_not_identifiable() -> None:
     assert signature.candidate.p_value == 1.0
 
 
-def test_drags_of_a_single_pendulum_are_twins(make_history) -> None:
+def test_drags_of_a_single_pendulum_are_indistinguishable(make_history) -> None:
     scene = Scene.load(MODELS / "pendulum" / "scene.toml")
     setup = replace(make_history.PENDULUM, n_intervals=40)
     train, _ = make_history.simulate(seed=9, setup=setup, pivot_damping=0.02)

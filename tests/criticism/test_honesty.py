@@ -152,9 +152,9 @@ def test_a_fit_leaves_the_hill_of_large_accelerations() -> None:
     drag = next(effect for effect in pp.catalogue if effect.name == "linear_drag")
     problem = Problem.of(Physics.declare(AIR, [drag.on("ball")]), falls(1, 0.0209))
     mode = trajectory_mode(problem, find_mode(problem, seed=1).phi)
-    loud = mode.sigma.copy()
-    loud[2:] = 14.0
-    again = trajectory_mode(smoothed(mode.problem, mode.phi, loud), 0.3 * mode.phi, loud)
+    noisy = mode.sigma.copy()
+    noisy[2:] = 14.0
+    again = trajectory_mode(smoothed(mode.problem, mode.phi, noisy), 0.3 * mode.phi, noisy)
     assert (again.sigma[2:] < 0.01).all()
     assert again.log_posterior == pytest.approx(mode.log_posterior, abs=1.0)
 

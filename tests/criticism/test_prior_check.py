@@ -10,8 +10,8 @@ import pytest
 import pbrl_ppl as pp
 from pbrl_ppl.criticism.prior_check import (
     QUANTILES,
+    informative_horizon,
     prior_predictive_check,
-    telling_horizon,
 )
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.history import History
@@ -133,7 +133,7 @@ def test_a_factor_of_units_is_named(columns, factor, near) -> None:
     )
 
     def said(history):
-        model = physics_model(scene, history, horizon=telling_horizon(history))
+        model = physics_model(scene, history, horizon=informative_horizon(history))
         return prior_predictive_check(model, draws=100).sentences
 
     assert said(history) == ()
@@ -251,7 +251,7 @@ def wave(dt: float, noise: float, turns: float = 0.0) -> History:
     ],
 )
 def test_prior_is_asked_where_motion_shows(dt, noise, turns, low, high) -> None:
-    assert low <= telling_horizon(wave(dt, noise, turns)) <= high
+    assert low <= informative_horizon(wave(dt, noise, turns)) <= high
 
 
 def test_a_recording_of_three_rows_is_asked_as_it_is() -> None:
@@ -260,7 +260,7 @@ def test_a_recording_of_three_rows_is_asked_as_it_is() -> None:
     rows = rows[rows["step"] < 3].assign(torque=[0.0, 0.0, np.nan])
     scene = Scene(time_step=0.1, bodies=(Body("puck", Shape.circle(0.1)),))
     rows.loc[rows["step"] == 2, ["force_x", "force_y"]] = np.nan
-    assert telling_horizon(History.from_dataframe(rows, scene)) == 1
+    assert informative_horizon(History.from_dataframe(rows, scene)) == 1
 
 
 def test_worse_sensors_than_the_noise_prior_has_are_no_wrong_prior(history, scene) -> None:
@@ -270,8 +270,8 @@ def test_worse_sensors_than_the_noise_prior_has_are_no_wrong_prior(history, scen
     spread = observed.std(("trajectory", "time", "body")).to_numpy()
     noisy = observed + (0, 0, 0, 0.3, 0.3, 0.3) * spread * rng.standard_normal(observed.shape)
     start = history.dataset["start"] + (noisy - observed).fillna(0.0)
-    louder = History(history.dataset.assign(observed=noisy, start=start))
-    assert prior_predictive_check(physics_model(scene, louder), draws=100).sentences == ()
+    noisier = History(history.dataset.assign(observed=noisy, start=start))
+    assert prior_predictive_check(physics_model(scene, noisier), draws=100).sentences == ()
 
 
 def pushed_straight(dt, velocities, seed=1) -> pd.DataFrame:
@@ -306,7 +306,7 @@ def pushed_straight(dt, velocities, seed=1) -> pd.DataFrame:
 def test_a_body_that_never_turns_is_no_wrong_prior(dt, velocities, stated, whole) -> None:
     scene = Scene(time_step=dt, bodies=(Body("cart", Shape.box(0.4, 0.3)),), noise=stated)
     history = History.from_dataframe(pushed_straight(dt, velocities), scene)
-    horizon = 29 if whole else telling_horizon(history)
+    horizon = 29 if whole else informative_horizon(history)
     assert whole or horizon <= 8  # what never turns does not make it longer
     check = prior_predictive_check(physics_model(scene, history, horizon=horizon), draws=100)
     assert check.sentences == ()
@@ -321,5 +321,5 @@ def test_stated_noise_is_that_of_the_predictions(scene, history) -> None:
     """Errors as large as the angles explain an angle in degrees."""
     degrees = scaled(history, scene, ["theta"], 180 / np.pi)
     assert named(prior_predictive_check(physics_model(scene, degrees))) == {"theta"}
-    loud = scene.replace(noise={"theta": 3.0})
-    assert prior_predictive_check(physics_model(loud, degrees)).sentences == ()
+    noisy_scene = scene.replace(noise={"theta": 3.0})
+    assert prior_predictive_check(physics_model(noisy_scene, degrees)).sentences == ()

@@ -397,12 +397,12 @@ class _Mode:
 def test_only_chains_are_said_not_to_converge(method, said, monkeypatch) -> None:
     """Independent draws have an R-hat too, and nothing to converge."""
 
-    def rough(*args: Any, **options: Any) -> Any:
+    def unconverged(*args: Any, **options: Any) -> Any:
         warnings.warn("the chains have not converged", ConvergenceWarning, stacklevel=1)
         held = {"interrupted": None, "pareto_k": None, "max_rhat": 1.02, "min_ess": 350.0}
         return SimpleNamespace(record=SimpleNamespace(**held))
 
-    monkeypatch.setattr("pbrl_ppl.criticism.closing.sample", rough)
+    monkeypatch.setattr("pbrl_ppl.criticism.closing.sample", unconverged)
     drawn = SimpleNamespace(likelihood=SimpleNamespace(simulated=False))
     mode = _Mode(SimpleNamespace(with_physics=lambda threads: drawn))
     task = SimpleNamespace(method=method, seed=1, draws=None, criteria=DEFAULT, say=print)

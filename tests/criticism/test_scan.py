@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import binom, chi2, norm
 
 from pbrl_ppl.criticism.criteria import DEFAULT
-from pbrl_ppl.criticism.scan import GridPoint, caps, detection_limits, grid_points
+from pbrl_ppl.criticism.scan import GridPoint, detection_limits, grid_points, is_upper_limit
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.effects import candidates, catalogue
 from pbrl_ppl.state import STATE
@@ -25,13 +25,13 @@ def mode(make_history):
     return fitted(BOX, box2d(make_history, 3, force_cutoff=2.0)[0])
 
 
-def test_looks_are_paid_for(mode) -> None:
+def test_grid_points_are_paid_for(mode) -> None:
     found = {one.candidate.effect: one for one in rank_candidates(mode, candidates(BOX, ()))}
-    assert found["linear_drag"].candidate.looks == 1
+    assert found["linear_drag"].candidate.n_grid_points == 1
     scanned = found["force_cutoff"]
-    n = scanned.candidate.looks
+    n = scanned.candidate.n_grid_points
     assert n > 10
-    # a whole change has one sign: half of a chi-squared, times the looks
+    # a whole change has one sign: half of a chi-squared, times the grid points
     single = chi2.logsf(scanned.candidate.statistic, 1) + np.log(0.5)
     assert scanned.log_p == pytest.approx(min(0.0, single + np.log(n)))
 
@@ -61,7 +61,7 @@ def test_a_signature_is_what_the_effect_does(mode) -> None:
 
 
 def test_the_smallest_size_is_of_the_look_that_shows_it_best() -> None:
-    needed = norm.isf(0.005 / (2 * 2)) + norm.isf(0.1)  # two candidates, two looks
+    needed = norm.isf(0.005 / (2 * 2)) + norm.isf(0.1)  # two candidates, two grid points
     signature = np.zeros((3, 1))
     free = [GridPoint(np.array([1.0, begin, 0.0]), signature, (0,)) for begin in (0.5, 1.5)]
     units = [np.array([2.0]), np.array([5.0])]
@@ -81,9 +81,9 @@ def test_the_smallest_size_is_of_the_look_that_shows_it_best() -> None:
     assert (
         detection_limits(EFFECTS["hidden_obstacle"], there, units[1:2], 2, DEFAULT.residual) == {}
     )
-    assert caps(EFFECTS["saturation"], whole)
-    assert not caps(EFFECTS["force_cutoff"], whole)
-    assert not caps(EFFECTS["mass_change"], free)
+    assert is_upper_limit(EFFECTS["saturation"], whole)
+    assert not is_upper_limit(EFFECTS["force_cutoff"], whole)
+    assert not is_upper_limit(EFFECTS["mass_change"], free)
 
 
 def test_sizes_of_what_is_scanned_are_seen(make_history) -> None:
@@ -113,5 +113,5 @@ def test_p_values_of_scans_are_no_smaller_than_chance_makes_them() -> None:
         assert (np.array(p) < 0.05).sum() <= binom.isf(0.001, 100, 0.05), name
 
 
-def test_an_effect_without_a_scan_has_no_looks(mode) -> None:
+def test_an_effect_without_a_scan_has_no_grid_points(mode) -> None:
     assert grid_points(mode, EFFECTS["linear_drag"].on("puck")) == []

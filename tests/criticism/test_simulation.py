@@ -1,4 +1,4 @@
-"""Whole held-out trajectories, simulated from fitted start states, and what was never measured."""
+"""Whole held-out trajectories, from fitted initial states, and what was never measured."""
 
 import numpy as np
 import pandas as pd

@@ -6,7 +6,7 @@ import pytest
 import pbrl_ppl as pp
 from pbrl_ppl.errors import UninformedWarning
 from pbrl_ppl.likelihood import Problem
-from pbrl_ppl.modes import Mode, find_mode, following, trajectory_mode
+from pbrl_ppl.modes import Mode, find_mode, trajectory_mode, with_state_sensitivity
 from pbrl_ppl.physics import Physics
 from tests.helpers.discs import SCENE, TRUTH, thrown
 from tests.helpers.marks import OBJECT_MODE
@@ -38,7 +38,7 @@ def test_whole_trajectories_inform_restitution_and_friction() -> None:
     for seed in (1, 2, 3):
         declared, truth = problem(seed)
         begin = find_mode(declared, seed=seed)
-        mode: Mode = following(trajectory_mode(declared, begin.phi))
+        mode: Mode = with_state_sensitivity(trajectory_mode(declared, begin.phi))
         sd = np.sqrt(np.diag(mode.covariance))
         assert (sd < 0.01).all()  # informative
         assert (np.abs(mode.phi - truth) < 0.02).all()
@@ -54,4 +54,4 @@ def test_without_contacts_the_posterior_is_the_prior() -> None:
     model = pp.physics_model(SCENE, recorded)
     with pytest.warns(UninformedWarning, match=r"mu_c\[one\], mu_c\[two\]"):
         idata = pp.fit(model, method="laplace", seed=1, progress=False)
-    assert set(pp.identify(idata).silent) == {"r[one]", "r[two]", "mu_c[one]", "mu_c[two]"}
+    assert set(pp.identify(idata).uninformed) == {"r[one]", "r[two]", "mu_c[one]", "mu_c[two]"}

@@ -291,8 +291,8 @@ def test_a_load_from_some_trajectory_on_is_on_all_test_trajectories():
 
 
 def test_noise_is_what_is_asked_for():
-    quiet = replace(mh.CART, n_train=4, noise=(0.0,) * 6)
-    (clean, _), (noisy, _) = mh.simulate(1, quiet), mh.simulate(1, replace(mh.CART, n_train=4))
+    noiseless = replace(mh.CART, n_train=4, noise=(0.0,) * 6)
+    (clean, _), (noisy, _) = mh.simulate(1, noiseless), mh.simulate(1, replace(mh.CART, n_train=4))
     first = clean["trajectory"] == 0  # the same draws are behind the first trajectory of both
     sd = (noisy.loc[first, STATE] - clean.loc[first, STATE]).std()
     np.testing.assert_allclose(sd, mh.CART.noise, rtol=0.5)

@@ -166,7 +166,7 @@ def test_what_cannot_be_read_is_said(tmp_path, monkeypatch) -> None:
     bag.add(7.0, "/far", bag.wrench_stamped(60.0, 0.0, 0.0, 0.0))
     path = bag.write(tmp_path)
     empty = tmp_path / "empty.mcap"
-    with Writer(tmp_path / "silent", version=9) as writer:
+    with Writer(tmp_path / "empty", version=9) as writer:
         writer.add_connection("/odom", KINDS["Odometry"], typestore=STORES["db3"])
     empty.write_bytes(b"")
     damaged = tmp_path / "damaged.bag"
@@ -185,7 +185,7 @@ def test_what_cannot_be_read_is_said(tmp_path, monkeypatch) -> None:
         (path, {"": "/odom", "b": "/odom"}, "name each body as the scene does"),
         (path, {"a": "/odom", "b": "/early"}, r"no time in common: .* \(a\), .* \(b\)"),
         (path, {"a": ["/odom", "/far"]}, '"/far" begins after the last message of "/odom"'),
-        (tmp_path / "silent", {"": "/odom"}, '"/odom" .nav_msgs/msg/Odometry. has no messages'),
+        (tmp_path / "empty", {"": "/odom"}, '"/odom" .nav_msgs/msg/Odometry. has no messages'),
         (tmp_path / "none.bag", {"": "/odom"}, "there is no such file"),
         (tmp_path / "text.txt", {"": "/odom"}, "the suffix is '.txt', expected .bag"),
         (tmp_path / "folder", {"": "/odom"}, "metadata"),

@@ -184,10 +184,10 @@ def test_gaps_are_left_empty_or_refused() -> None:
     back.loc[7, "time"] = back.loc[5, "time"]
     with pytest.raises(HistoryError, match="row 9: time does not rise"):
         History.from_dataframe(back, DISC, resample=True)
-    silent = frame.copy()
-    silent.loc[7, "force_x"] = np.nan
+    missing = frame.copy()
+    missing.loc[7, "force_x"] = np.nan
     with pytest.raises(HistoryError, match="row 9: a wrench is empty"):
-        History.from_dataframe(silent, DISC, resample=True)
+        History.from_dataframe(missing, DISC, resample=True)
 
 
 @pytest.mark.parametrize("kind", ["forward", "central"])

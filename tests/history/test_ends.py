@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.history import End, History, strange_ends, trimmed
+from pbrl_ppl.history import End, History, trimmed, unmodelled_ends
 from pbrl_ppl.scene import Body, Scene, Shape, Wall
 from tests.helpers.histories import COLUMNS
 from tests.helpers.kinks import MOTIONS, RATES, kinked
@@ -65,13 +65,13 @@ def falls(
 @pytest.mark.parametrize(("rate", "held", "rows"), [(10, 5, 40), (30, 6, 44), (100, 20, 100)])
 def test_a_held_ball(rate: int, held: int, rows: int, velocities: bool) -> None:
     history, scene = falls(rate, held=held, rows=rows, velocities=velocities)
-    ends = strange_ends(history, scene)
+    ends = unmodelled_ends(history, scene)
     assert [(end.trajectory, end.first, end.what) for end in ends] == [
         (trajectory, True, "held") for trajectory in range(3)
     ]
     assert all(held <= end.rows <= held + max(2, held // 5) for end in ends)
     kept = trimmed(history, ends)
-    assert not strange_ends(kept, scene)
+    assert not unmodelled_ends(kept, scene)
     assert kept.n_transitions == history.n_transitions - sum(end.rows for end in ends)
 
 
@@ -79,21 +79,21 @@ def test_a_held_ball(rate: int, held: int, rows: int, velocities: bool) -> None:
 @pytest.mark.parametrize("rate", [10, 30, 60])
 def test_an_abrupt_stop(rate: int, rebound: float) -> None:
     history, scene = falls(rate, stopped=5, rebound=rebound, noise=5e-4)
-    ends = strange_ends(history, scene)
+    ends = unmodelled_ends(history, scene)
     assert [(end.trajectory, end.first, end.what) for end in ends] == [
         (trajectory, False, "stopped") for trajectory in range(3)
     ]
     assert all(5 <= end.rows <= 6 for end in ends)
     kept = trimmed(history, ends)
-    assert not strange_ends(kept, scene)
+    assert not unmodelled_ends(kept, scene)
     assert kept.dataset["action"].isel(trajectory=0, time=-1).isnull().all()
 
 
 def test_what_the_scene_or_a_command_explains() -> None:
-    assert not strange_ends(*falls(30, stopped=5, floor=True))
+    assert not unmodelled_ends(*falls(30, stopped=5, floor=True))
     # as if it lay on a table and was pushed off
-    assert not strange_ends(*falls(30, held=6, push=1.0))
-    assert not strange_ends(*falls(30))
+    assert not unmodelled_ends(*falls(30, held=6, push=1.0))
+    assert not unmodelled_ends(*falls(30))
 
 
 @pytest.mark.parametrize("rate", RATES)
@@ -102,7 +102,7 @@ def test_clean_motions_have_none(name: str, rate: int) -> None:
     """A struck puck is left out: what strikes it is not in its scene."""
     for seed in range(2):
         for noise in (0.0, 2e-3, 1e-2):
-            assert not strange_ends(*kinked(name, rate, seed, noise=noise))
+            assert not unmodelled_ends(*kinked(name, rate, seed, noise=noise))
 
 
 @pytest.mark.skipif(not RECORDED.is_dir(), reason="../shared/data is not beside the repository")
@@ -110,7 +110,7 @@ def test_clean_simulated_recordings_have_none() -> None:
     for folder in sorted(each.parent for each in RECORDED.glob("*/scene.toml")):
         scene, *histories = load(folder)
         for history in histories:
-            assert not strange_ends(history, scene)
+            assert not unmodelled_ends(history, scene)
 
 
 def test_trimmed_is_as_recorded_without_the_rows() -> None:

@@ -319,7 +319,7 @@ def test_a_zero_that_is_unknown_or_has_no_hinge() -> None:
         Recording(columns={"theta": {"column": "knee"}})
 
 
-def doubts(frame: pd.DataFrame, scene: Scene, path: Path, **layout) -> str:
+def warned(frame: pd.DataFrame, scene: Scene, path: Path, **layout) -> str:
     """Return what reading a recording warns of."""
     frame.to_csv(path / "log.csv", index=False)
     with pytest.warns(UserWarning) as caught:
@@ -331,15 +331,15 @@ def test_angles_of_another_convention_are_asked_about(tmp_path: Path) -> None:
     time = 0.05 * np.arange(200)
     swing = np.exp(-0.5 * time) * np.sin(5 * time)
     names = {"time": "t", "theta": "knee"}
-    said = doubts(pd.DataFrame({"t": time, "knee": 40 * swing}), POLE, tmp_path, columns=names)
+    said = warned(pd.DataFrame({"t": time, "knee": 40 * swing}), POLE, tmp_path, columns=names)
     assert 'looks like deg: units = { theta = "deg" }' in said
     rest = pd.DataFrame({"t": time, "knee": np.radians(-67) + 0.5 * swing})
-    assert "comes to rest -67 degrees from hanging" in doubts(rest, POLE, tmp_path, columns=names)
+    assert "comes to rest -67 degrees from hanging" in warned(rest, POLE, tmp_path, columns=names)
     spun = pd.DataFrame({"t": time, "knee": swing, "w": -np.gradient(swing, time)})
-    said = doubts(spun, POLE, tmp_path, columns=names | {"omega": "w"})
+    said = warned(spun, POLE, tmp_path, columns=names | {"omega": "w"})
     assert "one of them is clockwise" in said
     headings = pd.DataFrame({"t": time, "knee": (60 * time) % 360})
-    assert "jumps by 360" in doubts(headings, PUCK.replace(time_step=0.05), tmp_path, columns=names)
+    assert "jumps by 360" in warned(headings, PUCK.replace(time_step=0.05), tmp_path, columns=names)
 
 
 def test_places_of_a_bob_give_its_angle() -> None:

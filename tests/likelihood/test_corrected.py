@@ -38,7 +38,7 @@ def test_nearby_the_error_is_far_smaller_than_without(problem, off, most) -> Non
     def error(model: Problem) -> float:
         return float(np.sqrt(np.mean((model.predict(others) - exact) ** 2)))
 
-    assert error(cheap) < most * error(problem.rough)
+    assert error(cheap) < most * error(problem.medium)
 
 
 def test_other_data_or_physics_have_no_correction(problem) -> None:
@@ -47,13 +47,13 @@ def test_other_data_or_physics_have_no_correction(problem) -> None:
     shorter = cheap.data.history.select(np.array([0, 1]))
     assert cheap.with_data(history=shorter).defect is None
     assert cheap.with_physics(substeps=40).defect is None
-    assert cheap.rough.defect is None
+    assert cheap.medium.defect is None
     assert cheap.coarse.defect is None
 
 
 def test_few_steps_are_not_corrected_by_hardly_more(problem) -> None:
-    rough = problem.rough
-    assert rough.corrected(problem.layout.to_vector(CART)) is rough
+    medium = problem.medium
+    assert medium.corrected(problem.layout.to_vector(CART)) is medium
 
 
 def test_modes_are_those_of_all_engine_steps(problem, monkeypatch) -> None:
@@ -62,7 +62,7 @@ def test_modes_are_those_of_all_engine_steps(problem, monkeypatch) -> None:
     quick = trajectory_mode(problem, begin)
     assert quick.problem.physics == problem.physics
     assert quick.problem.defect is None
-    monkeypatch.setattr(module, "nearby_mode", module._settled)
+    monkeypatch.setattr(module, "nearby_mode", module._alternate_smoothing)
     exact = trajectory_mode(problem, begin)
     assert quick.log_posterior > exact.log_posterior - 2.0
     sd = np.sqrt(np.diag(exact.covariance))

@@ -1,4 +1,4 @@
-"""Output-error likelihood: start states are eliminated exactly, correlation is measured."""
+"""Output-error likelihood: initial states are eliminated exactly, correlation is measured."""
 
 from dataclasses import replace
 
@@ -50,8 +50,8 @@ def test_a_velocity_recorded_at_the_start_alone_is_given(history) -> None:
     frame = history.to_dataframe()
     frame.loc[frame["step"] == 0, ["vx", "vy", "omega"]] = 0.0
     problem = fit_pieces(pieces(History.from_dataframe(frame, BALL), 44), np.zeros(0)).problem
-    starts = output_error(problem).starts
-    assert starts.given[:, starts.coordinates.places == 4].all()
+    initial_states = output_error(problem).initial_states
+    assert initial_states.given[:, initial_states.coordinates.places == 4].all()
     sigma = np.array([0.01])
     z = output_error(problem).whiten(problem.residual(np.zeros(0)), sigma)
     own = history.dataset["observed"].to_numpy()[:, :, 0, 1]
@@ -69,17 +69,19 @@ def test_noise_is_not_underestimated_on_short_pieces() -> None:
     own = fall(3, trajectories=25, memory=0.0)
     truth = 0.01
     mode = fit_pieces(pieces(own, 4), np.zeros(0))
-    freedom = output_error(mode.problem).starts.counts.sum()
+    freedom = output_error(mode.problem).initial_states.counts.sum()
     assert 0.5 < freedom / own.n_transitions < 0.8
     assert np.log(mode.sigma[0] / truth) == pytest.approx(0.0, abs=4 / np.sqrt(2 * freedom))
 
 
 def test_the_result_does_not_depend_on_the_start_states(history) -> None:
-    """Start states elsewhere, of a linear motion: the same whitened residual."""
+    """Initial states elsewhere, of a linear motion: the same whitened residual."""
     problem = fit_pieces(pieces(history, 44), np.zeros(0)).problem
     likelihood = output_error(problem)
     moved = problem.segments.start + np.array([0.0, 0.3, 0.0, 0.0, -0.7, 0.0])
-    other = linearised_pieces(problem, moved, likelihood.starts.slope, np.array(likelihood.tau))
+    other = linearised_pieces(
+        problem, moved, likelihood.initial_states.slope, np.array(likelihood.tau)
+    )
     sigma = np.array([0.01])
     here, there = (
         output_error(own).whiten(own.residual(np.zeros(0)), sigma) for own in (problem, other)
@@ -107,14 +109,14 @@ def test_the_correlation_time_is_that_of_the_errors(memory) -> None:
     rng = np.random.default_rng(1)
     n = 400
     error = lfilter([1.0], [1.0, -memory], rng.standard_normal((40, n + 100)))[:, 100:]
-    starts = replace(
-        likelihood.starts,
+    initial_states = replace(
+        likelihood.initial_states,
         seen=np.ones((40, n, 1, 1), dtype=bool),
-        slope=np.zeros((40, n, 1, 1, likelihood.starts.slope.shape[-1])),
-        begin=np.full((40, likelihood.starts.begin.shape[1]), np.nan),
-        given=np.zeros((40, likelihood.starts.begin.shape[1]), dtype=bool),
+        slope=np.zeros((40, n, 1, 1, likelihood.initial_states.slope.shape[-1])),
+        begin=np.full((40, likelihood.initial_states.begin.shape[1]), np.nan),
+        given=np.zeros((40, likelihood.initial_states.begin.shape[1]), dtype=bool),
     )
-    times = replace(likelihood, starts=starts).correlation_times(
+    times = replace(likelihood, initial_states=initial_states).correlation_times(
         error[:, :, None, None], np.ones(1)
     )
     assert times[0] == pytest.approx((1 + memory) / (1 - memory), rel=0.15)

@@ -25,7 +25,7 @@ TRUTH = {"mass": [2.0, 3.0], "r": [0.2, 0.2], "mu_c": [0.3, 0.3]}
 
 @pytest.fixture
 def checks(monkeypatch) -> list[int]:
-    """One entry for each time that start states are checked."""
+    """One entry for each time that initial states are checked."""
     seen: list[int] = []
     check = data_module.check_history
 
@@ -43,13 +43,13 @@ def problem() -> Problem:
 
 
 def test_other_noise_keeps_the_engine_and_the_checked_data(problem, checks) -> None:
-    engine, rough, segments = problem.simulator, problem.coarse.simulator, problem.segments
+    engine, coarse, segments = problem.simulator, problem.coarse.simulator, problem.segments
     for other in (
         problem.with_likelihood(prior=((1.0,) * 6, 2.0)),
         problem.with_likelihood(nu=4.0),
     ):
         assert other.simulator is engine
-        assert other.coarse.simulator is rough
+        assert other.coarse.simulator is coarse
         assert other.segments is segments
         assert other.observations is problem.observations
     assert checks == [segments.n]

@@ -37,7 +37,7 @@ def spoilt(scene, clean) -> History:
     rng = np.random.default_rng(12)
     frame: pd.DataFrame = clean.to_dataframe()
     columns = list(STATE)
-    # the last row of a trajectory is nobody's start state
+    # the last row of a trajectory is nobody's initial state
     last = frame.groupby("trajectory").tail(1).index[::2]
     off = rng.uniform(20, 60, (len(last), 6)) * rng.choice([-1, 1], (len(last), 6))
     frame.loc[last, columns] += off * NOISE

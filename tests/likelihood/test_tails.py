@@ -25,7 +25,7 @@ def history():
     frame = clean.to_dataframe()
     rng = np.random.default_rng(5)
     columns = ["x", "y", "theta", "vx", "vy", "omega"]
-    # the start states stay exact: Eq. 11 has noise on the next state alone
+    # the initial states stay exact: Eq. 11 has noise on the next state alone
     after = (frame["step"] == 1).to_numpy()
     frame.loc[after, columns] += rng.standard_t(3, (after.sum(), 6)) * SIGMA
     return type(clean).from_dataframe(frame, scene)

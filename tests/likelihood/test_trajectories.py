@@ -135,10 +135,10 @@ def test_score_of_the_noise_is_that_of_differences(problem, missing) -> None:
     """By the logarithm of every noise parameter; the first states are measured, or not at all."""
     noise = problem.trajectory_noise
     if missing:
-        seen, wide = noise.seen.copy(), noise.wide.copy()
+        seen, initial_variance = noise.seen.copy(), noise.initial_variance.copy()
         seen[1, 2:4] = seen[5] = False
-        wide[:, 4] = 3.0
-        noise = replace(noise, seen=seen, wide=wide)
+        initial_variance[:, 4] = 3.0
+        noise = replace(noise, seen=seen, initial_variance=initial_variance)
         problem = problem.along(noise)
     residual, at = problem.residual(PHI * 1.2), np.log(NOISE * np.linspace(0.5, 2.0, len(NOISE)))
     value, slope = noise.score(residual, np.exp(at))
@@ -153,16 +153,16 @@ def test_score_of_the_noise_is_that_of_differences(problem, missing) -> None:
 
 
 def test_smoothed_states_are_the_likeliest(problem) -> None:
-    """No state is moved once the smoother has settled, and the fit of all is a minimum there."""
-    settled = smoothed(problem, PHI, NOISE)
-    noise = settled.trajectory_noise
-    before, after = noise.smoothed(noise.coordinates.of_residual(settled.residual(PHI)), NOISE)
+    """No state is moved once the smoother has converged, and the fit of all is a minimum there."""
+    converged = smoothed(problem, PHI, NOISE)
+    noise = converged.trajectory_noise
+    before, after = noise.smoothed(noise.coordinates.of_residual(converged.residual(PHI)), NOISE)
     moved = np.vstack([before[noise.first], after]) / noise.coordinates.errors(NOISE)
     assert np.abs(moved).max() < 0.05
     # a puck with drag is linear: there is one answer, wherever smoothing began
     moved = replace(problem.data, states=problem.data.states + 1e-3)
     again = smoothed(replace(problem, data=moved), PHI, NOISE)
-    difference = (again.data.states - settled.data.states)[..., :3]
+    difference = (again.data.states - converged.data.states)[..., :3]
     assert np.abs(difference).max() < 1e-4
 
 

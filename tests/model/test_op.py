@@ -60,7 +60,7 @@ def test_compiled_function_is_the_simulator(mode, threads) -> None:
         f = compiled(op, mode)
         got = f(*values)
     np.testing.assert_array_equal(got, expected(op, *values))
-    # a transposed (not contiguous) start state, and other lengths
+    # a transposed (not contiguous) initial state, and other lengths
     phi, start, actions = values
     np.testing.assert_array_equal(f(phi, start[::-2], actions[::-2]), got[::-2])
     np.testing.assert_array_equal(f(phi, start, actions[:, :1]).shape, (len(start), 1, 1, 6))

@@ -13,7 +13,7 @@ NOISE = (0.002, 0.002, 0.004, 0.01, 0.01, 0.02)
 ROD = Joint("distance", ("a", "b"), (0.1, 0.05), (-0.1, 0.0))
 pytestmark = [
     pytest.mark.one_stack,
-    pytest.mark.filterwarnings("ignore:which bodies are joined is rough"),
+    pytest.mark.filterwarnings("ignore:which bodies are joined is uncertain"),
 ]
 
 

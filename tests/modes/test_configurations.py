@@ -21,7 +21,7 @@ from pbrl_ppl.modes.configurations import (
     Configuration,
     Weighed,
     configurations,
-    doubts,
+    evidence_warning,
     number,
     stored,
 )
@@ -196,7 +196,7 @@ def test_evidence_is_that_of_a_fine_grid() -> None:
     assert found.ess > 200
     # four standard errors, and the grid's own error
     assert found.log_z == pytest.approx(expected, abs=4 * found.error + 0.02)
-    # these data are rough; it only has to say what is hopeless, at 25 units
+    # these data are few; it only has to say what is hopeless, at 25 units
     assert laplace(mode).log_z == pytest.approx(expected, abs=3.0)
 
 
@@ -211,7 +211,7 @@ def rods() -> Scene:
 @pytest.mark.slow
 @pytest.mark.parametrize("joined", [True, False])
 def test_probabilities_are_those_of_weighted_prior_draws(joined) -> None:
-    """Data so rough that draws from the whole prior, indices and all, hit the posterior."""
+    """Data so noisy that draws from the whole prior, indices and all, hit the posterior."""
     free = rods()
     rod = (Joint("distance", ("a", "b"), (0.2, 0.1), (-0.1, 0.1)),) if joined else ()
     start = np.zeros((3, 2, 6))
@@ -290,7 +290,7 @@ def test_two_joints_are_found() -> None:
 
 @pytest.mark.long
 def test_bodies_that_lie_in_each_other_are_no_proof_of_a_joint() -> None:
-    """Shapes are rough: what says which bodies are joined is how they move.
+    """Shapes are approximate: what says which bodies are joined is how they move.
 
     Boxes a and b begin deep inside each other. A scene that joins others by name would be refused.
     """
@@ -432,16 +432,16 @@ def test_an_interrupt_with_others_to_come_ends_the_fit(rod) -> None:
 
 
 @pytest.mark.parametrize(
-    ("error", "ess", "rough"), [(0.2, 500.0, True), (0.01, 900.0, False), (0.01, 9.0, True)]
+    ("error", "ess", "uncertain"), [(0.2, 500.0, True), (0.01, 900.0, False), (0.01, 9.0, True)]
 )
-def test_rough_evidence_is_said(rod, error, ess, rough) -> None:
+def test_uncertain_evidence_is_said(rod, error, ess, uncertain) -> None:
     """A standard error of 0.2 moves a probability of 0.6 by a tenth; one of 0.01 by nothing."""
     found = [replace(each, evidence=Marginal(0.0, error, ess)) for each in weighed(rod)]
-    said = doubts(stored(found))
-    assert (said is not None) == rough
-    if rough:
+    said = evidence_warning(stored(found))
+    assert (said is not None) == uncertain
+    if uncertain:
         assert "the probability 0.6 of joint1: a-b may be off by" in said
-    assert doubts(()) is None
+    assert evidence_warning(()) is None
 
 
 # -- fitting ---------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from scipy import stats
 from pbrl_ppl.likelihood import Problem, along_trajectories, single_transitions
 from pbrl_ppl.model import build_model
 from pbrl_ppl.modes import Space, constrain, find_mode, trajectory_mode, unconstrain
-from pbrl_ppl.modes.space import silent
+from pbrl_ppl.modes.space import uninformed
 from pbrl_ppl.parameters import Prior, prior_draws, symmetrised
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.sampling import physics_model
@@ -258,11 +258,11 @@ def test_a_root_of_either_sign_is_the_same_noise() -> None:
 def test_whether_a_parameter_is_informed_does_not_depend_on_its_unit(mode) -> None:
     """The derivative by a mass of 1e6 kg is small, and times the mass it is not."""
     place = list(mode.problem.layout.labels).index("mass[cart]")
-    assert not silent(mode).any()
+    assert not uninformed(mode).any()
     phi, jacobian = mode.phi.copy(), mode.jacobian.copy()
     phi[place] *= 1e6
     jacobian[:, place] /= 1e6
-    assert not silent(replace(mode, phi=phi, jacobian=jacobian)).any()
+    assert not uninformed(replace(mode, phi=phi, jacobian=jacobian)).any()
 
 
 @pytest.mark.one_stack
@@ -274,21 +274,21 @@ def test_silent_parameters_are_drawn_from_the_prior() -> None:
     space = Space.of(find_mode(problem, seed=1))
     labels = list(problem.layout.labels)
     place = labels.index("r[a]")
-    assert list(np.flatnonzero(space.silent)) == [place]
-    assert place not in space.loud and len(space.loud) == space.size - 1
+    assert list(np.flatnonzero(space.uninformed)) == [place]
+    assert place not in space.informed and len(space.informed) == space.size - 1
     q = np.tile(space.at(space.centre, problem.noise_prior[0]), (4000, 1))
     before = q.copy()
     drawn = space.prior_draws(q, np.random.default_rng(1))
     np.testing.assert_array_equal(q, before)
-    np.testing.assert_array_equal(drawn[:, space.loud], q[:, space.loud])
+    np.testing.assert_array_equal(drawn[:, space.informed], q[:, space.informed])
     prior = problem.layout.priors[place]
     r = space.split(drawn)[0][:, place]
     assert prior.family == "log_normal"
     assert stats.kstest(np.log(r), stats.norm(prior.mu, prior.sigma).cdf).pvalue > 1e-4
     # and no density includes it
     assert np.ptp(space.log_density(drawn[:50])) < 1e-9
-    loud = Space(problem, space.centre)
-    assert np.ptp(loud.log_density(drawn[:50])) > 0.1
+    informed = Space(problem, space.centre)
+    assert np.ptp(informed.log_density(drawn[:50])) > 0.1
 
 
 # -- the Laplace approximation ---------------------------------------------------------------------
@@ -379,7 +379,9 @@ def test_it_is_widened_where_the_posterior_falls_off_more_slowly() -> None:
 
 
 @pytest.mark.one_stack
-@pytest.mark.parametrize("known", [PUCK, {"mu_c": 0.3, "mass": 2.0}], ids=["all known", "silent"])
+@pytest.mark.parametrize(
+    "known", [PUCK, {"mu_c": 0.3, "mass": 2.0}], ids=["all known", "uninformed"]
+)
 def test_a_space_of_the_noise_alone(known) -> None:
     """Of a body of which all is known, or of which the data inform nothing."""
     scene = pucks(known=known)
@@ -388,7 +390,7 @@ def test_a_space_of_the_noise_alone(known) -> None:
     mode = find_mode(problem, seed=1)
     mask = np.ones(problem.layout.size, dtype=bool)
     space = Space(problem, mode.phi, mask)
-    assert list(space.loud) == list(range(space.phi_size, space.size))
+    assert list(space.informed) == list(range(space.phi_size, space.size))
     mean, covariance = space.laplace(mode)
     np.testing.assert_array_equal(space.widened(mean, covariance), covariance)
 

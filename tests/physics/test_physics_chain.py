@@ -46,7 +46,7 @@ def chain_states(theta, omega) -> np.ndarray:
 
 
 def random_chains(n: int, seed: int) -> np.ndarray:
-    """Start states (n, 3, 6) that do not fold up within the duration."""
+    """Initial states (n, 3, 6) that do not fold up within the duration."""
     rng = np.random.default_rng(seed)
     return chain_states(rng.uniform(-1, 1, (n, 3)), rng.normal(0, 3.0, (n, 3)))
 

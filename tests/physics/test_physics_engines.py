@@ -138,7 +138,7 @@ def box2d_discs(make_history, start: np.ndarray, wrench: np.ndarray, step: float
 
 
 def encounters(rng: np.random.Generator, offset: np.ndarray) -> np.ndarray:
-    """Start states (N, 2, 6) of discs that come to ``offset`` of the line through their centres.
+    """Initial states (N, 2, 6) of discs that come to ``offset`` of the line through their centres.
 
     The offset is in units of the radii's sum; one above 1 misses. They meet within the interval.
     """

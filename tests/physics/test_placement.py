@@ -1,4 +1,4 @@
-"""Start states that cannot be are refused, those that noise or contact explain are not."""
+"""Initial states that cannot be are refused, those that noise or contact explain are not."""
 
 import re
 import time

@@ -114,10 +114,10 @@ def test_nothing_separates_a_model_from_itself(posterior) -> None:
     (one, _) = fit_rivals(
         posterior, named_effects(DRAGS, scene_of(posterior), pp.catalogue), pp.catalogue, 8, 1
     )
-    twin = Rival(one.attached, one.mode, one.mode.draws(np.random.default_rng(2), 8), one.sigma)
+    copy = Rival(one.attached, one.mode, one.mode.draws(np.random.default_rng(2), 8), one.sigma)
     pushes = np.zeros((2, 12, 1, 3))
     pushes[1, :, 0, 0] = 5.0
-    found, meeting = Separation((one, twin), np.zeros((1, 6)), np.zeros((1, 3)))(pushes, 8)
+    found, meeting = Separation((one, copy), np.zeros((1, 6)), np.zeros((1, 3)))(pushes, 8)
     assert not meeting.any()
     # what draws of one posterior differ by, its own width absorbs: 0 but for their number
     assert (np.abs(found) < 1.5).all()

@@ -67,9 +67,9 @@ def test_one_model_twice_gains_nothing() -> None:
 
 def test_transitions_with_heavy_weights_are_counted() -> None:
     idata = fitted(1.0)
-    rough = group(idata, "log_likelihood")["next_state"].copy(deep=True)
-    rough[..., [3, 5]] = 5.0 * np.random.default_rng(3).normal(size=(2, 2000, 2))
-    data = {"posterior": group(idata, "posterior"), "log_likelihood": rough.to_dataset()}
+    noisy = group(idata, "log_likelihood")["next_state"].copy(deep=True)
+    noisy[..., [3, 5]] = 5.0 * np.random.default_rng(3).normal(size=(2, 2000, 2))
+    data = {"posterior": group(idata, "posterior"), "log_likelihood": noisy.to_dataset()}
     found = compare(idata, from_groups(data, {}))
     assert (found.before.high_pareto_k, found.after.high_pareto_k) == (0, 2)
 

@@ -1,4 +1,4 @@
-"""What the data say: silent parameters, inseparable ones by name, and nothing where all is well."""
+"""What the data say: uninformed and inseparable parameters by name, nothing where all is well."""
 
 import json
 import warnings
@@ -86,7 +86,7 @@ def test_without_contacts_the_contact_parameters_are_the_prior_s(no_contact) -> 
     )
     (sentence,) = said.sentences
     assert sentence.startswith("The data say nothing about r[cart] and mu_c[cart]: record contacts")
-    assert said.silent == uninformed(no_contact) == ("r[cart]", "mu_c[cart]")
+    assert said.uninformed == uninformed(no_contact) == ("r[cart]", "mu_c[cart]")
 
 
 def test_a_mode_says_the_same_as_the_posterior_there(history, no_contact) -> None:
@@ -118,7 +118,7 @@ def test_mass_and_gain_move_together(history) -> None:
     (sentence,) = said.sentences
     assert "mass[cart] and push_gain_gain[cart] apart" in sentence
     assert "mass[cart] up with push_gain_gain[cart] up" in sentence
-    assert said.silent == ()
+    assert said.uninformed == ()
 
 
 def test_with_the_mass_known_the_gain_is_informed(history) -> None:

@@ -140,12 +140,12 @@ def test_a_candidate_with_a_large_score_says_why_it_was_not_added() -> None:
     assert "came closest (p < 1e-16); it was not added: changes predictions by 0.2 %." in text
 
 
-def candidate(effect: str, caps: bool = False, **sizes: float) -> Candidate:
+def candidate(effect: str, is_upper_limit: bool = False, **sizes: float) -> Candidate:
     named = {each.name: each for each in catalogue}
     units = {p.name: p.unit for p in named[effect].parameters}
     return Candidate(
         effect, "cart", "", 1.0, 1, 0.5, dict.fromkeys(units, 0.25), units, 1.0,
-        detectable=sizes, caps=caps,
+        detectable=sizes, is_upper_limit=is_upper_limit,
     )  # fmt: skip
 
 

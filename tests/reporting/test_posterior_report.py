@@ -91,9 +91,9 @@ def test_ranks_that_differ_are_said_and_others_are_not() -> None:
 def test_pairs_are_those_that_depend_on_each_other() -> None:
     posterior = made_up_posterior()
     parts = groups(posterior)
-    parts["posterior"]["twin"] = 2 * parts["posterior"]["mass"] + 1
+    parts["posterior"]["copy"] = 2 * parts["posterior"]["mass"] + 1
     names = most_dependent(from_groups(parts, {}))
-    assert set(names[:2]) == {"mass[cart]", "twin[cart]"} and len(names) == 4
+    assert set(names[:2]) == {"mass[cart]", "copy[cart]"} and len(names) == 4
     figure = plot_pairs(from_groups(parts, {}), names)
     assert [axes.get_title() for axes in figure.axes].count("+1.00") == 1
     assert plot_prior(posterior, ["mass[cart]"]).axes[0].get_title() == "mass[cart]"

@@ -12,7 +12,7 @@ import pytest
 import pbrl_ppl as pp
 from pbrl_ppl.criticism import loop as loop_module
 from pbrl_ppl.criticism.loop import FILES, Loop
-from pbrl_ppl.criticism.results import Errors, LawsOfSize, Rung
+from pbrl_ppl.criticism.results import Errors, LawsOfSize, SearchLength
 from pbrl_ppl.errors import OutputError
 from pbrl_ppl.history import History, UnusedVelocity
 from pbrl_ppl.parameters import BODY_PARAMETERS
@@ -76,14 +76,14 @@ def test_page_of_an_added_effect() -> None:
 
 
 #: A search that finds drag on short pieces, angular drag on longer ones, and drops a third law.
-RUNGS = (
-    Rung(
+LENGTHS = (
+    SearchLength(
         4, 0.4, {"x": 0.02},
         (LawsOfSize(("linear_drag on cart",), 490.0, 0.2),
          LawsOfSize(("linear_drag on cart", "spring on cart"), 485.0, 0.19)),
         ("linear_drag on cart",), (), {"x": 1.0},
     ),
-    Rung(
+    SearchLength(
         30, 3.0, {"x": 0.01}, (LawsOfSize(("angular_drag on cart",), 9.0, 0.9),),
         ("angular_drag on cart",), ("spring on cart",), {"x": 4.0},
     ),
@@ -99,7 +99,7 @@ def with_small() -> Loop:
         law, effect="angular_drag", main=False, simulated_share=0.1, simulated_nats=9.0,
         not_separable_from=("torque_gain",),
     )  # fmt: skip
-    return replace(found, added=(small, law), rungs=RUNGS)
+    return replace(found, added=(small, law), search=LENGTHS)
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -121,8 +121,8 @@ def test_page_shows_the_search_by_length_of_pieces() -> None:
     ):
         assert said in text
     assert "Search for missing laws" not in page("effects-added").text  # none is made up
-    short = replace(RUNGS[0], rows=1, seconds=0.1, accepted=(), path=())
-    text = Page(render(replace(made_up("adequate"), rungs=(short,)))).text
+    short = replace(LENGTHS[0], rows=1, seconds=0.1, accepted=(), path=())
+    text = Page(render(replace(made_up("adequate"), search=(short,)))).text
     assert "Nothing was accepted or dropped." in text and "Main laws" not in text
     assert "single transitions are predicted" in text and "Pieces of 1 interval, 0.1 s" in text
 
@@ -133,7 +133,7 @@ def test_curves_of_the_search_begin_without_further_laws() -> None:
     assert np.asarray(first.get_xydata()).tolist() == [[0, 1], [1, 0.2], [2, 0.19]]
     assert np.asarray(second.get_xydata()).tolist() == [[0, 1], [1, 0.9]]
     assert [line.get_label() for line in axes.lines] == ["0.4 s, 1 accepted", "3 s, 1 accepted"]
-    assert plot_search(replace(with_small(), rungs=(replace(RUNGS[0], path=()),))).axes
+    assert plot_search(replace(with_small(), search=(replace(LENGTHS[0], path=()),))).axes
 
 
 @pytest.mark.usefixtures("undrawn")

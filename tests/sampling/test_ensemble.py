@@ -10,7 +10,7 @@ from scipy.special import logsumexp
 from pbrl_ppl.likelihood import TransitionLikelihood
 from pbrl_ppl.modes import systematic
 from pbrl_ppl.modes.space import Independent
-from pbrl_ppl.sampling.ensemble import Ensemble, Path, Reference, anneal
+from pbrl_ppl.sampling.ensemble import Ensemble, Reference, Tempered, anneal
 
 pytestmark = pytest.mark.one_stack
 
@@ -52,11 +52,11 @@ class Density:
     def __init__(self, function) -> None:
         self.function = function
 
-    def look(self, q):
+    def evaluate(self, q):
         return q[:, None, None, None]
 
-    def columns(self, q, look):
-        np.testing.assert_array_equal(look[:, 0, 0, 0], q)  # it belongs to the particles
+    def columns(self, q, values):
+        np.testing.assert_array_equal(values[:, 0, 0, 0], q)  # it belongs to the particles
         return np.stack([self.function(q), np.zeros(len(q))], axis=1)
 
 
@@ -173,12 +173,12 @@ def test_parts_jump_by_themselves() -> None:
     space, rng = space_of([[0], [1]]), np.random.default_rng(22)
 
     class Both:
-        def look(self, q):
+        def evaluate(self, q):
             return q[:, None, None, :, None]
 
-        def columns(self, q, look):
+        def columns(self, q, values):
             each = [
-                np.log(share) + stats.norm(mean, sd).logpdf(look[:, 0, 0, :, 0])
+                np.log(share) + stats.norm(mean, sd).logpdf(values[:, 0, 0, :, 0])
                 for mean, sd, share in (NARROW, WIDE)
             ]
             return np.column_stack([np.logaddexp(*each), np.zeros(len(q))])
@@ -239,19 +239,19 @@ def test_particles_whose_density_is_zero_find_their_way() -> None:
 class Parts:
     """Two bodies' residuals x - 1 and x + 1, each N(0, s^2); log s ~ N(0, 0.3^2).
 
-    What is looked at is each body's residual alone; if parts' looks were mixed up or out of date,
-    so were the density.
+    What is evaluated is each body's residual alone; if parts' residuals were mixed up or out of
+    date, so were the density.
     """
 
     def __init__(self) -> None:
         self.shapes = []
 
-    def look(self, q):
+    def evaluate(self, q):
         self.shapes.append(len(q))
         return (q[:, :2] + np.array([-1.0, 1.0]))[:, None, None, :, None]
 
-    def columns(self, q, look):
-        residual = look[:, 0, 0, :, 0]
+    def columns(self, q, values):
+        residual = values[:, 0, 0, :, 0]
         np.testing.assert_allclose(residual, q[:, :2] + np.array([-1.0, 1.0]), atol=1e-12)
         each = stats.norm.logpdf(residual, scale=np.exp(q[:, 2:]))
         return np.concatenate([each, stats.norm.logpdf(q[:, 2:] / 0.3)], axis=1)
@@ -280,7 +280,7 @@ def test_parts_are_accepted_by_themselves() -> None:
         assert abs(np.corrcoef(own[:, a], own[:, b])[0, 1]) < BOUND / np.sqrt(3000)
 
 
-def test_the_noise_moves_without_a_look() -> None:
+def test_the_noise_moves_without_the_engine() -> None:
     """Engine batches: one where particles are, and one a sweep."""
     space, rng = space_of([[0], [1]], [[2]]), np.random.default_rng(9)
     start = rng.standard_normal((50, 3))
@@ -294,10 +294,10 @@ def test_a_part_without_coordinates_and_arguments_stay_as_they_are() -> None:
     space, rng = space_of([[0], []], [[1]]), np.random.default_rng(10)
 
     class One:
-        def look(self, q):
+        def evaluate(self, q):
             return np.zeros((len(q), 1, 1, 2, 1))
 
-        def columns(self, q, look):
+        def columns(self, q, values):
             each = stats.norm.logpdf(q)
             return np.stack([each[:, 0], np.zeros(len(q)), each[:, 1]], axis=1)
 
@@ -362,13 +362,13 @@ def test_annealed_particles_are_of_the_end() -> None:
     reference = two_guesses(space)
     ensemble = Ensemble(reference, reference.draw(4000, rng), rng)
     reached = anneal(ensemble, reference, Density(two_modes), worth=np.inf)
-    assert reached.rungs >= 1
+    assert reached.tempering_steps >= 1
     assert 0.0 < reached.accepted < 1.0
     assert (reached.log_weight == 0.0).all()
     wide = ensemble.q.mean(axis=1) > 4.0
-    assert abs(wide.mean() - 0.7) < BOUND * np.sqrt(0.21 / (4000 * reached.kept))
+    assert abs(wide.mean() - 0.7) < BOUND * np.sqrt(0.21 / (4000 * reached.independent_share))
     for which, (mean, sd, _) in ((~wide, NARROW), (wide, WIDE)):
-        size = which.sum() * reached.kept
+        size = which.sum() * reached.independent_share
         for own in ensemble.q[which].T:
             statistic = stats.kstest(own, stats.norm(mean, sd).cdf).statistic
             assert statistic * np.sqrt(size) < stats.kstwobign.isf(ALARM)
@@ -381,7 +381,7 @@ def test_weights_that_suffice_end_it_without_a_move() -> None:
     q = reference.draw(4000, rng)
     ensemble = Ensemble(reference, q, rng)
     reached = anneal(ensemble, reference, Density(gaussian))
-    assert (reached.rungs, reached.accepted, reached.kept) == (0, 1.0, 1.0)
+    assert (reached.tempering_steps, reached.accepted, reached.independent_share) == (0, 1.0, 1.0)
     np.testing.assert_array_equal(ensemble.q, q)
     left = reached.log_weight
     np.testing.assert_allclose(left, gaussian(q) - reference.log_density(q))
@@ -405,7 +405,7 @@ def test_kept_is_what_the_moves_leave_of_independent_particles() -> None:
         ensemble = Ensemble(reference, reference.draw(n, rng), rng)
         reached = anneal(ensemble, reference, Density(gaussian), worth=np.inf)
         means.append((ensemble.q.mean(axis=0) - MEAN) / SD)
-        kept.append(reached.kept)
+        kept.append(reached.independent_share)
     assert 0.2 < np.mean(kept) < 1.0
     worth = 1.0 / (n * np.var(means, axis=0))
     assert (worth > np.mean(kept) / 1.6).all(), (worth, np.mean(kept))
@@ -415,12 +415,12 @@ def test_a_path_is_between_its_ends() -> None:
     start, end = about(space_of([range(3)]), (MEAN, COVARIANCE)), Density(two_modes)
     q = np.random.default_rng(19).standard_normal((20, 3))
     for beta in (0.3, 1.0):
-        path = Path(start, end, beta)
-        found = path.columns(q, path.look(q))[:, 0]
+        path = Tempered(start, end, beta)
+        found = path.columns(q, path.evaluate(q))[:, 0]
         expected = (1 - beta) * start.log_density(q) + beta * two_modes(q)
         np.testing.assert_allclose(found, expected)
-    path = Path(start, Density(lambda q: np.full(len(q), -np.inf)), 0.5)
-    assert (path.columns(q, path.look(q))[:, 0] == -np.inf).all()
+    path = Tempered(start, Density(lambda q: np.full(len(q), -np.inf)), 0.5)
+    assert (path.columns(q, path.evaluate(q))[:, 0] == -np.inf).all()
 
 
 # -- the reference ---------------------------------------------------------------------------------

@@ -149,7 +149,7 @@ def test_truth_is_inside(model, fitted) -> None:
     for name in PARAMETERS:
         values = draws(fitted)[name]
         assert abs(values.mean() - CART[name]) < 4 * values.std(), name
-    # Eq. 11's sigma is the residual's, to 10 %; it holds the start state's noise beside the
+    # Eq. 11's sigma is the residual's, to 10 %; it holds the initial state's noise beside the
     # sensor's, and so lies between that and thrice it
     sigma = draws(fitted)["sigma"].mean(axis=0)
     residual = model.problem.residual(model.problem.layout.to_vector(CART))

@@ -170,13 +170,13 @@ def test_draws_have_the_moments_of_the_posterior(simple, monkeypatch, way) -> No
     reference = Reference.about(Space.of(mode), mode)
     for seed in range(10):
         pool = draw_proposals(reference, 750, [seed])
-        assert (pool.rungs > 0) == way.endswith("engine moves")
+        assert (pool.tempering_steps > 0) == way.endswith("engine moves")
         chosen, k, size = resample(pool.log_weight, 500, np.random.default_rng(seed))
         assert k < MAX_PARETO_K
         phi, sigma = reference.space.split(pool.q[chosen])
         first = unconstrain(problem.layout.priors[0], phi[:, 0])[0]
         q = np.stack([first, np.log(sigma[:, 0])], axis=1)
-        errors.append((q.mean(axis=0) - mean) / sd * np.sqrt(pool.kept * size))
+        errors.append((q.mean(axis=0) - mean) / sd * np.sqrt(pool.independent_share * size))
         widths.append(q.std(axis=0) / sd)
         evidences.append(pool.log_z)
     assert (np.square(errors).sum(axis=0) < 35.6).all(), errors
@@ -369,7 +369,7 @@ def test_an_uninformed_parameter_s_draws_follow_the_prior() -> None:
     start = find_mode(model.problem, seed=1)
     labels = list(model.problem.layout.labels)
     place = labels.index("r[a]")
-    assert list(np.flatnonzero(Space.of(start).silent)) == [place]
+    assert list(np.flatnonzero(Space.of(start).uninformed)) == [place]
     with pytest.warns(UserWarning, match=r"nothing about r\[a\]"):
         idata = fit(model, seed=5, start=start, **QUICK)
     assert idata.attrs["method"] == "importance"

@@ -1,4 +1,4 @@
-"""Forecasts from start states that the model fits to a few rows, as those of independent fits."""
+"""Forecasts from initial states that the model fits to a few rows, as those of independent fits."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def forecast_errors(
 ) -> dict[str, float]:
     """Return root mean square errors at the end of forecasts, by measured state dimension.
 
-    Start states are fitted to so many rows, and the forecast begins at the last of them. Starts are
-    half a forecast apart; none where trajectories are too short.
+    Initial states are fitted to so many rows, and the forecast begins at the last of them.
+    Forecasts are half a forecast apart; none where trajectories are too short.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def forecast_errors(
 
 
 def _fitted(problem: Problem, phi: Floats, start: Floats, inputs: Floats, rows: Floats) -> Floats:
-    """Return the start states that fit measured rows best, shape (n, body, 6).
+    """Return the initial states that fit measured rows best, shape (n, body, 6).
 
     ``inputs`` has shape (n, rows - 1, body, 3 or 9), ``rows`` (n, rows, body, 6).
     """
@@ -71,7 +71,7 @@ def _fitted(problem: Problem, phi: Floats, start: Floats, inputs: Floats, rows: 
     start = coordinates.completed(problem.scene, start.copy())
 
     def moved(change: Floats) -> Floats:
-        """Return start states (k, n, body, 6) moved by (k, n, cell)."""
+        """Return initial states (k, n, body, 6) moved by (k, n, cell)."""
         states = np.tile(start, (len(change), 1, 1, 1))
         states.reshape(len(change), n, -1)[..., coordinates.places] += change
         return coordinates.completed(problem.scene, states)
