@@ -96,7 +96,7 @@ def main() -> None:
     say(f"can be moved: {beliefs(after)}")
 
     done = pp.act(world, after, at_rest(failed.states[-1]), GOAL, pushes(), every=10, seed=SEED)
-    say(f"second plan, made anew every second ({done.plans} times): {told(done.states)}")
+    say(f"second plan, made again every second ({done.plans} times): {told(done.states)}")
     say(f"the goal is {'' if done.reached else 'not '}reached, {done.distance:.2f} m from it")
 
     figure, axes = plt.subplots(2, 2, figsize=(10, 7.4), layout="constrained")

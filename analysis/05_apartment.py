@@ -167,12 +167,12 @@ def trial(
         )
     variables = {key: ("observations", np.array(values)) for key, values in rows.items()}
     attrs = {"agent": name, "seed": seed, "sigma": sigma, "box2d": int(box2d)}
-    found = xr.Dataset(variables, {"observations": list(counts)}, attrs | described())
+    found = xr.Dataset(variables, {"observations": list(counts)}, attrs | task_attributes())
     save(found, path)
     return found
 
 
-def described() -> dict[str, str]:
+def task_attributes() -> dict[str, str]:
     """Return the scene and the actions, for a file's attributes."""
     return {"scene": TASK.scene.to_toml(), "actions": str(TASK.actions)}
 
@@ -204,7 +204,7 @@ def stored(path: Path, counts: tuple[int, ...], options: argparse.Namespace) -> 
             found = opened.load()
     except Exception as error:  # HDF5 raises many kinds on a damaged file
         raise EpisodeError(f"{path}: this is not a NetCDF file: {error}") from None
-    if any(found.attrs.get(key) != value for key, value in described().items()):
+    if any(found.attrs.get(key) != value for key, value in task_attributes().items()):
         raise EpisodeError(f"{path}: this is a trial in another scene; give another folder")
     wanted = (counts, options.sigma, options.box2d)
     own = (found["observations"].to_numpy(), found.attrs["sigma"], found.attrs.get("box2d", 0))
@@ -305,7 +305,7 @@ def run() -> None:
     data, done = plans(options, counts), acting(options, steps)
     command = f"05_apartment.py --sigma {options.sigma:g}" + " --box2d" * options.box2d
     command += f" --seeds {options.seeds} --only {' '.join(options.only)}"
-    about = origin(command) | described() | {"sigma": options.sigma}
+    about = origin(command) | task_attributes() | {"sigma": options.sigma}
     about |= {"start": TASK.reward(TASK.start), "nodes": SEARCH["nodes"]}
     save(data.assign_attrs(about), options.out / "figure_4c.nc")
     kept = of_episodes(done, steps, ("bumped", "planned", "seconds"))

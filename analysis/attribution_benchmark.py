@@ -48,7 +48,7 @@ from running import apart, begin_worker, part, save, sources
 
 #: Seconds that a case takes a worker, before any has been timed.
 SECONDS_A_CASE = 25.0
-#: Cases after which a worker starts anew: compiled models add up in its memory.
+#: Cases after which a worker restarts: compiled models add up in its memory.
 CASES_A_WORKER = 20
 #: Seconds after which a case, and a measured recording, fail.
 CASE_LIMIT, RECORDING_LIMIT = 180, 300
@@ -261,7 +261,7 @@ def run_once(recording: Recording, path: Path, options: argparse.Namespace) -> N
     if not recording.folder.is_dir():
         say(f"{recording.name}: no recording at {recording.folder}")
     elif is_fresh(Result.load(path), options):
-        say(f"{recording.name}: kept in {path}; delete it to run the loop anew")
+        say(f"{recording.name}: kept in {path}; delete it to run the loop again")
     else:
         say(f"{recording.name}: running")
         result, picture = run_apart(recording, options)

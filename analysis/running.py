@@ -50,7 +50,7 @@ def begin_worker() -> None:
     """Leave Ctrl-C to the process that stops the workers, and start chains as anywhere else."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, end_worker)
-    # a spawned process would spawn its chains too, and each would load PyMC anew
+    # a spawned process would spawn its chains too, and each would load PyMC again
     multiprocessing.set_start_method(None, force=True)
 
 

@@ -234,7 +234,7 @@ def test_a_page_is_written_between_its_markers_again_and_again(page, result, tmp
 
 
 def test_the_page_shows_the_results_beside_it(measured, page, tmp_path) -> None:
-    """Made anew of the same results it is the same: `--write-page` was run on what is there."""
+    """Made again of the same results it is the same: `--write-page` was run on what is there."""
     if not measured.SHARED.is_dir():
         pytest.skip(f"the independent fits are not at {measured.SHARED}")
     shutil.copytree(page.RESULTS, tmp_path / "hardware")

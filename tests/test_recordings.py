@@ -83,7 +83,7 @@ def test_a_pendulum_has_its_closed_forms(bench) -> None:
 
 
 def test_a_slider_solves_its_equation_until_and_after_it_stops(bench) -> None:
-    """Against the integrator, which begins anew where the block stops or the force changes."""
+    """Against the integrator, which restarts where the block stops or the force changes."""
     mass, mu, dt, rows = 0.8, 0.2, 0.1, 31
     block, time = bench.laws.Body(mass, (0.2, 0.1)), 0.1 * np.arange(rows)
     rng = np.random.default_rng(1)

@@ -86,7 +86,7 @@ class World:
 def success(idata: object, starts: np.ndarray, draws: int | None) -> tuple[float, float]:
     """Return the share of starts (n, 3) that reach the goal behind the wall, and seconds per start.
 
-    Plans are made anew as they are played.
+    Plans are made again as they are played.
     """
     truth = Dynamics.known(walled(), CART)
     goal = pp.Goal.of({"cart": (3.0, 0.0, 0.0)})  # 0.1 m, 0.1 rad

@@ -131,7 +131,7 @@ def fitted(model: pm.Model, **options: Any) -> tuple[dict[str, Moments], str]:
     if "pareto_k" in idata.attrs:
         how += f", Pareto k {idata.attrs['pareto_k']:.2f}"
     if "rungs" in idata.attrs:
-        how += f" from {idata.attrs['proposals']}, {idata.attrs['rungs']} rungs"
+        how += f" from {idata.attrs['proposals']}, {idata.attrs['rungs']} temperatures"
     return moments(model, idata), how
 
 

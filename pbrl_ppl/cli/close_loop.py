@@ -172,7 +172,7 @@ def demo(
     method
         laplace takes seconds; importance and metropolis draw from the posterior itself, in minutes.
     overwrite
-        Write to a folder that has content.
+        Write to a folder that is not empty.
     """
     cart = models_folder() / "shopping_cart"
     if not (as_json or quiet):

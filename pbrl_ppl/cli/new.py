@@ -289,9 +289,9 @@ def new(
     check_file(scene, (".toml",), overwrite)
     named = columns.layout()
     layout = Recording(commands=commands).with_entries(**named, topics=_topics(topics))
-    described = (bodies, time_step, history, columns.columns, columns.units)
-    if model is not None and (side is not None or any(described)):
-        raise SceneError("--from copies a model as it is: leave the other options, or --from")
+    given = (bodies, time_step, history, columns.columns, columns.units)
+    if model is not None and (side is not None or any(given)):
+        raise SceneError("--from copies a model as it is: omit the other options, or omit --from")
     if history is None and (columns.columns or columns.units or commands):
         raise SceneError(
             "--columns, --units and --commands say how a recording is read: add --history"
@@ -316,9 +316,9 @@ def new(
     if model is None:
         shown += [f"joints, walls, wheels, known masses: uncomment them in {scene}"]
     log = history or (written[-1] if len(written) > 1 else None)
-    following = ["pbrl-ppl", "check", str(scene), str(log or "history.csv")]
+    next_command = ["pbrl-ppl", "check", str(scene), str(log or "history.csv")]
     begin = "next" if log else "next, with your recording"
-    shown += [f"{begin}: {shlex.join(following)}"]
+    shown += [f"{begin}: {shlex.join(next_command)}"]
     return Result({"scene": scene, "written": written}, () if quiet else shown)
 
 

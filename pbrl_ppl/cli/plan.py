@@ -93,7 +93,7 @@ def plan(
     starts = options.starts_of(start, bodies)
     allowed = None if actions is None else ActionSet.load(actions)
     if weight is not None and method != "astar":
-        raise GoalError(f"--weight: it is for astar, not --method {method}; leave it out")
+        raise GoalError(f"--weight: it is for astar, not --method {method}; omit it")
     progress("planning")
     result = make_plan(
         idata, starts, wanted, allowed, method=method, draws=draws, tail=tail, noise=noise,

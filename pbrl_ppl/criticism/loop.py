@@ -293,7 +293,7 @@ class Loop:
         folder : str or pathlib.Path
             Made if missing; other files in it are left alone.
         overwrite : bool
-            Whether a folder that has content may be written to.
+            Whether a folder that is not empty may be written to.
         page : str
             HTML of the report, written as report.html with the other files; none if empty.
 
@@ -305,7 +305,7 @@ class Loop:
         Raises
         ------
         OutputError
-            If the folder cannot be written, or has content and ``overwrite`` is false.
+            If the folder cannot be written, or is not empty and ``overwrite`` is false.
 
         Examples
         --------
@@ -349,7 +349,7 @@ def check_folder(folder: Path, overwrite: bool) -> Path:
     Raises
     ------
     OutputError
-        If they cannot, or if the folder has content and ``overwrite`` is false.
+        If they cannot, or if the folder is not empty and ``overwrite`` is false.
     """
     nearest = folder
     # a dangling link counts as there: it cannot be made a folder

@@ -23,16 +23,16 @@ def with_enough_substeps(
     """Double the substeps until neither predictions nor the acceleration test move, and refit.
 
     The engine's error hardly depends on the parameters, so it is measured at the mode found with
-    fewer substeps. At the end smoothing begins anew: an optimum with too large a noise confirms
+    fewer substeps. At the end smoothing restarts: an optimum with too large a noise confirms
     itself through the states that were smoothed with that noise.
 
-    ``better_mode``: a mode is replaced by one smoothed anew whose log-posterior is higher by this
+    ``better_mode``: a mode is replaced by one smoothed again whose log-posterior is higher by this
     (nats).
     ``large``: an unexplained acceleration above this share of the bodies' is no numerical error.
     ``still``: nor is one that a doubling of the substeps moves by a smaller share.
     """
     limits = criteria.engine
-    confirmed = 0  # substeps with which smoothing began anew
+    confirmed = 0  # substeps with which smoothing was restarted
     while True:  # a better engine leaves less noise, against which its error shows again
         begin = substeps = mode.problem.physics.substeps
         while shift(mode, substeps) > limits.small_shift and substeps < limits.most_substeps:

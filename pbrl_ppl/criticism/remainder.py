@@ -60,13 +60,13 @@ def learn_remainder(
     The residual acceleration of each step, times mass and moment of inertia, is a force and a
     torque in the body's frame. A Gaussian process of the velocity in that frame (forward, sideways,
     angular) is fitted to each. The leading eigenvectors of its kernel, with standard normal
-    weights, go into the model, which is then fitted anew to whole trajectories with all parameters
+    weights, go into the model, which is then refitted to whole trajectories with all parameters
     and both noises. So the weights vary from draw to draw as far as the data leave them open. At
     speeds that were not recorded the mean force returns to zero and its spread to that of the
     process, up to a third of the recorded range beyond it; further off it is zero.
 
     An update by a few new transitions is quick. One by many moves the draws in as many dimensions
-    as there are weights, and takes long: learn the remainder anew from all data.
+    as there are weights, and takes long: learn the remainder again from all data.
 
     Parameters
     ----------

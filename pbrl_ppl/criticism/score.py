@@ -125,7 +125,7 @@ def score_candidates(
     residual : ndarray
         Shape (n,).
     list of Signature
-        Smallest p-value first; of equal ones, the earlier in the catalogue. Effects of the noise
+        Smallest p-value first; ties in the catalogue's order. Effects of the noise
         stage come last.
     """
     test = _score_test(mode, len(candidates), criteria)

@@ -305,6 +305,7 @@ class History:
     def pieces(self, states: Floats, horizon: int, breaks: Bools | None = None) -> Segments:
         """Cut every trajectory into pieces of ``horizon`` intervals between given states.
 
+        Pieces are the segments of multiple shooting: each is simulated from its own initial state.
         A rest of at least a third of a piece is a piece, too: nothing is measured after its end.
 
         Parameters

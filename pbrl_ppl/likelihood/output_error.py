@@ -38,7 +38,7 @@ class InitialStates:
     begin : ndarray
         Measured minus latent start, shape (piece, coordinate); NaN where not measured.
     given : ndarray of bool
-        Start coordinates that are given: recorded, of a dimension that is not observed. Shape
+        Initial coordinates that are given: recorded, of a dimension that is not observed. Shape
         (piece, coordinate).
     column : ndarray of int
         Place among the observed dimensions of each coordinate, -1 if it is not one; shape
@@ -59,7 +59,7 @@ class InitialStates:
         return self.totals(self.seen, np.isfinite(self.begin))
 
     def totals(self, measured: Floats | Bools, begin: Floats | Bools) -> Floats:
-        """Return sums over each observed dimension, its start coordinates among them, (state,).
+        """Return sums over each observed dimension, its initial coordinates among them, (state,).
 
         Arguments have the shapes (piece, H, body, state) and (piece, coordinate).
         """
@@ -69,14 +69,14 @@ class InitialStates:
 
     @property
     def unknown(self) -> int:
-        """Number of start coordinates that are inferred."""
+        """Number of initial coordinates that are inferred."""
         return int((~self.given).sum())
 
     @cached_property
     def counts(self) -> Floats:
         """Degrees of freedom of each observed dimension, shape (state,).
 
-        Its measurements, less its part of the start coordinates that are inferred (restricted
+        Its measurements, less its part of the initial coordinates that are inferred (restricted
         likelihood: H. D. Patterson and R. Thompson, Biometrika 58, 1971).
         """
         total = max(self.measured.sum(), 1.0)
@@ -124,7 +124,7 @@ class InitialStates:
     ) -> tuple[Floats, Floats]:
         """Return the basis for weights of which the largest is 1.
 
-        A given start coordinate has ``firm`` times the weight of all measurements that depend on
+        A given initial coordinate has ``firm`` times the weight of all measurements that depend on
         it. Directions with a singular value below ``seen`` move nothing that was measured.
         """
         pieces, coordinates = self.begin.shape

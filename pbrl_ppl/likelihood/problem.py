@@ -89,7 +89,7 @@ class Problem:
     def on(self, data: Data) -> Problem:
         """Return the same problem of other data, with the likelihood of single transitions.
 
-        Independent parts are found anew for another history; equal ones keep their engines.
+        Independent parts are found again for another history; equal ones keep their engines.
         """
         physics = self.physics
         if data.history is not self.data.history:

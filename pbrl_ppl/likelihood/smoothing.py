@@ -112,7 +112,7 @@ def smoothed(
 
     ``converged``: largest change of states in the last round (standard deviations).
     ``rounds``: rounds, at most.
-    ``stale``: a slope is taken anew where the state has moved by more than this (standard
+    ``stale``: a slope is computed again where the state has moved by more than this (standard
     deviations).
 
     ``little``: least unexplained acceleration to smooth with, as a share of its prior median.

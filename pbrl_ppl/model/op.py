@@ -170,7 +170,7 @@ class SimulatorOp(_BlackBoxOp):
             if self.sensitivity is None:
                 return self._engine(phi, start, actions)
             # a copy: a graph may write into its arrays
-            return self._memory.recall((phi, start, actions), self._following).copy()
+            return self._memory.recall((phi, start, actions), self._with_state_sensitivity).copy()
         except ParameterError:  # samplers try such points: their likelihood is zero
             return np.full((*actions.shape[:3], 6), np.nan)
 
@@ -180,7 +180,7 @@ class SimulatorOp(_BlackBoxOp):
     def _engine(self) -> Callable[[Floats, Floats, Floats], Floats]:
         return self.physics.one_world if self.one_world else self.physics.simulator.recall
 
-    def _following(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
+    def _with_state_sensitivity(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
         """Return predictions from initial states that follow phi."""
         return cast(Sensitivity, self.sensitivity).predicted(self._engine, phi, start, actions)
 

@@ -1,4 +1,4 @@
-"""Modes of simulated pieces, up a ladder of lengths.
+"""Modes of simulated pieces, which are segments of multiple shooting, up a ladder of lengths.
 
 The simulation error of a whole trajectory has false optima; that of pieces of a few rows has not.
 Each length begins at the optimum of the shorter one, its initial states on the trajectories that
@@ -92,7 +92,7 @@ def piece_lengths(mode: Mode) -> list[int]:
     if measured <= unknown:
         raise HistoryError(
             f"history: it has {measured} measurements, and simulations of its trajectories have"
-            f" {unknown} unknown start coordinates and parameters; record more rows of each"
+            f" {unknown} unknown initial coordinates and parameters; record more rows of each"
             " trajectory"
         )
     return lengths(longest, longest_gap(history))

@@ -19,7 +19,7 @@ class LWR(Learner):
 
     The paper's LWR agent uses the pose-invariant model, and so cannot predict collisions with
     walls. ``pose_invariant=False`` is Eq. 3 with the pose among the inputs: it can learn where
-    walls are, and must learn free motion anew at each place.
+    walls are, and must learn free motion again at each place.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ class OOLWR(Learner):
 
     In a condition that was never observed there is no model: :meth:`step` returns NaN, and plans
     avoid such states. The paper does not describe this case; it says that its agent had to learn
-    each contact anew, and that with too many conditions it has no valid plan.
+    each contact again, and that with too many conditions it has no valid plan.
 
     Parameters
     ----------

@@ -58,7 +58,7 @@ def compiled(function: Callable[..., Any]) -> Any:
     """
     dispatcher = numba.njit(nogil=True, error_model="numpy")(function)
     template = dispatcher.get_call_template
-    # not anew for each constant that is passed
+    # not again for each constant that is passed
     dispatcher.get_call_template = lambda args, kws: template(tuple(map(unliteral, args)), kws)
     with suppress(RuntimeError):
         dispatcher._cache = disk_cache(function, SOURCES)

@@ -111,7 +111,7 @@ class Simulator:
             If a parameter is impossible, such as a negative mass.
         """
         phi = np.asarray(phi, dtype=float)
-        # of one kind, for numba compiles the rollout anew for another
+        # of one kind, for numba recompiles the rollout for another
         start = np.require(start, float, ("C", "W"))
         actions = np.require(actions, float, ("C", "W"))
         check_shapes(self.physics.scene, self.physics.layout, phi, start, actions)
@@ -295,7 +295,7 @@ class Simulator:
     def _run_plain(
         self, choice: Choice, numbers: EngineInput, starts: Floats, inputs: Floats, out: Floats
     ) -> None:
-        follows = _following(inputs)
+        follows = _continues_previous(inputs)
         if not any(getattr(one.effect.stage, "remember", None) for one in self.physics.effects):
             follows[:] = False  # nothing remembers the intervals before
         for item in range(len(out)):
@@ -340,7 +340,7 @@ class Simulator:
         So many engine steps are worth a thread of their own.
         """
         batch = Batch(
-            tuple(numbers[:-1]), *self._laws, _following(inputs), starts, inputs,
+            tuple(numbers[:-1]), *self._laws, _continues_previous(inputs), starts, inputs,
             self.physics.scene.time_step, *self.levels, self.physics.tolerance,
         )  # fmt: skip
         steps = len(out) * inputs.shape[1] * int(self.levels[0].sum())
@@ -363,7 +363,7 @@ def _each(states: Floats, proposals: int) -> Floats:
     return np.array(np.broadcast_to(states, (proposals, *states.shape[1:])), order="C")
 
 
-def _following(inputs: Floats) -> NDArray[np.bool_]:
+def _continues_previous(inputs: Floats) -> NDArray[np.bool_]:
     """Return which transitions begin where the one before ends in the recording, (transition,)."""
     follows = np.zeros(len(inputs), dtype=bool)
     if inputs.shape[-1] > len(WRENCH):

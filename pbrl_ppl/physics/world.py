@@ -296,7 +296,7 @@ class World:
 
         The engine numbers shapes as they are added and visits them by that number modulo the size
         of a hash table: the first in a list that is larger than the number of entries. The first
-        shape must get a multiple of it, here and whenever they are added anew.
+        shape must get a multiple of it, here and whenever they are added again.
         """
         tables = (5, 13, 23, 47, 97, 193, 389, 769, 1543, 3079, 6151, 12289)
         table = next(size for size in tables if size > len(self.shapes))

@@ -20,7 +20,7 @@ from pbrl_ppl.physics import depth_of, overlap
 from pbrl_ppl.planning.actions import ActionSet, play
 from pbrl_ppl.planning.dynamics import TransitionModel, remembered
 from pbrl_ppl.planning.goals import Goal, Target
-from pbrl_ppl.planning.search import Found, Task, contact_cost, tail_mean
+from pbrl_ppl.planning.search import SearchResult, Task, contact_cost, tail_mean
 from pbrl_ppl.scene import Body, Scene, Shape
 from pbrl_ppl.state import Bools, Floats
 
@@ -39,7 +39,7 @@ def astar(
     improve: bool = False,
     share: float = 0.5,
     every: float = 0.5,
-) -> Found:
+) -> SearchResult:
     """Search for the quickest actions that bring bodies to the goal.
 
     The cost of a plan is its time and the penalties for contact. A node holds the states under all
@@ -67,7 +67,7 @@ def astar(
 
     Returns
     -------
-    Found
+    SearchResult
         If the goal is not reached, the plan that ends nearest to it in L2 distance. An empty plan
         counts only where bodies are at rest: others do not stay where they are.
 
@@ -112,7 +112,7 @@ def astar(
     path = search.path(search.best or search.nearest)
     which = np.array([[action for action, n in path for _ in range(n)]], dtype=np.intp)
     wrenches = play(task.dynamics, task.start, task.actions, which, mean_angle)[0]
-    return Found(wrenches, reached, stopped, search.generated, time.monotonic() - begin)
+    return SearchResult(wrenches, reached, stopped, search.generated, time.monotonic() - begin)
 
 
 class Edge(NamedTuple):

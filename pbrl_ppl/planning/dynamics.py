@@ -357,7 +357,7 @@ class Dynamics:
             If the dynamics are known, and so without noise.
         """
         if self._noise is None:
-            raise PosteriorError("noise: these parameters are known, and have no sigma; leave it")
+            raise PosteriorError("noise: these parameters are known, and have no sigma; omit it")
         out = np.ascontiguousarray(states).copy()
         for under_draw, add in zip(out, self._noise, strict=True):
             add(under_draw, rng)

@@ -22,14 +22,14 @@ from pbrl_ppl.planning.astar import astar
 from pbrl_ppl.planning.dynamics import Dynamics, TransitionModel, rollout
 from pbrl_ppl.planning.goals import Goal
 from pbrl_ppl.planning.receding import mppi
-from pbrl_ppl.planning.search import NODES, Found, Task, tail_mean
+from pbrl_ppl.planning.search import NODES, SearchResult, Task, tail_mean
 from pbrl_ppl.scene import Scene, nearest
 from pbrl_ppl.state import POSE, STATE, WRENCH, Floats
 
 if TYPE_CHECKING:
     from pbrl_ppl.posterior import Idata
 
-METHODS: dict[str, Callable[..., Found]] = {"astar": astar, "mppi": mppi}
+METHODS: dict[str, Callable[..., SearchResult]] = {"astar": astar, "mppi": mppi}
 
 
 @dataclass(frozen=True, eq=False, repr=False)

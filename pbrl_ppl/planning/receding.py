@@ -8,7 +8,7 @@ import numpy as np
 
 from pbrl_ppl.errors import GoalError
 from pbrl_ppl.planning.dynamics import remembered
-from pbrl_ppl.planning.search import Found, Task, contact_cost, tail_mean
+from pbrl_ppl.planning.search import SearchResult, Task, contact_cost, tail_mean
 from pbrl_ppl.state import Floats
 
 
@@ -124,7 +124,7 @@ def mppi(
     samples: int = 256,
     iterations: int = 3,
     intervals: int = 200,
-) -> Found:
+) -> SearchResult:
     """Plan with MPPI until the model reaches the goal.
 
     Parameters
@@ -138,7 +138,7 @@ def mppi(
 
     Returns
     -------
-    Found
+    SearchResult
         If the goal is not reached, up to where it was nearest; a start in motion does not count.
 
     Raises
@@ -182,4 +182,4 @@ def mppi(
         stopped = "interrupted"
     chosen = np.array(wrenches[:best]).reshape(-1, len(start), 3)
     took = time.monotonic() - begin
-    return Found(chosen, stopped == "goal", stopped, ahead.generated, took)
+    return SearchResult(chosen, stopped == "goal", stopped, ahead.generated, took)

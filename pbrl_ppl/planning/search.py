@@ -58,7 +58,7 @@ class Task:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class SearchResult:
     """Result of a search.
 
     Attributes

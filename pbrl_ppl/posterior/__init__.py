@@ -30,7 +30,7 @@ from .fit import Fit as Fit
 from .identifiability import Identifiability as Identifiability
 from .identifiability import identify as identify
 from .identifiability import uninformed as uninformed
-from .mode import Point as Point
+from .mode import ParameterPoint as ParameterPoint
 from .mode import stored_mode as stored_mode
 from .mode import updated_mode as updated_mode
 from .record import Linearisation as Linearisation

@@ -30,13 +30,13 @@ from pbrl_ppl.modes import evidence_warning
 from pbrl_ppl.parameters import Prior, by_prior, nearest, prior_draws
 from pbrl_ppl.posterior.data import placed, places, record_of, recording
 from pbrl_ppl.posterior.identifiability import uninformed
-from pbrl_ppl.posterior.mode import Point, packed_mode
+from pbrl_ppl.posterior.mode import ParameterPoint, packed_mode
 from pbrl_ppl.posterior.record import Linearisation, PosteriorRecord, vectors
 from pbrl_ppl.posterior.store import SIZE, Idata, convergence, from_groups, group, groups
 from pbrl_ppl.state import Floats, Ints
 
 #: Attributes of a trace of weighted proposals: their Pareto k, and log-likelihoods of transitions,
-#: shape (draw, transition), chains joined, which need not be evaluated anew.
+#: shape (draw, transition), chains joined, which need not be evaluated again.
 PARETO_K, LIKELIHOOD = "pareto_k", "log_likelihood"
 #: Attributes of a trace that are fields of the posterior's record.
 SAMPLED = (
@@ -67,7 +67,7 @@ def complete(
     seed: int,
     method: str,
     asked: tuple[int, int] | None = None,
-    mode: Point | None = None,
+    mode: ParameterPoint | None = None,
 ) -> Idata:
     """Return a posterior: a trace with likelihood, predictions, prior and the record of the fit.
 
@@ -83,7 +83,7 @@ def complete(
         The sampler's name.
     asked : tuple of int, optional
         Draws a chain, and chains, that were asked for, where an interrupt left fewer.
-    mode : Point, optional
+    mode : ParameterPoint, optional
         The posterior's mode, to be stored.
 
     Returns
@@ -330,7 +330,7 @@ def checked(
     weighted = record.importance_ess is not None
     more = f"raise draws, or {on}" if weighted else f"raise draws or thin, or {on}"
     if record.updates is not None:  # resampled draws are no chain that could go on
-        more = "these draws were reweighted by update; fit all data anew"
+        more = "these draws were reweighted by update; refit all data"
     warnings: list[_Warned] = []
     if asked is not None:
         record = replace(record, interrupted=True)
@@ -365,7 +365,7 @@ def _of_approximations(record: PosteriorRecord) -> Iterator[_Warned]:
     if linearisation is not None and not linearisation.sd <= MOST:
         text = (
             f"the likelihood is linearised where it does not hold: at {linearisation.draws} draws"
-            f" with the states smoothed anew it differs by {linearisation.sd:.2g} nats (standard"
+            f" with the states smoothed again it differs by {linearisation.sd:.2g} nats (standard"
             f" deviation; want <= {MOST:g}), most in trajectory {linearisation.trajectory}; cut"
             " that where bodies meet or wheels begin to slip, or compare with a fit of single"
             " transitions"

@@ -18,7 +18,7 @@ _CLIMB = 5
 
 
 @dataclass(frozen=True, eq=False)
-class Point:
+class ParameterPoint:
     """A point of the parameter space.
 
     Parameters
@@ -37,7 +37,7 @@ class Point:
 
 
 def packed_mode(
-    problem: Problem, mode: Point, phi: Floats, sigma: Floats, likelihood: Floats
+    problem: Problem, mode: ParameterPoint, phi: Floats, sigma: Floats, likelihood: Floats
 ) -> StoredMode:
     """Return a posterior's mode for its record.
 
@@ -48,7 +48,7 @@ def packed_mode(
     ----------
     problem : Problem
         What was fitted.
-    mode : Point
+    mode : ParameterPoint
         The mode as it was found.
     phi, sigma : ndarray
         Posterior draws, shapes (draw, p) and (draw, state).
@@ -62,12 +62,15 @@ def packed_mode(
         if draws[best] > value + 0.1:
             climbed = find_mode(problem, initial=phi[best], rounds=_CLIMB)
             if climbed.log_posterior > value:
-                mode, value = Point(climbed.phi, climbed.sigma), climbed.log_posterior
+                mode, value = ParameterPoint(climbed.phi, climbed.sigma), climbed.log_posterior
     return _packed(problem, mode, value, phi)
 
 
 def updated_mode(
-    problem: Problem, earlier: Point, draws: tuple[Floats, Floats, Ints | None], likelihood: Floats
+    problem: Problem,
+    earlier: ParameterPoint,
+    draws: tuple[Floats, Floats, Ints | None],
+    likelihood: Floats,
 ) -> StoredMode:
     """Return the mode of an updated posterior.
 
@@ -78,7 +81,7 @@ def updated_mode(
     ----------
     problem : Problem
         Of all data.
-    earlier : Point
+    earlier : ParameterPoint
         The mode of the earlier data.
     draws : tuple
         Phi, shape (draw, p), sigma, shape (draw, state), and over a library the index of each
@@ -89,14 +92,16 @@ def updated_mode(
     phi, sigma, choice = draws
     if problem.library is None and not problem.layout.discrete.any():
         mode = find_mode(problem, initial=earlier.phi, rounds=_CLIMB)
-        return _packed(problem, Point(mode.phi, mode.sigma), mode.log_posterior, phi)
+        return _packed(problem, ParameterPoint(mode.phi, mode.sigma), mode.log_posterior, phi)
     value = log_posterior(problem, phi, sigma, choice, log_likelihood=likelihood)
     i = int(np.argmax(value))
-    best = Point(phi[i], sigma[i], None if choice is None else choice[i])
+    best = ParameterPoint(phi[i], sigma[i], None if choice is None else choice[i])
     return _packed(problem, best, float(value[i]))
 
 
-def _packed(problem: Problem, mode: Point, value: float, draws: Floats | None = None) -> StoredMode:
+def _packed(
+    problem: Problem, mode: ParameterPoint, value: float, draws: Floats | None = None
+) -> StoredMode:
     """Return a point for a record, its wheels described as in draws (draw, p)."""
     layout, point, sets = problem.layout, mode.phi, None
     if problem.library is None and draws is not None:
@@ -113,7 +118,7 @@ def _packed(problem: Problem, mode: Point, value: float, draws: Floats | None = 
     )
 
 
-def stored_mode(problem: Problem, idata: Idata) -> Point:
+def stored_mode(problem: Problem, idata: Idata) -> ParameterPoint:
     """Return the mode that a posterior holds, in the order of the problem's layout.
 
     Parameters
@@ -134,4 +139,4 @@ def stored_mode(problem: Problem, idata: Idata) -> Point:
     if problem.library is not None and record.mode is not None and record.mode.sets is not None:
         names = [record.mode.sets[owner] for owner in problem.scene.owners]
         choice = np.array([problem.library.names.index(name) for name in names], dtype=np.intp)
-    return Point(phi, sigma, choice)
+    return ParameterPoint(phi, sigma, choice)

@@ -126,13 +126,13 @@ class PosteriorRecord:
     interrupted : bool, optional
         True if an interrupt left fewer draws than were asked for.
     pareto_k, importance_ess : float, optional
-        Of draws by importance sampling: Pareto k of the proposals' weights, and the number of
-        independent draws that the resampled draws are worth, which limits every parameter's ESS.
+        Of draws by importance sampling: Pareto k of the proposals' weights, and the effective
+        sample size of the resampled draws, which limits every parameter's ESS.
     proposals : str, optional
         The density that was weighted: Gaussians at the modes; of older posteriors also that of few
         engine steps.
     rungs : int, optional
-        Rungs at which the engine moved particles, where weights alone did not suffice.
+        Temperatures at which the engine moved particles, where weights alone did not suffice.
     acceptance : float, optional
         Share of those moves that were accepted; 1 without any.
     log_evidence : float, optional

@@ -28,7 +28,7 @@ DATATREE = not version("arviz").startswith("0.")
 
 #: Level of the intervals in reports, as in ArviZ 0.x.
 HDI_PROB = 0.94
-#: Attribute of resampled draws: the number of independent draws that they are worth.
+#: Attribute of resampled draws: their effective sample size by their weights.
 SIZE = "importance_ess"
 
 #: Version of the attributes of a posterior file, see `PosteriorRecord`.
@@ -269,7 +269,7 @@ def convergence(idata: Idata) -> tuple[dict[str, float], dict[str, float]]:
     r_hat, ess : dict of str to float
         By label, such as ``mass[cart]``. One that is the same in all draws, as the index of a joint
         that is certain, has converged: 1, and the number of draws. R-hat of one chain is NaN. Draws
-        by importance sampling are worth no more than ``attrs["importance_ess"]``.
+        by importance sampling have an ESS of at most ``attrs["importance_ess"]``.
     """
     variables = scalars(idata)
     fixed = [str(name) for name, v in variables.data_vars.items() if v.min() == v.max()]

@@ -146,7 +146,7 @@ def close_loop_many(
     ManifestError
         If the manifest cannot be used.
     OutputError
-        If the folder cannot be written, or has content of another kind.
+        If the folder cannot be written, or has files of another kind.
 
     Examples
     --------
@@ -223,7 +223,7 @@ def _opened(folder: Path) -> Path:
         ) from error
     if not ours:
         raise OutputError(
-            f"output folder {folder}: it has content that is not of many logs; choose another"
+            f"output folder {folder}: it has files that are not of many logs; choose another"
         )
     return folder.absolute()
 

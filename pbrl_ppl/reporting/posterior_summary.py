@@ -155,8 +155,8 @@ def summary(posterior: Idata) -> pd.DataFrame:
     Returns
     -------
     pandas.DataFrame
-        Columns mean, sd, lower, upper (94 % highest density), ess_bulk, ess_tail, r_hat. Resampled
-        draws are worth no more than their weights say, see `convergence`.
+        Columns mean, sd, lower, upper (94 % highest density), ess_bulk, ess_tail, r_hat. The ESS
+        of resampled draws is limited by their weights, see `convergence`.
     """
     # the same interval has other names before and after ArviZ 1.0
     options = {"ci_prob": HDI_PROB, "ci_kind": "hdi"} if DATATREE else {"hdi_prob": HDI_PROB}

@@ -28,7 +28,7 @@ from pbrl_ppl.posterior import (
     SIZE,
     Fit,
     Idata,
-    Point,
+    ParameterPoint,
     PosteriorRecord,
     complete,
     convergence,
@@ -127,8 +127,8 @@ def fit(
         their own labels), prior, log_prior, observed_data and constant_data, with units, and in
         ``attrs`` the scene, effects, method, versions, seed, the hash of the data and the
         convergence. Of importance sampling there are ``pareto_k``, the shape of the weights' tail
-        (at most 0.7), ``importance_ess``, the number of independent draws that the draws are worth
-        by their weights, which limits each parameter's effective sample size, ``proposals`` (what
+        (at most 0.7), ``importance_ess``, the effective sample size of the draws by their weights,
+        which limits that of each parameter, ``proposals`` (what
         was weighted), ``rungs`` and ``acceptance`` of the engine's moves, and ``log_evidence``.
         Interrupted chains keep the draws so far.
 
@@ -148,7 +148,8 @@ def fit(
         400, if sampling was interrupted, or if an evidence is too uncertain for the probability of
         a joint.
     LinearisationWarning
-        If states smoothed anew at draws give another likelihood (``attrs["linearisation"]``, nats).
+        If states smoothed again at draws give another likelihood (``attrs["linearisation"]``,
+        nats).
     MeetingWarning
         If bodies that were apart in the data meet under the parameters found.
     BoundWarning
@@ -240,7 +241,9 @@ def sample(
     return Fit(job.problem, posterior)
 
 
-def _drawn(job: SamplerRun, start: Mode | None, walks: bool) -> tuple[SamplerRun, Idata, Point]:
+def _drawn(
+    job: SamplerRun, start: Mode | None, walks: bool
+) -> tuple[SamplerRun, Idata, ParameterPoint]:
     """Return the job on the problem that was sampled, its draws, and its mode."""
     problem, method = job.problem, job.method
     if walks:
@@ -266,7 +269,7 @@ def _drawn(job: SamplerRun, start: Mode | None, walks: bool) -> tuple[SamplerRun
     gaussian = (METHODS["laplace"].run, METHODS["map"].run)
     if problem.likelihood.simulated and method.run not in gaussian:
         trace = _with_robust_width(job, trace)
-    return job, trace, Point(job.at_mode.phi, job.at_mode.sigma)
+    return job, trace, ParameterPoint(job.at_mode.phi, job.at_mode.sigma)
 
 
 def _at_mode(job: SamplerRun, start: Mode | None) -> SamplerRun:
@@ -411,6 +414,6 @@ def _appended(earlier: Idata, trace: Idata) -> Idata:
 
 
 def _size(idata: Idata) -> float:
-    """Return the number of independent draws that a posterior's or a trace's draws are worth."""
+    """Return the effective sample size of a posterior's or a trace's draws."""
     size = idata.attrs.get(SIZE)
     return min(convergence(idata)[1].values()) if size is None else float(size)

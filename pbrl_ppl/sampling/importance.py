@@ -82,8 +82,8 @@ def resample(
     k : float
         Pareto k; 0 for equal weights.
     size : float
-        Number of independent draws of the posterior that the draws are worth if the proposals are
-        independent; 0, with an infinite k, if a weight is infinite or fewer than two are positive.
+        Effective sample size of the draws if the proposals are independent; 0, with an infinite k,
+        if a weight is infinite or fewer than two are positive.
     """
     weight = np.zeros(len(log_weight))
     there = np.isfinite(log_weight)

@@ -20,7 +20,7 @@ from pbrl_ppl.modes import (
     stored,
 )
 from pbrl_ppl.parameters import JOINT_ANCHORS, JOINT_INDICES
-from pbrl_ppl.posterior import Idata, Point, from_groups, group, groups
+from pbrl_ppl.posterior import Idata, ParameterPoint, from_groups, group, groups
 from pbrl_ppl.sampling.methods import as_trace, posterior_dataset
 from pbrl_ppl.state import Bools, Floats, Ints
 
@@ -87,7 +87,7 @@ def mix(
     return from_groups(data, {"configurations": stored(weighed)})
 
 
-def most_probable(problem: Problem, weighed: Sequence[Weighed]) -> Point:
+def most_probable(problem: Problem, weighed: Sequence[Weighed]) -> ParameterPoint:
     """Return the mode of the most probable configuration, as a point of the whole model.
 
     Anchors of joints that join nothing are at the centre of their prior.
@@ -107,7 +107,7 @@ def most_probable(problem: Problem, weighed: Sequence[Weighed]) -> Point:
         law = _index_law(problem, joint, pair)
         _put_indices(problem, phi, np.array([True]), joint, np.array([law.argmax()]))
     _fill_anchors(problem, phi, None)
-    return Point(phi[0], best.mode.sigma)
+    return ParameterPoint(phi[0], best.mode.sigma)
 
 
 def allocate(probability: Floats, n: int) -> Ints:
@@ -211,7 +211,7 @@ def _stats(traces: Mapping[int, Idata], label: Ints) -> xr.Dataset:
     return xr.Dataset(mixed, first.coords)
 
 
-def summed(problem: Problem, draws: int, chains: int, seed: int) -> tuple[Idata, Point]:
+def summed(problem: Problem, draws: int, chains: int, seed: int) -> tuple[Idata, ParameterPoint]:
     """Return draws by summing over the choices, and the most probable choice.
 
     Parameters
@@ -227,7 +227,7 @@ def summed(problem: Problem, draws: int, chains: int, seed: int) -> tuple[Idata,
     return as_trace(problem, values, {"accept": np.ones((chains, draws))}), _point(problem, best)
 
 
-def most_frequent(problem: Problem, trace: Idata) -> Point:
+def most_frequent(problem: Problem, trace: Idata) -> ParameterPoint:
     """Return the most frequent choice among the draws, jointly for bodies that meet.
 
     Parameters
@@ -248,10 +248,10 @@ def most_frequent(problem: Problem, trace: Idata) -> Point:
     return _point(problem, best)
 
 
-def _point(problem: Problem, choice: Ints) -> Point:
+def _point(problem: Problem, choice: Ints) -> ParameterPoint:
     """Return the parameters of a choice (owner,), with the most probable sigma."""
     table = library_of(problem).table(problem.layout, problem.scene)
     names = list(problem.scene.owners)
     owners = [owner for block in problem.layout.blocks for owner in block.owners]
     phi = table[np.arange(len(owners)), choice[[names.index(owner) for owner in owners]]]
-    return Point(phi, profile_sigma(problem, problem.residual(phi), phi), choice)
+    return ParameterPoint(phi, profile_sigma(problem, problem.residual(phi), phi), choice)

@@ -75,8 +75,8 @@ def check_history(idata: Idata, record: PosteriorRecord, history: History) -> No
     if extra:
         raise HistoryError(
             f"update: the history measures {', '.join(extra)}, of which the posterior knows no"
-            f" noise, only of {', '.join(measured)}; leave those columns empty, or fit all data"
-            " anew"
+            f" noise, only of {', '.join(measured)}; leave those columns empty, or refit all"
+            " data"
         )
 
 
@@ -109,7 +109,7 @@ def check_engine(
         raise PosteriorError(
             f"update: the posterior's likelihoods are not what this engine gives (half of them are"
             f" off by {off:.2g} or more): it was made with other effects or another"
-            " version; fit all data anew"
+            " version; refit all data"
         )
 
 

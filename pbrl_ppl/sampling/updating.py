@@ -50,7 +50,7 @@ def update(
     their order, so that what is repeated shows as autocorrelation in ArviZ's figures (IBIS:
     Chopin, 2002). Only the new transitions are simulated, and all of them for the predictions.
     Where the weights' Pareto k is above 0.7 or fewer than 400 effective draws are left, all data
-    are fitted anew, with the defaults of fit: that takes as long as a fit. So they are where the
+    are refitted, with the defaults of fit: that takes as long as a fit. So they are where the
     new data have noise that the posterior lacks, and, by the posterior's own method, where the
     likelihood is of simulations, whose initial states are fitted with the parameters.
 
@@ -74,7 +74,7 @@ def update(
         A whole posterior of all data, with the prior of the first fit, noise's included. In
         ``attrs``, ``updates`` lists (as JSON) for each update the transitions, the effective share
         of the draws that the weights leave (``share``; None without weights), ``pareto_k``, and
-        what was done: ``reweighted`` or ``refitted``. The stored mode is climbed to anew from the
+        what was done: ``reweighted`` or ``refitted``. The stored mode is climbed to again from the
         old one under all data; over a library or joints of unknown bodies, it is the most probable
         of reweighted draws.
 
@@ -91,7 +91,7 @@ def update(
     Warns
     -----
     RefitWarning
-        If all data were fitted anew.
+        If all data were refitted.
     ConvergenceWarning, BoundWarning, UninformedWarning
         As for :func:`pbrl_ppl.fit`.
 
@@ -127,7 +127,7 @@ def update(
         why, whole = new.why_not, new.problem
         advice = f"; {judgement(new.earlier, new.likelihood)}"
         places = new.data["observed_data"].coords
-    warn(f"update: {why} are fitted anew, which takes as long as a fit{advice}", RefitWarning)
+    warn(f"update: {why} are refitted, which takes as long as a fit{advice}", RefitWarning)
     result = sample(whole, seed=seed, progress=progress, **options).posterior
     if places is not None:
         result = files.placed(result, places)
@@ -203,7 +203,7 @@ class _Weighted:
 
     @property
     def why_not(self) -> str:
-        """Why all data are fitted anew, as the beginning of a sentence about them."""
+        """Why all data are refitted, as the beginning of a sentence about them."""
         if self.more_noise:
             names = ", ".join(self.more_noise)
             return f"the new data have noise that the posterior lacks ({names}), so that all data"

@@ -56,7 +56,7 @@ def missing(share: float, lasting: bool) -> Mode:
 
 @pytest.mark.parametrize(("share", "lasting"), [(0.4, False), (0.2, True)])
 def test_a_negligible_acceleration_passes_every_test(share, lasting) -> None:
-    """One that lasts counts for more than one that is drawn anew in each interval."""
+    """One that lasts counts for more than one that is drawn again in each interval."""
     mode = missing(share * DEFAULT.negligible, lasting)
     left = unexplained_acceleration(mode)
     assert left.certain[0]

@@ -84,7 +84,7 @@ def learned(loop):
 
 
 @pytest.mark.slow
-def test_held_out_motion_is_foreseen_and_nothing_is_named(frames, loop, learned) -> None:
+def test_held_out_motion_is_predicted_and_nothing_is_named(frames, loop, learned) -> None:
     held_out = pp.History.from_dataframe(frames[1], BOX)
     before, after = (rollout_error(one, held_out) for one in (loop.posterior_after, learned))
     assert (after < 0.2 * before).all()

@@ -1,4 +1,4 @@
-"""Substeps enough for the data, and a mode that smoothing anew does not better."""
+"""Substeps enough for the data, and a mode that smoothing again does not better."""
 
 from dataclasses import replace
 

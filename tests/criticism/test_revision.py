@@ -151,8 +151,8 @@ def test_what_comes_by_chance_takes_no_name_away() -> None:
     """Two fifths of what was missing remain, and nothing predicts them: the rest is the drag's."""
     disc = Disc(8, 20, drag=1.2)
     rng = np.random.default_rng(2)
-    jolts = rng.normal(0.0, (0.45, 0.45, 0.0), disc.pushes.shape)
-    train, test = disc.frame(rng, pushed=jolts), disc.frame(rng, pushed=jolts[::-1])
+    noise = rng.normal(0.0, (0.45, 0.45, 0.0), disc.pushes.shape)
+    train, test = disc.frame(rng, pushed=noise), disc.frame(rng, pushed=noise[::-1])
     drags = [effect for effect in pp.catalogue if effect.name.endswith("drag")]
     found = loop((train, test), DISC, catalogue=drags)
     assert found.verdict == "unexplained"  # and that something remains is said

@@ -31,7 +31,7 @@ def test_whole_trajectories_inform_restitution_and_friction() -> None:
     Gaussians at a mode are too narrow where contacts make kinks: over 34 recordings 107 of
     136 intervals hold the truth, and 4 miss it by more than 4 standard deviations, up to 6. At
     that rate 0.6 % of runs have fewer than 6 of 12. The motion after a contact is chaotic, so that
-    another machine's rounding draws anew. The prior's standard deviations are 0.27 for friction
+    another machine's rounding draws again. The prior's standard deviations are 0.27 for friction
     and more for restitution.
     """
     deviations = []

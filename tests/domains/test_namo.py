@@ -126,7 +126,7 @@ def story(namo, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
         warnings.simplefilter("ignore", RefitWarning)
-        shorten(patch, draws=300)  # on purpose, also where the update fits anew
+        shorten(patch, draws=300)  # on purpose, also where the update refits
         world = namo.World(5)
         seen = namo.go_round(world)
         model = pp.physics_model(namo.SCENE, seen.history())

@@ -163,7 +163,7 @@ def test_double_pendulum_with_heavy_ends() -> None:
 
 @pytest.mark.parametrize("timed", [False, True])
 def test_paths_agree(timed) -> None:
-    """With a wheel, a wall and a load that is taken up on the way, for which mass is set anew."""
+    """With a wheel, a wall and a load that is taken up on the way, for which mass is set again."""
     scene = dataclasses.replace(
         free(normal_gravity=G), substeps=20, time_step=0.1,
         bodies=(body("puck", BOX, wheel=True, mass=MASS, mu_x=0.1, mu_y=0.5, w_x=-0.2),),

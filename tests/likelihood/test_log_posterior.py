@@ -173,7 +173,7 @@ def test_the_plan_s_draw_is_the_most_probable() -> None:
     posterior["sigma"].values[...] = median * 30.0
     table = problem.library.table(problem.layout, problem.scene)
     for i, where in enumerate([(0, 7), (1, 5), (0, 3)]):
-        # the second is the likeliest set, at a likely sigma; the third at an unlikely one
+        # the second is the most probable set, at a likely sigma; the third at an unlikely one
         which = [0, 1, 1][i]
         posterior["library_index"].values[where] = which
         posterior["sigma"].values[where] = median * [1.0, 1.0, 20.0][i] * np.exp(-(spread**2))

@@ -45,7 +45,7 @@ def test_between_the_rows_it_is_linearised_where_the_model_leads(problem) -> Non
     whole = along_trajectories(problem, phi)
     states, segments = whole.data.smoothed_states, single_transitions(problem).segments
     ends = problem.one_world(phi, states[:, 0], segments.inputs)
-    # an engine forgets its contacts where it begins anew: not to the last digit
+    # an engine forgets its contacts where it restarts: not to the last digit
     way = states[:, 1:-1, 1, :3] - ends[:, :-1, 1, :3]
     assert (np.sqrt((way**2).mean(axis=(0, 1))) < NOISE).all()
     measured = whole.data.history.dataset["observed"].to_numpy()[:, -1, 1, :3]

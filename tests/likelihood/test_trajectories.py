@@ -152,7 +152,7 @@ def test_score_of_the_noise_is_that_of_differences(problem, missing) -> None:
     np.testing.assert_allclose(slope, by_differences, rtol=1e-6, atol=1e-6 * np.abs(slope).max())
 
 
-def test_smoothed_states_are_the_likeliest(problem) -> None:
+def test_smoothed_states_are_the_most_probable(problem) -> None:
     """No state is moved once the smoother has converged, and the fit of all is a minimum there."""
     converged = smoothed(problem, PHI, NOISE)
     noise = converged.trajectory_noise

@@ -207,7 +207,7 @@ def test_anchors_of_a_hinge_are_recovered() -> None:
     np.testing.assert_allclose(found, reference_anchors(0, 1), atol=2e-3)
 
 
-def test_the_right_pair_is_the_likeliest() -> None:
+def test_the_right_pair_is_the_most_probable() -> None:
     """Of all pairs with their best anchors, on data with noise."""
     free = scene(Joint("hinge", known=False))
     problem = physics_model(free, recorded(free, noise=1e-3)).problem

@@ -207,7 +207,7 @@ def test_an_ordinary_model() -> None:
 
 @pytest.mark.one_stack
 def test_updates(apartment, furnished) -> None:
-    """Weights while they do; a sum anew where they do not."""
+    """Weights while they do; a new sum where they do not."""
     scene, _, library, _ = apartment
     light = dict(library.sets)["light"]
     more = simulated_history(

@@ -110,7 +110,7 @@ def test_folding_keeps_the_prior(name) -> None:
 
 
 @EVERY
-def test_the_likeliest_description_is(name) -> None:
+def test_the_most_probable_description_is(name) -> None:
     layout = layout_of(name)
     (wheel,) = wheels(layout)
     phi = draws_of(layout, 100)
@@ -120,7 +120,7 @@ def test_the_likeliest_description_is(name) -> None:
 
 
 @EVERY
-def test_descriptions_drawn_anew_have_the_prior_s_distribution(name) -> None:
+def test_redrawn_descriptions_have_the_prior_s_distribution(name) -> None:
     """Whichever description the draws had: folded by the prior afterwards they are the prior's.
 
     Two-sample Kolmogorov-Smirnov tests of three parameters: one false alarm in 3000.

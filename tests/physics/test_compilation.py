@@ -96,7 +96,7 @@ def module(tmp_path) -> ModuleType:
     return module
 
 
-def test_another_digest_compiles_anew(module) -> None:
+def test_another_digest_recompiles(module) -> None:
     def hits(digest: str) -> int:
         dispatcher = numba.njit(module.double)
         dispatcher._cache = disk_cache(module.double, digest)

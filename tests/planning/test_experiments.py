@@ -89,7 +89,7 @@ def test_a_random_sequence_separates_less(posterior, suggestion) -> None:
     assert suggestion.decisive
     assert suggestion.expected > 2 * suggestion.at_random
     assert {*suggestion.separation["true"].values} == {f"{name} on puck" for name in DRAGS}
-    # judged anew, with draws and sequences that the search has not seen
+    # evaluated again, with draws and sequences that the search has not seen
     rivals = fit_rivals(
         posterior, named_effects(DRAGS, scene_of(posterior), pp.catalogue), pp.catalogue, 8, 99
     )

@@ -1,4 +1,4 @@
-"""Check of a linearisation against states smoothed anew at draws."""
+"""Check of a linearisation against states smoothed again at draws."""
 
 import json
 import warnings

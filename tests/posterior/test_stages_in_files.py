@@ -81,7 +81,7 @@ def test_an_update_numbers_its_trajectories_on(idata, monkeypatch) -> None:
     since = recorded(STAGES, seed=2, trajectories=1)
     problem = problem_of(idata, history=since)
     assert problem.inputs[..., 6].min() == 8.0
-    # few draws, also where the update fits anew
+    # few draws, also where the update refits
     few = replace(fitting.METHODS["metropolis"], draws=60, tune=20)
     monkeypatch.setattr(fitting, "METHODS", {**fitting.METHODS, "metropolis": few})
     with pytest.warns(UserWarning):

@@ -21,7 +21,7 @@ from pbrl_ppl.posterior import (
     save_posterior,
     stored_mode,
 )
-from pbrl_ppl.posterior.mode import Point, packed_mode
+from pbrl_ppl.posterior.mode import ParameterPoint, packed_mode
 from pbrl_ppl.sampling import fit, physics_model, update
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
@@ -64,12 +64,12 @@ def test_the_mode_is_above_all_draws_and_described_as_they_are(idata) -> None:
         assert abs(off) < 4 * own.std(), label  # another description is dozens away
 
 
-def test_a_mode_that_a_draw_is_above_is_climbed_to_anew(idata) -> None:
-    """As where the search ended on a lower hill than the chains found."""
+def test_a_mode_that_a_draw_is_above_is_climbed_to_again(idata) -> None:
+    """As where the search ended at a lower mode than the chains found."""
     problem = problem_of(idata)
     phi, sigma = parameter_draws(problem, idata)
     likelihood = problem.log_density(problem.residual(phi), sigma, phi).sum(axis=-1)
-    low = Point(phi[0] + 0.1 * np.eye(len(phi[0]))[0], sigma[0])
+    low = ParameterPoint(phi[0] + 0.1 * np.eye(len(phi[0]))[0], sigma[0])
     found = packed_mode(problem, low, phi, sigma, likelihood)
     held = json.loads(idata.attrs["mode"])
     # friction makes the top rough by about a nat: a climb from elsewhere ends beside the highest

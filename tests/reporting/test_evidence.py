@@ -31,7 +31,9 @@ def test_evidence_adds_up_and_is_where_the_drag_is() -> None:
     evidence = find_evidence(findings)
     gain = compare(findings.posterior_before, findings.posterior_after).elpd_difference
     assert evidence.nats.shape == (72, 6)
-    assert evidence.nats.sum() == pytest.approx(gain, rel=0.1)  # of likeliest draws, not left out
+    assert evidence.nats.sum() == pytest.approx(
+        gain, rel=0.1
+    )  # of the most probable draws, not left out
     assert sum(evidence.by_cell.values()) == pytest.approx(evidence.nats.sum())
     assert set(list(evidence.by_cell)[:2]) == {"vx", "vy"}
     # a drag is seen where the puck is fast

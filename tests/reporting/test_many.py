@@ -91,7 +91,7 @@ def test_failures_do_not_stop_the_rest_and_are_tried_again(tmp_path) -> None:
     assert json.loads((out / "summary.json").read_text())["logs"][1]["status"] == "done"
 
 
-def test_changed_inputs_are_run_anew(tmp_path) -> None:
+def test_changed_inputs_are_run_again(tmp_path) -> None:
     logs, out = made_logs(tmp_path, a="", b=""), tmp_path / "out"
     run(logs, out)
     run(logs, out)
@@ -106,7 +106,7 @@ def test_changed_inputs_are_run_anew(tmp_path) -> None:
     assert lines(tmp_path, BEGUN)[5:] == ["a"]
     run(with_test, out, seed=2, again=True)
     assert lines(tmp_path, BEGUN)[6:] == ["a", "b"]
-    # what has no report that says it is done is made anew, and a dead worker's rests are cleared
+    # what has no report that says it is done is made again, and a dead worker's rests are cleared
     (out / "a" / "report.json").write_text("{half")
     (out / "a" / ".making-x").mkdir()
     run(with_test, out, seed=2)

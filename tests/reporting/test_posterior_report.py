@@ -58,7 +58,7 @@ def test_page_of_importance_draws() -> None:
     text = Page(render_posterior(drawn)).text
     assert "Did the sampler work? Yes. The draws suffice." in text
     assert "Pareto k of their weights is 0.250 (above 0.7" in text
-    assert "the draws are worth 432 independent ones" in text
+    assert "the effective sample size by their weights is 432" in text
     assert "Warning of the fit" not in text
 
 

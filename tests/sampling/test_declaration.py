@@ -85,8 +85,8 @@ def test_the_model_is_linearised_at_its_mode() -> None:
     found = float(mode.problem.log_density(mode.problem.residual(mode.phi), mode.sigma).sum())
     point = model.initial_point()  # in the sampler's space
     assert model.compile_logp(vars=model.observed_RVs)(point) == pytest.approx(found)
-    anew = smoothed(mode.problem, mode.phi, mode.sigma)
-    assert likelihood(anew, mode.phi, mode.sigma) == pytest.approx(found, abs=0.5)
+    again = smoothed(mode.problem, mode.phi, mode.sigma)
+    assert likelihood(again, mode.phi, mode.sigma) == pytest.approx(found, abs=0.5)
     centre = declared_problem(Physics.declare(scene), history, kind="trajectories")
     assert likelihood(centre, mode.phi, mode.sigma) < found - 100
 
@@ -187,7 +187,7 @@ def test_pymc_samples_the_same_posterior(model, half) -> None:
 
 @pytest.mark.slow
 def test_a_fit_in_two_halves_is_one(model, half, history, tmp_path) -> None:
-    """The model is made anew from the history; the file holds where it is linearised.
+    """The model is made again from the history; the file holds where it is linearised.
 
     Ten differences from a whole fit beyond 4.5 standard errors come by chance once in 15,000.
     """

@@ -1,6 +1,6 @@
 """The default sampler gives the posteriors that long runs gave.
 
-``analysis/benchmarks/reference_posteriors.py FOLDER`` stored them, and stores them anew where a
+``analysis/benchmarks/reference_posteriors.py FOLDER`` stored them, and stores them again where a
 model or a prior was changed on purpose.
 """
 

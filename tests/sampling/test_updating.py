@@ -233,13 +233,13 @@ def test_reproducible_and_the_same_from_a_file(parts, first, one, tmp_path) -> N
 
 
 @pytest.mark.long
-def test_other_data_are_fitted_anew(parts, first, monkeypatch) -> None:
+def test_other_data_are_refitted(parts, first, monkeypatch) -> None:
     """The masses are others now: nearly no draw is left, and the answer is the refit's."""
     shorten(monkeypatch, draws=500)
     scene, _, _, _ = parts
     heavy = PUCKS | {"mass": [4.0, 6.0]}
     new = simulated_history(scene, heavy, seed=4, trajectories=40, intervals=1, substeps=8)
-    with pytest.warns(RefitWarning, match="fitted anew, .*; look whether") as caught:
+    with pytest.warns(RefitWarning, match="refitted, .*; look whether") as caught:
         idata = quiet(update, first, new, seed=9, progress=False)
     assert [each.filename for each in caught if each.category is RefitWarning] == [__file__]
     assert did(idata) == ["refitted"]
@@ -405,7 +405,7 @@ def test_refused_posteriors(parts, first) -> None:
     with pytest.raises(PosteriorError, match="does not say its data_sha256"):
         update(from_groups(held, unknown), new)
     other = scene_of(first).replace(gravity=(0.0, -9.81))
-    with pytest.raises(PosteriorError, match=r"not what this engine gives.*fit all data anew"):
+    with pytest.raises(PosteriorError, match=r"not what this engine gives.*refit all data"):
         update(from_groups(held, dict(first.attrs) | {"scene": other.to_toml()}), new)
 
 

@@ -99,7 +99,7 @@ def test_a_file_holds_the_problem(first, tmp_path) -> None:
         np.testing.assert_allclose(each.log_density(each.residual(phi), sigma), stored, rtol=1e-9)
     # what was measured, not what was smoothed
     np.testing.assert_array_equal(group(idata, "observed_data")["next_state"].values, here.measured)
-    # and it can be smoothed anew elsewhere
+    # and it can be smoothed again elsewhere
     again = along_trajectories(problem, PHI, NOISE, problem.trajectory_noise.coordinates)
     assert again.segments.n == 12 * 5 - 4 * 2
     assert np.isfinite(again.log_density(again.residual(PHI), NOISE)).all()
@@ -181,7 +181,7 @@ def test_a_first_contact_brings_a_noise_of_its_own(monkeypatch) -> None:
     together = simulated_history(scene, {"mass": [2.0]}, seed=2, poses=beside, **made)
     first = quiet(pp.fit, physics_model(scene, apart, likelihood="trajectories"), seed=1, **QUICK)
     assert "contact_acceleration" not in group(first, "posterior")
-    with pytest.warns(RefitWarning, match=r"contact_acceleration\[vx\].* fitted anew"):
+    with pytest.warns(RefitWarning, match=r"contact_acceleration\[vx\].* refitted"):
         both = quiet(pp.update, first, together, seed=2, progress=False)
     assert set(group(both, "posterior")["contact_acceleration"]["velocity"].values) >= {"vx", "vy"}
     assert problem_of(both).trajectory_noise.touching.any()
