@@ -134,7 +134,7 @@ class HeldOut:
         """Return the errors of whole trajectories, simulated from initial states fitted to them.
 
         They are root mean squares by measured state dimension, in its unit, less the degrees of
-        freedom of the initial states; empty where simulations magnify their start, or trajectories
+        freedom of the initial states; empty where simulations magnify them, or trajectories
         are too short.
         """
         longest = int(self.problem.data.history.dataset["n_rows"].max()) - 1

@@ -173,9 +173,8 @@ def rehearse(
     for mode in _known_modes(problem, phi, states)[::-1]:
         seconds = mode.problem.data.horizon * scene.time_step
         say(f"linearising {len(tried)} laws on pieces of {seconds:.3g} s")
-        regressions.append(
-            _Regression.of(mode, tried, criteria, regressions[-1] if regressions else None)
-        )
+        longer = regressions[-1] if regressions else None
+        regressions.append(_Regression.of(mode, tried, criteria, longer))
     say("adding each law to the simulation")
     laws = in_parallel(partial(_rehearsed, regressions), tried)
     return Rehearsal(

@@ -351,7 +351,7 @@ class Errors:
         Log predictive density, summed over held-out transitions.
     simulated_rmse : dict of str to float
         Root mean square error of whole trajectories, simulated from initial states that are fitted
-        to them, per measured state dimension; empty where simulations magnify their start.
+        to them, per measured state dimension; empty where simulations magnify them.
     """
 
     one_step_rmse: Mapping[str, float]

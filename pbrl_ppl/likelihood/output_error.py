@@ -308,13 +308,11 @@ def in_pieces(problem: Problem, length: int, states: Floats) -> Problem:
     seen = problem.observations.measured
     slope = np.zeros((*seen.shape, len(coordinates.places)))
     begin = _begin(problem, coordinates, column, problem.segments.start)
-    known = (column < 0) & np.isfinite(coordinates.of(_observed_starts(problem)))
-    initial_states, tau = (
-        InitialStates(coordinates, slope, seen, begin, known, column),
-        (1.0,) * len(columns),
-    )
+    known = (column < 0) & np.isfinite(coordinates.of(_observed_initial_states(problem)))
     likelihood = OutputErrorLikelihood(
-        initial_states=initial_states, tau=tau, nu=problem.likelihood.nu
+        initial_states=InitialStates(coordinates, slope, seen, begin, known, column),
+        tau=(1.0,) * len(columns),
+        nu=problem.likelihood.nu,
     )
     return replace(problem, likelihood=likelihood)
 
@@ -364,11 +362,11 @@ def output_error(problem: Problem) -> OutputErrorLikelihood:
 
 def _begin(problem: Problem, coordinates: Coordinates, column: Ints, start: Floats) -> Floats:
     """Return measured minus latent initial states (piece, coordinate); NaN where not measured."""
-    off = coordinates.of(_observed_starts(problem)) - coordinates.of(start)
+    off = coordinates.of(_observed_initial_states(problem)) - coordinates.of(start)
     return np.where(column >= 0, coordinates.wrapped(off), np.nan)
 
 
-def _observed_starts(problem: Problem) -> Floats:
+def _observed_initial_states(problem: Problem) -> Floats:
     """Return what was measured where pieces begin, shape (piece, body, 6), NaN where nothing."""
     segments = problem.segments
     observed = problem.data.history.dataset["observed"].to_numpy()

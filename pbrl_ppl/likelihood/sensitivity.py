@@ -89,7 +89,7 @@ class Sensitivity:
         return self.coordinates.completed(self.scene, self._added(states, moved))
 
     def predicted(self, engine: Engine, phi: Floats, start: Floats, inputs: Floats) -> Floats:
-        """Return next states from the smoothed starts, shape (..., transition, 1, body, 6).
+        """Return next states from smoothed initial states, shape (..., transition, 1, body, 6).
 
         Parameters
         ----------

@@ -96,7 +96,7 @@ class SimulatorOp(_BlackBoxOp):
     body, 6); all float64, in SI units. A transition in which the engine diverges is NaN, and so is
     everything where phi is impossible (a mass that is not positive, say): the likelihood of that is
     zero. The derivative by phi is by finite differences, all columns in one call of the engine. It
-    leaves out that initial states follow phi: the correction to the smoothed starts cancels that.
+    leaves out that initial states follow phi: the correction to the smoothed states cancels that.
 
     Parameters
     ----------

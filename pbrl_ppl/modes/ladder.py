@@ -51,7 +51,8 @@ def ladder(mode: Mode) -> list[Mode]:
     Returns
     -------
     list of Mode
-        One for each length; the last is the greatest where a simulation does not magnify its start.
+        One for each length; the last is the greatest where simulations do not magnify their initial
+        states.
 
     Raises
     ------
@@ -220,10 +221,8 @@ def fit_pieces(
         First steps of derivatives, as shares of each scale.
     """
     priors, layout = problem.layout.priors, problem.layout
-    scale, sizes = (
-        layout.scale(phi),
-        output_error(problem).initial_states.coordinates.sizes(problem.scene),
-    )
+    scale = layout.scale(phi)
+    sizes = output_error(problem).initial_states.coordinates.sizes(problem.scene)
     phi, start = inside(priors, phi), problem.segments.start
     steps = first_width * np.where(layout.discrete, 0.0, scale), first_width * sizes
     damping, failed, one_sided = 1e-3, 0, True
@@ -430,10 +429,8 @@ class _Step:
         )
         by_start = np.where(self.initial_states.seen[..., None], self.by_start, 0.0)
         of_start = ((by_start * self.weight[:, None]) ** 2).sum((1, 2, 3))
-        of_start += (
-            np.isfinite(self.initial_states.begin)
-            * self.initial_states.of_coordinates(self.weight) ** 2
-        )
+        of_weight = self.initial_states.of_coordinates(self.weight)
+        of_start += np.isfinite(self.initial_states.begin) * of_weight**2
         begin = of_start_sd / np.sqrt(np.maximum(np.median(of_start, axis=0), 1e-300))
         return width, np.clip(begin, _LEAST * sizes, _MOST * sizes)
 

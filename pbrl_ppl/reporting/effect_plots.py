@@ -72,9 +72,8 @@ def plot_search(loop: Loop, width: float = style.WIDE) -> Figure:
     for length, shade, mark in zip(loop.search, shades, cycle("o^sDv"), strict=False):
         sizes = [0, *(len(best.laws) for best in length.path)]
         errors = [1.0, *(best.error for best in length.path)]
-        name = f"{length.seconds:.3g} s" + f", {len(length.accepted)} accepted" * bool(
-            length.accepted
-        )
+        accepted = f", {len(length.accepted)} accepted" * bool(length.accepted)
+        name = f"{length.seconds:.3g} s{accepted}"
         axes.plot(sizes, errors, color=shade, marker=mark, label=name)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set(xlabel="further laws in the best subset", ylabel="simulation error / error without")

@@ -64,8 +64,9 @@ def physics_model(
         touch ``contact_acceleration``, what comes on top of it there.
 
         ``simulation``: trajectories are simulated from latent initial states without process noise
-        (output error), in pieces as long as a simulation does not magnify its start. ``sigma`` is
-        the error of measuring a state; the log-likelihood is divided by its autocorrelation time.
+        (output error), in pieces as long as a simulation does not magnify its initial state.
+        ``sigma`` is the error of measuring a state; the log-likelihood is divided by its
+        autocorrelation time.
 
         The latter two are linearised about the states at the posterior's mode, which is searched
         for here, is the initial point of ``pm.sample`` and is kept as the model's ``mode`` for

@@ -1,4 +1,4 @@
-"""Where the scan for a hidden disc looks: on what the hits say, exactly where they say all."""
+"""Grid points of the scan for a hidden disc: on what the hits say, exactly where they say all."""
 
 import numpy as np
 import pandas as pd
@@ -30,7 +30,7 @@ def recording(shape: Shape, starts: list[np.ndarray], steps: int = 20) -> tuple[
     return scene, History.from_dataframe(pd.DataFrame(rows).assign(**wrench), scene)
 
 
-def looks(shape: Shape, starts: list[np.ndarray]) -> np.ndarray:
+def grid_points(shape: Shape, starts: list[np.ndarray]) -> np.ndarray:
     scene, history = recording(shape, starts)
     return np.asarray(SCAN(scene, history, scene.bodies[0]))
 
@@ -38,7 +38,7 @@ def looks(shape: Shape, starts: list[np.ndarray]) -> np.ndarray:
 def test_two_hits_give_the_disc() -> None:
     """Centre and radius follow from two places and directions; contacts last a substep."""
     starts = [state(x=-0.6, y=-0.1, vx=2.0), state(x=0.3, y=1.0, vy=-1.5, vx=0.1)]
-    found = looks(Shape.circle(0.1), starts)
+    found = grid_points(Shape.circle(0.1), starts)
     assert np.abs(found[0] - DISC).max() < 0.02
 
 
@@ -46,7 +46,7 @@ def test_two_hits_give_the_disc() -> None:
 def test_a_single_hit_gives_the_place_on_the_disc(shape) -> None:
     """Every disc that is tried touches the place of the hit, off the centre or not."""
     for y in (-0.32, -0.2, -0.1):
-        found = looks(shape, [state(x=-0.6, y=y, theta=0.3, vx=2.0)])
+        found = grid_points(shape, [state(x=-0.6, y=y, theta=0.3, vx=2.0)])
         gap = np.linalg.norm(found[:, :2] - DISC[:2], axis=1) - DISC[2]
         straight = found[::3]  # without a turn, the disc and the one tried touch inside
         apart = np.linalg.norm(straight[:, :2] - DISC[:2], axis=1) - abs(straight[:, 2] - DISC[2])
@@ -56,7 +56,7 @@ def test_a_single_hit_gives_the_place_on_the_disc(shape) -> None:
 
 
 def test_what_never_changes_its_velocity_hit_nothing() -> None:
-    assert looks(Shape.circle(0.1), [state(x=-0.6, y=5.0, vx=1.0)]).shape == (0, 3)
+    assert grid_points(Shape.circle(0.1), [state(x=-0.6, y=5.0, vx=1.0)]).shape == (0, 3)
 
 
 def test_a_hit_that_was_not_measured_is_left_out() -> None:

@@ -115,7 +115,7 @@ def test_what_hangs_is_not_tied() -> None:
         attach(hung, (BY_NAME["distance_joint"].on("box"),))
 
 
-def looks(make_history, **hidden) -> np.ndarray:
+def grid_points(make_history, **hidden) -> np.ndarray:
     setup = make_history.Setup(
         name="puck", size=(0.4, 0.3), mass=2.0, n_train=4, n_test=1, wrench_sd=(4.0, 4.0, 0.1)
     )
@@ -128,6 +128,6 @@ def looks(make_history, **hidden) -> np.ndarray:
 def test_it_is_found_from_poses_alone(make_history) -> None:
     """Both ends and the length within 5 mm, of a hundred poses measured to 2 mm and 4 mrad."""
     hidden = (0.1, 0.05, 1.0, -0.5, 1.5)
-    found = looks(make_history, distance_joint=hidden)
+    found = grid_points(make_history, distance_joint=hidden)
     assert np.abs(found - hidden).max(axis=1).min() < 0.005
-    assert len(looks(make_history)) == 0  # a free one goes on no circle
+    assert len(grid_points(make_history)) == 0  # a free one goes on no circle

@@ -67,9 +67,9 @@ def test_both_kinds_of_noise_are_told_apart(pucks) -> None:
         sigma = profile_sigma(made, made.residual(PHI), PHI)
         made = smoothed(made, PHI, sigma)
     sigma = profile_sigma(made, made.residual(PHI), PHI)
-    looks = 2 * made.trajectory_noise.touching.sum()  # at each of two bodies
-    assert looks > 100
-    assert (np.abs(np.log(sigma / NOISE)[9:]) < 4 / np.sqrt(2 * looks)).all()
+    measurements = 2 * made.trajectory_noise.touching.sum()  # at each of two bodies
+    assert measurements > 100
+    assert (np.abs(np.log(sigma / NOISE)[9:]) < 4 / np.sqrt(2 * measurements)).all()
     assert (np.abs(np.log(sigma / NOISE)[:6]) < 0.4).all()
     assert (sigma[6:9] < 0.2 * NOISE[9:]).all()
 
