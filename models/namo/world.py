@@ -43,14 +43,14 @@ class World:
         self.states = np.zeros((len(SCENE.dynamic), 6))
         self.states[:, :3] = [body.pose for body in SCENE.dynamic]
 
-    def look(self) -> np.ndarray:
+    def observe(self) -> np.ndarray:
         """Measured states, shape (body, 6), SI units."""
         return self.states + NOISE * self._rng.standard_normal(self.states.shape)
 
     def __call__(self, wrenches: np.ndarray) -> np.ndarray:
         """Play one sampling interval of wrenches (body, 3), N and N m; look."""
         self.states = self._truth.step(self.states[None, None], wrenches[None])[0, 0]
-        return self.look()
+        return self.observe()
 
 
 def at_rest(states: np.ndarray) -> np.ndarray:
@@ -111,7 +111,7 @@ def go_round(world: World) -> pp.Acted:
     phase = 2 * np.pi * SCENE.time_step * np.arange(40) / 2.0
     wrenches = np.zeros((len(phase), len(SCENE.dynamic), 3))
     wrenches[:, 0, :2] = FORCE * np.stack([-np.sin(phase), np.cos(phase)], axis=1)
-    return follow(world, world.look(), wrenches)
+    return follow(world, world.observe(), wrenches)
 
 
 def movable(idata: Any, body: str, draws: int = 200) -> float:

@@ -93,7 +93,7 @@ def act(
     --------
     ::
 
-        done = act(robot.push_and_look, idata, start, goal, every=10, draws=16)
+        done = act(robot.push_and_observe, idata, start, goal, every=10, draws=16)
         idata = pp.update(idata, done.history())
     """
     if intervals < 1 or (every is not None and every < 1):
