@@ -48,7 +48,7 @@ class World:
         return self.states + NOISE * self._rng.standard_normal(self.states.shape)
 
     def __call__(self, wrenches: np.ndarray) -> np.ndarray:
-        """Play one sampling interval of wrenches (body, 3), N and N m; look."""
+        """Play one sampling interval of wrenches (body, 3), N and N m, and measure."""
         self.states = self._truth.step(self.states[None, None], wrenches[None])[0, 0]
         return self.observe()
 
