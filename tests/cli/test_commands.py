@@ -473,8 +473,9 @@ def test_the_command_fits_what_python_fits(options: list[str]) -> None:
         main([*fit, *options])
         scene = Scene.load("scene.toml")
         history = History.load("train.csv", scene)
-        seed = {} if options else {"seed": 1}  # of the search for the mode
-        model = physics_model(scene, history, trajectories=not options, **seed)
+        # the seed is that of the search for the mode
+        settings = {} if options else {"likelihood": "trajectories", "seed": 1}
+        model = physics_model(scene, history, **settings)
         here = sampling.fit(model, seed=1, method="laplace", progress=False)
     there = load_posterior("puck.nc")
     for name, values in group(here, "posterior").items():

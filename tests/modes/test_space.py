@@ -150,7 +150,8 @@ def test_the_density_is_pymc_s(likelihood) -> None:
     history = simulated_history(scene, CART, seed=7, trajectories=3, intervals=4)
     whole = likelihood == "trajectories"
     sigma = "scalar" if likelihood == "scalar sigma" else "per_dimension"
-    model = physics_model(scene, history, trajectories=whole, **({} if whole else {"sigma": sigma}))
+    options = {"likelihood": "trajectories"} if whole else {"sigma": sigma}
+    model = physics_model(scene, history, **options)
     problem = model.problem
     mode = find_mode(single_transitions(problem) if whole else problem, seed=1, rounds=1)
     if whole:

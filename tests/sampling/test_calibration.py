@@ -516,22 +516,16 @@ def test_result_says_what_it_is_of(puck: tuple[Scene, History], runs: list[int])
         ({"likelihood": "simulation", "colour": -0.1}, "colour is -0.1, expected a correlation"),
         ({"likelihood": "simulation", "colour": np.nan}, "colour is nan, expected a correlation"),
         ({"colour": 0.5}, "colour is 0.5 with likelihood 'transitions', expected 0"),
-        ({"colour": 0.5, "trajectories": True}, "0.5 with likelihood 'trajectories', expected 0"),
+        (
+            {"colour": 0.5, "likelihood": "trajectories"},
+            "0.5 with likelihood 'trajectories', expected 0",
+        ),
         ({"likelihood": "simulation", "horizon": 2}, "'simulation', with horizon or library"),
     ],
 )
 def test_bad_arguments(puck: tuple[Scene, History], options: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         calibrate(*puck, **options)
-
-
-def test_the_old_spelling_of_trajectories(puck: tuple[Scene, History], runs: list[int]) -> None:
-    old, new = (
-        calibrate(*puck, replications=2, **QUICK, **each)
-        for each in ({"trajectories": True}, {"likelihood": "trajectories"})
-    )
-    assert json.loads(old.dataset.attrs["likelihood"]) == "trajectories"
-    xr.testing.assert_identical(old.dataset, new.dataset)
 
 
 def test_effects_have_the_model_s_prior(
