@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import Any, final
+from typing import final
 
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.oomdp.contacts import SectorContacts
@@ -112,14 +112,18 @@ class OOLWR(Learner):
         *,
         relations: Sequence[Relation] | None = None,
         share_classes: bool = True,
-        **options: Any,
+        neighbours: int = 1000,
+        bandwidth: float = 1.5,
+        ridge: float = 1e-3,
+        standardise: bool = True,
     ) -> None:
         if relations is None:
             attributes = (Attributes(),) * any(body.attributes for body in scene.moving)
             relations = (SectorContacts(), *attributes)
         super().__init__(
-            scene, pose_invariant=True, share_classes=share_classes, relations=relations, **options
-        )
+            scene, neighbours=neighbours, bandwidth=bandwidth, ridge=ridge,
+            standardise=standardise, share_classes=share_classes, relations=relations,
+        )  # fmt: skip
         for relation in self.relations:
             if not isinstance(relation, Relation):
                 raise FitError(
