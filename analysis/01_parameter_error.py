@@ -21,6 +21,7 @@ import pandas as pd
 from rich.progress import track
 
 import pbrl_ppl as pp
+from pbrl_ppl.model import problem_in
 from pbrl_ppl.modes import find_mode
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
@@ -35,7 +36,7 @@ def error(transitions: int, sigma: float, seed: int) -> dict[str, float]:
     """Return the absolute errors of one history's mode, relative for the mass."""
     scene, history = cart(transitions, noise=np.full(6, sigma), seed=100 + seed)
     model = pp.physics_model(scene, history, sigma="scalar", threads=2)
-    found = find_mode(model.problem, seed=1).values
+    found = find_mode(problem_in(model), seed=1).values
     errors = {name: abs(float(found[name][0]) - CART[name]) for name in ("mu_x", "mu_y", "w_x")}
     return {"mass": abs(float(found["mass"][0]) / CART["mass"] - 1)} | errors
 

@@ -29,6 +29,7 @@ from experiments import origin, save, to_end
 from matplotlib.axes import Axes
 
 import pbrl_ppl as pp
+from pbrl_ppl.model import problem_in
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.physics import Physics, Simulator, build_layout
 from pbrl_ppl.scene import Body, Scene, Shape, Wall
@@ -129,7 +130,7 @@ def observations_needed(scene: Scene, masses: dict[str, float], seen: pd.DataFra
         part = pp.History.from_dataframe(frame, scene)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            mode = find_mode(pp.physics_model(scene, part, sigma="per_dimension").problem, seed=1)
+            mode = find_mode(problem_in(pp.physics_model(scene, part)), seed=1)
         return bool((np.abs(mode.phi / truth - 1.0) < TOLERANCE).all())
 
     low, high = 0, 1

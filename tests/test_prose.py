@@ -17,6 +17,7 @@ import typer
 
 import pbrl_ppl as pp
 from pbrl_ppl.cli.app import app, main
+from pbrl_ppl.model import problem_in
 from pbrl_ppl.posterior import MAX_PARETO_K, MIN_ESS
 from tests.helpers.places import MODELS, ROOT
 
@@ -215,7 +216,7 @@ def test_blocks_run_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     whole, loop, plan = pp.fit, pp.close_loop, pp.plan
 
     def fit(model: Any, **options: Any) -> Any:
-        small = {} if model.problem.library is not None else {"method": "laplace"}
+        small = {} if problem_in(model).library is not None else {"method": "laplace"}
         return whole(model, **small, **options, draws=100, chains=2, progress=False)
 
     def planned(model: Any, *given: Any, draws: int | None = None, **options: Any) -> Any:

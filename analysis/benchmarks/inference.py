@@ -31,7 +31,7 @@ from pytensor.graph.op import Op
 import pbrl_ppl as pp
 from pbrl_ppl.history import lever
 from pbrl_ppl.likelihood import Problem
-from pbrl_ppl.model import LogLikelihoodOp
+from pbrl_ppl.model import LogLikelihoodOp, problem_in
 from pbrl_ppl.model.table1 import random_variable
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.parameters import WHEEL_PARAMETERS
@@ -216,9 +216,9 @@ def measure_map() -> Iterator[Row]:
     """The mode alone, two threads."""
     scene, history = cart(360)
     model = pp.physics_model(scene, history, threads=2)
-    find_mode(model.problem, seed=0)  # compiled code and worlds are there
+    find_mode(problem_in(model), seed=0)  # compiled code and worlds are there
     took = float(
-        np.median([seconds(lambda: find_mode(model.problem, seed=1))[0] for _ in range(ROUNDS)])
+        np.median([seconds(lambda: find_mode(problem_in(model), seed=1))[0] for _ in range(ROUNDS)])
     )
     yield "map_seconds", "mode of the same data: seconds", "<= 0.25", took
     try:
@@ -236,7 +236,7 @@ def measure_noise_free() -> Iterator[Row]:
     errors, friction = [], []
     for seed in range(10):
         scene, history = cart(2, noise=np.zeros(6), seed=seed)
-        mode = find_mode(pp.physics_model(scene, history).problem, seed=1)
+        mode = find_mode(problem_in(pp.physics_model(scene, history)), seed=1)
         found = dict(zip(mode.problem.layout.labels, mode.phi, strict=True))
         errors.append(abs(found["mass[cart]"] / CART["mass"] - 1))
         friction += [abs(found[f"{name}[cart]"] - CART[name]) for name in ("mu_x", "mu_y")]
@@ -273,7 +273,7 @@ class PythonLoop(Op):
 
 def plain_model(model: pm.Model) -> pm.Model:
     """Return the same model on the Python loop."""
-    problem = model.problem
+    problem = problem_in(model)
     loop = PythonLoop(problem)
     with pm.Model(coords=model.coords) as plain:
         phi = pt.concatenate(
@@ -295,8 +295,8 @@ def measure_ratio() -> Iterator[Row]:
     scene, history = cart(360)
     model = pp.physics_model(scene, history)
     took, _, ess = judged(*cart_posterior())
-    mode = find_mode(model.problem, seed=1)
-    point = model.problem.layout.to_dict(mode.phi) | {"sigma": mode.sigma}
+    mode = find_mode(problem_in(model), seed=1)
+    point = problem_in(model).layout.to_dict(mode.phi) | {"sigma": mode.sigma}
     quiet = {"chains": 2, "cores": 1, "progressbar": False, "compute_convergence_checks": False}
     with model:
         trace = pm.sample(
@@ -333,7 +333,7 @@ def measure_methods() -> Iterator[Row]:
     """
     scene, history = cart(30)
     model = pp.physics_model(scene, history)
-    mode = find_mode(model.problem, seed=1)
+    mode = find_mode(problem_in(model), seed=1)
     options = {"seed": 1, "start": mode, "progress": False, "chains": _CHAINS}
     for method, few in PILOT.items():
         share = METHODS[method].tune / METHODS[method].draws

@@ -25,6 +25,8 @@ import pymc as pm
 from scipy.stats import norm
 
 import pbrl_ppl as pp
+from pbrl_ppl.model import problem_in
+from pbrl_ppl.modes import Mode, find_trajectory_mode
 from pbrl_ppl.parameters import by_prior
 from pbrl_ppl.posterior import convergence, parameter_draws
 
@@ -65,13 +67,19 @@ class Moments:
         return (self.sd / self.mean_error) ** 2
 
 
-def declared(folder: Path, case: str, kind: str) -> pm.Model:
-    """Return the model of a recording: its scene, and the effect that is added to it."""
+def declared(folder: Path, case: str, kind: str) -> tuple[pm.Model, Mode | None]:
+    """Return the model of a recording, with the effect added to it, and its mode.
+
+    The mode is that of whole trajectories, which are linearised there.
+    """
     scene = pp.Scene.load(folder / case / "scene.toml")
     history = pp.History.load(folder / case / "train.csv", scene)
     history = history.select(range(KINDS[kind]))
     effects = [effect for effect in pp.catalogue if effect.name == RECORDINGS[case]]
-    return pp.physics_model(scene, history, effects, likelihood=kind, seed=MODEL_SEED)
+    model = pp.physics_model(scene, history, effects, likelihood=kind)
+    if kind == "transitions":
+        return model, None
+    return model, find_trajectory_mode(problem_in(model), MODEL_SEED)
 
 
 def moments(model: pm.Model, idata: Any) -> dict[str, Moments]:
@@ -81,13 +89,13 @@ def moments(model: pm.Model, idata: Any) -> dict[str, Moments]:
     that the data do not inform has tails too heavy for its moments. The error of
     a standard deviation is that of as many independent draws of this kurtosis.
     """
-    layout = model.problem.layout
-    phi, sigma = parameter_draws(model.problem, idata)
+    layout = problem_in(model).layout
+    phi, sigma = parameter_draws(problem_in(model), idata)
     phi = by_prior(layout, phi, equal_alone=True)
     columns: dict[str, Any] = {}
     for label, prior, x in zip(layout.labels, layout.priors, phi.T, strict=True):
         columns[label] = np.log(x) if prior.family == "log_normal" else x
-    columns |= dict(zip(model.problem.noise_labels, sigma.T, strict=True))
+    columns |= dict(zip(problem_in(model).noise_labels, sigma.T, strict=True))
     sizes, result = convergence(idata)[1], {}
     for label, x in columns.items():
         mean, sd, n = float(x.mean()), float(x.std()), sizes[label]
@@ -148,11 +156,11 @@ def store(folder: Path, cases: list[str], kinds: list[str]) -> None:
     stored = load_reference() if STORED.exists() else {}
     for kind in kinds:
         for case in cases:
-            model = declared(folder, case, kind)
-            found, how = fitted(model, **LONG)
+            model, mode = declared(folder, case, kind)
+            found, how = fitted(model, start=mode, **LONG)
             print(f"{case} {kind}: {how}", flush=True)
-            mode = None if model.mode is None else list(model.mode.phi)
-            stored[f"{case} {kind}"] = {"mode": mode, "moments": found}
+            at = None if mode is None else list(mode.phi)
+            stored[f"{case} {kind}"] = {"mode": at, "moments": found}
             write(stored)
 
 
@@ -177,12 +185,12 @@ def check(folder: Path, cases: list[str], kinds: list[str]) -> None:
     for case in cases:
         for kind in kinds:
             reference = stored[f"{case} {kind}"]["moments"]
-            model = declared(folder, case, kind)
-            found, how = fitted(model, **CHAINS)
+            model, mode = declared(folder, case, kind)
+            found, how = fitted(model, start=mode, **CHAINS)
             print(f"{case} {kind}\n  {how}: {worst(differences(found, reference))}", flush=True)
             every = []
             for seed in SEEDS:
-                found, how = fitted(model, seed=seed)
+                found, how = fitted(model, start=mode, seed=seed)
                 off = differences(found, reference)
                 every += off.values()
                 print(f"  seed {seed}: {how}: {worst(off)}", flush=True)

@@ -97,9 +97,8 @@ def fit(
         progress("looking for the mode, then sampling")
         try:
             model = sampling.physics_model(
-                declared, loaded, effects, likelihood=likelihood, horizon=horizon, nu=nu, seed=seed,
+                declared, loaded, effects, likelihood=likelihood, horizon=horizon, nu=nu,
                 sigma="scalar" if scalar else "per_dimension",
-                around=None if likelihood == "transitions" else earlier,
             )  # fmt: skip
         except ValueError as error:  # an option that the model refuses
             raise FitError(f"fit: {error}") from None

@@ -158,9 +158,12 @@ def prior_predictive_check(
         check.dataset["share_inside"]
         check.sentences  # ('omega of cart changes by up to 12 rad/s in 0.1 s; under ...',)
     """
-    problem = getattr(model, "problem", model)
-    if not isinstance(problem, Problem):
-        raise FitError("prior check: this pm.Model was not made by physics_model; make it so")
+    if isinstance(model, Problem):
+        problem = model
+    else:
+        from pbrl_ppl.model import problem_in  # PyMC takes seconds to load
+
+        problem = problem_in(model)
     if draws < least_draws:
         raise ValueError(f"draws is {draws}, expected at least {least_draws}")
     rng = np.random.default_rng(seed)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pymc as pm
@@ -12,6 +12,7 @@ import pytensor.tensor as pt
 from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 
+from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import (
     ACCELERATION,
     ACTION_DIMS,
@@ -26,35 +27,12 @@ from pbrl_ppl.model.table1 import random_variable
 from pbrl_ppl.parameters import Block, Layout, ParameterLibrary
 from pbrl_ppl.state import Floats
 
-if TYPE_CHECKING:
-    from pbrl_ppl.modes import Mode
 
-
-class PhysicsModel(pm.Model):  # type: ignore[misc]  # untyped
-    """The pm.Model of an inference problem; see :func:`pbrl_ppl.physics_model`.
-
-    Parameters
-    ----------
-    problem : Problem
-        Data, physics, likelihood and prior, which samplers evaluate in numpy.
-    mode : Mode, optional
-        The mode that trajectories are linearised at, where a fit may begin.
-    """
-
-    def __init__(self, problem: Problem, mode: Mode | None = None) -> None:
-        super().__init__(coords=variable_coords(problem))
-        self.problem, self.mode = problem, mode
-
-
-def build_model(problem: Problem, mode: Mode | None = None) -> PhysicsModel:
-    """Declare the pm.Model of a problem; see :func:`pbrl_ppl.physics_model`.
-
-    ``mode`` is that of :class:`PhysicsModel`.
-    """
+def build_model(problem: Problem) -> pm.Model:
+    """Declare the pm.Model of a problem; see :func:`pbrl_ppl.physics_model`."""
     observations, segments, physics = problem.observations, problem.segments, problem.physics
     sensitivity, dims = problem.likelihood.sensitivity, variable_dims(problem)
-    model = PhysicsModel(problem, mode)
-    with model:
+    with pm.Model(coords=variable_coords(problem)) as model:
         start = pm.Data("start", segments.start, dims=START_DIMS)
         actions = pm.Data("actions", problem.inputs, dims=ACTION_DIMS)
         # Table 1
@@ -92,6 +70,33 @@ def build_model(problem: Problem, mode: Mode | None = None) -> PhysicsModel:
             dims=NEXT_STATE_DIMS,
         )
     return model
+
+
+def problem_in(model: pm.Model) -> Problem:
+    """Return the problem that a model was declared from; its log-likelihood's Op holds it.
+
+    Parameters
+    ----------
+    model : pymc.Model
+        Returned by :func:`pbrl_ppl.physics_model`, or a copy.
+
+    Raises
+    ------
+    FitError
+        If the model is of something else, or its variables are not those of the problem.
+    """
+    observed = model.observed_RVs
+    if [variable.name for variable in observed] == ["next_state"]:
+        node = pm.logp(observed[0], model.rvs_to_values[observed[0]]).owner
+        if node is not None and isinstance(node.op, LogLikelihoodOp):
+            problem = node.op.problem
+            variables = {each.name for each in (*model.free_RVs, *model.deterministics)}
+            if variables == variable_dims(problem).keys() and not model.potentials:
+                return problem
+            raise FitError(
+                "the variables of this pm.Model were changed after physics_model; use pm.sample"
+            )
+    raise FitError("this pm.Model was not made by physics_model; use pm.sample for others")
 
 
 def prior_predictive_draws(

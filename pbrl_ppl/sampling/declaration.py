@@ -1,29 +1,17 @@
-"""Declaration of the model: Eq. 11, or trajectories linearised at their mode."""
+"""Declaration of the model: Eq. 11, or linearised trajectories."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pbrl_ppl.effects import LEARNED_REMAINDER, Attached, Effect, attach, catalogue
 from pbrl_ppl.history import History, with_units
-from pbrl_ppl.likelihood import (
-    OutputErrorLikelihood,
-    TransitionLikelihood,
-    declared_problem,
-)
-from pbrl_ppl.modes import (
-    Mode,
-    find_simulation_mode,
-    find_trajectory_mode,
-    simulation_mode,
-    trajectory_mode,
-    with_state_sensitivity,
-)
+from pbrl_ppl.likelihood import TransitionLikelihood, declared_problem
 from pbrl_ppl.parameters import ParameterLibrary
 from pbrl_ppl.physics import Physics, try_effect
-from pbrl_ppl.posterior import linearised_as
+from pbrl_ppl.posterior import Idata, PosteriorRecord, linearised_as, stored_mode
 from pbrl_ppl.scene import Scene
 
 if TYPE_CHECKING:
@@ -35,15 +23,13 @@ def physics_model(
     history: History,
     effects: Iterable[Effect | Attached] = (),
     *,
-    likelihood: str = TransitionLikelihood.name,
+    likelihood: str | Idata = TransitionLikelihood.name,
     horizon: int = 1,
     sigma: str = "per_dimension",
     nu: float | None = None,
     substeps: int | None = None,
     threads: int = 1,
     library: ParameterLibrary | None = None,
-    around: Any = None,
-    seed: int = 0,
 ) -> pm.Model:
     """Declare the model of the paper's section 3.2 for a scene and a history.
 
@@ -56,7 +42,7 @@ def physics_model(
     effects : iterable of Effect or Attached
         Effects beside those that the scene declares. Your own are tried once; see
         :func:`pbrl_ppl.physics.try_effect`.
-    likelihood : str
+    likelihood : str, InferenceData or DataTree
         ``transitions`` (Eq. 11): measured initial states are exact.
 
         ``trajectories``: whole trajectories are whitened together, with two noises: ``sigma``, the
@@ -68,11 +54,11 @@ def physics_model(
         ``sigma`` is the error of measuring a state; the log-likelihood is divided by its
         autocorrelation time.
 
-        The latter two are linearised about the states at the posterior's mode, which is searched
-        for here, is the initial point of ``pm.sample`` and is kept as the model's ``mode`` for
-        :func:`pbrl_ppl.fit`. Where a joint's bodies are unknown there is no one mode:
-        ``trajectories`` are then linearised about the prior's centre, and ``simulation`` is
-        refused.
+        The latter two are linearised about the states at the prior's centre, and again at the mode
+        by :func:`pbrl_ppl.fit`, which searches for it. A posterior of the same data has their
+        likelihood as it was linearised in that fit, and its mode as the initial point: give
+        ``fit(model, method="map")`` before ``pm.sample``. With joints of unknown bodies
+        ``simulation`` is refused.
     horizon : int
         Intervals predicted from one measured state, of ``transitions``; 1 is Eq. 11.
     sigma : str
@@ -87,18 +73,11 @@ def physics_model(
     library : ParameterLibrary, optional
         Pre-learned parameter sets of which each body has one, in place of Table 1: the variable
         ``library_index`` holds the bodies' choices, and the parameters follow from it.
-    around : Mode, InferenceData or DataTree, optional
-        Where trajectories are linearised in place of a search: a mode of whole trajectories, from
-        which the mode is climbed to, or a posterior of the same data and likelihood, whose
-        linearisation is taken as it is.
-    seed : int
-        Of the search; the same seed gives the same model.
 
     Returns
     -------
     pymc.Model
-        An ordinary model, for ``pm.sample`` too; its ``problem`` attribute is the :class:`Problem`
-        it was made from.
+        An ordinary model, for ``pm.sample`` too.
 
     Raises
     ------
@@ -112,10 +91,9 @@ def physics_model(
     ValueError
         If ``likelihood`` or ``sigma`` is no option, ``horizon`` is below 1 or ``nu`` is not above
         0, or an option does not go with the likelihood: a horizon, a library and a scalar sigma are
-        for ``transitions``, ``around`` is for the others, and ``simulation`` has Gaussian noise and
-        joints of known bodies.
+        for ``transitions``, and ``simulation`` has Gaussian noise and joints of known bodies.
     PosteriorError
-        If ``around`` is a posterior of other data, or of another likelihood.
+        If ``likelihood`` is a posterior of other data or parameters.
     ParameterError
         If the library does not fit the scene's bodies.
 
@@ -131,10 +109,10 @@ def physics_model(
     >>> [variable.name for variable in model.free_RVs]
     ['mass', 'r', 'mu_c', 'sigma']
     """
-    if around is not None and likelihood == TransitionLikelihood.name:
-        raise ValueError(
-            "around is given with likelihood 'transitions', expected 'trajectories' or 'simulation'"
-        )
+    if isinstance(likelihood, str):
+        kind, earlier = likelihood, None
+    else:
+        kind, earlier = PosteriorRecord.of(likelihood).likelihood_name, likelihood
     physics = Physics.declare(
         with_units(scene, history), effects, substeps=substeps, threads=threads
     )
@@ -145,25 +123,16 @@ def physics_model(
         horizon=horizon,
         likelihood=TransitionLikelihood.declare(sigma, nu),
         library=library,
-        kind=likelihood,
+        kind=kind,
     )
-    mode = None
-    if around is not None and not isinstance(around, Mode):
-        problem = linearised_as(problem, around)
-    elif likelihood != TransitionLikelihood.name and not problem.layout.discrete.any():
-        simulated = likelihood == OutputErrorLikelihood.name
-        if around is None:
-            mode = (find_simulation_mode if simulated else find_trajectory_mode)(problem, seed)
-        else:  # the mode that is reached from the given one
-            mode = with_state_sensitivity(trajectory_mode(problem, around.phi))
-            mode = simulation_mode(mode) if simulated else mode
-        problem = mode.problem
     from pbrl_ppl.model import build_model  # PyMC takes seconds to load
 
-    model = build_model(problem, mode)
-    if mode is not None:  # chains of pm.sample begin there
-        for name, value in problem.named(mode.phi, mode.sigma).items():
-            model.set_initval(model[name], value)
+    if earlier is None:
+        return build_model(problem)
+    problem = linearised_as(problem, earlier)
+    model, mode = build_model(problem), stored_mode(problem, earlier)
+    for name, value in problem.named(mode.phi, mode.sigma).items():  # pm.sample begins there
+        model.set_initval(model[name], value)
     return model
 
 

@@ -157,12 +157,11 @@ def fit(
     UninformedWarning
         If the data say nothing about a parameter.
     """
-    problem = getattr(model, "problem", None)
-    if not isinstance(problem, Problem):
-        raise FitError("fit: this pm.Model was not made by physics_model; use pm.sample for others")
+    from pbrl_ppl.model import problem_in  # PyMC takes seconds to load
+
     return sample(
-        problem, method=method, seed=seed, draws=draws, tune=tune, chains=chains, thin=thin,
-        cores=cores, start=start, resume=resume, progress=progress, declared=model,
+        problem_in(model), method=method, seed=seed, draws=draws, tune=tune, chains=chains,
+        thin=thin, cores=cores, start=start, resume=resume, progress=progress,
     ).posterior  # fmt: skip
 
 
@@ -175,7 +174,6 @@ def sample(
     start: Mode | None = None,
     resume: Idata | None = None,
     progress: bool = False,
-    declared: pm.Model | None = None,
     **schedule: int | None,
 ) -> Fit:
     """Sample the posterior of a problem; see :func:`pbrl_ppl.fit`, which takes its pm.Model.
@@ -186,9 +184,6 @@ def sample(
         What is fitted. Of whole trajectories it is linearised at the mode.
     method, seed, cores, start, resume, progress
         As of :func:`pbrl_ppl.fit`.
-    declared : pymc.Model, optional
-        Its pm.Model, which PyMC's samplers take if the problem stays as it is; they make one
-        otherwise.
     **schedule : int, optional
         ``draws``, ``tune``, ``chains`` and ``thin``, as of :func:`pbrl_ppl.fit`.
 
@@ -199,8 +194,6 @@ def sample(
     """
     _check(problem, method, start, resume)
     library = problem.library
-    if start is None and declared is not None:
-        start = declared.mode  # that the problem is linearised at
     # with one set there is no choice to walk over
     walks = library is not None and method in OVER_LIBRARY and len(library.names) > 1
     chosen = OVER_LIBRARY[method] if walks else METHODS[method]
@@ -215,7 +208,6 @@ def sample(
         seed=seed,
         cores=os.cpu_count() or 1 if cores is None else cores,
         progress=progress,
-        declared=declared,
     )
     while True:
         job, trace, point = _drawn(job, start, walks)
@@ -339,7 +331,7 @@ def _check(problem: Problem, method: str, start: Any, resume: Idata | None) -> N
     if "simulation" in names and names[0] != names[1]:
         raise FitError(
             f"fit: start is a mode of the likelihood {names[0]}, the model's is {names[1]}; leave"
-            " out start, or pass it to physics_model as around"
+            " out start"
         )
     argument = "start" if start is not None else "resume" if resume is not None else None
     if problem.library is not None and (method not in (DEFAULT, "paper") or argument):

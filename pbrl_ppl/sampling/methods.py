@@ -79,8 +79,6 @@ class SamplerRun:
         Posterior to go on from.
     seed, cores, progress
         As of :func:`pbrl_ppl.fit`, with defaults filled in.
-    declared : pymc.Model, optional
-        Of the problem, or of one that it was made from.
     """
 
     problem: Problem
@@ -90,13 +88,10 @@ class SamplerRun:
     seed: int
     cores: int
     progress: bool
-    declared: pm.Model | None = None
 
     @cached_property
     def model(self) -> pm.Model:
         """The problem's pm.Model, which PyMC's samplers need."""
-        if self.declared is not None and self.declared.problem is self.problem:
-            return self.declared
         from pbrl_ppl.model import build_model  # PyMC takes seconds to load
 
         return build_model(self.problem)

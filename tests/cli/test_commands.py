@@ -25,6 +25,7 @@ from pbrl_ppl.cli.app import app
 from pbrl_ppl.cli.options import commands
 from pbrl_ppl.errors import ConvergenceWarning, FitError
 from pbrl_ppl.history import History
+from pbrl_ppl.model import problem_in
 from pbrl_ppl.physics.table1 import table1
 from pbrl_ppl.posterior import PosteriorRecord, completion, group, load_posterior
 from pbrl_ppl.sampling import physics_model
@@ -563,7 +564,7 @@ def test_convergence_is_judged_as_it_is_written(monkeypatch: pytest.MonkeyPatch)
         monkeypatch.setattr(completion, "convergence", lambda idata, values=values: values)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            completion.checked(model.problem, PosteriorRecord.of(idata), idata)
+            completion.checked(problem_in(model), PosteriorRecord.of(idata), idata)
         said = [str(each.message) for each in caught if each.category is ConvergenceWarning]
         assert len(said) == len(words)
         assert all(f"not converged: {word}" in each for word, each in zip(words, said, strict=True))

@@ -15,6 +15,7 @@ from pbrl_ppl.criticism.prior_check import (
 )
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.history import History
+from pbrl_ppl.model import problem_in
 from pbrl_ppl.reporting import plot_prior_check, png
 from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.scene import Body, Scene, Shape
@@ -59,7 +60,7 @@ def test_good_data_pass(scene, history) -> None:
 def test_no_seed_rejects_a_sound_prior(name) -> None:
     """Of 100 draws, two and six seeds of these eight reject; of 400, none."""
     scene, history, _ = load(RECORDED / name)
-    problem = physics_model(scene, history).problem
+    problem = problem_in(physics_model(scene, history))
     for seed in range(8):
         assert prior_predictive_check(problem, seed=seed).sentences == ()
 
@@ -186,20 +187,22 @@ def test_missing_cells_count_on_neither_side(scene, history) -> None:
 
 def test_draws_that_diverge_are_left_out_and_counted(scene, history, monkeypatch) -> None:
     model = physics_model(scene, history)
-    honest = type(model.problem).predict
+    honest = type(problem_in(model)).predict
 
     def sometimes(problem, phi, engine=None):
         states = honest(problem, phi, engine)
         states[phi[:, 0] > np.exp(1.0)] = np.nan  # the upper half of the masses
         return states
 
-    monkeypatch.setattr(type(model.problem), "predict", sometimes)
+    monkeypatch.setattr(type(problem_in(model)), "predict", sometimes)
     check = prior_predictive_check(model, draws=60)
     assert 10 < check.diverged < 50
     assert any(f"diverged on {check.diverged} of 60 draws" in each for each in check.sentences)
     assert np.isfinite(check.dataset["predicted"]).all()
     monkeypatch.setattr(
-        type(model.problem), "predict", lambda p, phi, engine=None: np.nan * honest(p, phi)
+        type(problem_in(model)),
+        "predict",
+        lambda p, phi, engine=None: np.nan * honest(p, phi),
     )
     with pytest.raises(FitError, match="diverged on 60 of 60 draws"):
         prior_predictive_check(model, draws=60)

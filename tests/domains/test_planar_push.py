@@ -8,6 +8,7 @@ import pytest
 
 from pbrl_ppl.criticism import close_loop
 from pbrl_ppl.history import History
+from pbrl_ppl.model import problem_in
 from pbrl_ppl.modes import Mode, find_mode
 from pbrl_ppl.physics import Transition
 from pbrl_ppl.sampling import physics_model
@@ -49,7 +50,7 @@ def test_a_typical_friction_predicts_held_out_pushes(recorded) -> None:
 
 def test_a_push_of_unequal_length_is_one_segment(recorded) -> None:
     scene, train, _ = recorded
-    problem = physics_model(scene, train, horizon=68).problem
+    problem = problem_in(physics_model(scene, train, horizon=68))
     assert problem.segments.n == 30
     assert problem.observations.names == ("x", "y", "theta")
     assert problem.observations.measured.sum() == 90  # the block's last pose of each push
@@ -59,7 +60,7 @@ def test_a_push_of_unequal_length_is_one_segment(recorded) -> None:
 def test_the_fitted_friction_predicts_held_out_pushes(recorded) -> None:
     """References: no motion 9.7 mm and 4.8 degrees, a quasi-static model 1.49 mm and 1.38."""
     scene, train, test = recorded
-    problem = physics_model(scene, train, horizon=68, threads=2).problem
+    problem = problem_in(physics_model(scene, train, horizon=68, threads=2))
     centres = np.array([prior.centre for prior in problem.layout.priors])
     mode: Mode = find_mode(problem, initial=centres)
     far, turned = last_pose_error(scene, test, mode.values)

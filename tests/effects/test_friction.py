@@ -6,6 +6,7 @@ import pytest
 from pbrl_ppl.effects import attach, catalogue
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.history import from_segments
+from pbrl_ppl.model import problem_in
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.physics import Physics, Simulator, calls
 from pbrl_ppl.sampling import physics_model
@@ -214,7 +215,7 @@ def test_friction_and_radius_are_recovered() -> None:
     states = simulator(scene)(truth, start, actions)
     noise = np.array([1e-3, 1e-3, 2e-3, 5e-3, 5e-3, 1e-2])
     history = from_segments(scene, start, actions, states + noise * rng.normal(size=states.shape))
-    problem = physics_model(scene, history, horizon=2).problem
+    problem = problem_in(physics_model(scene, history, horizon=2))
     mode = find_mode(problem, initial=np.array([0.05, 0.6]))  # from far off
     sd = np.sqrt(np.diag(mode.covariance))
     assert (np.abs(mode.phi - truth) < 3.3 * sd).all()

@@ -36,7 +36,7 @@ def revised() -> Loop:
     drag = [effect for effect in catalogue if effect.name == "linear_drag"]
     models = (physics_model(DISC, train, e, likelihood="trajectories") for e in ((), drag))
     before, after = (
-        Fit(m.problem, fit(m, method="laplace", seed=1, draws=100, progress=False)) for m in models
+        Fit.of(fit(model, method="laplace", seed=1, draws=100, progress=False)) for model in models
     )
     modes = tuple(trajectory_mode(one.problem, *one.best) for one in (before, after))
     size = Estimate(DRAG, 0.01, (DRAG - 0.02, DRAG + 0.02), "kg/s")

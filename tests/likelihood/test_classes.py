@@ -7,6 +7,7 @@ import pbrl_ppl as pp
 from pbrl_ppl.history import History, with_units
 from pbrl_ppl.likelihood import Problem, along_trajectories
 from pbrl_ppl.likelihood.log_posterior import log_posterior, log_prior
+from pbrl_ppl.model import problem_in
 from pbrl_ppl.parameters import ParameterLibrary
 from pbrl_ppl.physics import PartedSimulator, Physics, build_layout, independent_parts
 from pbrl_ppl.planning import ActionSet, Dynamics, Goal
@@ -51,7 +52,10 @@ def test_layout_by_class() -> None:
     expected = ("mass[table]", "mass[chair]", "mass[chair (locked, new)]")
     assert build_layout(mixed).labels == expected
     drag = pp.physics_model(scene().with_effects("chair2", "linear_drag"), recorded())
-    assert drag.problem.layout.labels == ("mass[chair]", "linear_drag_coefficient[chair2]")
+    assert problem_in(drag).layout.labels == (
+        "mass[chair]",
+        "linear_drag_coefficient[chair2]",
+    )
 
 
 def test_inertia_is_each_bodys_own() -> None:

@@ -5,6 +5,7 @@ import pytest
 from pymc.model.transform.conditioning import remove_value_transforms
 
 from pbrl_ppl.likelihood import log_posterior, log_prior
+from pbrl_ppl.model import problem_in
 from pbrl_ppl.modes import Space, find_mode
 from pbrl_ppl.modes.noise import profile_sigma
 from pbrl_ppl.parameters import ParameterLibrary
@@ -62,7 +63,7 @@ MODELS = {
 def test_it_is_pymc_s(history, name) -> None:
     """At draws from the prior, with every constant: an anchor's depends on its index."""
     model = MODELS[name](history)
-    problem, rng, n = model.problem, np.random.default_rng(1), 4
+    problem, rng, n = problem_in(model), np.random.default_rng(1), 4
     logp = remove_value_transforms(model).compile_logp(mode="FAST_COMPILE")
     median, _ = problem.noise_prior
     typical = median.mean() * np.ones(6) if problem.scalar_sigma else median
@@ -84,7 +85,7 @@ def test_it_is_pymc_s(history, name) -> None:
 
 
 def test_outside_the_support_there_is_none(history) -> None:
-    problem = physics_model(cart_scene(), history).problem
+    problem = problem_in(physics_model(cart_scene(), history))
     phi = problem.layout.to_vector(CART)
     for label, value in (("mass[cart]", 0.0), ("mu_x[cart]", 1.1), ("w_x[cart]", -3.0)):
         wrong = phi.copy()
@@ -94,7 +95,7 @@ def test_outside_the_support_there_is_none(history) -> None:
 
 def test_a_mode_s_height_is_the_log_posterior(history) -> None:
     """P(sigma) included; it was left out of the search."""
-    problem = physics_model(cart_scene(known={"r": 0.2, "mu_c": 0.3}), history).problem
+    problem = problem_in(physics_model(cart_scene(known={"r": 0.2, "mu_c": 0.3}), history))
     mode = find_mode(problem, initial=problem.layout.to_vector(CART))
     assert mode.log_posterior == pytest.approx(
         float(log_posterior(problem, mode.phi, mode.sigma)), rel=1e-12
@@ -109,7 +110,7 @@ def test_sigma_is_the_most_probable_one(history, options) -> None:
 
     With eight transitions the likelihood's own maximum is 6 % larger.
     """
-    problem = physics_model(cart_scene(), history, **options).problem
+    problem = problem_in(physics_model(cart_scene(), history, **options))
     phi = problem.layout.to_vector(CART)
     sigma = profile_sigma(problem, problem.residual(phi))
     here = log_posterior(problem, phi, sigma)
@@ -128,7 +129,7 @@ def test_sigma_is_the_most_probable_one(history, options) -> None:
 
 def test_an_exact_fit_has_the_prior_s_sigma(history) -> None:
     """Two cells without residual: the likelihood alone would make sigma vanish."""
-    problem = physics_model(cart_scene(), history.select([0])).problem
+    problem = problem_in(physics_model(cart_scene(), history.select([0])))
     sigma = profile_sigma(problem, np.zeros_like(problem.observations.values))
     median, spread = problem.noise_prior
     count = problem.observations.measured.sum((0, 1, 2))
@@ -140,7 +141,7 @@ def test_an_exact_fit_has_the_prior_s_sigma(history) -> None:
 
 def test_the_evidence_s_coordinates_have_the_same_density(history) -> None:
     """In them it is the log-posterior with the volume of the change of coordinates."""
-    problem = physics_model(cart_scene(), history).problem
+    problem = problem_in(physics_model(cart_scene(), history))
     mode = find_mode(problem, initial=problem.layout.to_vector(CART), rounds=1)
     space = Space(problem, mode.phi)
     z = space.at(mode.phi, mode.sigma) + np.random.default_rng(2).normal(0, 0.1, (4, space.size))
@@ -168,7 +169,7 @@ def test_the_plan_s_draw_is_the_most_probable() -> None:
     posterior = idata["posterior"]
     likelihood = idata["log_likelihood"]["next_state"]
     likelihood.values[...] = 0.0
-    problem = model.problem
+    problem = problem_in(model)
     median, spread = problem.noise_prior
     posterior["sigma"].values[...] = median * 30.0
     table = problem.library.table(problem.layout, problem.scene)
@@ -191,7 +192,7 @@ def test_the_plan_s_draw_is_the_most_probable() -> None:
 def test_the_plan_knows_an_anchor_s_prior_by_its_index() -> None:
     """An anchor on a small body has a denser prior than one in the world."""
     model = jointed(Joint("hinge", known=False))
-    layout = model.problem.layout
+    layout = problem_in(model).layout
     phi = np.zeros((2, layout.size))
     phi[:, layout.index("i_b", "joint1")] = 1, 4
     one, other = layout.log_prior(phi)[:, layout.index("b_x", "joint1")]
@@ -205,7 +206,7 @@ def test_pucks_without_unknowns_have_the_noise_s_prior_alone() -> None:
     puck = Body("puck", Shape.circle(0.1), known={"mass": 1.0, "r": 0.2, "mu_c": 0.3})
     scene = Scene(time_step=0.1, substeps=4, bodies=(puck,))
     history = simulated_history(scene, {}, **FEW)
-    problem = physics_model(scene, history).problem
+    problem = problem_in(physics_model(scene, history))
     median, spread = problem.noise_prior
     found = log_prior(problem, np.zeros(0), median)
     expected = (-np.log(spread * np.sqrt(2 * np.pi)) - np.log(median)).sum()

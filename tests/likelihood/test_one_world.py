@@ -12,7 +12,7 @@ from pbrl_ppl.criticism.held_out import HeldOut, example_rollout
 from pbrl_ppl.errors import MeetingWarning
 from pbrl_ppl.history import from_segments
 from pbrl_ppl.likelihood import ACCELERATION, Problem, TrajectoryLikelihood, along_trajectories
-from pbrl_ppl.model import build_model
+from pbrl_ppl.model import build_model, problem_in
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.physics import Physics, Simulator
 from pbrl_ppl.posterior import Fit, evaluate, from_groups, group, problem_of
@@ -54,7 +54,7 @@ def recorded(scene: Scene, mass: float, n: int = 20, sigma: float = 0.002):
 @pytest.fixture(scope="module")
 def model():
     model = physics_model(LIGHT, recorded(LIGHT, TRUE))
-    assert model.problem.physics.parts == (("a",), ("b",))
+    assert problem_in(model).physics.parts == (("a",), ("b",))
     return model
 
 
@@ -77,10 +77,10 @@ def posterior_of(model, phi):
     """Draws (n, 1) of the mass, each with the recorded noise."""
     variables = {"mass": (("chain", "draw", "mass_body"), phi.reshape(1, -1, 1))}
     dims = {"sigma": "state"}
-    if isinstance(model.problem.likelihood, TrajectoryLikelihood):
+    if isinstance(problem_in(model).likelihood, TrajectoryLikelihood):
         dims = {"sigma": "sensor", ACCELERATION: "velocity"}
     for name, dim in dims.items():
-        of = len(model.problem.noise_variables[name])
+        of = len(problem_in(model).noise_variables[name])
         variables[name] = (("chain", "draw", dim), np.full((1, len(phi), of), 0.002))
     coords = {name: list(model.coords[name]) for name in ("mass_body", *dims.values())}
     return from_groups({"posterior": xr.Dataset(variables, coords)}, {})
@@ -91,8 +91,8 @@ def test_prior_draws_collide(model) -> None:
     drawn = pm.sample_prior_predictive(50, model=model, random_seed=1)
     prior, values = group(drawn, "prior"), group(drawn, "prior_predictive")["next_state"].values[0]
     mass, sigma = prior["mass"].values[0], prior["sigma"].values[0]
-    within_the_noise(model.problem, mass, sigma, values)
-    pushed = of_one_world(model.problem, mass)[:, :, 0, B, 0].max(axis=1) > APART + 0.1
+    within_the_noise(problem_in(model), mass, sigma, values)
+    pushed = of_one_world(problem_in(model), mass)[:, :, 0, B, 0].max(axis=1) > APART + 0.1
     assert 0.5 < pushed.mean() < 1.0  # P(mass < 0.5 kg) is 0.9
 
 
@@ -102,9 +102,9 @@ def test_posterior_draws_collide(model) -> None:
     trace = posterior_of(model, phi)
     drawn = pm.sample_posterior_predictive(trace, model=model, random_seed=1, progressbar=False)
     values = group(drawn, "posterior_predictive")["next_state"].values[0]
-    within_the_noise(model.problem, phi, sigma, values)
-    likelihood, stored = evaluate(model.problem, phi, sigma, [0, 1], np.random.default_rng(1))
-    within_the_noise(model.problem, phi, sigma, stored)
+    within_the_noise(problem_in(model), phi, sigma, values)
+    likelihood, stored = evaluate(problem_in(model), phi, sigma, [0, 1], np.random.default_rng(1))
+    within_the_noise(problem_in(model), phi, sigma, stored)
     # that of the likelihood is still cheap: part by part
     logp = model.compile_logp(vars=[model["next_state"]])
     point = {"mass_log__": np.log(phi[1]), "sigma_log__": np.log(sigma[1])}
@@ -117,23 +117,23 @@ def test_the_prior_check_s_draws_collide(model) -> None:
 
 
 def test_calibration_s_data_collide(model) -> None:
-    truths, _ = draw_truths(model.problem, 20, seed=1)
+    truths, _ = draw_truths(problem_in(model), 20, seed=1)
     for truth in truths:
-        within_the_noise(model.problem, truth.phi, truth.sigma[None], truth.values[None])
+        within_the_noise(problem_in(model), truth.phi, truth.sigma[None], truth.values[None])
     assert max(truth.values[..., B, 0].max() for truth in truths) > APART + 0.1
 
 
 def test_held_out_errors_are_of_one_world(model) -> None:
     phi = np.array([TOO_LIGHT])
-    whole = along_trajectories(model.problem, np.array([TRUE]))
+    whole = along_trajectories(problem_in(model), np.array([TRUE]))
     sigma = np.full(len(whole.trajectory_noise.sigma), 0.002)
     mode = Mode(whole, phi, sigma, np.zeros((0, 1)), np.eye(1), log_posterior=0.0)
-    held = HeldOut.of(mode, model.problem.data.history)
-    expected = of_one_world(model.problem, phi)
+    held = HeldOut.of(mode, problem_in(model).data.history)
+    expected = of_one_world(problem_in(model), phi)
     shown = example_rollout(held, held)
     assert shown.body == "a"  # which the other stops
     np.testing.assert_allclose(shown.before[1], expected[0, 0, A], atol=1e-9)
-    off = model.problem.observations.residual(expected)[:, -1]
+    off = problem_in(model).observations.residual(expected)[:, -1]
     fitted = Fit(whole, posterior_of(build_model(whole), phi))
     errors = held.errors(held, fitted, rollout=1, seed=1, noise=held.mode.sigma)
     for i, name in enumerate(STATE):
@@ -143,14 +143,14 @@ def test_held_out_errors_are_of_one_world(model) -> None:
 
 def test_whole_trajectories_are_joined_where_they_collide(model) -> None:
     """At noise parameters of which there are more than state dimensions."""
-    whole = along_trajectories(model.problem, np.array([TRUE]))
+    whole = along_trajectories(problem_in(model), np.array([TRUE]))
     sigma = np.full((1, len(whole.trajectory_noise.sigma)), 0.002)
     assert whole.joined(np.array([[TRUE]]), sigma) is whole
     assert whole.joined(np.array([[TOO_LIGHT]]), sigma).physics.together == ("a", "b")
 
 
 def test_what_has_not_met_is_predicted_as_the_likelihood_has_it(model) -> None:
-    problem = model.problem
+    problem = problem_in(model)
     data = problem.segments.start, problem.segments.actions
     physics = Physics(LIGHT, parts=problem.physics.parts)
     apart, one = physics.simulator, physics.one_world
@@ -163,7 +163,7 @@ def test_what_has_not_met_is_predicted_as_the_likelihood_has_it(model) -> None:
 
 
 def test_bodies_that_meet_are_joined(model) -> None:
-    problem, sigma = model.problem, np.full((1, 6), 0.002)
+    problem, sigma = problem_in(model), np.full((1, 6), 0.002)
     assert problem.joined(np.array([[TRUE]]), sigma) is problem
     joined = problem.joined(np.array([[TOO_LIGHT]]), sigma)
     assert joined.physics.parts == (("a", "b"),)
@@ -195,7 +195,7 @@ def test_a_fit_finds_out_that_they_have_met() -> None:
     ends = engine(engine.physics.layout.to_vector({"mass": 2.0}), start, actions)
     history = from_segments(scene, start, actions, ends + 0.002 * rng.standard_normal(ends.shape))
     model = physics_model(scene, history)
-    assert model.problem.physics.parts == (("a",), ("b",))
+    assert problem_in(model).physics.parts == (("a",), ("b",))
     with pytest.warns(MeetingWarning, match="a, b meet"):
         idata = fit(model, seed=1, draws=100, tune=100, chains=2, cores=1, progress=False)
     mass = group(idata, "posterior")["mass"].values

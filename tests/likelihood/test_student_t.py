@@ -9,7 +9,7 @@ from scipy.stats import t as student
 
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import TransitionLikelihood, next_state_random, robust
-from pbrl_ppl.model import LogLikelihoodOp
+from pbrl_ppl.model import LogLikelihoodOp, problem_in
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.posterior import draws
 from pbrl_ppl.sampling import fit, physics_model
@@ -56,7 +56,7 @@ def test_density() -> None:
 
 def test_the_model_s_density_is_the_same(scene, clean) -> None:
     """The Op against numpy, at one point."""
-    problem = physics_model(scene, clean, nu=NU).problem
+    problem = problem_in(physics_model(scene, clean, nu=NU))
     phi = problem.layout.to_vector(CART)
     mean = problem.predict(phi)[..., problem.observations.columns]
     value, sigma = problem.observations.values, np.array(NOISE)
@@ -82,19 +82,19 @@ def test_robust_residuals_square_to_the_density() -> None:
 
 def test_outliers_mislead_a_gaussian_only(scene, clean, spoilt) -> None:
     """The t fit of spoilt data stays by the truth, in units of the clean fit's deviations."""
-    right = find_mode(physics_model(scene, clean).problem, seed=1)
+    right = find_mode(problem_in(physics_model(scene, clean)), seed=1)
     deviation = np.sqrt(np.diag(right.covariance))
     truth = right.problem.layout.to_vector(CART)
     off = {}
     for nu in (None, NU):
-        mode = find_mode(physics_model(scene, spoilt, nu=nu).problem, seed=1)
+        mode = find_mode(problem_in(physics_model(scene, spoilt, nu=nu)), seed=1)
         off[nu] = np.abs((mode.phi - truth) / deviation).max()
     assert off[NU] < 4
     assert off[None] > 2 * off[NU]
 
 
 def test_scalar_sigma_is_allowed(scene, clean) -> None:
-    problem = physics_model(scene, clean, nu=NU, sigma="scalar").problem
+    problem = problem_in(physics_model(scene, clean, nu=NU, sigma="scalar"))
     mode = find_mode(problem, seed=1)
     assert np.ptp(mode.sigma) == 0
     assert np.isfinite(mode.log_posterior)

@@ -7,6 +7,7 @@ from scipy import stats
 from pbrl_ppl.effects import Effect, EffectParameter, Noise, catalogue
 from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.likelihood import log_norm, log_posterior, robust
+from pbrl_ppl.model import problem_in
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.sampling import physics_model
@@ -46,7 +47,7 @@ def test_infinite_degrees_of_freedom_are_a_gaussian() -> None:
 
 @pytest.mark.parametrize("tail", [0.0, 1e-9, 0.2, 0.9])
 def test_numpy_is_scipys_student_t(model, tail) -> None:
-    problem = model.problem
+    problem = problem_in(model)
     phi = problem.layout.to_vector(CART | {"heavy_tails_inverse_nu": tail})
     residual = problem.residual(phi)
     nu = np.inf if tail < 1e-7 else 1.0 / tail
@@ -56,7 +57,7 @@ def test_numpy_is_scipys_student_t(model, tail) -> None:
 
 
 def test_pymc_says_the_same(model) -> None:
-    problem = model.problem
+    problem = problem_in(model)
     values = {**CART, "heavy_tails_inverse_nu": 0.3}
     phi = problem.layout.to_vector(values)
     point = {k: np.atleast_1d(v) for k, v in problem.layout.to_dict(phi).items()}
@@ -88,14 +89,14 @@ def test_the_tail_has_a_gradient(model) -> None:
 
 
 def test_without_parameters_there_is_no_tail(model) -> None:
-    problem = model.problem
+    problem = problem_in(model)
     with pytest.raises(ParameterError, match="give phi"):
         problem.log_density(np.zeros_like(problem.observations.values), SIGMA)
 
 
 def test_predictive_draws_have_the_tail(model) -> None:
     # the share of draws beyond 4 sigma is 0.028 for 3 degrees of freedom
-    problem = model.problem
+    problem = problem_in(model)
     phi = problem.layout.to_vector(CART | {"heavy_tails_inverse_nu": 1 / 3})
     rng = np.random.default_rng(0)
     states = problem.predict(phi)
@@ -106,7 +107,7 @@ def test_predictive_draws_have_the_tail(model) -> None:
 
 
 def test_the_mode_finds_the_tail_and_the_mass(model) -> None:
-    problem = model.problem
+    problem = problem_in(model)
     phi = problem.layout.to_vector(CART | {"heavy_tails_inverse_nu": 0.02, "mass": 9.0})
     mode = find_mode(problem, initial=phi)
     place = problem.layout.index("heavy_tails_inverse_nu", "cart")
@@ -126,6 +127,6 @@ def test_a_tail_of_ones_own() -> None:
     mine = Effect("fat", parameters, "tails of my own", "a test", Noise(lambda v: 2.0 * v["share"]))
     scene = cart_scene()
     history = simulated_history(scene, CART, seed=1, trajectories=2)
-    problem = physics_model(scene, history, [mine]).problem
+    problem = problem_in(physics_model(scene, history, [mine]))
     phi = problem.layout.to_vector(CART | {"fat_share": 0.1})
     assert np.ravel(problem.nu(phi)) == pytest.approx([5.0])

@@ -20,7 +20,7 @@ from pbrl_ppl.likelihood import (
     smoothed,
     with_measurements,
 )
-from pbrl_ppl.model import LogLikelihoodOp, build_model
+from pbrl_ppl.model import LogLikelihoodOp, build_model, problem_in
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.scene import Body, Scene, Shape
@@ -292,7 +292,7 @@ def test_what_never_moves_has_no_noise() -> None:
     history = simulated_history(PUCK, TRUTH, seed=1, trajectories=3, intervals=4, substeps=2)
     frame = history.to_dataframe().assign(x=0.0, vx=0.0)
     still = physics_model(PUCK, History.from_dataframe(frame, PUCK), likelihood="trajectories")
-    noise = still.problem.noise_variables
+    noise = problem_in(still).noise_variables
     assert noise["sigma"] == ("y", "theta", "vy", "omega")
     assert noise["unexplained_acceleration"] == ("vy", "omega")
 
@@ -338,5 +338,5 @@ def test_computed_velocities_are_left_out_of_the_model() -> None:
     computed = History.from_dataframe(frame, PUCK)
     problem = declared_problem(Physics.declare(PUCK), computed, kind="trajectories")
     assert problem.noise_variables["sigma"] == ("x", "y", "theta")
-    eq_11 = physics_model(PUCK, computed).problem
+    eq_11 = problem_in(physics_model(PUCK, computed))
     assert len(eq_11.noise_variables["sigma"]) == 6  # the paper's likelihood takes what it is given

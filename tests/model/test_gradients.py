@@ -9,6 +9,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from pbrl_ppl.errors import ConvergenceWarning
+from pbrl_ppl.model import problem_in
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.posterior.store import group
 from pbrl_ppl.sampling import fit, physics_model
@@ -41,7 +42,7 @@ def model():
 
 
 def truth(model) -> np.ndarray:
-    return model.problem.layout.to_vector(TRUTH)
+    return problem_in(model).layout.to_vector(TRUTH)
 
 
 def test_gradient_of_the_log_density_is_its_difference_quotient(model) -> None:
@@ -69,16 +70,16 @@ def test_find_map_is_the_mode_and_recovers_the_truth(model) -> None:
         # PyMC 6 announces that it will return something else one day
         warnings.simplefilter("ignore", FutureWarning)
         found = pm.find_MAP(progressbar=False)
-    mode = find_mode(model.problem, seed=1)
+    mode = find_mode(problem_in(model), seed=1)
     deviation = np.sqrt(np.diag(mode.covariance))
-    for block, at, sd in zip(model.problem.layout.blocks, mode.phi, deviation, strict=True):
+    for block, at, sd in zip(problem_in(model).layout.blocks, mode.phi, deviation, strict=True):
         assert found[block.name] == pytest.approx(at, abs=0.01 * sd), block.name
         assert abs(at - TRUTH[block.name]) < 4 * sd, block.name
 
 
 def test_least_squares_with_the_batched_jacobian(model) -> None:
     """To the truth itself on data without noise, from the prior's centre."""
-    problem = problem_of(noise=0.0).problem
+    problem = problem_in(problem_of(noise=0.0))
     segments = problem.segments
 
     def jacobian(phi: np.ndarray) -> np.ndarray:
@@ -98,7 +99,7 @@ def test_nuts_agrees_with_the_default_sampler() -> None:
     scene = Scene(time_step=0.1, substeps=4, bodies=(puck,))
     some = {"trajectories": 2, "intervals": 6, "noise": 0.01}
     model = physics_model(scene, simulated_history(scene, TWO, seed=8, **some), sigma="scalar")
-    mode = find_mode(model.problem, seed=1)
+    mode = find_mode(problem_in(model), seed=1)
     options = {"chains": 2, "cores": 1, "progress": False, "start": mode, "seed": 3}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)  # few draws, on purpose

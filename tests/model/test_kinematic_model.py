@@ -6,6 +6,7 @@ import pytest
 from pbrl_ppl.errors import GoalError, HistoryError
 from pbrl_ppl.history import History, from_segments
 from pbrl_ppl.likelihood import along_trajectories
+from pbrl_ppl.model import problem_in
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.physics import Transition
 from pbrl_ppl.planning import Action, ActionSet, Dynamics, Goal, plan
@@ -35,7 +36,7 @@ def hits() -> History:
 
 @pytest.fixture(scope="module")
 def problem(hits):
-    return physics_model(SCENE, hits, horizon=4).problem
+    return problem_in(physics_model(SCENE, hits, horizon=4))
 
 
 def test_only_the_block_is_observed(problem) -> None:
@@ -81,7 +82,7 @@ def test_a_horizon_that_reaches_no_measurement_is_refused(hits) -> None:
     ends = History.from_dataframe(rows, SCENE)
     with pytest.raises(HistoryError, match=r"no measured next state within 2 intervals.* longer"):
         physics_model(SCENE, ends, horizon=2)
-    assert physics_model(SCENE, ends, horizon=4).problem.observations.measured.sum() == 20 * 6
+    assert problem_in(physics_model(SCENE, ends, horizon=4)).observations.measured.sum() == 20 * 6
 
 
 def test_a_plan_leaves_it_where_it_is() -> None:

@@ -13,6 +13,7 @@ from pbrl_ppl.effects import catalogue
 from pbrl_ppl.errors import EffectError, HistoryError, SimulationError
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem, along_trajectories
+from pbrl_ppl.model import problem_in
 from pbrl_ppl.physics import Physics, Simulator
 from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, units_of
@@ -44,7 +45,7 @@ def expected_logp(model: pm.Model, point: Mapping[str, np.ndarray], priors) -> f
 
     ``priors`` gives scipy's distribution of each parameter.
     """
-    problem = model.problem
+    problem = problem_in(model)
     layout, segments = problem.layout, problem.segments
     simulator = Simulator(
         Physics(
@@ -125,7 +126,7 @@ def test_logp_is_the_sum_of_priors_and_eq_11(cart, body, options, priors) -> Non
     model = physics_model(cart_scene(**body), history, **options)
     assert {variable.name for variable in model.free_RVs} == {*priors, "sigma"}
     if "linear_drag_coefficient" in priors:  # in the recording's units: half-normal, force / speed
-        units = units_of(model.problem.scene, "cart")
+        units = units_of(problem_in(model).scene, "cart")
         scale = units.force / units.speed
         priors = priors | {"linear_drag_coefficient": stats.halfnorm(scale=scale)}
     point = model.initial_point()
@@ -166,7 +167,7 @@ def test_names_coordinates_and_dimensions(cart) -> None:
     for name in PRIORS:
         assert dims[name] == ("body",)
     assert [variable.name for variable in model.observed_RVs] == ["next_state"]
-    assert isinstance(model.problem, Problem)
+    assert isinstance(problem_in(model), Problem)
 
 
 def test_bodies_with_different_parameters_have_dimensions_of_their_own() -> None:
@@ -196,7 +197,7 @@ def test_prior_predictive(cart) -> None:
     assert predicted.sizes["transition"] == 12
     assert np.isfinite(predicted.values).all()
     # one draw: its noise about the engine's prediction, in units of its own sigma
-    problem = model.problem
+    problem = problem_in(model)
     values = {name: prior[name].values[0, 0] for name in PRIORS}
     mean = problem.predict(problem.layout.to_vector(values))
     z = (predicted.values[0, 0] - mean) / prior["sigma"].values[0, 0]
@@ -248,7 +249,7 @@ def test_a_missing_cell_takes_no_part(cart) -> None:
     whole = whole_model.compile_logp(vars=whole_model["next_state"], **at)(point)[0]
     part = model.compile_logp(vars=model["next_state"], **at)(point)[0]
     values = constrained(whole_model, point)
-    problem = whole_model.problem
+    problem = problem_in(whole_model)
     residual = problem.residual(problem.layout.to_vector(values))[5, 0, 0, 2]
     missing = stats.norm(0.0, values["sigma"][2]).logpdf(residual)
     np.testing.assert_allclose(np.delete(part, 5), np.delete(whole, 5))
@@ -260,7 +261,7 @@ def test_slopes_are_closed_forms() -> None:
     body = Body("puck", Shape.circle(0.2), known={"mass": 1.0, "r": 0.0})
     scene = Scene(time_step=0.1, bodies=(body,))
     history = simulated_history(scene, {"mu_c": 0.1}, seed=3, trajectories=1, intervals=4)
-    problem = physics_model(scene, history).problem
+    problem = problem_in(physics_model(scene, history))
     found = along_trajectories(problem, np.array([0.1])).trajectory_noise.slope
     expected = np.eye(6)
     expected[:3, 3:] = 0.1 * np.eye(3)
@@ -286,7 +287,7 @@ def test_slopes_follow_the_hinge() -> None:
     )
     for column in ("x", "y", "vx", "vy"):
         frame[column] = np.nan
-    problem = physics_model(scene, History.from_dataframe(frame, scene)).problem
+    problem = problem_in(physics_model(scene, History.from_dataframe(frame, scene)))
     assert problem.observations.names == ("theta", "omega")
     noise = np.array([1e-3, 1e-3, 1e-3])
     found = along_trajectories(problem, np.array([0.1]), noise).trajectory_noise.slope[0]

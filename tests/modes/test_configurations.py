@@ -16,6 +16,7 @@ from scipy.special import logsumexp
 from pbrl_ppl.errors import FitError, PosteriorError, RefitWarning, UninformedWarning
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem
+from pbrl_ppl.model import problem_in
 from pbrl_ppl.modes import Mode, find_mode, weigh
 from pbrl_ppl.modes.configurations import (
     Configuration,
@@ -162,7 +163,7 @@ def of_wheel(intervals: int) -> Problem:
     truth = Scene(time_step=0.1, normal_gravity=G, bodies=(cart,), substeps=10)
     history = simulated_history(truth, {}, seed=3, trajectories=1, intervals=intervals, noise=0.05)
     free = truth.replace(bodies=(replace(cart, known=wheel),))
-    return physics_model(free, history, sigma="scalar").problem
+    return problem_in(physics_model(free, history, sigma="scalar"))
 
 
 @pytest.mark.slow
@@ -218,7 +219,7 @@ def test_probabilities_are_those_of_weighted_prior_draws(joined) -> None:
     start[..., :3] = [each.pose for each in free.bodies]
     actions = np.random.default_rng(4).normal(0.0, (8.0, 8.0, 1.0), (3, 1, 2, 3))
     history = transitions(free.replace(joints=rod), start, actions, np.full(6, 0.5))
-    problem = physics_model(free, history, sigma="scalar").problem
+    problem = problem_in(physics_model(free, history, sigma="scalar"))
     rng = np.random.default_rng(1)
     n = 80_000
     index = rng.integers(0, 3, (n, 2))
@@ -259,7 +260,7 @@ def test_what_is_joined_is_found(joined, request) -> None:
     if joined == ("hinge", "a", "b"):
         found = request.getfixturevalue("found")
     else:
-        found = weigh(physics_model(*recorded(*joined)).problem, seed=1)
+        found = weigh(problem_in(physics_model(*recorded(*joined))), seed=1)
     best = max(found, key=lambda each: each.probability)
     assert best.configuration.pairs == (("joint1", joined[1:] or None),)
     assert best.probability > 0.999
@@ -282,7 +283,7 @@ def test_two_joints_are_found() -> None:
     )
     unknown = Joint("hinge", known=False, name="pin"), Joint("distance", known=False, name="rod")
     free = scene(*unknown, poses=LINED).subset("ab").replace(substeps=5)
-    problem = physics_model(free, history).problem
+    problem = problem_in(physics_model(free, history))
     best = max(weigh(problem, seed=1), key=lambda each: each.probability)
     assert dict(best.configuration.pairs) == {"pin": ("a", "b"), "rod": ("b", WORLD)}
     assert best.probability > 0.999
@@ -305,7 +306,7 @@ def test_bodies_that_lie_in_each_other_are_no_proof_of_a_joint() -> None:
         actions = rng.normal(0.0, (8.0, 8.0, 1.0), (20, 1, 4, 3))
         history = transitions(truth, start, actions, np.array(NOISE))
         free = scene(Joint(kind, known=False), poses=HINGED)
-        found = weigh(physics_model(free, history).problem, seed=1)
+        found = weigh(problem_in(physics_model(free, history)), seed=1)
         assert best_of(found).pairs[0][1] == pair
 
 
@@ -323,7 +324,7 @@ def model() -> pm.Model:
 @pytest.fixture(scope="module")
 def found(model) -> list[Weighed]:
     """Its configurations, weighed."""
-    return weigh(model.problem, seed=1)
+    return weigh(problem_in(model), seed=1)
 
 
 @pytest.fixture
@@ -341,8 +342,8 @@ def rod() -> pm.Model:
 def weighed(model: pm.Model) -> list[Weighed]:
     """Configurations of known weights."""
     found = []
-    for each in configurations(model.problem.scene):
-        own = each.problem(model.problem)
+    for each in configurations(problem_in(model).scene):
+        own = each.problem(problem_in(model))
         phi = np.array([prior.centre for prior in own.layout.priors])
         nothing = np.zeros((0, 0))
         mode = Mode(own, phi, np.full(6, 0.1), nothing, nothing, 0.0)
@@ -366,7 +367,7 @@ def numbered(mode: Mode, chains: int = 2, n: int = 5000):
 
 def mixed(rod: pm.Model, seed: int = 1):
     found = weighed(rod)
-    return mixture.mix(rod.problem, found, numbered, draws=5000, chains=2, seed=seed)
+    return mixture.mix(problem_in(rod), found, numbered, draws=5000, chains=2, seed=seed)
 
 
 def test_draws_are_shared_out_by_weight(rod) -> None:
@@ -398,7 +399,7 @@ def test_no_joint_is_any_equal_pair_with_anchors_from_the_prior(rod) -> None:
     none = named["i_a"][:, 0] == named["i_b"][:, 0]
     held = named["i_a"][none, 0]
     assert stats.chisquare(np.bincount(held, minlength=5)).pvalue > 1e-4
-    for block in rod.problem.layout.blocks[2:]:
+    for block in problem_in(rod).layout.blocks[2:]:
         x = named[block.name][none, 0]
         for i in (0, 4):
             prior = block.conditional[0][i]
@@ -428,7 +429,7 @@ def test_an_interrupt_with_others_to_come_ends_the_fit(rod) -> None:
         return numbered(mode, n=100)
 
     with pytest.raises(KeyboardInterrupt):
-        mixture.mix(rod.problem, weighed(rod), interrupted, draws=5000, chains=2, seed=1)
+        mixture.mix(problem_in(rod), weighed(rod), interrupted, draws=5000, chains=2, seed=1)
 
 
 @pytest.mark.parametrize(
@@ -475,17 +476,17 @@ def test_fit_finds_the_hinge(fitted) -> None:
 
 def test_an_anchor_s_bounds_are_its_body_s(model) -> None:
     """Pressed against a bound is what lies on the edge of the body that holds it."""
-    layout = model.problem.layout
+    layout = problem_in(model).layout
     phi = np.zeros((2, layout.size))
     phi[:, layout.index("i_b", "joint1")] = 1, 4  # b, which is 0.5 m wide, and the world
     lower, upper = (each[:, layout.index("b_y", "joint1")] for each in layout.supports(phi))
     assert (lower[0], upper[0]) == (-0.25, 0.25)
-    assert (lower[1], upper[1]) == model.problem.scene.extent[2:]
+    assert (lower[1], upper[1]) == problem_in(model).scene.extent[2:]
 
 
 def test_the_record_is_of_the_whole_model(model, fitted) -> None:
     """Likelihoods and predictions come from the problem that takes the indices."""
-    problem = model.problem
+    problem = problem_in(model)
     named = draws(fitted)
     phi = problem.layout.to_vectors({k: v.astype(float) for k, v in named.items()}, 200)
     expected = problem.log_density(problem.residual(phi[:5]), named["sigma"][:5])
@@ -585,7 +586,7 @@ def test_what_cannot_be_done_is_refused(model, fitted) -> None:
     with pytest.raises(FitError, match=r"resume was given and which bodies.*leave resume out"):
         fit(model, resume=fitted)
     with pytest.raises(FitError, match=r"a mode is one of continuous.*pbrl_ppl.fit finds them"):
-        find_mode(model.problem)
+        find_mode(problem_in(model))
 
 
 def test_constants_have_converged_and_disagreeing_chains_have_not() -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from pbrl_ppl.errors import PosteriorError, SceneError
+from pbrl_ppl.model import problem_in
 from pbrl_ppl.modes import Mode, Weighed
 from pbrl_ppl.modes.configurations import (
     configurations,
@@ -159,7 +160,7 @@ def test_draws_have_each_order_s_share() -> None:
     probability = {("a", "c"): 0.6, None: 0.4}
     found = []
     for each in configurations(hooked()):
-        own = each.problem(model.problem)
+        own = each.problem(problem_in(model))
         phi = np.array([0.1, 0.2, -0.1, -0.2])[: own.layout.size]
         mode = Mode(own, phi, np.full(6, 0.1), np.zeros((0, 0)), np.zeros((0, 0)), 0.0)
         weight = probability.get(each.pairs[0][1], 0.0)
@@ -172,7 +173,7 @@ def test_draws_have_each_order_s_share() -> None:
         rest = dict.fromkeys(("sample_stats", "observed_data", "constant_data"), posterior)
         return from_groups({"posterior": posterior, **rest}, {})
 
-    trace = mixture.mix(model.problem, found, constant, draws=5000, chains=2, seed=1)
+    trace = mixture.mix(problem_in(model), found, constant, draws=5000, chains=2, seed=1)
     named = {k: v[:, 0] for k, v in draws(trace).items()}
     joined = named["i_a"] != named["i_b"]
     assert joined.sum() == 6000

@@ -7,6 +7,7 @@ import pytest
 from pbrl_ppl.effects import attach, candidates
 from pbrl_ppl.errors import FitError, ParameterError
 from pbrl_ppl.history import History
+from pbrl_ppl.model import problem_in
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.physics import Physics, Simulator, build_layout
 from pbrl_ppl.sampling import physics_model
@@ -172,7 +173,7 @@ def test_anchors_are_bounded_by_the_body_that_holds_them() -> None:
 def test_a_mode_over_unknown_bodies_is_refused() -> None:
     free = scene(Joint("hinge", known=False))
     with pytest.raises(FitError, match="which bodies a joint of the scene joins is unknown"):
-        find_mode(physics_model(free, recorded(free)).problem)
+        find_mode(problem_in(physics_model(free, recorded(free))))
 
 
 def test_a_given_anchor_is_the_centre_of_its_prior() -> None:
@@ -201,7 +202,7 @@ def recorded(one: Scene, *, with_wall: bool = False, noise: float = 0.0) -> Hist
 def test_anchors_of_a_hinge_are_recovered() -> None:
     """From starts anywhere in the bodies; measured with 1 mm of noise."""
     held = scene(Joint("hinge", ("a", "b"), known=False))
-    problem = physics_model(held, recorded(held, noise=1e-3)).problem
+    problem = problem_in(physics_model(held, recorded(held, noise=1e-3)))
     found = find_mode(problem, seed=1).phi
     # 40 transitions give 0.3 mm by their positions alone; the engine's error adds as much
     np.testing.assert_allclose(found, reference_anchors(0, 1), atol=2e-3)
@@ -210,7 +211,7 @@ def test_anchors_of_a_hinge_are_recovered() -> None:
 def test_the_right_pair_is_the_most_probable() -> None:
     """Of all pairs with their best anchors, on data with noise."""
     free = scene(Joint("hinge", known=False))
-    problem = physics_model(free, recorded(free, noise=1e-3)).problem
+    problem = problem_in(physics_model(free, recorded(free, noise=1e-3)))
     anchors = reference_anchors(0, 1)
     cost = {}
     for i in range(5):

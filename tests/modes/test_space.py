@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 from pbrl_ppl.likelihood import Problem, along_trajectories, single_transitions
-from pbrl_ppl.model import build_model
+from pbrl_ppl.model import build_model, problem_in
 from pbrl_ppl.modes import Space, constrain, find_mode, trajectory_mode, unconstrain
 from pbrl_ppl.modes.space import uninformed
 from pbrl_ppl.parameters import Prior, prior_draws, symmetrised
@@ -152,7 +152,7 @@ def test_the_density_is_pymc_s(likelihood) -> None:
     sigma = "scalar" if likelihood == "scalar sigma" else "per_dimension"
     options = {"likelihood": "trajectories"} if whole else {"sigma": sigma}
     model = physics_model(scene, history, **options)
-    problem = model.problem
+    problem = problem_in(model)
     mode = find_mode(single_transitions(problem) if whole else problem, seed=1, rounds=1)
     if whole:
         mode = trajectory_mode(problem, mode.phi)

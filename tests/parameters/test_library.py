@@ -15,6 +15,7 @@ from scipy.special import logsumexp
 
 import pbrl_ppl as pp
 from pbrl_ppl.errors import FitError, ParameterError, PosteriorError, RefitWarning
+from pbrl_ppl.model import build_model, problem_in
 from pbrl_ppl.parameters import ParameterLibrary
 from pbrl_ppl.posterior import learned_library, library_probabilities, problem_of
 from pbrl_ppl.posterior import save_posterior as save
@@ -82,9 +83,9 @@ def test_ambiguous_sets_have_the_brute_force_probabilities(names) -> None:
         noise=(0.01, 0.01, 0.01, 0.04, 0.04, 0.1), substeps=4,
     )  # fmt: skip
     model = physics_model(scene, history, library=library, sigma="scalar")
-    assert len(model.problem.simulator.parts) == len(names)
+    assert len(problem_in(model).simulator.parts) == len(names)
     idata = quick(model)
-    expected = brute_force(model.problem, library)
+    expected = brute_force(problem_in(model), library)
     assert (expected > 0.005).sum() >= 2
     index = draws(idata)["library_index"]
     combination = index @ 3 ** np.arange(len(names))[::-1]
@@ -93,9 +94,8 @@ def test_ambiguous_sets_have_the_brute_force_probabilities(names) -> None:
     error = np.sqrt(expected * (1 - expected) / ess)
     assert (np.abs(found - expected) < 4 * error + 1e-3).all(), (found, expected)
     # one joined part gives the same answer as two
-    joined = physics_model(scene, history, library=library, sigma="scalar")
-    joined.problem = joined.problem.with_physics(parts=(tuple(names),))
-    again = draws(quick(joined))["library_index"] @ 3 ** np.arange(len(names))[::-1]
+    joined = problem_in(model).with_physics(parts=(tuple(names),))
+    again = draws(quick(build_model(joined)))["library_index"] @ 3 ** np.arange(len(names))[::-1]
     share = np.bincount(again, minlength=len(expected)) / len(again)
     assert (np.abs(share - expected) < 4 * error + 1e-3).all()
 

@@ -6,6 +6,7 @@ import pytest
 
 from pbrl_ppl.errors import SceneError, SimulationError
 from pbrl_ppl.history import History
+from pbrl_ppl.model import problem_in
 from pbrl_ppl.modes import Space
 from pbrl_ppl.parameters import inside
 from pbrl_ppl.physics import PartedSimulator, Physics, Simulator, build_layout, independent_parts
@@ -168,9 +169,9 @@ def test_each_parameter_is_in_one_block_of_the_sampler() -> None:
     scene = scene_of(Joint("hinge", ("a", "b"), (0.3, 0.0), (-0.3, 0.0), known=False))
     places = {name: [(0.6 if name == "b" else 2.0 * i, 0.0)] * 3 for i, name in enumerate(NAMES)}
     model = physics_model(scene, history_of(scene, places))
-    layout = model.problem.layout
+    layout = problem_in(model).layout
     phi = inside(layout.priors, np.array([prior.centre for prior in layout.priors]))
-    space = Space(model.problem, phi)
+    space = Space(problem_in(model), phi)
     blocks = [part.places for part in space.parts] + list(space.noise_blocks)
     assert len(blocks) == 4  # a and b, c, d, the noise
     assert sorted(np.concatenate(blocks)) == list(range(len(phi) + 6))

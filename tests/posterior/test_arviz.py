@@ -10,6 +10,7 @@ import pytest
 import xarray as xr
 from pymc.stats import compute_log_prior
 
+from pbrl_ppl.model import problem_in
 from pbrl_ppl.parameters import wheels
 from pbrl_ppl.posterior import by_number, from_groups, group, groups, loo_pit, predicted_rows
 from pbrl_ppl.posterior.completion import predictive_rows, prior_groups
@@ -129,7 +130,7 @@ def test_prior_is_pymc_s(idata) -> None:
 def test_prior_of_a_wheel_is_described_like_the_posterior() -> None:
     """Its angle is within an eighth of a turn of the posterior's, where every one is equal."""
     scene = cart_scene(known={"r": 0.2, "mu_c": 0.3})
-    problem = physics_model(scene, simulated_history(scene, CART, seed=1)).problem
+    problem = problem_in(physics_model(scene, simulated_history(scene, CART, seed=1)))
     draws = 400
     phi = np.tile(problem.layout.to_vector(CART), (draws, 1))
     sigma = np.full((draws, 6), 0.01)
@@ -210,7 +211,7 @@ def test_predictions_belong_to_draws(idata) -> None:
     np.testing.assert_array_equal(
         posterior["sigma"].sel(draw=predictive["draw"]).values.reshape(200, -1), sigma[rows]
     )
-    problem = physics_model(SCENE, history(1)).problem
+    problem = problem_in(physics_model(SCENE, history(1)))
     phi = posterior["mass"].values.reshape(1000, 1)[rows]
     predicted = predictive["next_state"].values.reshape(200, *problem.measured.shape)
     z = (predicted - problem.predict(phi)) / sigma[rows][:, None, None, None]
@@ -284,7 +285,7 @@ def test_loo_pit_of_angles_and_gaps(idata) -> None:
 def test_prior_of_one_sigma_for_all() -> None:
     """As the paper has it: a single number, whose median is the geometric mean."""
     model = physics_model(SCENE, history(1), sigma="scalar")
-    problem = model.problem
+    problem = problem_in(model)
     phi, sigma = np.full((300, 1), 2.0), np.full((300, 6), 0.05)
     named = {"mass": phi, "sigma": sigma[:, 0]}
     dims = {"mass": ("chain", "draw", "body"), "sigma": ("chain", "draw")}

@@ -9,6 +9,7 @@ import pytest
 import pbrl_ppl as pp
 from pbrl_ppl.effects import Effect, EffectParameter
 from pbrl_ppl.errors import ConvergenceWarning
+from pbrl_ppl.model import problem_in
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.posterior import draws, identify, uninformed
@@ -54,7 +55,7 @@ def history():
 
 
 def mode_of(history, effects=(), **known):
-    return find_mode(physics_model(cart_scene(known=known), history, effects).problem, seed=1)
+    return find_mode(problem_in(physics_model(cart_scene(known=known), history, effects)), seed=1)
 
 
 def quick_fit(model, **options):

@@ -9,6 +9,7 @@ import pytest
 import pbrl_ppl as pp
 from pbrl_ppl.errors import LinearisationWarning
 from pbrl_ppl.likelihood import declared_problem
+from pbrl_ppl.model import problem_in
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.posterior import from_groups, groups, parameter_draws
 from pbrl_ppl.posterior.completion import MOST, complete, linearisation, linearisation_errors
@@ -22,7 +23,7 @@ def test_linear_motion_has_no_error() -> None:
     puck = Body("puck", Shape.circle(0.2), known={"r": 0.2, "mu_c": 0.3})
     scene = Scene(time_step=0.1, substeps=2, bodies=(puck,))
     history = simulated_history(scene, {"mass": 2.0}, seed=1, trajectories=3, intervals=4)
-    problem = pp.physics_model(scene, history, likelihood="trajectories").problem
+    problem = problem_in(pp.physics_model(scene, history, likelihood="trajectories"))
     rng = np.random.default_rng(1)
     sigma = problem.trajectory_noise.sigma * np.exp(0.3 * rng.normal(size=(5, 9)))
     errors = linearisation_errors(problem, rng.uniform(1.9, 2.1, (5, 1)), sigma)
@@ -44,7 +45,7 @@ def test_a_fit_says_where_it_does_not_hold() -> None:
     assert found["draws"] == 16 and found["sd"] <= MOST
     assert found["sd"] <= found["largest"] and 0 <= found["trajectory"] < 6
     centre = declared_problem(Physics.declare(scene), history, kind="trajectories")
-    phi, sigma = parameter_draws(model.problem, idata)
+    phi, sigma = parameter_draws(problem_in(model), idata)
     assert linearisation(centre, phi, sigma).sd > 10 * MOST
     data = groups(idata)
     data["constant_data"] = data["constant_data"][["start", "actions"]]

@@ -8,6 +8,7 @@ import pytest
 
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.history import History
+from pbrl_ppl.model import problem_in
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.planning import Dynamics, plan
 from pbrl_ppl.posterior import load_posterior, problem_of, save_posterior
@@ -57,17 +58,17 @@ def history() -> History:
 def idata(history):
     declared = scene(*STAGES)
     model = physics_model(declared, history)
-    start = model.problem.layout.to_vector(TRUTH)
+    start = problem_in(model).layout.to_vector(TRUTH)
     with pytest.warns(UserWarning):  # so few draws have not converged
         return fit(model, seed=1, draws=60, tune=20, chains=2, progress=False,
-                   start=find_mode(model.problem, initial=start, rounds=1))  # fmt: skip
+                   start=find_mode(problem_in(model), initial=start, rounds=1))  # fmt: skip
 
 
 def test_a_loaded_file_predicts_as_the_fit(history, idata, tmp_path) -> None:
     """The command before, the trajectory and the clock are in it."""
     save_posterior(idata, tmp_path / "puck.nc")
     loaded = problem_of(load_posterior(tmp_path / "puck.nc"))
-    fitted = physics_model(scene(*STAGES), history).problem
+    fitted = problem_in(physics_model(scene(*STAGES), history))
     phi = fitted.layout.to_vector(TRUTH)
     np.testing.assert_array_equal(loaded.inputs, fitted.inputs)
     np.testing.assert_array_equal(loaded.predict(phi), fitted.predict(phi))
@@ -137,7 +138,7 @@ def test_a_plan_from_the_file_knows_the_load_and_the_delay(idata, tmp_path) -> N
 def test_a_declared_effect_is_recovered_from_a_wrong_start(name, known, wrong) -> None:
     """The truth within four Laplace sd of each parameter: a false alarm in 0.03 % of recordings."""
     history = noisy(recorded((name,), trajectories=40, intervals=5, noise=0.0))
-    problem = physics_model(scene(name), history, horizon=5).problem
+    problem = problem_in(physics_model(scene(name), history, horizon=5))
     start = {k: v for k, v in TRUTH.items() if k == "mass" or k.startswith(name)}
     start |= {"mass": 3.0} | {f"{name}_{key}": value for key, value in wrong.items()}
     mode = find_mode(problem, initial=problem.layout.to_vector(start))

@@ -159,7 +159,8 @@ def test_motions_start_from_velocities_fitted_to_the_first_rows() -> None:
     history = History.from_dataframe(coarse.drop(columns=["vx", "vy", "omega"]), DISC)
     model = physics_model(DISC, history, (), likelihood="trajectories")
     fitted = fit(model, method="laplace", seed=1, draws=20, progress=False)
-    mode = trajectory_mode(model.problem, *Fit(model.problem, fitted).best)
+    found = Fit.of(fitted)
+    mode = trajectory_mode(found.problem, *found.best)
     findings = replace(unexplained(), innovations=(mode, mode), held_out=history)
     truth = states.groupby("trajectory")["x"].last().to_numpy()
     off = [

@@ -18,7 +18,7 @@ from pbrl_ppl.cli import main
 from pbrl_ppl.errors import FitError, OutputError
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem, TransitionLikelihood, declared_problem
-from pbrl_ppl.model import build_model
+from pbrl_ppl.model import build_model, problem_in
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.reporting import plot_calibration, png
 from pbrl_ppl.sampling import calibrate, calibration, physics_model, replication
@@ -159,7 +159,7 @@ def test_holm_and_bins() -> None:
 
 
 def design_of(history: History, scene: Scene, **options: Any) -> Problem:
-    problem: Problem = physics_model(scene, history, **options).problem
+    problem: Problem = problem_in(physics_model(scene, history, **options))
     return problem
 
 

@@ -1,5 +1,6 @@
 """Models of whole trajectories: linearised at their mode, with the data, and gone on with."""
 
+import copy
 import warnings
 
 import arviz as az
@@ -9,11 +10,19 @@ import pytest
 
 import pbrl_ppl as pp
 from pbrl_ppl.cli import main
-from pbrl_ppl.errors import ConvergenceWarning, PosteriorError
+from pbrl_ppl.errors import ConvergenceWarning, FitError, PosteriorError
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import declared_problem, simulated_trajectories, smoothed
+from pbrl_ppl.model import problem_in
 from pbrl_ppl.physics import Physics
-from pbrl_ppl.posterior import convergence, from_groups, group, groups, parameter_draws
+from pbrl_ppl.posterior import (
+    convergence,
+    from_groups,
+    group,
+    groups,
+    parameter_draws,
+    stored_mode,
+)
 from pbrl_ppl.posterior.store import load_posterior, save_posterior, scalars
 from pbrl_ppl.scene import Body, Scene, Shape
 from pbrl_ppl.state import STATE
@@ -48,13 +57,19 @@ def history() -> History:
 
 
 @pytest.fixture(scope="module")
-def model(history) -> pm.Model:
+def declared(history) -> pm.Model:
     return pp.physics_model(SCENE, history, likelihood="trajectories")
 
 
 @pytest.fixture(scope="module")
-def half(model):
-    return quiet(pp.fit, model, seed=1, draws=400, chains=4, **FIT)
+def half(declared):
+    return quiet(pp.fit, declared, seed=1, draws=400, chains=4, **FIT)
+
+
+@pytest.fixture(scope="module")
+def model(history, half) -> pm.Model:
+    """The model as it was linearised in the fit."""
+    return pp.physics_model(SCENE, history, likelihood=half)
 
 
 def quiet(function, *arguments, **options):
@@ -70,64 +85,71 @@ def likelihood(problem, phi, sigma) -> float:
 
 def at(model, phi, sigma) -> float:
     """The log-likelihood that PyMC's model has there."""
-    named = model.problem.named(phi, sigma)
+    named = problem_in(model).named(phi, sigma)
     return model.compile_logp(vars=model.observed_RVs)(
         {model.rvs_to_values[v].name: np.log(named[v.name]) for v in model.free_RVs}
     )
 
 
-def test_the_model_is_linearised_at_its_mode() -> None:
+def test_a_fit_linearises_at_its_mode() -> None:
     """A cart, whose wheel slips or rolls: linearised elsewhere its mode is improbable."""
     scene = cart_scene(known={"r": 0.2, "mu_c": 0.3})
     history = simulated_history(scene, CART, seed=1, trajectories=6)
-    model = pp.physics_model(scene, history, likelihood="trajectories")
-    mode = model.mode
-    found = float(mode.problem.log_density(mode.problem.residual(mode.phi), mode.sigma).sum())
+    centre = pp.physics_model(scene, history, likelihood="trajectories")
+    fitted = quiet(pp.fit, centre, method="map", seed=1, progress=False)
+    model = pp.physics_model(scene, history, likelihood=fitted)
+    problem, mode = problem_in(model), stored_mode(problem_in(model), fitted)
+    found = likelihood(problem, mode.phi, mode.sigma)
     point = model.initial_point()  # in the sampler's space
     assert model.compile_logp(vars=model.observed_RVs)(point) == pytest.approx(found)
-    again = smoothed(mode.problem, mode.phi, mode.sigma)
+    stored = float(group(fitted, "log_likelihood")["next_state"].sum())
+    assert stored == pytest.approx(found)
+    again = smoothed(problem, mode.phi, mode.sigma)
     assert likelihood(again, mode.phi, mode.sigma) == pytest.approx(found, abs=0.5)
-    centre = declared_problem(Physics.declare(scene), history, kind="trajectories")
-    assert likelihood(centre, mode.phi, mode.sigma) < found - 100
+    assert likelihood(problem_in(centre), mode.phi, mode.sigma) < found - 100
 
 
-def test_the_same_seed_gives_the_same_model(model, history) -> None:
-    again = pp.physics_model(SCENE, history, likelihood="trajectories", seed=0)
-    np.testing.assert_array_equal(again.mode.phi, model.mode.phi)
-    np.testing.assert_array_equal(
-        again.problem.trajectory_noise.slope, model.problem.trajectory_noise.slope
+def test_the_same_seed_gives_the_same_mode(declared, history) -> None:
+    first, second = (
+        pp.physics_model(SCENE, history, likelihood=pp.fit(declared, method="map", progress=False))
+        for _ in range(2)
     )
+    noise, again = (problem_in(each).trajectory_noise for each in (first, second))
+    np.testing.assert_array_equal(noise.slope, again.slope)
 
 
-def test_fit_does_not_search_again(model, monkeypatch) -> None:
-    monkeypatch.setattr("pbrl_ppl.sampling.fitting.find_trajectory_mode", None)
-    idata = pp.fit(model, method="map", progress=False)
-    phi, sigma = parameter_draws(model.problem, idata)
-    np.testing.assert_allclose(phi[0], model.mode.phi)
-    stored = float(group(idata, "log_likelihood")["next_state"].sum())
-    assert stored == pytest.approx(at(model, phi[0], sigma[0]))
+def test_declaring_searches_for_no_mode(half, history, monkeypatch) -> None:
+    monkeypatch.setattr("pbrl_ppl.modes.search.find_mode", None)
+    pp.physics_model(SCENE, history, likelihood="trajectories")
+    model = pp.physics_model(SCENE, history, likelihood=half)
+    phi, sigma = (draws[7] for draws in parameter_draws(problem_in(model), half))
+    stored = group(half, "log_likelihood")["next_state"].sum("transition").to_numpy().ravel()[7]
+    assert at(model, phi, sigma) == pytest.approx(stored, abs=1e-6)
 
 
-def test_around_a_mode_or_a_posterior(model, half, history, monkeypatch) -> None:
-    """Neither is a search."""
-    monkeypatch.setattr("pbrl_ppl.sampling.declaration.find_trajectory_mode", None)
-    near = pp.physics_model(SCENE, history, likelihood="trajectories", around=model.mode)
-    sd = np.sqrt(np.diag(model.mode.covariance))
-    assert (np.abs(near.mode.phi - model.mode.phi) < sd).all()
-    same = pp.physics_model(SCENE, history, likelihood="trajectories", around=half)
-    phi, sigma = (draws[7] for draws in parameter_draws(same.problem, half))
-    assert at(same, phi, sigma) == pytest.approx(at(model, phi, sigma), abs=1e-6)
-
-
-def test_around_what_is_of_something_else(half, history) -> None:
-    with pytest.raises(ValueError, match="around is given with likelihood 'transitions'"):
-        pp.physics_model(SCENE, history, around=half)
+def test_posteriors_of_something_else_are_refused(half, history) -> None:
     other = history.select(range(9))
     with pytest.raises(PosteriorError, match="50 transitions that are not the model's 45"):
-        pp.physics_model(SCENE, other, likelihood="trajectories", around=half)
+        pp.physics_model(SCENE, other, likelihood=half)
     single = pp.physics_model(SCENE, history)
     with pytest.raises(PosteriorError, match="of trajectories, the model's of transitions"):
         pp.fit(single, resume=half)
+
+
+def test_changed_models_are_refused(history) -> None:
+    """A copy is the same model; with a variable fixed or a factor added it is not."""
+    model = pp.physics_model(SCENE, history)
+    assert problem_in(copy.copy(model)) is problem_in(model)
+    with pytest.raises(FitError, match="changed after physics_model"):
+        pp.fit(pm.do(model, {"mass": np.array([2.0])}))
+    with model:
+        pm.Potential("more", -model["mass"])
+    with pytest.raises(FitError, match="changed after physics_model"):
+        pp.fit(model)
+    with pm.Model() as other:
+        pm.Normal("next_state", observed=1.0)
+    with pytest.raises(FitError, match="not made by physics_model"):
+        pp.fit(other)
 
 
 @pytest.mark.filterwarnings("ignore:Numba will use object mode")  # PyMC 6, for random draws
@@ -135,14 +157,14 @@ def test_pymc_s_predictions_are_of_the_filter(model, half) -> None:
     """Of one draw, repeated: 300 means of 2000 within 5 standard errors, false alarm 2e-4."""
     one = groups(half)["posterior"].isel(chain=[0], draw=[5])
     phi, sigma = (
-        each[0] for each in parameter_draws(model.problem, from_groups({"posterior": one}, {}))
+        each[0] for each in parameter_draws(problem_in(model), from_groups({"posterior": one}, {}))
     )
     many = one.isel(draw=[0] * 2000).assign_coords(draw=np.arange(2000))
     with model:
         drawn = pm.sample_posterior_predictive(many, random_seed=1, progressbar=False)
         prior = pm.sample_prior_predictive(draws=3, random_seed=1)
     drawn = group(drawn, "posterior_predictive")["next_state"].to_numpy()[0]
-    noise, problem = model.problem.trajectory_noise, model.problem
+    noise, problem = problem_in(model).trajectory_noise, problem_in(model)
     mean, covariance = noise.predictive(noise.coordinates.of_residual(problem.residual(phi)), sigma)
     off = (drawn - problem.observations.values)[:, :, 0, 0]
     sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
@@ -193,15 +215,17 @@ def test_a_fit_in_two_halves_is_one(model, half, history, tmp_path) -> None:
     """
     save_posterior(half, tmp_path / "half.nc")
     stored = load_posterior(tmp_path / "half.nc")
-    new = pp.physics_model(SCENE, history, likelihood="trajectories", seed=5)
+    new = pp.physics_model(SCENE, history, likelihood="trajectories")
     gone_on = quiet(pp.fit, new, seed=2, draws=400, resume=stored, **FIT)
     # all draws, old and new, are of one likelihood: that of the first half
-    phi, sigma = parameter_draws(model.problem, gone_on)
+    phi, sigma = parameter_draws(problem_in(model), gone_on)
     of_all = group(gone_on, "log_likelihood")["next_state"].sum("transition").to_numpy()
     of_half = group(half, "log_likelihood")["next_state"].sum("transition").to_numpy()
     np.testing.assert_allclose(of_all[:, :400], of_half, atol=1e-6)
     for i in (0, 399, 400, 799):
-        assert of_all[0, i] == pytest.approx(likelihood(model.problem, phi[i], sigma[i]), abs=1e-6)
+        assert of_all[0, i] == pytest.approx(
+            likelihood(problem_in(model), phi[i], sigma[i]), abs=1e-6
+        )
     assert max(convergence(gone_on)[0].values()) <= 1.05
     second = {"posterior": group(gone_on, "posterior").isel(draw=slice(400, None))}
     found = errors(half, from_groups(second, {}))

@@ -8,6 +8,7 @@ from scipy.special import logsumexp
 
 from pbrl_ppl.errors import ConvergenceWarning
 from pbrl_ppl.likelihood import log_prior
+from pbrl_ppl.model import problem_in
 from pbrl_ppl.posterior import convergence, draws
 from pbrl_ppl.sampling import fit, physics_model
 from tests.helpers.carts import CART, cart_scene
@@ -51,7 +52,7 @@ def test_the_posterior_is_the_declared_one(prior, turns) -> None:
         scene, CART, seed=3, trajectories=2, intervals=3, noise=np.full(6, 0.3), substeps=4
     )
     model = physics_model(scene, history, sigma="scalar")
-    problem = model.problem
+    problem = problem_in(model)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
         idata = fit(model, seed=4, draws=1000, tune=500, chains=2, cores=1, progress=False)

@@ -18,6 +18,7 @@ from pbrl_ppl.errors import (
     PosteriorError,
     UninformedWarning,
 )
+from pbrl_ppl.model import problem_in
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.posterior import (
     convergence,
@@ -58,7 +59,7 @@ def model() -> pm.Model:
 
 @pytest.fixture(scope="module")
 def mode(model):
-    return find_mode(model.problem, seed=1)
+    return find_mode(problem_in(model), seed=1)
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +97,7 @@ def test_groups_are_complete(model, fitted) -> None:
     assert set(data["constant_data"].data_vars) == {"start", "actions"}
     assert dict(data["sample_stats"]["log_weight"].sizes) == {"chain": 2, "draw": 200}
     np.testing.assert_array_equal(
-        data["observed_data"]["next_state"].values, model.problem.segments.observed
+        data["observed_data"]["next_state"].values, problem_in(model).segments.observed
     )
 
 
@@ -108,10 +109,10 @@ def test_units(fitted) -> None:
 
 def test_origin(model, fitted) -> None:
     attrs = fitted.attrs
-    assert scene_of(fitted) == model.problem.scene
+    assert scene_of(fitted) == problem_in(model).scene
     assert json.loads(attrs["effects"]) == []
     assert (attrs["seed"], attrs["horizon"], attrs["substeps"]) == (1, 1, 10)
-    assert attrs["data_sha256"] == model.problem.data.history.data_sha256
+    assert attrs["data_sha256"] == problem_in(model).data.history.data_sha256
     versions = json.loads(attrs["versions"])
     assert versions["pymc"] == pm.__version__
     assert versions["numpy"] == np.__version__
@@ -152,7 +153,7 @@ def test_truth_is_inside(model, fitted) -> None:
     # Eq. 11's sigma is the residual's, to 10 %; it holds the initial state's noise beside the
     # sensor's, and so lies between that and thrice it
     sigma = draws(fitted)["sigma"].mean(axis=0)
-    residual = model.problem.residual(model.problem.layout.to_vector(CART))
+    residual = problem_in(model).residual(problem_in(model).layout.to_vector(CART))
     np.testing.assert_allclose(sigma, np.sqrt((residual**2).mean(axis=(0, 1, 2))), rtol=0.1)
     assert (sigma > np.array(NOISE)).all()
     assert (sigma < 3.0 * np.array(NOISE)).all()
@@ -223,15 +224,15 @@ def test_file_round_trip(fitted, tmp_path) -> None:
 
 def test_model_goes_to_another_process(model) -> None:
     """The problem, with its engine, survives pickling."""
-    copy = pickle.loads(pickle.dumps(model.problem))
-    phi = model.problem.layout.to_vector(CART)
-    np.testing.assert_array_equal(copy.predict(phi), model.problem.predict(phi))
+    copy = pickle.loads(pickle.dumps(problem_in(model)))
+    phi = problem_in(model).layout.to_vector(CART)
+    np.testing.assert_array_equal(copy.predict(phi), problem_in(model).predict(phi))
 
 
 def test_effects_and_scalar_sigma_and_horizon(model) -> None:
     """An added effect is in the scene that is stored; the options are among the attributes."""
     drag = next(effect for effect in catalogue if effect.name == "linear_drag")
-    problem = model.problem
+    problem = problem_in(model)
     scene = cart_scene(known={name: CART[name] for name in CART if name != "mass"})
     small = physics_model(
         scene, problem.data.history, [drag], sigma="scalar", horizon=2, substeps=8
@@ -373,7 +374,7 @@ def test_an_interrupted_fit_goes_on(model, interrupted) -> None:
 
 def test_a_start_of_another_model_is_refused(model, interrupted) -> None:
     scene = cart_scene()  # r and mu_c are unknown here
-    other = physics_model(scene, model.problem.data.history)
+    other = physics_model(scene, problem_in(model).data.history)
     with pytest.raises(PosteriorError, match="has no r, mu_c"):
         fit(other, resume=interrupted, progress=False)
 
@@ -399,7 +400,7 @@ def test_chains_in_equal_descriptions_of_a_wheel_agree(model, fitted) -> None:
     posterior["mu_y"].values[1] = mu_x
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
-        again = complete(model.problem, from_groups(turned, {}), seed=1, method="metropolis")
+        again = complete(problem_in(model), from_groups(turned, {}), seed=1, method="metropolis")
     for name in PARAMETERS:
         np.testing.assert_allclose(draws(again)[name], draws(fitted)[name], atol=1e-12)
     np.testing.assert_allclose(
@@ -418,7 +419,7 @@ def test_a_parameter_at_its_bound_is_named(model) -> None:
         pytest.warns(BoundWarning, match=r"w_x\[cart\] is at its bound.*lacks may press"),
     ):
         idata = fit(
-            physics_model(scene.replace(bodies=(small,)), model.problem.data.history),
+            physics_model(scene.replace(bodies=(small,)), problem_in(model).data.history),
             seed=1,
             **SHORT,
         )
@@ -434,7 +435,7 @@ def test_a_parameter_that_the_data_say_nothing_about_is_named(model) -> None:
         warnings.catch_warnings(),
     ):
         warnings.simplefilter("ignore", ConvergenceWarning)
-        fit(physics_model(scene, model.problem.data.history), seed=1, **SHORT)
+        fit(physics_model(scene, problem_in(model).data.history), seed=1, **SHORT)
 
 
 def test_unknown_method(model) -> None:
@@ -461,7 +462,7 @@ def puck():
 @pytest.mark.parametrize("method", [name for name in METHODS if name not in ("map", "nuts")])
 def test_methods_agree(puck, method) -> None:
     """Each sampler's mean mass is the mode, within 4 Monte Carlo errors and 0.3 sd for skewness."""
-    mode = find_mode(puck.problem, seed=1)
+    mode = find_mode(problem_in(puck), seed=1)
     deviation = float(np.sqrt(mode.covariance[0, 0]))
     options = {"draws": 300, "chains": 2, "cores": 1, "progress": False}
     if method in ("paper", "demetropolisz"):

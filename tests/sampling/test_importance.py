@@ -18,6 +18,7 @@ from scipy.stats import ks_2samp, kstest, kstwobign, norm
 from pbrl_ppl.background import background
 from pbrl_ppl.effects import Effect, EffectParameter
 from pbrl_ppl.errors import ConvergenceWarning, RefitWarning
+from pbrl_ppl.model import problem_in
 from pbrl_ppl.modes import Space, constrain, find_mode, trajectory_mode, unconstrain
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.posterior import (
@@ -82,7 +83,7 @@ def test_proposals_along_trajectories_are_annealed(monkeypatch) -> None:
     monkeypatch.setattr("pbrl_ppl.sampling.importance.adaptive_importance", no_weights)
     scene = pucks()
     model = physics_model(scene, pushed(scene, trajectories=3, intervals=8), substeps=4)
-    mode = trajectory_mode(model.problem, model.problem.layout.to_vector(TRUTH))
+    mode = trajectory_mode(problem_in(model), problem_in(model).layout.to_vector(TRUTH))
     pool = draw_proposals(Reference.about(Space.of(mode), mode), 400, 1)
     assert len(np.unique(pool.q, axis=0)) > 200
     assert np.isfinite(pool.log_z)
@@ -96,7 +97,7 @@ def model():
 
 @pytest.fixture(scope="module")
 def mode(model):
-    return find_mode(model.problem, seed=1)
+    return find_mode(problem_in(model), seed=1)
 
 
 @pytest.fixture(scope="module")
@@ -136,7 +137,7 @@ def grid_moments(problem, mode) -> tuple[np.ndarray, np.ndarray, float]:
 def simple():
     """One parameter and one sigma: the mode, and the moments and log-evidence by a grid."""
     scene = pucks(known=FREE | {"mass": 2.0})
-    problem = physics_model(scene, pushed(scene), sigma="scalar").problem
+    problem = problem_in(physics_model(scene, pushed(scene), sigma="scalar"))
     mode = find_mode(problem, seed=1)
     return mode, *grid_moments(problem, mode)
 
@@ -209,7 +210,7 @@ def test_a_cart_s_posterior_is_that_of_chains() -> None:
     scene = cart_scene(known=known).replace(substeps=4)
     history = simulated_history(scene, CART, seed=7, trajectories=4, intervals=10, substeps=4)
     model = physics_model(scene, history)
-    start = find_mode(model.problem, seed=1)
+    start = find_mode(problem_in(model), seed=1)
     quick = QUICK | {"start": start, "chains": 2}
     weighted = quiet(fit, model, seed=1, **(quick | {"draws": 1000}))
     chains = quiet(fit, model, seed=2, method="metropolis", tune=300, **(quick | {"draws": 700}))
@@ -226,8 +227,8 @@ def test_independent_parts_share_the_noise_alone() -> None:
     """Two pucks with drag and masses, as by chains: 10 numbers, false alarm 2e-3."""
     scene = pucks("ab")
     model = physics_model(scene, pushed(scene, trajectories=20))
-    assert len(model.problem.simulator.parts) == 2
-    start = find_mode(model.problem, seed=1)
+    assert len(problem_in(model).simulator.parts) == 2
+    start = find_mode(problem_in(model), seed=1)
     weighted = quiet(fit, model, seed=1, start=start, **QUICK)
     assert weighted.attrs["method"] == "importance"
     assert weighted.attrs[PARETO_K] < MAX_PARETO_K
@@ -264,7 +265,7 @@ def twofold():
         substeps=4,
     )  # fmt: skip
     model = physics_model(scene, history, [BREEZE])
-    one, other = (find_mode(model.problem, initial=np.array([x])) for x in (1.0, -1.0))
+    one, other = (find_mode(problem_in(model), initial=np.array([x])) for x in (1.0, -1.0))
     return model, replace(one, others=(other,))
 
 
@@ -343,7 +344,7 @@ def test_a_wheel_half_a_turn_on_is_another_mode() -> None:
     scene = scene.replace(substeps=4)
     history = simulated_history(scene, CART, seed=7, trajectories=3, intervals=8, substeps=4)
     model = physics_model(scene, history)
-    mode = find_mode(model.problem, seed=1)
+    mode = find_mode(problem_in(model), seed=1)
     (other,) = mode.others
     assert abs(np.cos(mode.phi[0] - other.phi[0]) + 1) < 1e-3
     idata = quiet(fit, model, seed=1, start=mode, **QUICK)
@@ -366,14 +367,14 @@ def test_an_uninformed_parameter_s_draws_follow_the_prior() -> None:
     """
     scene = pucks(known={"mu_c": 0.3, "mass": 2.0}, walls=(Wall((50.0, -1.0), (50.0, 1.0)),))
     model = physics_model(scene, pushed(scene))
-    start = find_mode(model.problem, seed=1)
-    labels = list(model.problem.layout.labels)
+    start = find_mode(problem_in(model), seed=1)
+    labels = list(problem_in(model).layout.labels)
     place = labels.index("r[a]")
     assert list(np.flatnonzero(Space.of(start).uninformed)) == [place]
     with pytest.warns(UserWarning, match=r"nothing about r\[a\]"):
         idata = fit(model, seed=5, start=start, **QUICK)
     assert idata.attrs["method"] == "importance"
-    prior = model.problem.layout.priors[place]
+    prior = problem_in(model).layout.priors[place]
     assert prior.family == "log_normal"
     found = kstest(np.log(draws(idata)["r"].ravel()), norm(prior.mu, prior.sigma).cdf).statistic
     assert found * np.sqrt(idata.attrs[SIZE]) < 1.95
@@ -484,11 +485,9 @@ def test_diagnostics(model, mode, fitted, tmp_path) -> None:
     assert np.isfinite(attrs["log_evidence"])
     assert attrs["min_ess"] <= attrs[SIZE] <= 1000
     assert "log_likelihood" not in attrs
-    theirs = model.problem.log_density(
-        model.problem.residual(model.problem.layout.to_vectors(draws(fitted), 1000)),
-        draws(fitted)["sigma"],
-        model.problem.layout.to_vectors(draws(fitted), 1000),
-    )
+    problem = problem_in(model)
+    phi = problem.layout.to_vectors(draws(fitted), 1000)
+    theirs = problem.log_density(problem.residual(phi), draws(fitted)["sigma"], phi)
     ours = group(fitted, "log_likelihood")["next_state"].values.reshape(1000, -1)
     np.testing.assert_allclose(ours, theirs)
     save_posterior(fitted, tmp_path / "puck.nc")

@@ -5,6 +5,7 @@ import pymc as pm
 import pytest
 
 from pbrl_ppl.errors import ConvergenceWarning
+from pbrl_ppl.model import problem_in
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.posterior import group
 from pbrl_ppl.sampling import fit, physics_model
@@ -29,7 +30,7 @@ def puck():
 
 @pytest.fixture(scope="module")
 def mode(puck):
-    return find_mode(puck.problem, seed=1)
+    return find_mode(problem_in(puck), seed=1)
 
 
 @pytest.mark.parametrize(

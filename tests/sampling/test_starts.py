@@ -5,6 +5,7 @@ import pytest
 
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import Problem
+from pbrl_ppl.model import problem_in
 from pbrl_ppl.modes import Space, find_mode
 from pbrl_ppl.parameters import ParameterLibrary
 from pbrl_ppl.physics import Physics
@@ -47,7 +48,7 @@ def test_walkers_go_on_at_their_last_draws(mode) -> None:
     history = mode.problem.data.history
     model = physics_model(mode.problem.scene, history)
     idata = fit(model, start=mode, method="laplace", draws=12, chains=2, progress=False)
-    problem = model.problem
+    problem = problem_in(model)
     phi, sigma = (each.reshape(2, 12, -1) for each in parameter_draws(problem, idata))
     for walkers, last in ((1, [11]), (3, [3, 7, 11])):
         found = last_draws(problem, idata, walkers)
@@ -61,9 +62,9 @@ def test_chains_over_a_library_begin_anywhere_in_the_prior(mode) -> None:
         "light": 1, "heavy": 4,
     })  # fmt: skip
     model = physics_model(cart_scene(), mode.problem.data.history, library=library)
-    starts = prior_starts(model.problem, np.random.default_rng(2), 400)
+    starts = prior_starts(problem_in(model), np.random.default_rng(2), 400)
     share = np.mean([start["library_index"] for start in starts])
     assert abs(share - 0.8) < 4 * np.sqrt(0.16 / 400)
-    np.testing.assert_array_equal(starts[0]["sigma"], model.problem.noise_prior[0])
+    np.testing.assert_array_equal(starts[0]["sigma"], problem_in(model).noise_prior[0])
     with pytest.raises(FitError, match="has no library"):
         prior_starts(mode.problem, np.random.default_rng(2), 4)
