@@ -260,7 +260,7 @@ def jacobian_rows() -> list[Row]:
     layout, sigma = problem.layout, problem.noise_prior[0]
     phi = layout.to_vector(CART | SIZES)
     lower, upper = box(layout.priors)
-    steps, coarse = 1e-3 * layout.scale(phi), problem.coarse.simulator
+    steps, coarse = 1e-3 * layout.scale(phi), problem.coarse.physics.simulator
 
     def both(engine: PartedSimulator) -> Callable[[], float]:
         """The time of values and derivatives, the latter through an engine."""
@@ -275,7 +275,7 @@ def jacobian_rows() -> list[Row]:
     what = f"residual of the demo's {history.n_transitions} transitions with its derivatives by"
     return [
         Row("jacobian_over_value", f"{what} {layout.size} parameters / the residual alone",
-            "<= 10", both(problem.simulator), value),
+            "<= 10", both(problem.physics.simulator), value),
         Row("coarse_jacobian_over_value", "the same, derivatives with few engine steps, as in the"
             " search for modes", "", both(coarse), value),
     ]  # fmt: skip

@@ -97,7 +97,7 @@ def rollout(problem: Problem, phi: Floats, start: Floats, inputs: Floats) -> Flo
     """
     states = np.full((*inputs.shape[:2], *start.shape[1:]), np.nan)
     finite = np.isfinite(start).all(axis=(1, 2))
-    states[finite] = problem.one_world(phi, start[finite], inputs[finite])
+    states[finite] = problem.physics.one_world(phi, start[finite], inputs[finite])
     states[~np.isfinite(states)] = np.nan
     return states
 

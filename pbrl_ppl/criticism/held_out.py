@@ -75,7 +75,7 @@ class HeldOut:
         """Return the linearised innovations in units of another model's noise."""
         physics = self.mode.problem.physics
         model = unit.problem.with_physics(effects=physics.effects, substeps=physics.substeps)
-        return model.whitened(self.mode.phi, unit.mode.sigma, model.one_world)
+        return model.whitened(self.mode.phi, unit.mode.sigma, model.physics.one_world)
 
     def residuals(self, unit: HeldOut) -> dict[str, Floats]:
         """Return innovations in units of another model's noise, by state dimension."""
@@ -121,7 +121,7 @@ class HeldOut:
         phi = fit.draws[0]
         rng = np.random.default_rng(seed)
         phi = phi[rng.choice(len(phi), min(most_draws, len(phi)), replace=False)]
-        residual = self.problem.residual(phi, self.problem.one_world)
+        residual = self.problem.residual(phi, self.problem.physics.one_world)
         density = self.problem.log_density(residual, np.tile(mode.sigma, (len(phi), 1)), phi)
         return Errors(
             one_step_rmse=forecast(self.problem, mode.phi, mode.sigma, 1).rmse(),

@@ -187,7 +187,7 @@ def prior_predictive_check(
         phi[:, problem.layout.labels.index(label)] = value
     ends = np.concatenate(
         [
-            _at(problem.predict(phi[i : i + chunk], problem.one_world)[..., columns], last)
+            _at(problem.predict(phi[i : i + chunk], problem.physics.one_world)[..., columns], last)
             for i in range(0, len(phi), chunk)
         ]
     )

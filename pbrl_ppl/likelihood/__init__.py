@@ -39,8 +39,10 @@ from .problem import ACTION_DIMS as ACTION_DIMS
 from .problem import NEXT_STATE_DIMS as NEXT_STATE_DIMS
 from .problem import START_DIMS as START_DIMS
 from .problem import Problem as Problem
+from .problem import corrected as corrected
 from .problem import variable_coords as variable_coords
 from .problem import variable_dims as variable_dims
+from .problem import with_defect as with_defect
 from .sensitivity import Sensitivity as Sensitivity
 from .simulation import simulated_trajectories as simulated_trajectories
 from .simulation import with_measurements as with_measurements

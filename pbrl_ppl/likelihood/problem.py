@@ -22,7 +22,7 @@ from pbrl_ppl.likelihood.likelihood import (
 from pbrl_ppl.likelihood.tails import degrees_of_freedom, tail_places
 from pbrl_ppl.likelihood.trajectory_noise import TrajectoryNoise
 from pbrl_ppl.parameters import Block, Layout, ParameterLibrary
-from pbrl_ppl.physics import OneWorld, PartedSimulator, Physics
+from pbrl_ppl.physics import PartedSimulator, Physics
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import INPUT, STATE, Floats
 
@@ -55,7 +55,7 @@ class Problem:
     library : ParameterLibrary, optional
         Parameter sets of which each body has one, in place of Table 1.
     defect : ndarray, optional
-        Added to predictions; see :meth:`corrected`. Shape (transition, H, body, 6).
+        Added to predictions; see :func:`with_defect`. Shape (transition, H, body, 6).
     """
 
     data: Data
@@ -102,7 +102,10 @@ class Problem:
         return replace(self, data=replace(self.data, states=states))
 
     def with_physics(self, **changes: Any) -> Problem:
-        """Return the same problem with other physics; arguments are fields of :class:`Physics`."""
+        """Return the same problem with other physics; arguments are fields of :class:`Physics`.
+
+        Predictions have no correction of few engine steps then.
+        """
         physics, likelihood = self.physics.changed(**changes), self.likelihood
         if "scene" in changes or "together" in changes:
             physics = physics.in_parts(self.data.history)
@@ -132,58 +135,6 @@ class Problem:
         """The same problem with at most a medium number of engine steps."""
         return replace(self, physics=self.physics.medium, defect=None)
 
-    def corrected(self, phi: Floats, *, worth: int = 3) -> Problem:
-        """Return the problem with few engine steps, its predictions corrected at phi, shape (p,).
-
-        The error of few steps hardly depends on the parameters: the difference between both engines
-        at phi is added to every prediction (defect correction: P. Zadunaisky, On the estimation of
-        errors propagated in the numerical integration of differential equations, 1976).
-
-        ``worth``: ratio of engine steps from which a correction saves time.
-        """
-        medium = self.medium
-        if medium.physics.substeps * worth > self.physics.substeps:
-            return self
-        return medium.corrected_to(self, phi)
-
-    def corrected_to(self, exact: Problem, phi: Floats) -> Problem:
-        """Return the problem with predictions corrected to those of more engine steps at phi."""
-        return replace(self, defect=np.nan_to_num(exact.predict(phi) - self.predict(phi)))
-
-    def joined(self, phi: Floats, sigma: Floats, most: int = 50, *, same: float = 0.01) -> Problem:
-        """Return the problem with bodies that meet at these draws in one part; itself if none do.
-
-        Parameters
-        ----------
-        phi, sigma : ndarray
-            Draws, shapes (n, p) and (n, parameter).
-        most : int
-            Of more draws so many are simulated, evenly spread.
-        same : float
-            How far predictions may differ and be the same to the likelihood, in units of the noise.
-        """
-        if len(self.simulator.parts) == 1:
-            return self
-        rows = np.linspace(0, len(phi) - 1, min(most, len(phi))).astype(int)
-        phi, sigma = phi[rows], sigma[rows]
-        segments, columns = self.segments, list(self.observations.columns)
-        states, met = self.one_world.meetings(phi, segments.start, self.inputs)
-        if not met.any():
-            return self
-        apart = self.simulator(phi, segments.start, self.inputs)
-        off = abs(self.observations.wrapped((states - apart)[..., columns]))
-        if isinstance(self.likelihood, TrajectoryLikelihood):  # errors of measurement alone
-            sensors, stated = self.likelihood.noise.coordinates.sensors, dict(self.scene.noise)
-            known = np.tile([stated.get(name, np.inf) for name in STATE], (len(phi), 1))
-            known[:, list(sensors)] = sigma[:, : len(sensors)]
-            sigma = known[:, columns]
-        matters = np.any(~(off <= same * sigma[:, None, None, None]), axis=(2, 3, 4))
-        meet = (met & matters[..., None]).any(axis=(0, 1))
-        meeting = [body.name for body, one in zip(self.scene.moving, meet, strict=True) if one]
-        if not meeting:
-            return self
-        return self.with_physics(together=tuple(dict.fromkeys((*self.physics.together, *meeting))))
-
     @property
     def scene(self) -> Scene:
         """The scene of the physics."""
@@ -193,16 +144,6 @@ class Problem:
     def layout(self) -> Layout:
         """Order of the unknown parameters in phi."""
         return self.physics.layout
-
-    @property
-    def simulator(self) -> PartedSimulator:
-        """The engine of the likelihood, in parts."""
-        return self.physics.simulator
-
-    @property
-    def one_world(self) -> OneWorld:
-        """The engine of predictions, in which bodies that were apart in the data may meet."""
-        return self.physics.one_world
 
     @property
     def segments(self) -> Segments:
@@ -251,12 +192,6 @@ class Problem:
             f"the problem's likelihood is of {self.likelihood.name}, expected trajectories"
         )
 
-    def with_small_process_noise(self, sigma: Floats, share: float) -> Floats:
-        """Return sigma with unexplained accelerations of at most a share of their prior median."""
-        steps, sigma = self.trajectory_noise.coordinates.accelerations, sigma.copy()
-        sigma[steps] = np.minimum(sigma[steps], share * self.noise_prior[0][steps])
-        return sigma
-
     @property
     def noise_variables(self) -> dict[str, tuple[str, ...]]:
         """Noise variables with their state dimensions, in the order of sigma."""
@@ -264,21 +199,16 @@ class Problem:
 
     def named(self, phi: Floats, sigma: Floats) -> dict[str, Floats]:
         """Return the model's variables by name at phi (..., p) and sigma (..., parameter)."""
-        if self.scalar_sigma:
+        if self.likelihood.scalar:
             return self.layout.to_dict(phi) | {"sigma": sigma[..., 0]}
         ends = np.cumsum([len(labels) for labels in self.noise_variables.values()])[:-1]
         noise = dict(zip(self.noise_variables, np.split(sigma, ends, axis=-1), strict=True))
         return self.layout.to_dict(phi) | noise
 
     @property
-    def scalar_sigma(self) -> bool:
-        """Whether one sigma serves all state dimensions."""
-        return self.likelihood.scalar
-
-    @property
     def noise_labels(self) -> tuple[str, ...]:
         """Labels of the inferred noise parameters, such as ``sigma[x]``."""
-        return noise_labels(self.noise_variables, self.scalar_sigma)
+        return noise_labels(self.noise_variables, self.likelihood.scalar)
 
     @property
     def measured(self) -> Floats:
@@ -292,7 +222,7 @@ class Problem:
 
     def predict(self, phi: Floats, engine: Engine | None = None) -> Floats:
         """Return predicted states, shape (..., transition, H, body, 6), for phi (..., p)."""
-        predict, sensitivity = engine or self.simulator, self.likelihood.sensitivity
+        predict, sensitivity = engine or self.physics.simulator, self.likelihood.sensitivity
         if sensitivity is not None:
             predict = partial(sensitivity.predicted, predict)
         states = predict(phi, self.segments.start, self.inputs)
@@ -358,6 +288,27 @@ class Problem:
         return self.likelihood.random(predicted, values, sigma, rng, self.nu(phi))
 
 
+def with_defect(problem: Problem, exact: Problem, phi: Floats) -> Problem:
+    """Return a problem of few engine steps, predictions corrected at phi (p,) to an exact one's.
+
+    The error of few steps hardly depends on the parameters: the difference between both engines at
+    phi is added to every prediction (defect correction: P. Zadunaisky, On the estimation of errors
+    propagated in the numerical integration of differential equations, 1976).
+    """
+    return replace(problem, defect=np.nan_to_num(exact.predict(phi) - problem.predict(phi)))
+
+
+def corrected(problem: Problem, phi: Floats, *, worth: int = 3) -> Problem:
+    """Return the problem with fewer engine steps, corrected at phi, where that saves time.
+
+    ``worth``: ratio of engine steps from which it does.
+    """
+    medium = problem.medium
+    if medium.physics.substeps * worth > problem.physics.substeps:
+        return problem
+    return with_defect(medium, problem, phi)
+
+
 def variable_dims(problem: Problem) -> dict[str, tuple[str, ...]]:
     """Return the dimensions of each parameter and noise variable by name."""
     dims: dict[str, tuple[str, ...]] = {
@@ -366,7 +317,7 @@ def variable_dims(problem: Problem) -> dict[str, tuple[str, ...]]:
     if problem.library is not None:
         dims["library_index"] = (_owner_dim(problem, tuple(problem.scene.owners), "library"),)
     for name in problem.noise_variables:
-        if problem.scalar_sigma:
+        if problem.likelihood.scalar:
             dims[name] = ()
         else:
             dims[name] = (_NOISE_DIMS[name] if problem.likelihood.filtered else "state",)

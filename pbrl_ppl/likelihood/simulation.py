@@ -32,6 +32,7 @@ def simulated_trajectories(
         everywhere in a trajectory in which the engine diverged.
     """
     coordinates, segments = problem.trajectory_noise.coordinates, problem.segments
+    world = problem.physics.one_world
     observed = problem.data.history.dataset["observed"].to_numpy()
     states = problem.data.smoothed_states.copy()
     flat = states.reshape(*states.shape[:2], -1)
@@ -40,7 +41,7 @@ def simulated_trajectories(
         trajectory = segments.trajectory[now]
         begin, inputs = states[trajectory, step], problem.inputs[now]
         lost = ~np.isfinite(begin).all(axis=(1, 2))
-        ends = problem.one_world(phi, np.where(lost[:, None, None], 0.0, begin), inputs)[:, 0]
+        ends = world(phi, np.where(lost[:, None, None], 0.0, begin), inputs)[:, 0]
         ends[lost] = np.nan
         met = touching(problem.scene, begin, np.nan_to_num(ends))
         pushes = coordinates.pushes(sigma, met, rng)

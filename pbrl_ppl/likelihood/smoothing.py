@@ -161,7 +161,7 @@ def with_sensitivity(problem: Problem, phi: Floats, sigma: Floats) -> Problem:
         return problem
     noise, segments = problem.trajectory_noise, problem.segments
     coordinates, nothing = noise.coordinates, np.zeros_like(noise.measured)
-    slopes = problem.medium.simulator.jacobian(phi, segments.start, problem.inputs)[:, 0]
+    slopes = problem.medium.physics.simulator.jacobian(phi, segments.start, problem.inputs)[:, 0]
     still = replace(noise, begin=nothing, measured=nothing, sensitivity=None)
     before = np.empty((*nothing.shape, len(phi)))
     for j, slope in enumerate(coordinates.of(np.moveaxis(slopes, -1, 0))):
@@ -194,7 +194,7 @@ def with_predicted_gaps(problem: Problem, phi: Floats) -> Problem:
     for step in np.flatnonzero(hidden.any(axis=(0, 2))):
         now = np.flatnonzero(segments.step == step - 1)
         trajectory = segments.trajectory[now]
-        ends = problem.one_world(phi, states[trajectory, step - 1], inputs[now])[:, 0]
+        ends = problem.physics.one_world(phi, states[trajectory, step - 1], inputs[now])[:, 0]
         filled = hidden[trajectory, step] & np.isfinite(ends).all(axis=-1)
         states[trajectory, step] = np.where(filled[..., None], ends, states[trajectory, step])
     return problem.with_states(states)
@@ -260,7 +260,7 @@ def _sloped(problem: Problem, phi: Floats, sigma: Floats, steps: Floats, rows: B
         """Return the states after an interval; a coarse engine's slope agrees with a fine one's."""
         begin = states.reshape(-1, *states.shape[2:])
         repeated = np.tile(inputs, (len(states), 1, 1, 1))
-        return np.asarray(problem.medium.simulator(phi, begin, repeated)[:, 0]).reshape(
+        return np.asarray(problem.medium.physics.simulator(phi, begin, repeated)[:, 0]).reshape(
             states.shape
         )
 

@@ -53,7 +53,7 @@ def build_model(problem: Problem) -> pm.Model:
         predicted = SimulatorOp(physics, sensitivity)(phi, start, actions)[..., columns]
         # bodies of independent parts never meet in the likelihood; in draws they may
         whole = predicted
-        if len(problem.simulator.parts) > 1:
+        if len(problem.physics.simulator.parts) > 1:
             world = SimulatorOp(physics, sensitivity, one_world=True)
             whole = world(phi, start, actions)[..., columns]
         log_likelihood = LogLikelihoodOp(problem)
@@ -147,7 +147,7 @@ def _chosen(
 def _noise(problem: Problem) -> TensorVariable:
     """Declare the noise parameters, shape (parameter,)."""
     median, spread = problem.noise_prior
-    if problem.scalar_sigma:
+    if problem.likelihood.scalar:
         scalar = pm.LogNormal("sigma", mu=np.log(median).mean(), sigma=spread)
         return pt.ones(len(median)) * scalar
     if not problem.likelihood.filtered:

@@ -21,6 +21,7 @@ from pbrl_ppl.likelihood import (
     linearised_about,
     linearised_pieces,
     output_error,
+    with_defect,
     without,
 )
 from pbrl_ppl.modes.laplace import Mode, covariance_of
@@ -299,13 +300,13 @@ def fit_pieces_closely(
 def corrected(mode: Mode) -> Mode:
     """Return a mode of simulated pieces with few engine steps, whose error there is corrected."""
     problem = mode.problem
-    return replace(mode, problem=problem.coarse.corrected_to(problem.medium, mode.phi))
+    return replace(mode, problem=with_defect(problem.coarse, problem.medium, mode.phi))
 
 
 def _residual(problem: Problem, points: Floats, initial_states: Floats) -> Floats:
     """Return residuals at points (n, p) and initial states (n, piece, body, 6)."""
     engine = problem.medium if problem.defect is None else problem
-    states = engine.simulator(points, np.ascontiguousarray(initial_states), problem.inputs)
+    states = engine.physics.simulator(points, np.ascontiguousarray(initial_states), problem.inputs)
     states = states if problem.defect is None else states + problem.defect
     return finite(problem, problem.observations.residual(states))
 
@@ -453,7 +454,7 @@ class _Step:
 def simulated_states(mode: Mode) -> Floats:
     """Return the states along the simulated pieces, shape (trajectory, time, body, 6)."""
     problem, segments = mode.problem, mode.problem.segments
-    ends = problem.medium.simulator(mode.phi, segments.start, problem.inputs)
+    ends = problem.medium.physics.simulator(mode.phi, segments.start, problem.inputs)
     states = problem.data.smoothed_states.copy()
     last = problem.data.history.dataset["n_rows"].to_numpy()[segments.trajectory] - 1
     follows = np.flatnonzero(np.diff(segments.trajectory) == 0)

@@ -208,7 +208,7 @@ def finish(problem: Problem, peak: LocalMode) -> Mode:
         return np.nan_to_num(_least_squares(problem, points, sigma, phi, engine))
 
     begin = 1e-3 * problem.layout.scale(phi)
-    coarse = partial(residual, engine=problem.coarse.simulator)
+    coarse = partial(residual, engine=problem.coarse.physics.simulator)
     jacobian = posterior_slopes(residual, phi, lower, upper, begin, coarse)
     precision = jacobian.T @ jacobian
     if problem.tails:

@@ -128,7 +128,7 @@ def choose_from_library(
     rng = np.random.default_rng(seed)
     names = list(problem.scene.owners)
     table = library_of(problem).table(problem.layout, problem.scene)
-    parts = [_Combinations(problem, part, table) for part in problem.simulator.parts]
+    parts = [_Combinations(problem, part, table) for part in problem.physics.simulator.parts]
     median, spread = problem.noise_prior
     counts = problem.observations.measured.sum((0, 1, 2)).astype(float)
     counts, ones = problem.likelihood.pooled(counts), np.ones(len(median))
@@ -152,7 +152,7 @@ def choose_from_library(
     log_sigma = x[rng.permutation(drawn)]
     index = np.zeros((n, len(names)), dtype=np.intp)
     best = np.zeros(len(names), dtype=np.intp)
-    for choice, part in zip(parts, problem.simulator.parts, strict=True):
+    for choice, part in zip(parts, problem.physics.simulator.parts, strict=True):
         joint = choice.log_joint(np.exp(log_sigma) * ones, problem.nu())
         # the largest of log-probabilities with Gumbel noise is a draw
         which = (joint + rng.gumbel(size=joint.shape)).argmax(axis=1)
@@ -170,7 +170,7 @@ def _estimated_sigma(problem: Problem, parts: list[_Combinations], sigma: Floats
     observations = problem.observations
     residual = np.zeros_like(observations.values)
     for turn in range(3):
-        for choice, part in zip(parts, problem.simulator.parts, strict=True):
+        for choice, part in zip(parts, problem.physics.simulator.parts, strict=True):
             z = np.nan_to_num(choice.residual / sigma, nan=1e6)
             cost = np.log1p(z**2) if turn == 0 else z**2
             best = int(cost.reshape(len(z), -1).sum(axis=1).argmin())

@@ -66,7 +66,7 @@ def find_modes(
     FitError
         If a joint's bodies are unknown: modes are sought over continuous parameters.
     """
-    priors = problem.layout.priors
+    priors, coarse = problem.layout.priors, problem.coarse.physics.simulator
     if problem.layout.discrete.any():
         raise FitError(
             "which bodies a joint of the scene joins is unknown, and a mode is one of continuous"
@@ -74,10 +74,10 @@ def find_modes(
             " joint_probabilities says which they are"
         )
     if initial is not None:
-        near = climb(problem, inside(priors, initial), problem.coarse.simulator, rounds or ROUNDS)
+        near = climb(problem, inside(priors, initial), coarse, rounds or ROUNDS)
         return [finish(problem, near if rounds else _polish(problem, near))]
     if not priors:  # everything is known but the noise
-        return [finish(problem, climb(problem, np.zeros(0), problem.coarse.simulator))]
+        return [finish(problem, climb(problem, np.zeros(0), coarse))]
     few = problem.segments.n <= n_few
     # more starts with few data: they cost little, and friction makes more modes
     starts, screened = (16, 1000) if few else (4, 48)
@@ -92,14 +92,14 @@ def find_modes(
     # log(1 + z^2): a good start fits most transitions, not the worst one
     order = np.argsort(np.log1p(np.minimum(z, FAR_OFF) ** 2).sum(axis=1))
     begin = draws[order[:starts]]
-    steps = problem.simulator.steps * problem.segments.n * problem.data.horizon
+    steps = problem.physics.simulator.steps * problem.segments.n * problem.data.horizon
     if few and len(priors) <= most_parameters and steps * _POPULATION * _GENERATIONS < afforded:
         begin = np.vstack([begin, _evolve(problem, rng)])
     peaks = _distinct(
-        part, [canonical_wheels(part, climb(part, phi, part.simulator)) for phi in begin]
+        part, [canonical_wheels(part, climb(part, phi, part.physics.simulator)) for phi in begin]
     )
     if not few:  # all data may join what a part of them told apart
-        peaks = [climb(problem, phi, problem.coarse.simulator) for phi, *_ in peaks[:polished]]
+        peaks = [climb(problem, phi, coarse) for phi, *_ in peaks[:polished]]
         peaks = _distinct(problem.coarse, peaks)
     best = _polish(problem, peaks[0])
     return [finish(problem, peak) for peak in (best, *peaks[1:])]
@@ -200,7 +200,7 @@ def _polish(problem: Problem, start: LocalMode, *, worthwhile: float = 5.0) -> L
     if not problem.layout.size:
         return start
     start = canonical_wheels(problem, start)
-    exact = climb(problem, start.phi, problem.simulator, rounds=1, tries=2)
+    exact = climb(problem, start.phi, problem.physics.simulator, rounds=1, tries=2)
     if exact.log_posterior < start.log_posterior + worthwhile:
         return max(start, exact, key=lambda peak: peak.log_posterior)
-    return climb(problem, exact.phi, problem.simulator)
+    return climb(problem, exact.phi, problem.physics.simulator)

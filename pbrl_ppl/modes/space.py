@@ -132,7 +132,7 @@ class Space:
     @cached_property
     def parts(self) -> tuple[Independent, ...]:
         """Independent parts; one where the likelihood mixes the bodies' residuals."""
-        parts = self.problem.simulator.parts
+        parts = self.problem.physics.simulator.parts
         if not self.problem.likelihood.independent:
             bodies = np.arange(len(self.problem.scene.moving))
             return (Independent(np.flatnonzero(~self.uninformed), bodies),)

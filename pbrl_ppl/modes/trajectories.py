@@ -9,6 +9,7 @@ import numpy as np
 from pbrl_ppl.likelihood import (
     Problem,
     along_trajectories,
+    corrected,
     log_posterior,
     single_transitions,
     smoothed,
@@ -89,11 +90,18 @@ def trajectory_mode(
         problem = _smoothed_cheaply(problem, phi)
         sigma = problem.trajectory_noise.sigma
     mode = nearby_mode(problem, phi, sigma)
-    small_noise = mode.problem.with_small_process_noise(mode.sigma, share)
+    small_noise = _with_small_process_noise(mode.problem, mode.sigma, share)
     if not np.array_equal(small_noise, mode.sigma):
         other = nearby_mode(smoothed(mode.problem, mode.phi, small_noise), mode.phi, small_noise)
         mode = max(mode, other, key=lambda candidate: candidate.log_posterior)
     return mode
+
+
+def _with_small_process_noise(problem: Problem, sigma: Floats, share: float) -> Floats:
+    """Return sigma with unexplained accelerations of at most a share of their prior median."""
+    steps, sigma = problem.trajectory_noise.coordinates.accelerations, sigma.copy()
+    sigma[steps] = np.minimum(sigma[steps], share * problem.noise_prior[0][steps])
+    return sigma
 
 
 def _smoothed_cheaply(problem: Problem, phi: Floats) -> Problem:
@@ -124,7 +132,7 @@ def filtered_mode(mode: Mode, other: Mode, *, share: float = 0.1, rounds: int = 
     problem = _smoothed_cheaply(problem, phi)
     sigma = problem.trajectory_noise.sigma
     ends: list[tuple[Problem, LocalMode]] = []
-    for begin in (sigma, problem.with_small_process_noise(sigma, share)):
+    for begin in (sigma, _with_small_process_noise(problem, sigma, share)):
         sigma, there = begin, problem
         for _ in range(rounds):
             there = smoothed(there, phi, sigma)
@@ -154,7 +162,7 @@ def nearby_mode(
     """
     modes: list[Mode] = []
     for _ in range(corrections):
-        cheap = problem.corrected(phi)
+        cheap = corrected(problem, phi)
         mode = _alternate_smoothing(cheap, phi, sigma)
         if cheap is problem:
             return mode

@@ -179,7 +179,7 @@ def evaluate(
             residual = problem.observations.residual(states)
             likelihood[part] = problem.log_density(residual, sigma[part], phi[part])
         for i in rows[(begin <= rows) & (rows < begin + size)]:
-            states = parallel.predict(phi[i], parallel.one_world)
+            states = parallel.predict(phi[i], parallel.physics.one_world)
             predictive.append(problem.next_states(states, sigma[i], rng, phi[i]))
     return likelihood, np.array(predictive)
 

@@ -61,7 +61,7 @@ def record_of(problem: Problem, seed: int, method: str) -> PosteriorRecord:
         tolerance=problem.physics.tolerance,
         together=tuple(problem.physics.together),
         measured=problem.observations.names,
-        scalar_sigma=problem.scalar_sigma,
+        scalar_sigma=problem.likelihood.scalar,
         sigma_prior=(tuple(float(value) for value in median), float(spread)),
         data_sha256=problem.data.history.data_sha256,
         seed=seed,

@@ -41,7 +41,7 @@ from pbrl_ppl.posterior import (
 )
 from pbrl_ppl.sampling.methods import METHODS, OVER_LIBRARY, SamplerRun
 from pbrl_ppl.sampling.mixture import mix, most_frequent, most_probable, summed
-from pbrl_ppl.state import Floats
+from pbrl_ppl.state import STATE, Floats
 from pbrl_ppl.threads import one_blas_thread
 
 if TYPE_CHECKING:
@@ -354,6 +354,47 @@ def _check(problem: Problem, method: str, start: Any, resume: Idata | None) -> N
             )
 
 
+def joined_at(
+    problem: Problem, phi: Floats, sigma: Floats, most: int = 50, *, same: float = 0.01
+) -> Problem:
+    """Return the problem with bodies that meet at these draws in one part; itself if none do.
+
+    Parameters
+    ----------
+    problem : Problem
+        Bodies that were apart in its data are simulated apart.
+    phi, sigma : ndarray
+        Draws, shapes (n, p) and (n, parameter).
+    most : int
+        Of more draws so many are simulated, evenly spread.
+    same : float
+        How far predictions may differ and be the same to the likelihood, in units of the noise.
+    """
+    physics = problem.physics
+    if len(physics.simulator.parts) == 1:
+        return problem
+    rows = np.linspace(0, len(phi) - 1, min(most, len(phi))).astype(int)
+    phi, sigma = phi[rows], sigma[rows]
+    start, columns = problem.segments.start, list(problem.observations.columns)
+    states, met = physics.one_world.meetings(phi, start, problem.inputs)
+    if not met.any():
+        return problem
+    apart = physics.simulator(phi, start, problem.inputs)
+    off = abs(problem.observations.wrapped((states - apart)[..., columns]))
+    if problem.likelihood.filtered:  # errors of measurement alone
+        sensors = problem.trajectory_noise.coordinates.sensors
+        stated = dict(problem.scene.noise)
+        known = np.tile([stated.get(name, np.inf) for name in STATE], (len(phi), 1))
+        known[:, list(sensors)] = sigma[:, : len(sensors)]
+        sigma = known[:, columns]
+    matters = np.any(~(off <= same * sigma[:, None, None, None]), axis=(2, 3, 4))
+    meet = (met & matters[..., None]).any(axis=(0, 1))
+    meeting = [body.name for body, one in zip(problem.scene.moving, meet, strict=True) if one]
+    if not meeting:
+        return problem
+    return problem.with_physics(together=tuple(dict.fromkeys((*physics.together, *meeting))))
+
+
 def _joined(problem: Problem, phi: Floats, sigma: Floats) -> Problem:
     """Return the problem with bodies that meet at draws (n, p) and (n, state) in one part.
 
@@ -365,7 +406,7 @@ def _joined(problem: Problem, phi: Floats, sigma: Floats) -> Problem:
     MeetingWarning
         If bodies meet.
     """
-    joined = problem.joined(phi, sigma)
+    joined = joined_at(problem, phi, sigma)
     if joined is problem:
         return problem
     warn(

@@ -223,7 +223,8 @@ def summed(problem: Problem, draws: int, chains: int, seed: int) -> tuple[Idata,
     """
     phi, sigma, index, best = choose_from_library(problem, draws, chains, seed)
     values: dict[str, Any] = problem.layout.to_dict(phi)
-    values |= {"library_index": index, "sigma": sigma[..., 0] if problem.scalar_sigma else sigma}
+    sigma = sigma[..., 0] if problem.likelihood.scalar else sigma
+    values |= {"library_index": index, "sigma": sigma}
     return as_trace(problem, values, {"accept": np.ones((chains, draws))}), _point(problem, best)
 
 
@@ -241,7 +242,7 @@ def most_frequent(problem: Problem, trace: Idata) -> ParameterPoint:
     index = drawn.to_numpy().reshape(-1, drawn.shape[-1])
     names = list(problem.scene.owners)
     best = np.zeros(index.shape[1], dtype=np.intp)
-    for part in problem.simulator.parts:
+    for part in problem.physics.simulator.parts:
         columns = [names.index(owner) for owner in part.physics.scene.owners]
         choices, counts = np.unique(index[:, columns], axis=0, return_counts=True)
         best[columns] = choices[counts.argmax()]

@@ -28,7 +28,7 @@ from pbrl_ppl.posterior import (
     parameter_draws,
     problem_of,
 )
-from pbrl_ppl.sampling.fitting import sample
+from pbrl_ppl.sampling.fitting import joined_at, sample
 from pbrl_ppl.sampling.ranks import MOST_DRAWS, rank
 from pbrl_ppl.state import STATE, Floats
 
@@ -119,7 +119,7 @@ def _trajectories(design: Problem, phi: Floats, sigma: Floats, seed: int, colour
     if design.likelihood.simulated:
         every = np.repeat(design.data.smoothed_states[None], len(phi), axis=0)
         # without process noise; each piece of the design is a whole trajectory
-        simulated_states = design.one_world(phi, design.segments.start, design.inputs)
+        simulated_states = design.physics.one_world(phi, design.segments.start, design.inputs)
         every[:, design.segments.trajectory, 1:] = simulated_states
         columns = list(design.observations.columns)
         for states, noise, rng in zip(every, sigma, rngs, strict=True):
@@ -220,7 +220,7 @@ def replicate(
         ``rank``, ``size``, ``truth``, ``ess`` and ``r_hat``, over the parameters.
     """
     # bodies that met in the simulation are simulated in one world
-    problem = simulated(design, truth.values).joined(truth.phi[None], truth.sigma[None])
+    problem = joined_at(simulated(design, truth.values), truth.phi[None], truth.sigma[None])
     settings = {"cores": 1, **settings}
     for again in range(most_repeats + 1):
         with warnings.catch_warnings():

@@ -42,7 +42,7 @@ def prior_starts(problem: Problem, rng: np.random.Generator, chains: int) -> lis
     """Draw starts of chains over a library: each owner's set from the prior, the median sigma."""
     library = library_of(problem)
     median = problem.noise_prior[0]
-    sigma = np.exp(np.log(median).mean()) if problem.scalar_sigma else median
+    sigma = np.exp(np.log(median).mean()) if problem.likelihood.scalar else median
     laws = [library.prior(owner) for owner in problem.scene.owners]
     return [
         {"library_index": np.array([rng.choice(len(p), p=p) for p in laws]), "sigma": sigma}

@@ -25,7 +25,7 @@ from pbrl_ppl.likelihood import (
 )
 from pbrl_ppl.modes import systematic
 from pbrl_ppl.posterior import Idata, PosteriorRecord, from_groups, group, groups, parameter_draws
-from pbrl_ppl.sampling.fitting import sample
+from pbrl_ppl.sampling.fitting import joined_at, sample
 from pbrl_ppl.sampling.update_checks import (
     as_recorded,
     check_engine,
@@ -220,7 +220,7 @@ def _weighted(
     problem = files.problem_of(idata, effects, history)
     check_engine(idata, problem)
     phi, sigma = parameter_draws(problem, idata)
-    problem = problem.joined(phi, sigma)
+    problem = joined_at(problem, phi, sigma)
     likelihood, _ = files.evaluate(problem, phi, sigma, (), np.random.default_rng(0))
     log_weights = likelihood.sum(axis=1)
     weights, k = np.zeros(len(phi)), np.inf

@@ -87,7 +87,7 @@ def test_likelihood_is_that_of_equal_masses(trajectories) -> None:
     np.testing.assert_allclose(
         density, two.log_density(two.residual(both), sigma, both).sum(axis=-1), rtol=1e-9
     )
-    slope = [p.simulator.jacobian(x, p.segments.start, p.inputs)
+    slope = [p.physics.simulator.jacobian(x, p.segments.start, p.inputs)
              for p, x in ((one, m[1]), (two, both[1]))]  # fmt: skip
     np.testing.assert_allclose(slope[0][..., 0], slope[1].sum(axis=-1), atol=1e-7)
     # P(m), not P(m)^2

@@ -66,8 +66,8 @@ def test_it_is_pymc_s(history, name) -> None:
     problem, rng, n = problem_in(model), np.random.default_rng(1), 4
     logp = remove_value_transforms(model).compile_logp(mode="FAST_COMPILE")
     median, _ = problem.noise_prior
-    typical = median.mean() * np.ones(6) if problem.scalar_sigma else median
-    moved = rng.normal(0.0, 1.0, (n, 1 if problem.scalar_sigma else 6))
+    typical = median.mean() * np.ones(6) if problem.likelihood.scalar else median
+    moved = rng.normal(0.0, 1.0, (n, 1 if problem.likelihood.scalar else 6))
     sigma = typical * np.exp(moved)
     choice = None
     if problem.library is None:

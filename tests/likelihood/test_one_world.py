@@ -17,6 +17,7 @@ from pbrl_ppl.modes import Mode
 from pbrl_ppl.physics import Physics, Simulator
 from pbrl_ppl.posterior import Fit, evaluate, from_groups, group, problem_of
 from pbrl_ppl.sampling import fit, physics_model
+from pbrl_ppl.sampling.fitting import joined_at
 from pbrl_ppl.sampling.replication import draw_truths
 from pbrl_ppl.scene import Body, Scene, Shape
 from pbrl_ppl.state import STATE
@@ -145,8 +146,8 @@ def test_whole_trajectories_are_joined_where_they_collide(model) -> None:
     """At noise parameters of which there are more than state dimensions."""
     whole = along_trajectories(problem_in(model), np.array([TRUE]))
     sigma = np.full((1, len(whole.trajectory_noise.sigma)), 0.002)
-    assert whole.joined(np.array([[TRUE]]), sigma) is whole
-    assert whole.joined(np.array([[TOO_LIGHT]]), sigma).physics.together == ("a", "b")
+    assert joined_at(whole, np.array([[TRUE]]), sigma) is whole
+    assert joined_at(whole, np.array([[TOO_LIGHT]]), sigma).physics.together == ("a", "b")
 
 
 def test_what_has_not_met_is_predicted_as_the_likelihood_has_it(model) -> None:
@@ -164,11 +165,11 @@ def test_what_has_not_met_is_predicted_as_the_likelihood_has_it(model) -> None:
 
 def test_bodies_that_meet_are_joined(model) -> None:
     problem, sigma = problem_in(model), np.full((1, 6), 0.002)
-    assert problem.joined(np.array([[TRUE]]), sigma) is problem
-    joined = problem.joined(np.array([[TOO_LIGHT]]), sigma)
+    assert joined_at(problem, np.array([[TRUE]]), sigma) is problem
+    joined = joined_at(problem, np.array([[TOO_LIGHT]]), sigma)
     assert joined.physics.parts == (("a", "b"),)
     assert joined.with_data(history=recorded(LIGHT, TRUE, n=5)).physics.parts == (("a", "b"),)
-    assert joined.joined(np.array([[TOO_LIGHT]]), sigma) is joined
+    assert joined_at(joined, np.array([[TOO_LIGHT]]), sigma) is joined
 
 
 def test_a_body_too_heavy_to_be_moved_is_joined_with_what_meets_it() -> None:
@@ -176,7 +177,7 @@ def test_a_body_too_heavy_to_be_moved_is_joined_with_what_meets_it() -> None:
     wall = Body("b", Shape.circle(0.2), known={"r": 0.0, "mu_c": 0.0, "mass": 1e4})
     scene = LIGHT.replace(bodies=(LIGHT.bodies[0], wall))
     problem = Problem.of(Physics(scene), recorded(scene, TRUE))
-    joined = problem.joined(np.array([[TOO_LIGHT]]), np.full((1, 6), 0.05))
+    joined = joined_at(problem, np.array([[TOO_LIGHT]]), np.full((1, 6), 0.05))
     assert joined.physics.parts == (("a", "b"),)
 
 

@@ -43,13 +43,17 @@ def problem() -> Problem:
 
 
 def test_other_noise_keeps_the_engine_and_the_checked_data(problem, checks) -> None:
-    engine, coarse, segments = problem.simulator, problem.coarse.simulator, problem.segments
+    engine, coarse, segments = (
+        problem.physics.simulator,
+        problem.coarse.physics.simulator,
+        problem.segments,
+    )
     for other in (
         problem.with_likelihood(prior=((1.0,) * 6, 2.0)),
         problem.with_likelihood(nu=4.0),
     ):
-        assert other.simulator is engine
-        assert other.coarse.simulator is coarse
+        assert other.physics.simulator is engine
+        assert other.coarse.physics.simulator is coarse
         assert other.segments is segments
         assert other.observations is problem.observations
     assert checks == [segments.n]
@@ -57,7 +61,7 @@ def test_other_noise_keeps_the_engine_and_the_checked_data(problem, checks) -> N
 
 def test_other_physics_keep_the_checked_data(problem, checks) -> None:
     drag = next(effect for effect in catalogue if effect.name == "linear_drag")
-    segments, engine = problem.segments, problem.simulator
+    segments, engine = problem.segments, problem.physics.simulator
     fewer = PUCKS.replace(bodies=tuple(Body(n, Shape.circle(0.2), known={"r": 0.1}) for n in "ab"))
     for other in (
         problem.with_physics(effects=attach(PUCKS, [drag])),
@@ -66,28 +70,28 @@ def test_other_physics_keep_the_checked_data(problem, checks) -> None:
     ):
         assert other.segments is segments
         assert other.likelihood is problem.likelihood
-        assert other.simulator is not engine
-    assert problem.with_physics(substeps=5, threads=1).simulator is engine
+        assert other.physics.simulator is not engine
+    assert problem.with_physics(substeps=5, threads=1).physics.simulator is engine
     assert checks == [segments.n]
 
 
 def test_other_data_keep_the_engine_where_its_parts_are_the_same(problem) -> None:
     longer = problem.with_data(horizon=2)
-    assert longer.simulator is problem.simulator
+    assert longer.physics.simulator is problem.physics.simulator
     assert longer.segments.actions.shape[1] == 2
     apart = problem.with_data(history=simulated_history(PUCKS, TRUTH, seed=2))
-    assert apart.simulator is problem.simulator
+    assert apart.physics.simulator is problem.physics.simulator
     poses = np.array([[0.0, 0.0, 0.0], [0.45, 0.0, 0.0]])
     meeting = problem.with_data(history=simulated_history(PUCKS, TRUTH, seed=3, poses=poses))
-    assert [len(each.bodies) for each in problem.simulator.parts] == [1, 1]
-    assert [len(each.bodies) for each in meeting.simulator.parts] == [2]
+    assert [len(each.bodies) for each in problem.physics.simulator.parts] == [1, 1]
+    assert [len(each.bodies) for each in meeting.physics.simulator.parts] == [2]
 
 
 def test_noise_along_trajectories_is_of_its_own_data(problem) -> None:
     phi = problem.layout.to_vector(TRUTH)
     whole = along_trajectories(problem.with_likelihood(nu=4.0), phi)
     assert isinstance(whole.likelihood, TrajectoryLikelihood)
-    assert whole.simulator is problem.simulator
+    assert whole.physics.simulator is problem.physics.simulator
     for other in (whole.with_data(states=None), whole.with_data(history=problem.data.history)):
         assert isinstance(other.likelihood, TransitionLikelihood)
         assert other.likelihood.nu == 4.0

@@ -44,7 +44,7 @@ def test_between_the_rows_it_is_linearised_where_the_model_leads(problem) -> Non
     phi = problem.layout.to_vector(TRUTH)
     whole = along_trajectories(problem, phi)
     states, segments = whole.data.smoothed_states, single_transitions(problem).segments
-    ends = problem.one_world(phi, states[:, 0], segments.inputs)
+    ends = problem.physics.one_world(phi, states[:, 0], segments.inputs)
     # an engine forgets its contacts where it restarts: not to the last digit
     way = states[:, 1:-1, 1, :3] - ends[:, :-1, 1, :3]
     assert (np.sqrt((way**2).mean(axis=(0, 1))) < NOISE).all()

@@ -83,7 +83,7 @@ def test_least_squares_with_the_batched_jacobian(model) -> None:
     segments = problem.segments
 
     def jacobian(phi: np.ndarray) -> np.ndarray:
-        found = problem.simulator.jacobian(phi, segments.start, segments.actions)
+        found = problem.physics.simulator.jacobian(phi, segments.start, segments.actions)
         return -found.reshape(-1, problem.layout.size)
 
     begin = np.array([max(prior.centre, 0.1) for prior in problem.layout.priors])

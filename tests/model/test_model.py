@@ -67,7 +67,7 @@ def expected_logp(model: pm.Model, point: Mapping[str, np.ndarray], priors) -> f
     change = segments.observed - segments.start[:, None]
     change[..., 2] = np.angle(np.exp(1j * change[..., 2]))
     median = 0.1 * np.sqrt(np.nanmean(change[..., measured] ** 2, axis=(0, 1, 2)))
-    if problem.scalar_sigma:
+    if problem.likelihood.scalar:
         median = np.exp(np.log(median).mean())
     return total + stats.lognorm(s=2.0, scale=median).logpdf(point["sigma"]).sum()
 

@@ -180,7 +180,7 @@ def test_four_descriptions_of_a_wheel_are_one(problem, x, y, angle, mu_x, mu_y) 
         others = [i for i, name in enumerate(layout.labels) if not name.startswith("w_theta")]
         np.testing.assert_array_equal(folded[:, others], folded[[0]][:, others].repeat(4, 0))
     some = slice(0, 5)
-    states = problem.simulator(
+    states = problem.physics.simulator(
         np.vstack([phis, folded]), problem.segments.start[some], problem.segments.actions[some]
     )
     # the solver goes over the wheel's axes one after the other until they agree

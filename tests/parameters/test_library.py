@@ -83,7 +83,7 @@ def test_ambiguous_sets_have_the_brute_force_probabilities(names) -> None:
         noise=(0.01, 0.01, 0.01, 0.04, 0.04, 0.1), substeps=4,
     )  # fmt: skip
     model = physics_model(scene, history, library=library, sigma="scalar")
-    assert len(problem_in(model).simulator.parts) == len(names)
+    assert len(problem_in(model).physics.simulator.parts) == len(names)
     idata = quick(model)
     expected = brute_force(problem_in(model), library)
     assert (expected > 0.005).sum() >= 2

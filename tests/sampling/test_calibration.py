@@ -236,7 +236,7 @@ def test_simulations_have_errors_of_measurement_alone(
         states = design.data.smoothed_states.copy()
         for row in range(3):  # of the one body, step by step
             inputs = design.inputs[:, row : row + 1]
-            states[:, row + 1] = design.one_world(truth.phi, states[:, row], inputs)[:, 0]
+            states[:, row + 1] = design.physics.one_world(truth.phi, states[:, row], inputs)[:, 0]
         off = np.where(measured, truth.values - states, np.nan) / truth.sigma
         errors.append(off[..., [0, 1, 3, 4]])  # angles may be wrapped
         assert (truth.values[~measured] == 0.0).all()

@@ -227,7 +227,7 @@ def test_independent_parts_share_the_noise_alone() -> None:
     """Two pucks with drag and masses, as by chains: 10 numbers, false alarm 2e-3."""
     scene = pucks("ab")
     model = physics_model(scene, pushed(scene, trajectories=20))
-    assert len(problem_in(model).simulator.parts) == 2
+    assert len(problem_in(model).physics.simulator.parts) == 2
     start = find_mode(problem_in(model), seed=1)
     weighted = quiet(fit, model, seed=1, start=start, **QUICK)
     assert weighted.attrs["method"] == "importance"
