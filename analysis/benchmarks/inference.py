@@ -32,7 +32,7 @@ import pbrl_ppl as pp
 from pbrl_ppl.history import lever
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.model import LogLikelihoodOp, problem_in
-from pbrl_ppl.model.table1 import random_variable
+from pbrl_ppl.model.declaration import random_variable
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.parameters import WHEEL_PARAMETERS
 from pbrl_ppl.physics import PartedSimulator, Physics, build_layout

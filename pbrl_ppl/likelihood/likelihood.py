@@ -11,8 +11,7 @@ import numpy as np
 from scipy.special import gammaln
 
 from pbrl_ppl.likelihood.data import Observations
-from pbrl_ppl.likelihood.sensitivity import Sensitivity
-from pbrl_ppl.likelihood.trajectory_noise import TrajectoryNoise
+from pbrl_ppl.likelihood.trajectory_noise import Sensitivity, TrajectoryNoise
 from pbrl_ppl.state import Bools, Floats
 
 #: Medians of the noise parameters' prior, and the standard deviation of their logarithm.

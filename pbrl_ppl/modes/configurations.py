@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from pbrl_ppl.likelihood import Problem
-from pbrl_ppl.modes.evidence import Marginal
+from pbrl_ppl.modes.importance import Marginal
 from pbrl_ppl.modes.laplace import Mode
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.physics import index_priors

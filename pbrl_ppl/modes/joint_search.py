@@ -22,7 +22,7 @@ from pbrl_ppl.modes.configurations import (
     number,
     one_more,
 )
-from pbrl_ppl.modes.evidence import Marginal, importance, laplace
+from pbrl_ppl.modes.importance import Marginal, importance, laplace
 from pbrl_ppl.modes.laplace import Mode
 from pbrl_ppl.modes.search import find_mode, find_modes
 from pbrl_ppl.parameters import JOINT_ANCHORS, inside, prior_draws

@@ -8,7 +8,7 @@ from scipy import stats
 
 from pbrl_ppl.effects import attach, catalogue
 from pbrl_ppl.errors import ParameterError
-from pbrl_ppl.model.table1 import random_variable
+from pbrl_ppl.model.declaration import random_variable
 from pbrl_ppl.parameters import BODY_PARAMETERS, WHEEL_PARAMETERS, Prior
 from pbrl_ppl.physics import build_layout
 from pbrl_ppl.physics.table1 import table1

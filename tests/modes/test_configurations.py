@@ -26,7 +26,7 @@ from pbrl_ppl.modes.configurations import (
     number,
     stored,
 )
-from pbrl_ppl.modes.evidence import Marginal, importance, laplace
+from pbrl_ppl.modes.importance import Marginal, importance, laplace
 from pbrl_ppl.physics import Physics, Simulator
 from pbrl_ppl.planning import Dynamics
 from pbrl_ppl.posterior import (

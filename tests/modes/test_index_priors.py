@@ -17,7 +17,7 @@ from pbrl_ppl.modes.configurations import (
     one_more,
     stored,
 )
-from pbrl_ppl.modes.evidence import Marginal
+from pbrl_ppl.modes.importance import Marginal
 from pbrl_ppl.physics import build_layout, index_priors
 from pbrl_ppl.posterior import draws, from_groups, group, updated_scene
 from pbrl_ppl.sampling import mixture, physics_model

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from pbrl_ppl.effects import attach
 from pbrl_ppl.errors import ParameterError
-from pbrl_ppl.model.table1 import random_variable
+from pbrl_ppl.model.declaration import random_variable
 from pbrl_ppl.parameters import BODY_PARAMETERS, WHEEL_PARAMETERS, Block, Layout, Prior
 from pbrl_ppl.physics import build_layout
 from pbrl_ppl.physics.table1 import table1

@@ -11,7 +11,7 @@ from scipy import stats
 import pbrl_ppl as pp
 from pbrl_ppl.effects import attach
 from pbrl_ppl.errors import ConvergenceWarning, ParameterError, PosteriorError, SceneError
-from pbrl_ppl.model.table1 import random_variable
+from pbrl_ppl.model.declaration import random_variable
 from pbrl_ppl.parameters import Prior, nearest
 from pbrl_ppl.physics import build_layout
 from pbrl_ppl.posterior import draws, from_groups, group, groups
