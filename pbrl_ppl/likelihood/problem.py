@@ -364,9 +364,9 @@ def variable_dims(problem: Problem) -> dict[str, tuple[str, ...]]:
     return dims
 
 
-def variable_coords(problem: Problem) -> dict[str, list[Any]]:
+def variable_coords(problem: Problem) -> dict[str, list[str] | list[int]]:
     """Return the labels of each dimension by name."""
-    coords: dict[str, list[Any]] = {
+    coords: dict[str, list[str] | list[int]] = {
         "body": [body.name for body in problem.scene.moving],
         "full_state": list(STATE),
         "state": list(problem.observations.names),

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
-from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 from scipy.special import i0e
 
@@ -101,7 +100,7 @@ def problem_in(model: pm.Model) -> Problem:
 
 def prior_predictive_draws(
     model: pm.Model, names: Sequence[str], draws: int, seed: int
-) -> dict[str, NDArray[Any]]:
+) -> dict[str, Floats]:
     """Draw from the prior of a model with PyMC.
 
     Parameters
@@ -217,7 +216,7 @@ def random_variable(
     """
     family = priors[0].family
 
-    def hyper(key: str) -> Any:
+    def hyper(key: str) -> list[float] | TensorVariable:
         if index is None:
             return [getattr(prior, key) for prior in priors]
         table = np.array([[getattr(prior, key) for prior in row] for row in conditional])

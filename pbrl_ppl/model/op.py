@@ -19,6 +19,9 @@ from pbrl_ppl.likelihood import Problem, Sensitivity
 from pbrl_ppl.physics import Memory, Physics
 from pbrl_ppl.state import INPUT, WRENCH, Floats
 
+#: Symbolic sizes of an array's axes.
+Shape = tuple[Variable, ...]
+
 
 class _BlackBoxOp(Op):
     """An Op of one output that numpy computes, with the pullback of some inputs.
@@ -71,7 +74,7 @@ class _PullbackOp(Op):
         tensors = [pt.as_tensor_variable(value) for value in inputs]
         return Apply(self, tensors, [tensors[i].type() for i in self.op.differentiable])
 
-    def infer_shape(self, *arguments: Any) -> list[tuple[Any, ...]]:
+    def infer_shape(self, *arguments: Any) -> list[Shape]:
         return [arguments[-1][i] for i in self.op.differentiable]
 
     def perform(self, node: Apply, inputs: Sequence[Floats], outputs: list[list[Floats]]) -> None:
@@ -81,7 +84,7 @@ class _PullbackOp(Op):
 
 @numba_funcify.register(_BlackBoxOp)
 @numba_funcify.register(_PullbackOp)
-def _in_object_mode(op: Op, node: Any = None, **kwargs: Any) -> Any:
+def _in_object_mode(op: Op, node: Apply | None = None, **kwargs: object) -> object:
     """Dispatch the Op in numba as pytensor does by itself, without its warning."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
@@ -155,7 +158,7 @@ class SimulatorOp(_BlackBoxOp):
             inputs.append(tensor)
         return Apply(self, inputs, [pt.tensor(dtype="float64", shape=(None, None, k, 6))])
 
-    def infer_shape(self, *arguments: Any) -> list[tuple[Any, ...]]:
+    def infer_shape(self, *arguments: Any) -> list[Shape]:
         """Return (transition, H) from the shape of the actions."""
         actions = arguments[-1][2]  # older stacks pass (fgraph, node, shapes), newer (node, shapes)
         return [(*actions[:3], 6)]
@@ -222,7 +225,7 @@ class LogLikelihoodOp(_BlackBoxOp):
         tensors = [pt.cast(pt.as_tensor_variable(value), "float64") for value in inputs]
         return Apply(self, tensors, [pt.vector(dtype="float64")])
 
-    def infer_shape(self, *arguments: Any) -> list[tuple[Any, ...]]:
+    def infer_shape(self, *arguments: Any) -> list[Shape]:
         """Return (transition,) from the shape of the measurements."""
         return [(arguments[-1][0][0],)]
 

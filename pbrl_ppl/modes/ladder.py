@@ -264,11 +264,7 @@ def fit_pieces(
         damping, failed = 1e-3, failed + 1
     else:
         linear = _linearise(problem, phi, start, steps)
-    step = _Step(problem, linear, phi, start)
-    tau = np.array(output_error(step.problem).tau)
-    problem = linearised_pieces(step.problem, start, linear.by_start, tau)
-    log_posterior = -_cost(problem, step.sigma, phi)
-    return Mode(problem, phi, step.sigma, step.jacobian, step.covariance, log_posterior)
+    return _Step(problem, linear, phi, start).mode()
 
 
 @one_blas_thread
@@ -406,6 +402,13 @@ class _Step:
         )
         sigma = np.sqrt(square / self.initial_states.counts) / self.weight
         return _cost(self.problem, np.maximum(sigma, self.problem.least_noise), phi)
+
+    def mode(self) -> Mode:
+        """Return the point as a mode, whose problem is linearised there."""
+        tau = np.array(output_error(self.problem).tau)
+        problem = linearised_pieces(self.problem, self.start, self.by_start, tau)
+        log_posterior = -_cost(problem, self.sigma, self.phi)
+        return Mode(problem, self.phi, self.sigma, self.jacobian, self.covariance, log_posterior)
 
     @property
     def covariance(self) -> Floats:

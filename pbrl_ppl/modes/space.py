@@ -18,7 +18,7 @@ from pbrl_ppl.state import Bools, Floats, Ints, wrapped
 _ROOT = 3.0
 
 
-def unconstrain(prior: Prior, x: Any) -> tuple[Any, Any]:
+def unconstrain(prior: Prior, x: Floats) -> tuple[Floats, Floats]:
     """Return the unconstraining transform of a prior's variable at x, and its derivative.
 
     Numbers or arrays of any shape.
@@ -31,12 +31,12 @@ def unconstrain(prior: Prior, x: Any) -> tuple[Any, Any]:
     return x, np.ones_like(x)
 
 
-def constrain(prior: Prior, u: Any) -> Any:
+def constrain(prior: Prior, u: Floats) -> Floats:
     """Return the inverse of :func:`unconstrain`."""
     if prior.family in ("log_normal", "half_normal"):
         return np.exp(u)
     if prior.family == "truncated_normal":
-        return prior.lower + (prior.upper - prior.lower) * expit(u)
+        return np.asarray(prior.lower + (prior.upper - prior.lower) * expit(u))
     return u
 
 
