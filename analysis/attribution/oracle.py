@@ -144,7 +144,7 @@ def _share(mode: Mode, case: Case) -> float:
     problem, null = mode.problem, mode.phi.copy()
     added = true_effect(case).on(str(case.on))
     null[[problem.layout.labels.index(label) for label in added.labels]] = added.effect.null
-    coordinates = problem.trajectory_noise.coordinates
+    coordinates = problem.likelihood.noise.coordinates
     change = coordinates.of((problem.predict(mode.phi) - problem.predict(null))[:, 0])
     velocity = coordinates.places % len(STATE)
     square = np.nanmean(change**2, axis=0) / problem.scene.time_step**2

@@ -57,11 +57,12 @@ def declared_problem(
             " shorter horizon"
         )
     problem = Problem.of(physics, history, horizon=horizon, likelihood=likelihood, library=library)
-    if whole:
-        centre = np.array([prior.centre for prior in problem.layout.priors])
-        problem = along_trajectories(problem, centre)
-    if kind != OutputErrorLikelihood.name:
+    if not whole:
         return problem
+    centre = np.array([prior.centre for prior in problem.layout.priors])
+    filtered = along_trajectories(problem, centre)
+    if kind != OutputErrorLikelihood.name:
+        return filtered
     if likelihood.nu is not None or problem.tails:
         raise ValueError(
             "likelihood is 'simulation', whose noise is Gaussian: leave out nu and effects on the"
@@ -72,4 +73,4 @@ def declared_problem(
             "likelihood is 'simulation' and which bodies a joint joins is unknown: name them in the"
             " scene, or choose 'trajectories'"
         )
-    return in_pieces(problem, longest, problem.data.smoothed_states)
+    return in_pieces(filtered, longest, filtered.data.smoothed_states)

@@ -9,6 +9,7 @@ from typing import ClassVar, Self, final
 
 import numpy as np
 from scipy.special import gammaln
+from typing_extensions import TypeVar
 
 from pbrl_ppl.likelihood.data import Observations
 from pbrl_ppl.likelihood.trajectory_noise import Sensitivity, TrajectoryNoise
@@ -193,6 +194,10 @@ class Likelihood(ABC):
         nu : float, ndarray or None
             Degrees of freedom.
         """
+
+
+#: The likelihood of a problem or a mode; any without an argument.
+LikelihoodT = TypeVar("LikelihoodT", bound=Likelihood, default=Likelihood, covariant=True)
 
 
 @final

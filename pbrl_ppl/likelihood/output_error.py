@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import ClassVar, final
+from typing import ClassVar, TypeGuard, final
 
 import numpy as np
 
@@ -284,12 +284,21 @@ class OutputErrorLikelihood(Likelihood):
         return tau
 
 
+#: A problem whose trajectories are simulated from latent initial states.
+SimulatedProblem = Problem[OutputErrorLikelihood]
+
+
+def is_simulated(problem: Problem) -> TypeGuard[SimulatedProblem]:
+    """Return whether the problem's trajectories are simulated from latent initial states."""
+    return isinstance(problem.likelihood, OutputErrorLikelihood)
+
+
 def without(u: Floats, rows: Floats) -> Floats:
     """Return rows (piece, row) without what orthonormal columns (piece, row, direction) explain."""
     return np.asarray(rows - (u @ (np.swapaxes(u, 1, 2) @ rows[..., None]))[..., 0])
 
 
-def in_pieces(problem: Problem, length: int, states: Floats) -> Problem:
+def in_pieces(problem: Problem, length: int, states: Floats) -> SimulatedProblem:
     """Return the problem of pieces that are simulated from latent initial states.
 
     Parameters
@@ -301,7 +310,7 @@ def in_pieces(problem: Problem, length: int, states: Floats) -> Problem:
     states : ndarray
         Initial states, shape (trajectory, time, body, 6), SI units.
     """
-    problem = problem.on(replace(problem.data, horizon=length, states=states, columns=None))
+    problem = problem.with_data(horizon=length, states=states, columns=None)
     coordinates = observed_coordinates(problem.scene, problem.data.history)
     columns, dimension = problem.observations.columns, coordinates.places % len(STATE)
     column = np.array([columns.index(d) if d in columns else -1 for d in dimension])
@@ -314,15 +323,17 @@ def in_pieces(problem: Problem, length: int, states: Floats) -> Problem:
         tau=(1.0,) * len(columns),
         nu=problem.likelihood.nu,
     )
-    return replace(problem, likelihood=likelihood)
+    return Problem(problem.data, problem.physics, likelihood, problem.library)
 
 
-def linearised_pieces(problem: Problem, start: Floats, slope: Floats, tau: Floats) -> Problem:
+def linearised_pieces(
+    problem: SimulatedProblem, start: Floats, slope: Floats, tau: Floats
+) -> SimulatedProblem:
     """Return the problem of pieces with other initial states and what was linearised there.
 
     Parameters
     ----------
-    problem : Problem
+    problem : SimulatedProblem
         Result of :func:`in_pieces`.
     start : ndarray
         Initial states, shape (piece, body, 6), SI units.
@@ -337,27 +348,14 @@ def linearised_pieces(problem: Problem, start: Floats, slope: Floats, tau: Float
     return problem.with_likelihood(tau=tuple(np.asarray(tau).tolist())).with_states(states)
 
 
-def linearised_about(problem: Problem, start: Floats, slope: Floats) -> Problem:
+def linearised_about(problem: SimulatedProblem, start: Floats, slope: Floats) -> SimulatedProblem:
     """Return the problem with the likelihood about other initial states; its data stay.
 
     Arguments are those of :func:`linearised_pieces`.
     """
-    old = output_error(problem).initial_states
+    old = problem.likelihood.initial_states
     begin = _begin(problem, old.coordinates, old.column, start)
     return problem.with_likelihood(initial_states=replace(old, slope=slope, begin=begin))
-
-
-def output_error(problem: Problem) -> OutputErrorLikelihood:
-    """Return the likelihood of a problem of pieces.
-
-    Raises
-    ------
-    TypeError
-        If it is another.
-    """
-    if isinstance(problem.likelihood, OutputErrorLikelihood):
-        return problem.likelihood
-    raise TypeError("the problem has another likelihood, expected that of simulated pieces")
 
 
 def _begin(problem: Problem, coordinates: Coordinates, column: Ints, start: Floats) -> Floats:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, Generic, Self, TypeGuard, cast
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from pbrl_ppl.history import History, Segments
 from pbrl_ppl.likelihood.coordinates import ACCELERATION, CONTACT
 from pbrl_ppl.likelihood.data import Data, Observations, least_noise, sigma_prior
 from pbrl_ppl.likelihood.likelihood import (
-    Likelihood,
+    LikelihoodT,
     TrajectoryLikelihood,
     TransitionLikelihood,
     noise_labels,
@@ -79,7 +79,7 @@ ACTION_DIMS = ("transition", "step", "body", "wrench")
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class Problem(Generic[LikelihoodT]):
     """An inference problem in numpy, from which :func:`physics_model` declares a PyMC model.
 
     A change of one part keeps the others, with their engines and segments.
@@ -100,7 +100,7 @@ class Problem:
 
     data: Data
     physics: Physics
-    likelihood: Likelihood
+    likelihood: LikelihoodT
     library: ParameterLibrary | None = None
     defect: Floats | None = None
 
@@ -112,21 +112,22 @@ class Problem:
         *,
         horizon: int = 1,
         columns: tuple[int, ...] | None = None,
-        likelihood: Likelihood | None = None,
+        likelihood: TransitionLikelihood | None = None,
         library: ParameterLibrary | None = None,
-    ) -> Problem:
+    ) -> Problem[TransitionLikelihood]:
         """Return the problem of a history, with the parts that it shows; Eq. 11 by default.
 
         ``horizon`` and ``columns`` are fields of :class:`Data`.
         """
         data = Data(physics.scene, history, horizon, columns)
-        return cls(data, physics.in_parts(history), likelihood or TransitionLikelihood(), library)
+        physics, likelihood = physics.in_parts(history), likelihood or TransitionLikelihood()
+        return Problem(data, physics, likelihood, library)
 
-    def with_data(self, **changes: Any) -> Problem:
+    def with_data(self, **changes: Any) -> Problem[TransitionLikelihood]:
         """Return the same problem of other data; arguments are fields of :class:`Data`."""
         return self.on(replace(self.data, **changes))
 
-    def on(self, data: Data) -> Problem:
+    def on(self, data: Data) -> Problem[TransitionLikelihood]:
         """Return the same problem of other data, with the likelihood of single transitions.
 
         Independent parts are found again for another history; equal ones keep their engines.
@@ -134,14 +135,13 @@ class Problem:
         physics = self.physics
         if data.history is not self.data.history:
             physics = physics.in_parts(data.history)
-        likelihood = self.likelihood.of_data()
-        return replace(self, data=data, physics=physics, likelihood=likelihood, defect=None)
+        return Problem(data, physics, self.likelihood.of_data(), self.library)
 
-    def with_states(self, states: Floats) -> Problem:
+    def with_states(self, states: Floats) -> Self:
         """Return the same problem with other smoothed states; the likelihood stays."""
         return replace(self, data=replace(self.data, states=states))
 
-    def with_physics(self, **changes: Any) -> Problem:
+    def with_physics(self, **changes: Any) -> Self:
         """Return the same problem with other physics; arguments are fields of :class:`Physics`.
 
         Predictions have no correction of few engine steps then.
@@ -153,25 +153,26 @@ class Problem:
             likelihood = likelihood.of_parameters()
         return replace(self, physics=physics, likelihood=likelihood, defect=None)
 
-    def with_likelihood(self, **changes: Any) -> Problem:
+    def with_likelihood(self, **changes: Any) -> Self:
         """Return the same problem with other noise; arguments are fields of its likelihood."""
         return replace(self, likelihood=replace(self.likelihood, **changes))
 
-    def along(self, noise: TrajectoryNoise, **changes: Any) -> Problem:
+    def along(self, noise: TrajectoryNoise, **changes: Any) -> FilteredProblem:
         """Return the same problem with the likelihood of whole trajectories.
 
         ``changes`` are other fields of :class:`TrajectoryLikelihood`.
         """
         settings = {"nu": self.likelihood.nu, "prior": self.likelihood.prior, **changes}
-        return replace(self, likelihood=TrajectoryLikelihood(noise=noise, **settings))
+        likelihood = TrajectoryLikelihood(noise=noise, **settings)
+        return Problem(self.data, self.physics, likelihood, self.library, self.defect)
 
     @property
-    def coarse(self) -> Problem:
+    def coarse(self) -> Self:
         """The same problem with the fewest engine steps; see ``Physics.coarse``."""
         return replace(self, physics=self.physics.coarse, defect=None)
 
     @property
-    def medium(self) -> Problem:
+    def medium(self) -> Self:
         """The same problem with at most a medium number of engine steps."""
         return replace(self, physics=self.physics.medium, defect=None)
 
@@ -219,18 +220,7 @@ class Problem:
 
     @property
     def trajectory_noise(self) -> TrajectoryNoise:
-        """The noise along whole trajectories.
-
-        Raises
-        ------
-        TypeError
-            If the likelihood is of single transitions.
-        """
-        if isinstance(self.likelihood, TrajectoryLikelihood):
-            return self.likelihood.noise
-        raise TypeError(
-            f"the problem's likelihood is of {self.likelihood.name}, expected trajectories"
-        )
+        return cast(TrajectoryLikelihood, self.likelihood).noise
 
     @property
     def noise_variables(self) -> dict[str, tuple[str, ...]]:
@@ -328,7 +318,16 @@ class Problem:
         return self.likelihood.random(predicted, values, sigma, rng, self.nu(phi))
 
 
-def with_defect(problem: Problem, exact: Problem, phi: Floats) -> Problem:
+#: A problem whose trajectories are filtered.
+FilteredProblem = Problem[TrajectoryLikelihood]
+
+
+def is_filtered(problem: Problem) -> TypeGuard[FilteredProblem]:
+    """Return whether the problem's trajectories are filtered, with process noise."""
+    return isinstance(problem.likelihood, TrajectoryLikelihood)
+
+
+def with_defect(problem: Problem[LikelihoodT], exact: Problem, phi: Floats) -> Problem[LikelihoodT]:
     """Return a problem of few engine steps, predictions corrected at phi (p,) to an exact one's.
 
     The error of few steps hardly depends on the parameters: the difference between both engines at
@@ -338,7 +337,9 @@ def with_defect(problem: Problem, exact: Problem, phi: Floats) -> Problem:
     return replace(problem, defect=np.nan_to_num(exact.predict(phi) - problem.predict(phi)))
 
 
-def corrected(problem: Problem, phi: Floats, *, worth: int = 3) -> Problem:
+def corrected(
+    problem: Problem[LikelihoodT], phi: Floats, *, worth: int = 3
+) -> Problem[LikelihoodT]:
     """Return the problem with fewer engine steps, corrected at phi, where that saves time.
 
     ``worth``: ratio of engine steps from which it does.

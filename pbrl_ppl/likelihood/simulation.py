@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from pbrl_ppl.history import History
-from pbrl_ppl.likelihood.problem import Problem
+from pbrl_ppl.likelihood.problem import FilteredProblem
 from pbrl_ppl.likelihood.smoothing import along_trajectories
 from pbrl_ppl.physics import touching
 from pbrl_ppl.state import Floats
 
 
 def simulated_trajectories(
-    problem: Problem, phi: Floats, sigma: Floats, rng: np.random.Generator
+    problem: FilteredProblem, phi: Floats, sigma: Floats, rng: np.random.Generator
 ) -> Floats:
     """Return simulated measurements from the recorded first states and commands.
 
@@ -31,7 +31,7 @@ def simulated_trajectories(
         Shape (trajectory, time, body, 6), SI units; NaN where the recording has no measurement, and
         everywhere in a trajectory in which the engine diverged.
     """
-    coordinates, segments = problem.trajectory_noise.coordinates, problem.segments
+    coordinates, segments = problem.likelihood.noise.coordinates, problem.segments
     world = problem.physics.one_world
     observed = problem.data.history.dataset["observed"].to_numpy()
     states = problem.data.smoothed_states.copy()
@@ -53,7 +53,7 @@ def simulated_trajectories(
     return np.where(np.isfinite(observed), measured, np.nan)
 
 
-def with_measurements(problem: Problem, observed: Floats) -> Problem:
+def with_measurements(problem: FilteredProblem, observed: Floats) -> FilteredProblem:
     """Return the problem of whole trajectories with other measurements.
 
     Parameters
@@ -63,7 +63,7 @@ def with_measurements(problem: Problem, observed: Floats) -> Problem:
     observed : ndarray
         Shape (trajectory, time, body, 6), SI units, NaN where missing.
     """
-    noise = problem.trajectory_noise
+    noise = problem.likelihood.noise
     dataset = problem.data.history.dataset.copy()
     start = np.where(np.isfinite(observed), observed, dataset["start"])
     for name, values in (("observed", observed), ("start", start)):

@@ -17,7 +17,8 @@ from pbrl_ppl.likelihood.coordinates import (
     observed_coordinates,
 )
 from pbrl_ppl.likelihood.data import least_noise
-from pbrl_ppl.likelihood.problem import Problem
+from pbrl_ppl.likelihood.likelihood import LikelihoodT, TransitionLikelihood
+from pbrl_ppl.likelihood.problem import FilteredProblem, Problem
 from pbrl_ppl.likelihood.trajectory_noise import Sensitivity, TrajectoryNoise
 from pbrl_ppl.physics import touching
 from pbrl_ppl.scene import Scene
@@ -31,7 +32,7 @@ def along_trajectories(
     coordinates: Coordinates | None = None,
     *,
     shares: tuple[float, ...] = (0.5, 1.0),
-) -> Problem:
+) -> FilteredProblem:
     """Return the problem with the likelihood of whole trajectories, linearised at smoothed states.
 
     Parameters
@@ -60,35 +61,34 @@ def along_trajectories(
     """
     history = problem.data.history
     data = replace(problem.data, horizon=1, states=first_states(history))
-    problem = with_predicted_gaps(problem.on(data), phi)
+    eq_11 = with_predicted_gaps(problem.on(data), phi)
     continued = coordinates is not None
     if coordinates is None:
-        coordinates = observed_coordinates(problem.scene, history)
-        check_moves(coordinates, problem.scene)
-        states = problem.data.smoothed_states
-        medians = tuple(noise_medians(coordinates, problem.scene, history, states).tolist())
-        eq_11 = replace(problem.likelihood.of_data(), scalar=False, prior=(medians, SPREAD))
-        problem = replace(problem, likelihood=eq_11)
-    problem = problem.on(replace(problem.data, columns=coordinates.columns))
-    begin = _guess(problem, coordinates, phi)
+        coordinates = observed_coordinates(eq_11.scene, history)
+        check_moves(coordinates, eq_11.scene)
+        states = eq_11.data.smoothed_states
+        medians = tuple(noise_medians(coordinates, eq_11.scene, history, states).tolist())
+        eq_11 = eq_11.with_likelihood(scalar=False, prior=(medians, SPREAD))
+    eq_11 = eq_11.with_data(columns=coordinates.columns)
+    begin = _guess(eq_11, coordinates, phi)
     sigma = begin if sigma is None else sigma
-    n, d = problem.segments.n, len(coordinates.places)
-    problem = problem.along(linearised(problem, coordinates, np.zeros((n, d, d)), begin))
-    problem = _sloped(problem, phi, begin, _steps(problem, coordinates, begin), np.full(n, True))
-    problem = smoothed(problem, phi, begin)
+    n, d = eq_11.segments.n, len(coordinates.places)
+    whole = eq_11.along(linearised(eq_11, coordinates, np.zeros((n, d, d)), begin))
+    whole = _sloped(whole, phi, begin, _steps(whole, coordinates, begin), np.full(n, True))
+    whole = smoothed(whole, phi, begin)
     if sigma is not begin:  # the physics alone may diverge from rough states
         for share in shares:
-            problem = smoothed(problem, phi, _between(begin, sigma, share, coordinates))
+            whole = smoothed(whole, phi, _between(begin, sigma, share, coordinates))
     if not continued:  # the noise of measurements adds to the changes of states as measured
-        moved = noise_medians(coordinates, problem.scene, history, problem.data.smoothed_states)
+        moved = noise_medians(coordinates, whole.scene, history, whole.data.smoothed_states)
         steps = list(coordinates.accelerations)
-        least = problem.noise_prior[0].copy()
+        least = whole.noise_prior[0].copy()
         least[steps] = np.minimum(least[steps], moved[steps])
-        problem = problem.with_likelihood(prior=(tuple(least.tolist()), SPREAD))
-    return problem
+        whole = whole.with_likelihood(prior=(tuple(least.tolist()), SPREAD))
+    return whole
 
 
-def single_transitions(problem: Problem) -> Problem:
+def single_transitions(problem: Problem) -> Problem[TransitionLikelihood]:
     """Return the problem with the likelihood of single transitions (Eq. 11)."""
     horizon = longest_gap(problem.data.history)
     data = replace(problem.data, horizon=horizon, states=None, columns=None)
@@ -96,7 +96,7 @@ def single_transitions(problem: Problem) -> Problem:
 
 
 def smoothed(
-    problem: Problem,
+    problem: FilteredProblem,
     phi: Floats,
     sigma: Floats,
     *,
@@ -104,7 +104,7 @@ def smoothed(
     rounds: int = 4,
     stale: float = 0.3,
     little: float = 0.1,
-) -> Problem:
+) -> FilteredProblem:
     """Return the problem linearised about states smoothed at phi and sigma.
 
     Near-zero unexplained accelerations are raised to a small value: with stick and slip, smoothing
@@ -117,13 +117,13 @@ def smoothed(
 
     ``little``: least unexplained acceleration to smooth with, as a share of its prior median.
     """
-    steps = list(problem.trajectory_noise.coordinates.accelerations)
+    steps = list(problem.likelihood.noise.coordinates.accelerations)
     sigma = sigma.copy()
     sigma[steps] = np.maximum(sigma[steps], little * problem.noise_prior[0][steps])
     begun: Floats = np.array(np.inf)  # states at which each transition's slope was taken
-    residual = problem.trajectory_noise.coordinates.of_residual(problem.residual(phi))
+    residual = problem.likelihood.noise.coordinates.of_residual(problem.residual(phi))
     for _ in range(rounds):
-        noise = problem.trajectory_noise
+        noise = problem.likelihood.noise
         coordinates = noise.coordinates
         before, after = noise.smoothed(residual, sigma)
         spread = np.sqrt(np.median(np.diagonal(noise.covariance(sigma), axis1=1, axis2=2), axis=0))
@@ -136,7 +136,7 @@ def smoothed(
         moved = _sloped(moved, phi, sigma, spread, far)
         begun = np.where(far[:, None], begin, begun)
         residual = coordinates.of_residual(moved.residual(phi))
-        if not np.isfinite(moved.trajectory_noise.filtered(residual[None], sigma)[0]).all():
+        if not np.isfinite(moved.likelihood.noise.filtered(residual[None], sigma)[0]).all():
             break  # diverged: nothing follows from the new one
         problem = moved
         shown = after[noise.seen.any(axis=1)]
@@ -145,7 +145,7 @@ def smoothed(
     return problem
 
 
-def with_sensitivity(problem: Problem, phi: Floats, sigma: Floats) -> Problem:
+def with_sensitivity(problem: FilteredProblem, phi: Floats, sigma: Floats) -> FilteredProblem:
     """Return the problem with smoothed states that follow phi to first order.
 
     Parameters
@@ -159,7 +159,7 @@ def with_sensitivity(problem: Problem, phi: Floats, sigma: Floats) -> Problem:
     """
     if not len(phi):
         return problem
-    noise, segments = problem.trajectory_noise, problem.segments
+    noise, segments = problem.likelihood.noise, problem.segments
     coordinates, nothing = noise.coordinates, np.zeros_like(noise.measured)
     slopes = problem.medium.physics.simulator.jacobian(phi, segments.start, problem.inputs)[:, 0]
     still = replace(noise, begin=nothing, measured=nothing, sensitivity=None)
@@ -174,7 +174,7 @@ def with_sensitivity(problem: Problem, phi: Floats, sigma: Floats) -> Problem:
     return problem.along(replace(noise, sensitivity=follow))
 
 
-def with_predicted_gaps(problem: Problem, phi: Floats) -> Problem:
+def with_predicted_gaps(problem: Problem[LikelihoodT], phi: Floats) -> Problem[LikelihoodT]:
     """Return the problem with states of unobserved rows predicted from the row before.
 
     Interpolation between rows that are far apart would miss contacts.
@@ -235,10 +235,10 @@ def _guess(problem: Problem, coordinates: Coordinates, phi: Floats) -> Floats:
     return np.maximum(guess, problem.noise_prior[0] * 0.01)
 
 
-def _moved(problem: Problem, before: Floats, after: Floats) -> Floats:
+def _moved(problem: FilteredProblem, before: Floats, after: Floats) -> Floats:
     """Return the states moved by the smoothed deviations."""
-    segments, first = problem.segments, problem.trajectory_noise.first
-    coordinates = problem.trajectory_noise.coordinates
+    segments, first = problem.segments, problem.likelihood.noise.first
+    coordinates = problem.likelihood.noise.coordinates
     states = problem.data.smoothed_states.copy()
     flat = states.reshape(*states.shape[:2], -1)
     at = segments.trajectory[:, None], segments.step[:, None] + 1, coordinates.places
@@ -248,12 +248,14 @@ def _moved(problem: Problem, before: Floats, after: Floats) -> Floats:
     return coordinates.completed(problem.scene, states)
 
 
-def _sloped(problem: Problem, phi: Floats, sigma: Floats, steps: Floats, rows: Bools) -> Problem:
+def _sloped(
+    problem: FilteredProblem, phi: Floats, sigma: Floats, steps: Floats, rows: Bools
+) -> FilteredProblem:
     """Return the problem linearised about its states by central differences.
 
     Where ``rows``, shape (transition,), is not set, the slopes are those that the problem has.
     """
-    coordinates, slope = problem.trajectory_noise.coordinates, problem.trajectory_noise.slope
+    coordinates, slope = problem.likelihood.noise.coordinates, problem.likelihood.noise.slope
     inputs = problem.inputs[rows]
 
     def predict(states: Floats) -> Floats:
@@ -389,11 +391,11 @@ def _vectors(typical: Floats, rates: tuple[int, ...]) -> Floats:
     return np.array([typical[d] if d % VELOCITY == THETA else size for d in rates])
 
 
-def bodies_acceleration(problem: Problem) -> Floats:
+def bodies_acceleration(problem: FilteredProblem) -> Floats:
     """Return the root mean square acceleration along smoothed trajectories, shape (velocity,).
 
     Of x and y it is that of the vector, whatever the axes' directions (m/s^2); of omega in rad/s^2.
     """
-    coordinates, segments = problem.trajectory_noise.coordinates, problem.segments
+    coordinates, segments = problem.likelihood.noise.coordinates, problem.segments
     change = segments.observed[:, 0] - segments.start
     return _vectors(_typical(coordinates, [change]), coordinates.rates) / problem.scene.time_step

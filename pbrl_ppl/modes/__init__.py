@@ -19,8 +19,12 @@ from .ladder import ladder as ladder
 from .ladder import piece_lengths as piece_lengths
 from .ladder import simulated_states as simulated_states
 from .ladder import with_robust_covariance as with_robust_covariance
+from .laplace import FilteredMode as FilteredMode
 from .laplace import Mode as Mode
+from .laplace import SimulatedMode as SimulatedMode
 from .laplace import covariance_of as covariance_of
+from .laplace import is_filtered_mode as is_filtered_mode
+from .laplace import is_simulated_mode as is_simulated_mode
 from .laplace import posterior_slopes as posterior_slopes
 from .library_choice import choose_from_library as choose_from_library
 from .library_choice import library_of as library_of

@@ -15,16 +15,15 @@ import numpy as np
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import longest_gap
 from pbrl_ppl.likelihood import (
-    Problem,
+    SimulatedProblem,
     autocovariance,
     in_pieces,
     linearised_about,
     linearised_pieces,
-    output_error,
     with_defect,
     without,
 )
-from pbrl_ppl.modes.laplace import Mode, covariance_of
+from pbrl_ppl.modes.laplace import Mode, SimulatedMode, covariance_of
 from pbrl_ppl.modes.noise import finite
 from pbrl_ppl.modes.search import find_mode
 from pbrl_ppl.parameters import box, inside, prior_residual, prior_slopes
@@ -41,7 +40,7 @@ _LEAST, _MOST = 1e-6, 2e-2
 
 
 @one_blas_thread
-def ladder(mode: Mode) -> list[Mode]:
+def ladder(mode: Mode) -> list[SimulatedMode]:
     """Return the modes of simulated pieces of a model, the shortest pieces first.
 
     Parameters
@@ -60,7 +59,7 @@ def ladder(mode: Mode) -> list[Mode]:
     HistoryError
         If no trajectory has three rows, or initial states can follow all that was measured.
     """
-    modes: list[Mode] = []
+    modes: list[SimulatedMode] = []
     states, phi = mode.problem.data.smoothed_states, mode.phi
     for length in piece_lengths(mode):
         problem = in_pieces(mode.problem, length, states)
@@ -87,9 +86,9 @@ def piece_lengths(mode: Mode) -> list[int]:
             f"history: its longest trajectory has {longest + 1} rows, a simulation is judged by at"
             " least 3; record longer trajectories"
         )
-    initial_states = output_error(
-        in_pieces(mode.problem, longest, mode.problem.data.smoothed_states)
-    ).initial_states
+    initial_states = in_pieces(
+        mode.problem, longest, mode.problem.data.smoothed_states
+    ).likelihood.initial_states
     measured, unknown = int(initial_states.measured.sum()), initial_states.unknown + len(mode.phi)
     if measured <= unknown:
         raise HistoryError(
@@ -121,7 +120,7 @@ def lengths(longest: int, gap: int = 1, *, shortest: int = 4, ratio: int = 4) ->
     return [*shorter, longest]
 
 
-def with_robust_covariance(mode: Mode, *, many: int = 8) -> Mode:
+def with_robust_covariance(mode: SimulatedMode, *, many: int = 8) -> SimulatedMode:
     """Return a mode of simulated pieces with the covariance under errors as correlated as they are.
 
     A sandwich: the inverse precision, the variance of the score, the inverse precision. With many
@@ -130,7 +129,7 @@ def with_robust_covariance(mode: Mode, *, many: int = 8) -> Mode:
 
     ``many``: trajectories whose scores' scatter is a variance, at least.
     """
-    problem, likelihood, p = mode.problem, output_error(mode.problem), len(mode.phi)
+    problem, likelihood, p = mode.problem, mode.problem.likelihood, len(mode.phi)
     if not p:
         return mode
     initial_states, weight = likelihood.initial_states, likelihood.weight(mode.sigma)
@@ -181,7 +180,7 @@ class Linear:
 
 @one_blas_thread
 def fit_pieces(
-    problem: Problem,
+    problem: SimulatedProblem,
     phi: Floats,
     rounds: int = 20,
     tolerance: float = 0.1,
@@ -193,7 +192,7 @@ def fit_pieces(
     least_damping: float = 1e-8,
     wider: tuple[float, ...] = (3.0, 0.1),
     first_width: float = 1e-4,
-) -> Mode:
+) -> SimulatedMode:
     """Return a mode of simulated pieces by Gauss-Newton steps, initial states projected out.
 
     Parameters
@@ -223,7 +222,7 @@ def fit_pieces(
     """
     priors, layout = problem.layout.priors, problem.layout
     scale = layout.scale(phi)
-    sizes = output_error(problem).initial_states.coordinates.sizes(problem.scene)
+    sizes = problem.likelihood.initial_states.coordinates.sizes(problem.scene)
     phi, start = inside(priors, phi), problem.segments.start
     steps = first_width * np.where(layout.discrete, 0.0, scale), first_width * sizes
     damping, failed, one_sided = 1e-3, 0, True
@@ -269,14 +268,14 @@ def fit_pieces(
 
 @one_blas_thread
 def fit_pieces_closely(
-    problem: Problem,
+    problem: SimulatedProblem,
     phi: Floats,
     rounds: int = 8,
     tolerance: float = 0.5,
     *,
     repeats: int = 2,
     worth: float = 1.0,
-) -> Mode:
+) -> SimulatedMode:
     """Return a mode of simulated pieces that climbs from the linearised initial states confirm.
 
     Friction makes kinks, at which Gauss-Newton steps of parameters and initial states end. Climbs
@@ -293,13 +292,13 @@ def fit_pieces_closely(
     return mode
 
 
-def corrected(mode: Mode) -> Mode:
+def corrected(mode: SimulatedMode) -> SimulatedMode:
     """Return a mode of simulated pieces with few engine steps, whose error there is corrected."""
     problem = mode.problem
     return replace(mode, problem=with_defect(problem.coarse, problem.medium, mode.phi))
 
 
-def _residual(problem: Problem, points: Floats, initial_states: Floats) -> Floats:
+def _residual(problem: SimulatedProblem, points: Floats, initial_states: Floats) -> Floats:
     """Return residuals at points (n, p) and initial states (n, piece, body, 6)."""
     engine = problem.medium if problem.defect is None else problem
     states = engine.physics.simulator(points, np.ascontiguousarray(initial_states), problem.inputs)
@@ -308,7 +307,7 @@ def _residual(problem: Problem, points: Floats, initial_states: Floats) -> Float
 
 
 def _linearise(
-    problem: Problem,
+    problem: SimulatedProblem,
     phi: Floats,
     start: Floats,
     steps: tuple[Floats, Floats],
@@ -318,7 +317,7 @@ def _linearise(
 
     They are central but for those by phi where ``one_sided``.
     """
-    coordinates = output_error(problem).initial_states.coordinates
+    coordinates = problem.likelihood.initial_states.coordinates
     lower, upper = box(problem.layout.priors)
     ahead, behind = np.minimum(phi + steps[0], upper), np.maximum(phi - steps[0], lower)
     if one_sided:
@@ -340,7 +339,7 @@ def _linearise(
     return Linear(residual[0], by_phi, by_start)
 
 
-def _cost(problem: Problem, sigma: Floats, phi: Floats) -> float:
+def _cost(problem: SimulatedProblem, sigma: Floats, phi: Floats) -> float:
     """Return the negative log-posterior, the noise at its profile, up to a constant."""
     weight = problem.likelihood.counts(problem.observations)
     prior = 0.5 * (prior_residual(problem.layout.priors, phi) ** 2).sum()
@@ -350,13 +349,15 @@ def _cost(problem: Problem, sigma: Floats, phi: Floats) -> float:
 class _Step:
     """Gauss-Newton steps from one linearisation, with fixed noise, weights and projection."""
 
-    def __init__(self, problem: Problem, linear: Linear, phi: Floats, start: Floats) -> None:
+    def __init__(
+        self, problem: SimulatedProblem, linear: Linear, phi: Floats, start: Floats
+    ) -> None:
         problem, residual = linearised_about(problem, start, linear.by_start), linear.residual
-        likelihood, self.by_start = output_error(problem), linear.by_start
+        likelihood, self.by_start = problem.likelihood, linear.by_start
         self.sigma = likelihood.profile(residual, problem.least_noise)
         tau = likelihood.correlation_times(residual, self.sigma)
         self.problem = problem.with_likelihood(tau=tuple(tau.tolist()))
-        likelihood = output_error(self.problem)
+        likelihood = self.problem.likelihood
         self.initial_states, self.weight = likelihood.initial_states, likelihood.weight(self.sigma)
         self.u, self.back = self.initial_states.basis(self.weight)
         by_phi = np.moveaxis(linear.by_phi, -1, 0) * self.weight
@@ -388,7 +389,7 @@ class _Step:
     def _rows(self, start: Floats, residual: Floats) -> Floats:
         """Return weighted residuals with those of the initial states, shape (piece, row)."""
         begun = linearised_about(self.problem, start, self.by_start)
-        return output_error(begun).initial_states.rows(residual, self.weight)
+        return begun.likelihood.initial_states.rows(residual, self.weight)
 
     def cost(self, phi: Floats, start: Floats, residual: Floats) -> float:
         """Return the negative log-posterior at a point, the noise at its profile."""
@@ -403,9 +404,9 @@ class _Step:
         sigma = np.sqrt(square / self.initial_states.counts) / self.weight
         return _cost(self.problem, np.maximum(sigma, self.problem.least_noise), phi)
 
-    def mode(self) -> Mode:
+    def mode(self) -> SimulatedMode:
         """Return the point as a mode, whose problem is linearised there."""
-        tau = np.array(output_error(self.problem).tau)
+        tau = np.array(self.problem.likelihood.tau)
         problem = linearised_pieces(self.problem, self.start, self.by_start, tau)
         log_posterior = -_cost(problem, self.sigma, self.phi)
         return Mode(problem, self.phi, self.sigma, self.jacobian, self.covariance, log_posterior)
@@ -454,7 +455,7 @@ class _Step:
         return phi, coordinates.completed(self.problem.scene, states)
 
 
-def simulated_states(mode: Mode) -> Floats:
+def simulated_states(mode: SimulatedMode) -> Floats:
     """Return the states along the simulated pieces, shape (trajectory, time, body, 6)."""
     problem, segments = mode.problem, mode.problem.segments
     ends = problem.medium.physics.simulator(mode.phi, segments.start, problem.inputs)
@@ -469,9 +470,9 @@ def simulated_states(mode: Mode) -> Floats:
     return states
 
 
-def growth(problem: Problem) -> float:
+def growth(problem: SimulatedProblem) -> float:
     """Return how much pieces magnify initial states, beyond growth in proportion to time."""
-    slope = np.abs(output_error(problem).initial_states.slope)
+    slope = np.abs(problem.likelihood.initial_states.slope)
     size = np.sqrt((slope**2).sum(axis=(2, 3)))  # (piece, H, cell)
     first = max(3, min(size.shape[1] // 2, 8))
     begin = size[:, :first].max(axis=1)

@@ -5,12 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeGuard
 
 import numpy as np
 from scipy.optimize import least_squares
 
-from pbrl_ppl.likelihood import Problem, log_posterior
+from pbrl_ppl.likelihood import (
+    LikelihoodT,
+    OutputErrorLikelihood,
+    Problem,
+    TrajectoryLikelihood,
+    log_posterior,
+)
 from pbrl_ppl.modes.noise import FAR_OFF, best_tails, noise_gaussian, profile_sigma, tail_precision
 from pbrl_ppl.parameters import Prior, box, by_prior, differentiate, inside, prior_residual
 from pbrl_ppl.physics import PartedSimulator
@@ -33,7 +39,7 @@ class LocalMode(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Mode:
+class Mode(Generic[LikelihoodT]):
     """A mode of the posterior.
 
     Parameters
@@ -54,13 +60,13 @@ class Mode:
         Lower modes that may hold a share of the posterior.
     """
 
-    problem: Problem
+    problem: Problem[LikelihoodT]
     phi: Floats
     sigma: Floats
     jacobian: Floats
     covariance: Floats
     log_posterior: float
-    others: tuple[Mode, ...] = ()
+    others: tuple[Mode[LikelihoodT], ...] = ()
 
     @property
     def values(self) -> dict[str, Floats]:
@@ -79,7 +85,7 @@ class Mode:
 
         Shapes (parameter,) and (parameter, parameter).
         """
-        if self.problem.likelihood.filtered:
+        if isinstance(self.problem.likelihood, TrajectoryLikelihood):
             residual = self.problem.residual(self.phi)
             return noise_gaussian(self.problem, residual, self.sigma, self.phi)
         # half the inverse of the number of measurements
@@ -97,6 +103,21 @@ class Mode:
         residual = self.problem.whitened(self.phi, self.sigma)
         residual.setflags(write=False)
         return residual
+
+
+#: Modes of filtered and of simulated trajectories.
+FilteredMode = Mode[TrajectoryLikelihood]
+SimulatedMode = Mode[OutputErrorLikelihood]
+
+
+def is_filtered_mode(mode: Mode) -> TypeGuard[FilteredMode]:
+    """Return whether the mode's trajectories are filtered, with process noise."""
+    return isinstance(mode.problem.likelihood, TrajectoryLikelihood)
+
+
+def is_simulated_mode(mode: Mode) -> TypeGuard[SimulatedMode]:
+    """Return whether the mode's trajectories are simulated from latent initial states."""
+    return isinstance(mode.problem.likelihood, OutputErrorLikelihood)
 
 
 def posterior_slopes(
@@ -195,7 +216,7 @@ def canonical_wheels(problem: Problem, peak: LocalMode) -> LocalMode:
     return LocalMode(better, peak.sigma, peak.log_posterior + float(gain.sum()))
 
 
-def finish(problem: Problem, peak: LocalMode) -> Mode:
+def finish(problem: Problem[LikelihoodT], peak: LocalMode) -> Mode[LikelihoodT]:
     """Return the mode at a peak, with the Jacobian taken at the posterior's scale."""
     phi, sigma, log_posterior = canonical_wheels(problem, peak)
     priors = problem.layout.priors

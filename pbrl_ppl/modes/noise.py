@@ -10,12 +10,14 @@ from scipy.optimize import minimize
 from scipy.special import wrightomega
 
 from pbrl_ppl.likelihood import (
+    FilteredProblem,
     Problem,
     exponential,
+    is_filtered,
+    is_simulated,
     log_noise_prior,
     noise_law,
     noise_prior_slope,
-    output_error,
 )
 from pbrl_ppl.parameters import box
 from pbrl_ppl.scene import state_sizes
@@ -55,11 +57,11 @@ def profile_sigma(
         Noise parameters of whole trajectories that are given.
     """
     residual, medians = finite(problem, residual), problem.noise_prior[0]
-    filtered, gaussian = problem.likelihood.filtered, problem.nu(phi) is None
-    if filtered:
-        begin = np.log(problem.trajectory_noise.sigma)
-    elif problem.likelihood.simulated:
-        begin = np.log(output_error(problem).profile(residual, problem.least_noise))
+    filtered, gaussian = is_filtered(problem), problem.nu(phi) is None
+    if is_filtered(problem):
+        begin = np.log(problem.likelihood.noise.sigma)
+    elif is_simulated(problem):
+        begin = np.log(problem.likelihood.profile(residual, problem.least_noise))
     else:
         begin = gaussian_log_sigma(problem, (residual**2).sum((0, 1, 2)))
         if gaussian:
@@ -87,9 +89,11 @@ def _cost(log_sigma: Floats, problem: Problem, residual: Floats, phi: Floats | N
     return float(log_sigma.sum() - log_noise_prior(problem, log_sigma) - likelihood)
 
 
-def _cost_and_slope(log_sigma: Floats, problem: Problem, residual: Floats) -> tuple[float, Floats]:
+def _cost_and_slope(
+    log_sigma: Floats, problem: FilteredProblem, residual: Floats
+) -> tuple[float, Floats]:
     """Return the negative log-density for Gaussian noise, and its derivative by log sigma."""
-    likelihood, slope = problem.trajectory_noise.score(residual, np.exp(log_sigma))
+    likelihood, slope = problem.likelihood.noise.score(residual, np.exp(log_sigma))
     cost = float(log_sigma.sum() - log_noise_prior(problem, log_sigma) - likelihood)
     return cost, 1.0 - noise_prior_slope(problem, log_sigma) - slope
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import differential_evolution
 
 from pbrl_ppl.errors import FitError
-from pbrl_ppl.likelihood import Problem, estimate_sigma
+from pbrl_ppl.likelihood import LikelihoodT, Problem, estimate_sigma
 from pbrl_ppl.modes.laplace import ROUNDS, STALLED, LocalMode, Mode, canonical_wheels, climb, finish
 from pbrl_ppl.modes.noise import FAR_OFF, finite, gaussian_profile
 from pbrl_ppl.parameters import box, by_prior, inside, prior_draws
@@ -22,7 +22,7 @@ _POPULATION, _GENERATIONS = 200, 120
 
 @one_blas_thread
 def find_modes(
-    problem: Problem,
+    problem: Problem[LikelihoodT],
     *,
     seed: int | np.random.Generator = 0,
     initial: Floats | None = None,
@@ -32,7 +32,7 @@ def find_modes(
     n_few: int = 20,
     most_parameters: int = 15,
     afforded: float = 2e7,
-) -> list[Mode]:
+) -> list[Mode[LikelihoodT]]:
     """Return modes found from several starts, best first.
 
     Parameters
@@ -174,13 +174,13 @@ def _part(problem: Problem, transitions: int) -> Problem:
 
 
 def find_mode(
-    problem: Problem,
+    problem: Problem[LikelihoodT],
     *,
     seed: int | np.random.Generator = 0,
     initial: Floats | None = None,
     rounds: int | None = None,
     lower: float = 20.0,
-) -> Mode:
+) -> Mode[LikelihoodT]:
     """Return the best mode with others that are not far below it; see :func:`find_modes`.
 
     ``lower``: log-posterior by which a mode is too low to hold a share of the posterior, however

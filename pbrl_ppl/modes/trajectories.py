@@ -7,17 +7,19 @@ from dataclasses import replace
 import numpy as np
 
 from pbrl_ppl.likelihood import (
+    FilteredProblem,
     NoisePrior,
     Problem,
     along_trajectories,
     corrected,
+    is_filtered,
     log_posterior,
     single_transitions,
     smoothed,
     with_sensitivity,
 )
 from pbrl_ppl.modes.ladder import ladder, with_robust_covariance
-from pbrl_ppl.modes.laplace import LocalMode, Mode, finish, profiled
+from pbrl_ppl.modes.laplace import FilteredMode, LocalMode, Mode, SimulatedMode, finish, profiled
 from pbrl_ppl.modes.search import find_mode
 from pbrl_ppl.parameters import change_from, inside
 from pbrl_ppl.state import Floats
@@ -32,7 +34,7 @@ _CLIMB = 5
 @one_blas_thread
 def find_trajectory_mode(
     problem: Problem, seed: int, *, starts: int = 5, wider: float = 2.0
-) -> Mode:
+) -> FilteredMode:
     """Return the best mode of whole trajectories, from several starts about one of Eq. 11.
 
     A climb's end depends on the side of a kink that the states are smoothed on.
@@ -65,7 +67,7 @@ def find_trajectory_mode(
 
 def trajectory_mode(
     problem: Problem, phi: Floats, sigma: Floats | None = None, *, share: float = 0.1
-) -> Mode:
+) -> FilteredMode:
     """Return the mode of whole trajectories, linearised at smoothed states.
 
     The better of two, which start with the given noise and with near-zero process noise.
@@ -88,10 +90,11 @@ def trajectory_mode(
     Mode
         Its problem has a :class:`pbrl_ppl.likelihood.TrajectoryLikelihood`.
     """
-    if sigma is None or not problem.likelihood.filtered:
-        problem = _smoothed_cheaply(problem, phi)
-        sigma = problem.trajectory_noise.sigma
-    mode = nearby_mode(problem, phi, sigma)
+    if sigma is not None and is_filtered(problem):
+        mode = nearby_mode(problem, phi, sigma)
+    else:
+        whole = _smoothed_cheaply(problem, phi)
+        mode = nearby_mode(whole, phi, whole.likelihood.noise.sigma)
     small_noise = _with_small_process_noise(mode.problem, mode.sigma, share)
     if not np.array_equal(small_noise, mode.sigma):
         other = nearby_mode(smoothed(mode.problem, mode.phi, small_noise), mode.phi, small_noise)
@@ -99,22 +102,24 @@ def trajectory_mode(
     return mode
 
 
-def _with_small_process_noise(problem: Problem, sigma: Floats, share: float) -> Floats:
+def _with_small_process_noise(problem: FilteredProblem, sigma: Floats, share: float) -> Floats:
     """Return sigma with unexplained accelerations of at most a share of their prior median."""
-    steps, sigma = problem.trajectory_noise.coordinates.accelerations, sigma.copy()
+    steps, sigma = problem.likelihood.noise.coordinates.accelerations, sigma.copy()
     sigma[steps] = np.minimum(sigma[steps], share * problem.noise_prior[0][steps])
     return sigma
 
 
-def _smoothed_cheaply(problem: Problem, phi: Floats) -> Problem:
+def _smoothed_cheaply(problem: Problem, phi: Floats) -> FilteredProblem:
     """Return the problem of whole trajectories, smoothed at phi with fewer engine steps."""
-    coordinates = problem.trajectory_noise.coordinates if problem.likelihood.filtered else None
+    coordinates = problem.likelihood.noise.coordinates if is_filtered(problem) else None
     medium = along_trajectories(problem.medium, phi, coordinates=coordinates)
     return replace(medium, physics=problem.physics)
 
 
 @one_blas_thread
-def filtered_mode(mode: Mode, other: Mode, *, share: float = 0.1, rounds: int = 3) -> Mode:
+def filtered_mode(
+    mode: FilteredMode, other: Mode, *, share: float = 0.1, rounds: int = 3
+) -> FilteredMode:
     """Return the mode of whole trajectories at another mode's parameters.
 
     Noise and smoothed states are fitted in turn, from two sizes of the unexplained acceleration as
@@ -132,8 +137,8 @@ def filtered_mode(mode: Mode, other: Mode, *, share: float = 0.1, rounds: int = 
     physics, phi = other.problem.physics, other.phi
     problem = mode.problem.with_physics(effects=physics.effects, substeps=physics.substeps)
     problem = _smoothed_cheaply(problem, phi)
-    sigma = problem.trajectory_noise.sigma
-    ends: list[tuple[Problem, LocalMode]] = []
+    sigma = problem.likelihood.noise.sigma
+    ends: list[tuple[FilteredProblem, LocalMode]] = []
     for begin in (sigma, _with_small_process_noise(problem, sigma, share)):
         sigma, there = begin, problem
         for _ in range(rounds):
@@ -144,8 +149,13 @@ def filtered_mode(mode: Mode, other: Mode, *, share: float = 0.1, rounds: int = 
 
 
 def nearby_mode(
-    problem: Problem, phi: Floats, sigma: Floats, *, corrections: int = 3, same: float = 0.5
-) -> Mode:
+    problem: FilteredProblem,
+    phi: Floats,
+    sigma: Floats,
+    *,
+    corrections: int = 3,
+    same: float = 0.5,
+) -> FilteredMode:
     """Return the mode by alternating climbs with smoothing.
 
     It climbs with few engine steps, whose error at the start is corrected, and corrects it again
@@ -162,7 +172,7 @@ def nearby_mode(
     same : float
         A correction with which the log-posterior (nats) is as with many steps is the last.
     """
-    modes: list[Mode] = []
+    modes: list[FilteredMode] = []
     for _ in range(corrections):
         cheap = corrected(problem, phi)
         mode = _alternate_smoothing(cheap, phi, sigma)
@@ -177,7 +187,7 @@ def nearby_mode(
     return max(modes, key=lambda candidate: candidate.log_posterior)
 
 
-def _alternate_smoothing(problem: Problem, phi: Floats, sigma: Floats) -> Mode:
+def _alternate_smoothing(problem: FilteredProblem, phi: Floats, sigma: Floats) -> FilteredMode:
     """Return the mode of a problem by alternating climbs with smoothing."""
     for i in range(_ROUNDS):
         if i:
@@ -190,7 +200,7 @@ def _alternate_smoothing(problem: Problem, phi: Floats, sigma: Floats) -> Mode:
     return mode
 
 
-def with_state_sensitivity(mode: Mode) -> Mode:
+def with_state_sensitivity(mode: FilteredMode) -> FilteredMode:
     """Return a mode of whole trajectories whose smoothed states follow the parameters.
 
     Parameters
@@ -203,7 +213,7 @@ def with_state_sensitivity(mode: Mode) -> Mode:
     Mode
         Its problem's noise has a :class:`pbrl_ppl.model.Sensitivity`.
     """
-    modes: list[tuple[float, Mode]] = []
+    modes: list[tuple[float, FilteredMode]] = []
     problem, phi, sigma = mode.problem, mode.phi, mode.sigma
     for i in range(_ROUNDS):
         if i:
@@ -219,14 +229,14 @@ def with_state_sensitivity(mode: Mode) -> Mode:
     return max(modes, key=lambda pair: pair[0])[1]
 
 
-def _change(mode: Mode, phi: Floats) -> float:
+def _change(mode: FilteredMode, phi: Floats) -> float:
     """Return the distance of a mode from the start of its search, in standard deviations."""
     spread = np.sqrt(np.maximum(np.diag(mode.covariance), 1e-300))
     moved = change_from(mode.problem.layout, mode.phi, phi)
     return float((np.abs(moved) / spread).max(initial=0.0))
 
 
-def find_simulation_mode(problem: Problem, seed: int) -> Mode:
+def find_simulation_mode(problem: Problem, seed: int) -> SimulatedMode:
     """Return the best mode of simulated trajectories, from one of whole trajectories.
 
     Parameters
@@ -247,7 +257,9 @@ def find_simulation_mode(problem: Problem, seed: int) -> Mode:
 
 
 @one_blas_thread
-def simulation_mode(mode: Mode, prior: NoisePrior | None = None, *, rounds: int = 5) -> Mode:
+def simulation_mode(
+    mode: Mode, prior: NoisePrior | None = None, *, rounds: int = 5
+) -> SimulatedMode:
     """Return the mode of simulated trajectories, from one of whole trajectories.
 
     Parameters
@@ -268,7 +280,9 @@ def simulation_mode(mode: Mode, prior: NoisePrior | None = None, *, rounds: int 
     return tempered_mode(ladder(mode)[-1], prior, rounds=rounds)
 
 
-def tempered_mode(mode: Mode, prior: NoisePrior | None = None, *, rounds: int = 5) -> Mode:
+def tempered_mode(
+    mode: SimulatedMode, prior: NoisePrior | None = None, *, rounds: int = 5
+) -> SimulatedMode:
     """Return a mode of simulated pieces as the mode of their posterior; arguments as above.
 
     The density of each dimension is divided by its autocorrelation time.

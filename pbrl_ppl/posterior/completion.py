@@ -21,8 +21,10 @@ from pbrl_ppl.likelihood import (
     ACCELERATION,
     CONTACT,
     NEXT_STATE_DIMS,
+    FilteredProblem,
     Problem,
     exponential,
+    is_filtered,
     noise_law,
     smoothed,
 )
@@ -125,7 +127,7 @@ def complete(
     if mode is not None:
         stored = packed_mode(problem, mode, phi, sigma, likelihood.sum(axis=1))
         record = replace(record, mode=stored)
-    if problem.likelihood.filtered and len(phi) > 1:
+    if is_filtered(problem) and len(phi) > 1:
         record = replace(record, linearisation=linearisation(problem, phi, sigma))
     idata = placed(from_groups(result, record.attributes()), places(problem.segments))
     return checked(problem, record, idata, asked)
@@ -264,7 +266,7 @@ def prior_groups(
     }
 
 
-def linearisation_errors(problem: Problem, phi: Floats, sigma: Floats) -> Floats:
+def linearisation_errors(problem: FilteredProblem, phi: Floats, sigma: Floats) -> Floats:
     """Return log-likelihoods with the states smoothed at each draw, less the linearised ones.
 
     Parameters
@@ -290,7 +292,7 @@ def linearisation_errors(problem: Problem, phi: Floats, sigma: Floats) -> Floats
     return errors
 
 
-def linearisation(problem: Problem, phi: Floats, sigma: Floats) -> Linearisation:
+def linearisation(problem: FilteredProblem, phi: Floats, sigma: Floats) -> Linearisation:
     """Return a summary of :func:`linearisation_errors` at up to 16 of a posterior's draws.
 
     Parameters

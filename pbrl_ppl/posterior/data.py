@@ -21,10 +21,11 @@ from pbrl_ppl.likelihood import (
     TransitionLikelihood,
     along_trajectories,
     in_pieces,
+    is_filtered,
+    is_simulated,
     linearised,
     linearised_pieces,
     observed_coordinates,
-    output_error,
     with_sensitivity,
 )
 from pbrl_ppl.posterior.record import PosteriorRecord, vectors
@@ -71,7 +72,7 @@ def record_of(problem: Problem, seed: int, method: str) -> PosteriorRecord:
         nu=problem.likelihood.nu,
         library=problem.library,
         learned_remainder=tables[-1] if tables else None,
-        cells=problem.trajectory_noise.coordinates if likelihood.filtered else None,
+        cells=problem.likelihood.noise.coordinates if is_filtered(problem) else None,
     )
 
 
@@ -133,15 +134,14 @@ def problem_of(
         library=record.library,
     )
     stored = with_recording(problem, constants, record.data_sha256)
-    if not other or not stored.likelihood.filtered:
+    if not other or not is_filtered(stored):
         return stored if not other or SMOOTHED not in constants else problem
     # linearised at the posterior's best draw
     phi, sigma = vectors(idata, problem.layout, stored.noise_variables)
     best = best_draw(idata)
-    problem = along_trajectories(
-        problem, phi[best], sigma[best], stored.trajectory_noise.coordinates
-    )
-    return with_sensitivity(problem, phi[best], sigma[best])
+    coordinates = stored.likelihood.noise.coordinates
+    whole = along_trajectories(problem, phi[best], sigma[best], coordinates)
+    return with_sensitivity(whole, phi[best], sigma[best])
 
 
 def linearised_as(problem: Problem, idata: Idata) -> Problem:
@@ -195,14 +195,13 @@ def recording(problem: Problem) -> xr.Dataset:
     kept = kept.drop_vars([name for name in kept.coords if name not in kept.dims])
     dims = tuple(f"{_PREFIX}{name}" for name in ("trajectory", "time", "body", "state"))
     kept[SMOOTHED] = (dims, problem.data.smoothed_states)
-    if problem.likelihood.simulated:
-        kept[_BY_START] = (
-            (*NEXT_STATE_DIMS, "cell_before"),
-            output_error(problem).initial_states.slope,
-        )
-        kept[_TAU] = (("state",), np.array(output_error(problem).tau), {"units": "rows"})
+    if is_simulated(problem):
+        slope, tau = problem.likelihood.initial_states.slope, np.array(problem.likelihood.tau)
+        kept[_BY_START] = ((*NEXT_STATE_DIMS, "cell_before"), slope)
+        kept[_TAU] = (("state",), tau, {"units": "rows"})
+    if not is_filtered(problem):
         return kept.assign_attrs({})
-    noise = problem.trajectory_noise
+    noise = problem.likelihood.noise
     kept["slope"] = (("transition", "cell_after", "cell_before"), noise.slope)
     kept["linearised_at"] = (("noise_parameter",), noise.sigma)
     if noise.sensitivity is not None:
@@ -220,10 +219,10 @@ def with_recording(problem: Problem, constants: xr.Dataset, data_sha256: str) ->
     states = constants[SMOOTHED].to_numpy()
     if _BY_START in constants:
         length, prior = constants[_BY_START].sizes["step"], problem.likelihood.prior
-        problem = in_pieces(problem.with_data(history=history), length, states)
-        start = problem.segments.start
+        pieces = in_pieces(problem.with_data(history=history), length, states)
+        start = pieces.segments.start
         slope, tau = constants[_BY_START].to_numpy(), constants[_TAU].to_numpy()
-        return linearised_pieces(problem, start, slope, tau).with_likelihood(prior=prior)
+        return linearised_pieces(pieces, start, slope, tau).with_likelihood(prior=prior)
     coordinates = recorded_coordinates(problem.scene, constants)
     data = replace(
         problem.data, history=history, horizon=1, states=states, columns=coordinates.columns

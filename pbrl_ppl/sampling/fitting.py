@@ -12,13 +12,14 @@ import numpy as np
 import xarray as xr
 
 from pbrl_ppl.errors import FitError, MeetingWarning, warn
-from pbrl_ppl.likelihood import Problem
+from pbrl_ppl.likelihood import Problem, is_filtered
 from pbrl_ppl.modes import (
     Mode,
     covariance_of,
     find_mode,
     find_simulation_mode,
     find_trajectory_mode,
+    is_filtered_mode,
     weigh,
     with_state_sensitivity,
 )
@@ -270,8 +271,7 @@ def _at_mode(job: SamplerRun, start: Mode | None) -> SamplerRun:
         problem = job.problem
         mode = start or _SEARCHES[problem.likelihood.name](problem, seed=job.seed)
         if not mode.problem.likelihood.independent:
-            filtered = mode.problem.likelihood.filtered
-            if filtered and mode.problem.trajectory_noise.sensitivity is None:
+            if is_filtered_mode(mode) and mode.problem.likelihood.sensitivity is None:
                 mode = with_state_sensitivity(mode)
             problem = mode.problem  # linearised at the mode
         joined = _joined(problem, mode.phi[None], mode.sigma[None])
@@ -381,8 +381,8 @@ def joined_at(
         return problem
     apart = physics.simulator(phi, start, problem.inputs)
     off = abs(problem.observations.wrapped((states - apart)[..., columns]))
-    if problem.likelihood.filtered:  # errors of measurement alone
-        sensors = problem.trajectory_noise.coordinates.sensors
+    if is_filtered(problem):  # errors of measurement alone
+        sensors = problem.likelihood.noise.coordinates.sensors
         stated = dict(problem.scene.noise)
         known = np.tile([stated.get(name, np.inf) for name in STATE], (len(phi), 1))
         known[:, list(sensors)] = sigma[:, : len(sensors)]

@@ -111,7 +111,7 @@ def test_a_mode_is_judged_by_other_data_at_the_same_noise(frames) -> None:
     mode = fitted(BOX, frames[0])
     problem = HeldOut.of(mode, history(frames[1])).problem
     assert problem.data.history.n_trajectories == 4
-    assert problem.trajectory_noise.coordinates is mode.problem.trajectory_noise.coordinates
+    assert problem.likelihood.noise.coordinates is mode.problem.likelihood.noise.coordinates
     np.testing.assert_array_equal(problem.noise_prior[0], mode.problem.noise_prior[0])
 
 

@@ -43,7 +43,7 @@ def pucks() -> Problem:
 
 
 def test_its_score_is_that_of_differences(pucks) -> None:
-    noise, residual = pucks.trajectory_noise, pucks.residual(PHI)
+    noise, residual = pucks.likelihood.noise, pucks.residual(PHI)
     assert 0.1 < noise.touching.mean() < 0.9
     at = np.log(NOISE)
     slope = noise.score(residual, NOISE)[1]
@@ -67,7 +67,7 @@ def test_both_kinds_of_noise_are_told_apart(pucks) -> None:
         sigma = profile_sigma(made, made.residual(PHI), PHI)
         made = smoothed(made, PHI, sigma)
     sigma = profile_sigma(made, made.residual(PHI), PHI)
-    measurements = 2 * made.trajectory_noise.touching.sum()  # at each of two bodies
+    measurements = 2 * made.likelihood.noise.touching.sum()  # at each of two bodies
     assert measurements > 100
     assert (np.abs(np.log(sigma / NOISE)[9:]) < 4 / np.sqrt(2 * measurements)).all()
     assert (np.abs(np.log(sigma / NOISE)[:6]) < 0.4).all()
@@ -76,7 +76,7 @@ def test_both_kinds_of_noise_are_told_apart(pucks) -> None:
 
 def test_a_measured_contact_counts_where_smoothing_takes_it_away(pucks) -> None:
     """Blaming a start's measurement, smoothed states may pass by: the contact stays one."""
-    noise = pucks.trajectory_noise
+    noise = pucks.likelihood.noise
     apart = pucks.data.smoothed_states + np.array([[0.0] * 6, [5.0] + [0.0] * 5])
     moved = replace(pucks, data=replace(pucks.data, states=apart))
     again = linearised(moved, noise.coordinates, noise.slope, noise.sigma)

@@ -127,7 +127,7 @@ def test_calibration_s_data_collide(model) -> None:
 def test_held_out_errors_are_of_one_world(model) -> None:
     phi = np.array([TOO_LIGHT])
     whole = along_trajectories(problem_in(model), np.array([TRUE]))
-    sigma = np.full(len(whole.trajectory_noise.sigma), 0.002)
+    sigma = np.full(len(whole.likelihood.noise.sigma), 0.002)
     mode = Mode(whole, phi, sigma, np.zeros((0, 1)), np.eye(1), log_posterior=0.0)
     held = HeldOut.of(mode, problem_in(model).data.history)
     expected = of_one_world(problem_in(model), phi)
@@ -145,7 +145,7 @@ def test_held_out_errors_are_of_one_world(model) -> None:
 def test_whole_trajectories_are_joined_where_they_collide(model) -> None:
     """At noise parameters of which there are more than state dimensions."""
     whole = along_trajectories(problem_in(model), np.array([TRUE]))
-    sigma = np.full((1, len(whole.trajectory_noise.sigma)), 0.002)
+    sigma = np.full((1, len(whole.likelihood.noise.sigma)), 0.002)
     assert joined_at(whole, np.array([[TRUE]]), sigma) is whole
     assert joined_at(whole, np.array([[TOO_LIGHT]]), sigma).physics.together == ("a", "b")
 

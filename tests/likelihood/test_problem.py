@@ -97,7 +97,7 @@ def test_noise_along_trajectories_is_of_its_own_data(problem) -> None:
         assert other.likelihood.nu == 4.0
     # other noise and other physics keep it, with the smoothed states that it is about
     for other in (whole.with_likelihood(nu=None), whole.with_physics(substeps=10)):
-        assert other.trajectory_noise is whole.trajectory_noise
+        assert other.likelihood.noise is whole.likelihood.noise
         assert other.segments is whole.segments
     assert isinstance(single_transitions(whole).likelihood, TransitionLikelihood)
     np.testing.assert_array_equal(single_transitions(whole).segments.start, problem.segments.start)

@@ -73,7 +73,7 @@ def test_nothing_changes_where_the_motion_is_linear() -> None:
     noise = np.array([2e-3, 2e-3, 4e-3, 1e-2, 1e-2, 2e-2, 0.3, 0.3, 0.5])
     still, phi = simulated(PUCK, {"mass": 2.0}, noise, seed=1)
     follows = with_sensitivity(still, phi, noise)
-    assert np.abs(follows.trajectory_noise.sensitivity.before).max() > 1e-3
+    assert np.abs(follows.likelihood.noise.sensitivity.before).max() > 1e-3
     others = phi * np.array([0.7, 0.99, 1.3])[:, None]
     np.testing.assert_allclose(follows.residual(others), still.residual(others), atol=1e-10)
 
@@ -105,7 +105,7 @@ def test_the_op_remembers_what_follows(cart) -> None:
     still, phi = cart
     follows = with_sensitivity(still, phi, BLIND)
     given = follows.segments.start, follows.segments.inputs
-    op = SimulatorOp(follows.physics, follows.trajectory_noise.sensitivity)
+    op = SimulatorOp(follows.physics, follows.likelihood.noise.sensitivity)
     others = phi * (1.0 + 0.02 * np.random.default_rng(2).standard_normal((6, len(phi))))
     expected = [follows.predict(other) for other in others]
     for i in (0, 1, 0, 0, 5, 4, 3, 2, 1, 0):
@@ -144,7 +144,7 @@ def test_hung_bodies_stay_in_their_hinges() -> None:
     phi = np.array([1.0])
     sigma = problem.noise_prior[0]
     follows = with_sensitivity(along_trajectories(problem, phi, sigma), phi, sigma)
-    follow = follows.trajectory_noise.sensitivity
+    follow = follows.likelihood.noise.sensitivity
     others = np.array([[0.7], [1.2]])
     begun = follow.begun(follow.moved(others), follows.segments.start)
     angle = begun[..., 0, 2]

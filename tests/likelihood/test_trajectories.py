@@ -69,7 +69,7 @@ def dense(noise, sigma) -> tuple[np.ndarray, np.ndarray]:
 
 def test_whitening_is_that_of_the_whole_covariance(problem) -> None:
     """DESIGN section 7: R + F R F' + Q with itself, -R F' with its successor."""
-    noise = problem.trajectory_noise
+    noise = problem.likelihood.noise
     covariance, own = dense(noise, NOISE)
     residual = noise.coordinates.of_residual(problem.residual(PHI))[own]
     begin = np.where(
@@ -84,7 +84,7 @@ def test_whitening_is_that_of_the_whole_covariance(problem) -> None:
 
 def test_many_noises_are_whitened_as_one_by_one(problem) -> None:
     """Each residual with its own noise; one that diverged is no number, and leaves the others."""
-    rng, noise = np.random.default_rng(1), problem.trajectory_noise
+    rng, noise = np.random.default_rng(1), problem.likelihood.noise
     sigma = NOISE * np.exp(0.3 * rng.standard_normal((40, len(NOISE))))
     residual = problem.residual(PHI) + 1e-3 * rng.standard_normal((40, *problem.measured.shape))
     residual[7, 2, 0, 0, 1] = np.nan
@@ -104,8 +104,8 @@ def test_what_was_not_measured_is_left_out(problem) -> None:
     observed[:, 2, 0, [0, 3]] = np.nan
     dataset["observed"] = dataset["observed"].copy(data=observed)
     gaps = problem.with_data(history=History(dataset), states=None)
-    gaps = along_trajectories(gaps, PHI, NOISE, problem.trajectory_noise.coordinates)
-    noise, whole = gaps.trajectory_noise, problem.trajectory_noise
+    gaps = along_trajectories(gaps, PHI, NOISE, problem.likelihood.noise.coordinates)
+    noise, whole = gaps.likelihood.noise, problem.likelihood.noise
     assert (~noise.seen).sum() == 6
     covariance, own = dense(whole, NOISE)
     vague = covariance.copy()
@@ -133,7 +133,7 @@ def test_what_was_not_measured_is_left_out(problem) -> None:
 @pytest.mark.parametrize("missing", [False, True])
 def test_score_of_the_noise_is_that_of_differences(problem, missing) -> None:
     """By the logarithm of every noise parameter; the first states are measured, or not at all."""
-    noise = problem.trajectory_noise
+    noise = problem.likelihood.noise
     if missing:
         seen, initial_variance = noise.seen.copy(), noise.initial_variance.copy()
         seen[1, 2:4] = seen[5] = False
@@ -155,7 +155,7 @@ def test_score_of_the_noise_is_that_of_differences(problem, missing) -> None:
 def test_smoothed_states_are_the_most_probable(problem) -> None:
     """No state is moved once the smoother has converged, and the fit of all is a minimum there."""
     converged = smoothed(problem, PHI, NOISE)
-    noise = converged.trajectory_noise
+    noise = converged.likelihood.noise
     before, after = noise.smoothed(noise.coordinates.of_residual(converged.residual(PHI)), NOISE)
     moved = np.vstack([before[noise.first], after]) / noise.coordinates.errors(NOISE)
     assert np.abs(moved).max() < 0.05
@@ -237,7 +237,7 @@ def test_the_data_are_in_the_model_s_graph(problem) -> None:
     found = model.compile_fn(moved)(
         {model.rvs_to_values[v].name: np.log(point[v.name]) for v in model.free_RVs}
     )
-    noise = gappy.trajectory_noise
+    noise = gappy.likelihood.noise
     deviation = noise.coordinates.of_residual(np.nan_to_num(other) - gappy.observations.values)
     there = gappy.along(replace(noise, measured=deviation))
     np.testing.assert_allclose(found, there.log_density(there.residual(PHI), NOISE))
@@ -261,7 +261,7 @@ def test_the_model_is_the_problem_where_a_body_turns_by_more_than_half_a_turn() 
 
 def test_draws_of_the_model_have_its_covariance(problem) -> None:
     """Posterior predictive draws: mean and covariance of a measurement, given those before."""
-    noise = problem.trajectory_noise
+    noise = problem.likelihood.noise
     rng = np.random.default_rng(4)
     drawn = np.array([problem.next_states(problem.predict(PHI), NOISE, rng) for _ in range(4000)])
     mean, covariance = noise.predictive(noise.coordinates.of_residual(problem.residual(PHI)), NOISE)
@@ -313,11 +313,11 @@ def test_a_stated_noise_is_not_inferred(problem, stated) -> None:
     free = [name for name in truth if name not in stated]
     assert list(known.noise_variables.get("sigma", ())) == free
     sigma = np.array([*(truth[name] for name in free), *NOISE[6:]])
-    np.testing.assert_array_equal(known.trajectory_noise.coordinates.errors(sigma), NOISE[:6])
+    np.testing.assert_array_equal(known.likelihood.noise.coordinates.errors(sigma), NOISE[:6])
     # linearised where all are inferred, the density is the same
-    same = known.trajectory_noise.coordinates
+    same = known.likelihood.noise.coordinates
     states = problem
-    noise = replace(states.trajectory_noise, coordinates=same)
+    noise = replace(states.likelihood.noise, coordinates=same)
     there = states.along(noise)
     residual = problem.residual(PHI)
     np.testing.assert_allclose(

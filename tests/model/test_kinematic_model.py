@@ -55,11 +55,11 @@ def test_restitution_is_recovered(problem) -> None:
 
 def test_its_path_has_no_noise(problem) -> None:
     whole = along_trajectories(problem, np.array([R]))
-    coordinates = whole.trajectory_noise.coordinates
+    coordinates = whole.likelihood.noise.coordinates
     assert (coordinates.places // 6 == 1).all()  # the block's
     own = whole.data.history.dataset["start"].to_numpy()[:, :, 0, :3]
     np.testing.assert_array_equal(whole.data.states[:, :, 0, :3], own)
-    density = whole.log_density(whole.residual(np.array([R])), whole.trajectory_noise.sigma)
+    density = whole.log_density(whole.residual(np.array([R])), whole.likelihood.noise.sigma)
     assert np.isfinite(density).all()
 
 

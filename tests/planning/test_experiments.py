@@ -166,7 +166,7 @@ def _density(data: np.ndarray, mean: np.ndarray, cov: np.ndarray) -> float:
 def _noise(judge: Separation, steps: int) -> np.ndarray:
     """Covariance of what is measured of a free body: errors of the start and of steps run on."""
     one = judge.rivals[0]
-    coordinates = one.mode.problem.trajectory_noise.coordinates
+    coordinates = one.mode.problem.likelihood.noise.coordinates
     errors, step = np.diag(coordinates.errors(one.sigma) ** 2), coordinates.steps(one.sigma)[0]
     flow = np.eye(6)
     flow[:3, 3:] = judge.scene.time_step * np.eye(3)

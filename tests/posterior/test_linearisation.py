@@ -25,7 +25,7 @@ def test_linear_motion_has_no_error() -> None:
     history = simulated_history(scene, {"mass": 2.0}, seed=1, trajectories=3, intervals=4)
     problem = problem_in(pp.physics_model(scene, history, likelihood="trajectories"))
     rng = np.random.default_rng(1)
-    sigma = problem.trajectory_noise.sigma * np.exp(0.3 * rng.normal(size=(5, 9)))
+    sigma = problem.likelihood.noise.sigma * np.exp(0.3 * rng.normal(size=(5, 9)))
     errors = linearisation_errors(problem, rng.uniform(1.9, 2.1, (5, 1)), sigma)
     assert errors.shape == (5, 3)
     np.testing.assert_allclose(errors, 0.0, atol=1e-5)

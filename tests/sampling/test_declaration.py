@@ -114,7 +114,7 @@ def test_the_same_seed_gives_the_same_mode(declared, history) -> None:
         pp.physics_model(SCENE, history, likelihood=pp.fit(declared, method="map", progress=False))
         for _ in range(2)
     )
-    noise, again = (problem_in(each).trajectory_noise for each in (first, second))
+    noise, again = (problem_in(each).likelihood.noise for each in (first, second))
     np.testing.assert_array_equal(noise.slope, again.slope)
 
 
@@ -164,7 +164,7 @@ def test_pymc_s_predictions_are_of_the_filter(model, half) -> None:
         drawn = pm.sample_posterior_predictive(many, random_seed=1, progressbar=False)
         prior = pm.sample_prior_predictive(draws=3, random_seed=1)
     drawn = group(drawn, "posterior_predictive")["next_state"].to_numpy()[0]
-    noise, problem = problem_in(model).trajectory_noise, problem_in(model)
+    noise, problem = problem_in(model).likelihood.noise, problem_in(model)
     mean, covariance = noise.predictive(noise.coordinates.of_residual(problem.residual(phi)), sigma)
     off = (drawn - problem.observations.values)[:, :, 0, 0]
     sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))

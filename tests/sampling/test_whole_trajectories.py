@@ -100,7 +100,7 @@ def test_a_file_holds_the_problem(first, tmp_path) -> None:
     # what was measured, not what was smoothed
     np.testing.assert_array_equal(group(idata, "observed_data")["next_state"].values, here.measured)
     # and it can be smoothed again elsewhere
-    again = along_trajectories(problem, PHI, NOISE, problem.trajectory_noise.coordinates)
+    again = along_trajectories(problem, PHI, NOISE, problem.likelihood.noise.coordinates)
     assert again.segments.n == 12 * 5 - 4 * 2
     assert np.isfinite(again.log_density(again.residual(PHI), NOISE)).all()
 
