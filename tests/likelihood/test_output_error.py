@@ -12,7 +12,6 @@ from pbrl_ppl.likelihood import (
     first_states,
     in_pieces,
     linearised_pieces,
-    output_error,
 )
 from pbrl_ppl.modes import fit_pieces
 from pbrl_ppl.physics import Physics
@@ -35,13 +34,13 @@ def test_start_states_are_eliminated_exactly(history) -> None:
     """A fall is linear in its start: the projection leaves what a regression on 1 and t leaves."""
     problem = fit_pieces(pieces(history, 44), np.zeros(0)).problem
     sigma = np.array([0.01])
-    z = output_error(problem).whiten(problem.residual(np.zeros(0)), sigma)
+    z = problem.likelihood.whiten(problem.residual(np.zeros(0)), sigma)
     y = history.dataset["observed"].to_numpy()[:, :, 0, 1]
     t = np.arange(45) / 30
     basis = np.column_stack([np.ones(45), t])
     own = y + 0.5 * GRAVITY * t**2
     left = own - (basis @ np.linalg.lstsq(basis, own.T)[0]).T
-    tau = output_error(problem).tau[0]
+    tau = problem.likelihood.tau[0]
     assert (z**2).sum() == pytest.approx((left**2).sum() / 0.01**2 / tau, rel=1e-6)
 
 
@@ -50,14 +49,14 @@ def test_a_velocity_recorded_at_the_start_alone_is_given(history) -> None:
     frame = history.to_dataframe()
     frame.loc[frame["step"] == 0, ["vx", "vy", "omega"]] = 0.0
     problem = fit_pieces(pieces(History.from_dataframe(frame, BALL), 44), np.zeros(0)).problem
-    initial_states = output_error(problem).initial_states
+    initial_states = problem.likelihood.initial_states
     assert initial_states.given[:, initial_states.coordinates.places == 4].all()
     sigma = np.array([0.01])
-    z = output_error(problem).whiten(problem.residual(np.zeros(0)), sigma)
+    z = problem.likelihood.whiten(problem.residual(np.zeros(0)), sigma)
     own = history.dataset["observed"].to_numpy()[:, :, 0, 1]
     own = own + 0.5 * GRAVITY * (np.arange(45) / 30) ** 2
     left = own - own.mean(axis=1, keepdims=True)
-    tau = output_error(problem).tau[0]
+    tau = problem.likelihood.tau[0]
     assert (z**2).sum() == pytest.approx((left**2).sum() / 0.01**2 / tau, rel=1e-6)
 
 
@@ -69,7 +68,7 @@ def test_noise_is_not_underestimated_on_short_pieces() -> None:
     own = fall(3, trajectories=25, memory=0.0)
     truth = 0.01
     mode = fit_pieces(pieces(own, 4), np.zeros(0))
-    freedom = output_error(mode.problem).initial_states.counts.sum()
+    freedom = mode.problem.likelihood.initial_states.counts.sum()
     assert 0.5 < freedom / own.n_transitions < 0.8
     assert np.log(mode.sigma[0] / truth) == pytest.approx(0.0, abs=4 / np.sqrt(2 * freedom))
 
@@ -77,14 +76,14 @@ def test_noise_is_not_underestimated_on_short_pieces() -> None:
 def test_the_result_does_not_depend_on_the_start_states(history) -> None:
     """Initial states elsewhere, of a linear motion: the same whitened residual."""
     problem = fit_pieces(pieces(history, 44), np.zeros(0)).problem
-    likelihood = output_error(problem)
+    likelihood = problem.likelihood
     moved = problem.segments.start + np.array([0.0, 0.3, 0.0, 0.0, -0.7, 0.0])
     other = linearised_pieces(
         problem, moved, likelihood.initial_states.slope, np.array(likelihood.tau)
     )
     sigma = np.array([0.01])
     here, there = (
-        output_error(own).whiten(own.residual(np.zeros(0)), sigma) for own in (problem, other)
+        own.likelihood.whiten(own.residual(np.zeros(0)), sigma) for own in (problem, other)
     )
     assert there == pytest.approx(here, abs=1e-6)
 
@@ -105,7 +104,7 @@ def test_the_correlation_time_is_that_of_the_errors(memory) -> None:
     """Of an AR(1) process it is (1 + a) / (1 - a); the estimate of 40 long ones is within 15 %."""
     history = fall(0, trajectories=2)
     problem = replace(pieces(history, 44))
-    likelihood = output_error(problem)
+    likelihood = problem.likelihood
     rng = np.random.default_rng(1)
     n = 400
     error = lfilter([1.0], [1.0, -memory], rng.standard_normal((40, n + 100)))[:, 100:]

@@ -262,7 +262,7 @@ def test_slopes_are_closed_forms() -> None:
     scene = Scene(time_step=0.1, bodies=(body,))
     history = simulated_history(scene, {"mu_c": 0.1}, seed=3, trajectories=1, intervals=4)
     problem = problem_in(physics_model(scene, history))
-    found = along_trajectories(problem, np.array([0.1])).trajectory_noise.slope
+    found = along_trajectories(problem, np.array([0.1])).likelihood.noise.slope
     expected = np.eye(6)
     expected[:3, 3:] = 0.1 * np.eye(3)
     np.testing.assert_allclose(found, np.tile(expected, (4, 1, 1)), atol=1e-9)
@@ -290,7 +290,7 @@ def test_slopes_follow_the_hinge() -> None:
     problem = problem_in(physics_model(scene, History.from_dataframe(frame, scene)))
     assert problem.observations.names == ("theta", "omega")
     noise = np.array([1e-3, 1e-3, 1e-3])
-    found = along_trajectories(problem, np.array([0.1]), noise).trajectory_noise.slope[0]
+    found = along_trajectories(problem, np.array([0.1]), noise).likelihood.noise.slope[0]
     moment = (0.03**2 + 0.4**2) / 12 + 0.18**2
     w = math.sqrt(9.81 * 0.18 / moment)
     t = 0.02

@@ -184,7 +184,7 @@ def test_a_first_contact_brings_a_noise_of_its_own(monkeypatch) -> None:
     with pytest.warns(RefitWarning, match=r"contact_acceleration\[vx\].* refitted"):
         both = quiet(pp.update, first, together, seed=2, progress=False)
     assert set(group(both, "posterior")["contact_acceleration"]["velocity"].values) >= {"vx", "vy"}
-    assert problem_of(both).trajectory_noise.touching.any()
+    assert problem_of(both).likelihood.noise.touching.any()
     more = simulated_history(scene, {"mass": [2.0]}, seed=3, **made | {"trajectories": 1})
     monkeypatch.setattr("pbrl_ppl.posterior.MIN_ESS", 30)
     with warnings.catch_warnings():
