@@ -314,7 +314,7 @@ def _run(job: SamplerRun) -> Idata:
         return job.method.run(job)
 
 
-def _check(problem: Problem, method: str, start: Any, resume: Idata | None) -> None:
+def _check(problem: Problem, method: str, start: object, resume: Idata | None) -> None:
     """Refuse arguments of `fit` that do not go with a problem."""
     if method not in METHODS:
         raise FitError(f"fit: method is {method!r}, expected one of {', '.join(METHODS)}")
