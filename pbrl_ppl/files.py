@@ -46,7 +46,7 @@ def json_fields(value: Any) -> dict[str, Any]:
     return {keys.get(name, name): item for name, item in vars(value).items()}
 
 
-def json_values(value: Any) -> Any:
+def json_values(value: object) -> Any:
     """Return plain values for JSON: arrays as lists, paths as text, non-finite numbers as null.
 
     A dataclass becomes an object of its fields.

@@ -1,6 +1,6 @@
 """Names, units and order of a body's state and of the wrench on it; angles; array types."""
 
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
+
+Angle = TypeVar("Angle", float, Floats)
 
 #: A body's state: pose and velocity of its origin in the world frame.
 STATE = ("x", "y", "theta", "vx", "vy", "omega")
@@ -34,7 +36,7 @@ def acceleration_unit(velocity: str) -> str:
     return "rad/s²" if velocity == "omega" else "m/s²"
 
 
-def wrapped(angle: Any) -> Any:
+def wrapped(angle: Angle) -> Angle:
     """Return an angle, or an array of any shape, in (-pi, pi] (rad).
 
     Examples
@@ -42,4 +44,5 @@ def wrapped(angle: Any) -> Any:
     >>> wrapped(np.array([0.5, 2 * np.pi - 0.5, -np.pi])).round(3)
     array([ 0.5  , -0.5  ,  3.142])
     """
-    return np.pi - np.mod(np.pi - angle, 2 * np.pi)
+    result: Angle = np.pi - np.mod(np.pi - angle, 2 * np.pi)
+    return result

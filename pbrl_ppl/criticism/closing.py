@@ -9,7 +9,6 @@ from functools import partial
 
 import numpy as np
 
-from pbrl_ppl.background import background
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.held_out import HeldOut, example_rollout, longest_rollout, rollout_horizon
 from pbrl_ppl.criticism.loop import ADEQUATE, EFFECTS_ADDED, NOT_CONVERGED, UNEXPLAINED, Loop
@@ -65,7 +64,7 @@ from pbrl_ppl.posterior import MAX_PARETO_K, Comparison, Fit, compare, identify,
 from pbrl_ppl.posterior import draws as posterior_draws
 from pbrl_ppl.sampling import sample
 from pbrl_ppl.scene import Scene, check_substeps
-from pbrl_ppl.threads import one_blas_thread
+from pbrl_ppl.threads import background, one_blas_thread
 
 #: Draws of each chain by method, then those where that is not enough.
 _DRAWS = {"importance": (180, 600), "laplace": (125,)}

@@ -1,6 +1,5 @@
 """Object-oriented baselines: relations, conditions, LWR and OO-LWR."""
 
-from .contacts import SectorContacts as SectorContacts
 from .lwr import LWR as LWR
 from .lwr import OOLWR as OOLWR
 from .regression import Regression as Regression
@@ -8,3 +7,4 @@ from .relations import Attributes as Attributes
 from .relations import Condition as Condition
 from .relations import Pushed as Pushed
 from .relations import Relation as Relation
+from .relations import SectorContacts as SectorContacts

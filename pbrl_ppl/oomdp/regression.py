@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -125,12 +124,14 @@ class Experience:
     standardise : bool
         Whether distances are in units of each input's standard deviation over all conditions;
         otherwise in SI units.
-    options : mapping
-        Options of :class:`Regression`.
+    regression : callable
+        :class:`Regression` with its options.
     """
 
-    def __init__(self, reach: float, *, standardise: bool, options: Mapping[str, Any]) -> None:
-        self._reach, self._standardise, self._options = reach, standardise, options
+    def __init__(
+        self, reach: float, *, standardise: bool, regression: Callable[..., Regression]
+    ) -> None:
+        self._reach, self._standardise, self._regression = reach, standardise, regression
         self._x: list[Floats] = []
         self._y: list[Floats] = []
         self._rows: dict[Key, list[int]] = {}
@@ -174,7 +175,7 @@ class Experience:
                 scale, size = x.std(axis=0), self._sizes(x)
                 scale = np.where(scale > 1e-9 * size, scale, size)
             rows = self._rows[key]
-            self._models[key] = Regression(x[rows], y[rows], scale=scale, **self._options)
+            self._models[key] = self._regression(x[rows], y[rows], scale=scale)
         return self._models[key]
 
     def _sizes(self, x: Floats) -> Floats:

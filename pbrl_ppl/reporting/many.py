@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pandas as pd
 
-from pbrl_ppl.background import as_ended
 from pbrl_ppl.criticism import ADEQUATE, EFFECTS_ADDED, check_folder
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.errors import OutputError, PbrlError
@@ -35,6 +34,7 @@ from pbrl_ppl.reporting.logs import (
 )
 from pbrl_ppl.reporting.page import Source
 from pbrl_ppl.sampling import Pooled, pool
+from pbrl_ppl.threads import as_ended
 
 #: Marks the summary of many logs, and with it their folder.
 _KIND = "pbrl_ppl logs 1"

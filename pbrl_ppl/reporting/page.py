@@ -14,7 +14,6 @@ import jinja2
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from pbrl_ppl.background import background
 from pbrl_ppl.reporting import (
     effect_plots,
     error_plots,
@@ -27,6 +26,7 @@ from pbrl_ppl.reporting import (
     words,
 )
 from pbrl_ppl.reporting.style import NARROW, WIDE, png
+from pbrl_ppl.threads import background
 
 _MODULES = (
     words, tables, evidence, motion, posterior_summary, effect_plots, error_plots, posterior_plots,

@@ -20,7 +20,6 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
-from pbrl_ppl.background import as_ended
 from pbrl_ppl.effects import Attached, Effect
 from pbrl_ppl.errors import FitError, OutputError, warn
 from pbrl_ppl.files import write_text
@@ -36,6 +35,7 @@ from pbrl_ppl.posterior import versions
 from pbrl_ppl.sampling.ranks import Calibration
 from pbrl_ppl.sampling.replication import Record, draw_truths, labels, replicate
 from pbrl_ppl.scene import Scene
+from pbrl_ppl.threads import as_ended
 
 #: File of all that the replications in a folder depend on.
 _DESIGN = "design.json"

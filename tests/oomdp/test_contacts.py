@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from pbrl_ppl.errors import FitError, HistoryError
 from pbrl_ppl.oomdp import SectorContacts
-from pbrl_ppl.oomdp.contacts import spans
+from pbrl_ppl.oomdp.relations import spans
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 
 pytestmark = pytest.mark.one_stack

@@ -15,7 +15,6 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import ks_2samp, kstest, kstwobign, norm
 
-from pbrl_ppl.background import background
 from pbrl_ppl.effects import Effect, EffectParameter
 from pbrl_ppl.errors import ConvergenceWarning, RefitWarning
 from pbrl_ppl.model import problem_in
@@ -40,6 +39,7 @@ from pbrl_ppl.sampling import fit, physics_model, update
 from pbrl_ppl.sampling.ensemble import Reference
 from pbrl_ppl.sampling.importance import draw_proposals, resample
 from pbrl_ppl.scene import Body, Scene, Shape, Wall
+from pbrl_ppl.threads import background
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
 
@@ -621,7 +621,7 @@ def test_background_ends_with_its_context() -> None:
 #: Prints the number of the process in the background, which computes or has a result to send.
 KILLED = """
 import multiprocessing, os, time
-from pbrl_ppl.background import background
+from pbrl_ppl.threads import background
 multiprocessing.cpu_count = lambda: 2
 def work():
     print(os.getpid(), flush=True)
