@@ -188,7 +188,11 @@ class Dynamics:
 
     @classmethod
     def known(
-        cls, scene: Scene, parameters: Mapping[str, object], effects: Any = (), **options: Any
+        cls,
+        scene: Scene,
+        parameters: Mapping[str, object],
+        effects: Iterable[Effect | Attached] = (),
+        **options: Any,
     ) -> Dynamics:
         """Return dynamics of named parameters, as :class:`pbrl_ppl.Transition` takes them."""
         layout = Physics.declare(scene, effects).layout

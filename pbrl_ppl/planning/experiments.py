@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -25,7 +25,8 @@ from pbrl_ppl.scene import Scene, body_sizes
 from pbrl_ppl.state import WRENCH, WRENCH_UNITS, Bools, Floats
 
 if TYPE_CHECKING:  # with the samplers, which a plan does not need
-    from pbrl_ppl.criticism import Rival
+    from pbrl_ppl.criticism import Loop, Rival
+    from pbrl_ppl.posterior import Idata
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,7 +294,7 @@ class Suggestion:
 
 
 def suggest_actions(
-    known: Any,
+    known: Loop | Idata,
     start: Mapping[str, Sequence[float]] | ArrayLike,
     actions: ActionSet | Bounds | None = None,
     *,
@@ -370,21 +371,13 @@ def suggest_actions(
         said.to_csv("next.csv")  # play it, record, and close the loop on both recordings
     """
     # with the samplers, which a plan does not need
-    from pbrl_ppl.criticism import fit_rivals, kept_groups, named_effects
+    from pbrl_ppl.criticism import Loop, fit_rivals, named_effects
     from pbrl_ppl.posterior import scene_of
 
     progress = progress or (lambda stage: None)
-    posterior = getattr(known, "posterior_after", known)
-    catalogue = tuple(getattr(known, "catalogue", catalogue))
-    scene = scene_of(posterior)
-    if effects is None:
-        groups = kept_groups(posterior)
-        if not groups:
-            raise EffectError(
-                "effects: the loop found none that its data cannot separate; name two or more,"
-                " such as effects=('linear_drag', 'quadratic_drag')"
-            )
-        effects = groups[0]
+    posterior = known.posterior_after if isinstance(known, Loop) else known
+    catalogue = known.catalogue if isinstance(known, Loop) else tuple(catalogue)
+    scene, effects = scene_of(posterior), _confounded(posterior) if effects is None else effects
     chosen = named_effects(effects, scene, catalogue)
     if steps < 1 or (hold is not None and hold < 1):
         raise GoalError(f"steps is {steps} and hold {hold}; both must be at least 1")
@@ -413,16 +406,7 @@ def suggest_actions(
     return Suggestion(
         scene,
         first,
-        xr.DataArray(
-            wrenches[best],
-            {
-                "time": ("time", scene.time_step * np.arange(steps), {"units": "s"}),
-                "body": [body.name for body in scene.moving],
-                "wrench": list(WRENCH),
-            },
-            ("time", "body", "wrench"),
-            attrs={"units": ", ".join(WRENCH_UNITS)},
-        ),
+        _labelled(scene, wrenches[best]),
         xr.DataArray(
             separation[..., best], {"true": names, "rival": names}, ("true", "rival"),
             attrs={"units": "nats"},
@@ -430,6 +414,32 @@ def suggest_actions(
         at_random,
         bool(meeting[best]),
     )  # fmt: skip
+
+
+def _confounded(posterior: Idata) -> tuple[str, ...]:
+    """Return the first group of effects that a posterior's recording cannot separate."""
+    from pbrl_ppl.criticism import kept_groups
+
+    if groups := kept_groups(posterior):
+        return groups[0]
+    raise EffectError(
+        "effects: the loop found none that its data cannot separate; name two or more,"
+        " such as effects=('linear_drag', 'quadratic_drag')"
+    )
+
+
+def _labelled(scene: Scene, wrenches: Floats) -> xr.DataArray:
+    """Return wrenches (time, body, wrench) with their coordinates."""
+    return xr.DataArray(
+        wrenches,
+        {
+            "time": ("time", scene.time_step * np.arange(len(wrenches)), {"units": "s"}),
+            "body": [body.name for body in scene.moving],
+            "wrench": list(WRENCH),
+        },
+        ("time", "body", "wrench"),
+        attrs={"units": ", ".join(WRENCH_UNITS)},
+    )
 
 
 def _evolved(

@@ -7,13 +7,19 @@ import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from pbrl_ppl.errors import GoalError
 from pbrl_ppl.scene import Scene, nearest
 from pbrl_ppl.state import POSE, Floats
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+#: A class of what a table of a file declares.
+Table = TypeVar("Table", bound="DataclassInstance")
 
 
 @dataclass(frozen=True)
@@ -130,11 +136,10 @@ class Goal:
         for name, pose in targets.items():
             if len(pose) != 3:
                 raise GoalError(f"goal of {name}: got {len(pose)} values, expected x, y, theta")
-        shared: Any = options
-        read = tuple(
-            Target(name, pose[0], pose[1], pose[2], **shared) for name, pose in targets.items()
+        read = (
+            Target(name, pose[0], pose[1], pose[2], **options) for name, pose in targets.items()
         )
-        return cls(read, **penalty)
+        return cls(tuple(read), **penalty)
 
     @classmethod
     def load(cls, path: str | Path) -> Goal:
@@ -231,8 +236,8 @@ def check_pushed(scene: Scene, names: Iterable[str], where: str, hint: str = "")
 
 
 def read_tables(
-    path: str | Path, what: str, kind: Any, options: Iterable[str]
-) -> tuple[list[Any], dict[str, Any]]:
+    path: str | Path, what: str, kind: type[Table], options: Iterable[str]
+) -> tuple[list[Table], dict[str, Any]]:
     """Read a TOML file: a Target or Action for each of its tables, and options.
 
     Raises
@@ -256,7 +261,7 @@ def read_tables(
     return [kind(**table) for table in tables], document
 
 
-def _check_keys(table: Mapping[str, Any], known: list[str], where: str) -> None:
+def _check_keys(table: Mapping[str, object], known: list[str], where: str) -> None:
     """Check the keys of a table; the error for an unknown one names the nearest known one."""
     for key in table:
         if key not in known:

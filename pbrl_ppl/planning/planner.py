@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -21,8 +21,7 @@ from pbrl_ppl.planning.actions import ActionSet
 from pbrl_ppl.planning.astar import astar
 from pbrl_ppl.planning.dynamics import Dynamics, TransitionModel, rollout
 from pbrl_ppl.planning.goals import Goal
-from pbrl_ppl.planning.receding import mppi
-from pbrl_ppl.planning.search import NODES, SearchResult, Task, tail_mean
+from pbrl_ppl.planning.search import NODES, SearchResult, Task, mppi, tail_mean
 from pbrl_ppl.scene import Scene, nearest
 from pbrl_ppl.state import POSE, STATE, WRENCH, Floats
 
@@ -164,7 +163,7 @@ def plan(
     before: ArrayLike | None = None,
     effects: Iterable[Effect] = catalogue,
     progress: Callable[[str], None] | None = None,
-    **options: Any,
+    **options: object,
 ) -> Plan:
     """Plan from a start to a goal with what a posterior knows, and nothing else.
 
@@ -206,7 +205,7 @@ def plan(
         Called with a text on the progress of the search.
     **options
         Of :func:`pbrl_ppl.planning.astar.astar`, such as ``weight=1`` for A* without a weight, or
-        of :func:`pbrl_ppl.planning.receding.mppi`.
+        of :func:`pbrl_ppl.planning.search.mppi`.
 
     Returns
     -------
@@ -262,7 +261,15 @@ def plan(
         states = np.concatenate(
             [rollout(dynamics, first, result.wrenches, rng) for _ in range(times)]
         )
-    predicted = xr.Dataset(
+    return Plan(
+        scene, goal, first, result.wrenches, _labelled(scene, states), result.reached,
+        result.stopped, distance, result.nodes, result.seconds,
+    )  # fmt: skip
+
+
+def _labelled(scene: Scene, states: Floats) -> xr.Dataset:
+    """Return predicted states (draw, time, body, state) as a dataset."""
+    return xr.Dataset(
         {"predicted": (("draw", "time", "body", "state"), states)},
         {
             "draw": np.arange(len(states)),
@@ -271,10 +278,6 @@ def plan(
             "state": list(STATE),
         },
     )
-    return Plan(
-        scene, goal, first, result.wrenches, predicted, result.reached, result.stopped, distance,
-        result.nodes, result.seconds,
-    )  # fmt: skip
 
 
 def start_state(scene: Scene, start: Mapping[str, Sequence[float]] | ArrayLike) -> Floats:

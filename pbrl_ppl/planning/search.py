@@ -1,15 +1,21 @@
-"""Task and result of a search for a plan, its risk over draws and its contact penalty."""
+"""Searches for a plan: their task, result and cost, and MPPI, a receding horizon for dynamic tasks.
+
+Model predictive path integral control (MPPI) is one search, :func:`pbrl_ppl.planning.astar.astar`
+the other.
+"""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
+from pbrl_ppl.errors import GoalError
 from pbrl_ppl.physics import overlap
 from pbrl_ppl.planning.actions import ActionSet
-from pbrl_ppl.planning.dynamics import TransitionModel
+from pbrl_ppl.planning.dynamics import TransitionModel, remembered
 from pbrl_ppl.planning.goals import Goal
 from pbrl_ppl.scene import Scene, smallest_radius
 from pbrl_ppl.state import Floats
@@ -125,3 +131,176 @@ def contact_cost(goal: Goal, scene: Scene, states: Floats, *, near: float = 0.01
     touch = near * smallest_radius(scene)
     share = (overlap(scene, poses) > -touch).reshape(states.shape[:2]).mean(axis=0)
     return np.where(share > 0, goal.contact_penalty * np.maximum(share, 1e-9), 0.0)
+
+
+class Horizon:
+    """Receding horizon: wrenches for the next intervals, improved and shifted at every step.
+
+    Wrenches may be anything up to the strongest of the action set, on all of its bodies at once.
+
+    Parameters
+    ----------
+    task : Task
+        Model, goal, actions and risk.
+    horizon : int
+        Intervals looked ahead.
+    samples : int
+        Sequences tried at a time.
+    iterations : int
+        Times they are drawn about the best mean.
+    rng : Generator
+        Source of the samples.
+
+    References
+    ----------
+    Williams, Wagener, Goldfain, Drews, Rehg, Boots, Theodorou, "Information theoretic MPC for
+    model-based reinforcement learning", ICRA 2017.
+    """
+
+    def __init__(
+        self, task: Task, horizon: int, samples: int, iterations: int, rng: np.random.Generator
+    ) -> None:
+        self.task, self.rng = task, rng
+        self.samples, self.iterations = samples, iterations
+        scene = task.dynamics.scene
+        strongest = [task.actions.strongest(body.name) for body in scene.moving]
+        self.most = np.array([(force, force, torque) for force, torque in strongest])
+        self.mean = np.zeros((horizon, *self.most.shape))
+        self.bodies = task.goal.places(scene)
+        # the penalty of contact is in seconds: over the horizon, they count as the way at the start
+        reach = min(scene.moving[i].shape.bounding_radius for i in self.bodies)
+        self.way = max(float(task.goal.distance(scene, task.start)), reach)
+        self.generated = 0
+
+    def improve(
+        self,
+        start: Floats,
+        before: Floats,
+        *,
+        persistence: float = 0.7,
+        first_spread: float = 0.5,
+        elite: float = 0.05,
+    ) -> None:
+        """Draw sequences about the mean; weigh them by their cost.
+
+        Parameters
+        ----------
+        start : ndarray
+            States that they begin from, shape (draw, body, 6).
+        before : ndarray
+            Wrenches in the interval before, shape (body, 3).
+        persistence : float
+            Correlation of the noise from one interval to the next.
+        first_spread : float
+            Standard deviation of the wrenches that are tried, as a share of the strongest.
+        elite : float
+            Share of the samples that have about as much weight as all others.
+        """
+        size = (self.samples, *self.mean.shape)
+        for iteration in range(self.iterations):
+            spread = first_spread * self.most * 0.7**iteration
+            noise = self.rng.standard_normal(size)
+            for t in range(1, size[1]):
+                noise[:, t] = (
+                    persistence * noise[:, t - 1] + np.sqrt(1 - persistence**2) * noise[:, t]
+                )
+            tried = np.clip(self.mean + spread * noise, -self.most, self.most)
+            tried[0] = self.mean
+            cost = self._cost(start, tried, before)
+            worst = np.max(cost[np.isfinite(cost)], initial=0.0)
+            cost = np.where(np.isfinite(cost), cost, 1e3 * worst)
+            few = np.sort(cost)[: max(2, int(elite * self.samples))]
+            least = 1e-9 * few[-1] + np.finfo(float).tiny
+            weight = np.exp(-(cost - few[0]) / max(few[-1] - few[0], least))
+            self.mean = np.tensordot(weight / weight.sum(), tried, axes=1)
+
+    def _cost(self, start: Floats, tried: Floats, before: Floats, *, at_end: float = 0.8) -> Floats:
+        """Return L2 distance from the goal (mean and last), last speed, and contacts.
+
+        ``at_end``: cost of the speed at the end of the horizon, in sampling intervals at it: a fast
+        body does not stay there.
+        """
+        task, horizon = self.task, tried.shape[1]
+        scene, goal = task.dynamics.scene, task.goal
+        states = np.repeat(start[:, None], len(tried), axis=1)
+        cost = np.zeros(len(tried))
+        last = np.broadcast_to(before, (len(tried), *before.shape))
+        for t in range(horizon):
+            states = task.dynamics.step(states, tried[:, t], last)
+            last = remembered(tried[:, t], last)
+            if task.noise:
+                states = task.dynamics.noisy(states, self.rng)
+            self.generated += len(tried) * task.dynamics.draws
+            far = tail_mean(goal.distance(scene, states), task.tail)
+            cost += (far + self.way * contact_cost(goal, scene, states)) / horizon
+        speed = np.sqrt((states[..., self.bodies, 3:5] ** 2).sum(axis=(-2, -1)))
+        arrival = at_end * scene.time_step * tail_mean(speed, task.tail)
+        return np.asarray(cost + far + arrival)
+
+
+def mppi(
+    task: Task,
+    *,
+    horizon: int = 15,
+    samples: int = 256,
+    iterations: int = 3,
+    intervals: int = 200,
+) -> SearchResult:
+    """Plan with MPPI until the model reaches the goal.
+
+    Parameters
+    ----------
+    task : Task
+        Model, start, goal, actions and limits.
+    horizon, samples, iterations : int
+        As for :class:`Horizon`.
+    intervals : int
+        The longest plan.
+
+    Returns
+    -------
+    SearchResult
+        If the goal is not reached, up to where it was nearest; a start in motion does not count.
+
+    Raises
+    ------
+    GoalError
+        If a number is below 1.
+    """
+    nodes, dynamics, goal, start = task.nodes, task.dynamics, task.goal, task.start
+    if min(horizon, samples, iterations, intervals, nodes) < 1:
+        raise GoalError(
+            "MPPI: horizon, samples, iterations, intervals and nodes must be at least 1"
+        )
+    scene, begin = dynamics.scene, time.monotonic()
+    rng = task.rng or np.random.default_rng(0)
+    ahead = Horizon(task, horizon, samples, iterations, rng)
+    states = np.repeat(start[None, None], dynamics.draws, axis=0)
+    wrenches, last = list[Floats](), dynamics.before
+    nearest, best, stopped = np.inf, 0, "exhausted"
+
+    try:
+        while True:
+            if float(tail_mean(goal.shortfall(scene, states), task.tail)[0]) <= 1.0:
+                stopped, best = "goal", len(wrenches)
+                break
+            far = float(tail_mean(goal.distance(scene, states), task.tail)[0])
+            if far < nearest and (wrenches or not start[:, 3:].any()):
+                nearest, best = far, len(wrenches)
+            if len(wrenches) >= intervals:
+                break
+            if ahead.generated >= nodes or time.monotonic() - begin > task.seconds:
+                stopped = "nodes" if ahead.generated >= nodes else "time"
+                break
+            task.progress(f"interval {len(wrenches)}, {far:.3g} m from the goal")
+            ahead.improve(states[:, 0], last)
+            wrench = ahead.mean[0]
+            ahead.mean = np.concatenate([ahead.mean[1:], ahead.mean[-1:]])  # the others move up
+            wrenches.append(wrench)
+            states = dynamics.step(states, wrench[None], last[None])
+            last = remembered(wrench, last)
+    except KeyboardInterrupt:
+        stopped = "interrupted"
+    chosen = np.array(wrenches[:best]).reshape(-1, len(start), 3)
+    took = time.monotonic() - begin
+    return SearchResult(chosen, stopped == "goal", stopped, ahead.generated, took)

@@ -12,7 +12,7 @@ from pbrl_ppl.agents import act
 from pbrl_ppl.errors import GoalError, PosteriorError
 from pbrl_ppl.history import History
 from pbrl_ppl.physics import Transition, overlap
-from pbrl_ppl.planning import ActionSet, Dynamics, Goal, astar, plan, receding
+from pbrl_ppl.planning import ActionSet, Dynamics, Goal, astar, plan, search
 from pbrl_ppl.planning.astar import TimeToGo
 from pbrl_ppl.scene import Joint, Scene, Shape, Wall
 from tests.helpers.pucks import ACROSS, FORCE, FREE, MASS, PUSHES, ROOM, known
@@ -210,7 +210,7 @@ def test_time_is_a_limit_too() -> None:
     [
         (astar, {}),
         (astar, {"draws": 3, "nodes": 20_000}),
-        (receding, {"method": "mppi", "intervals": 10, "samples": 20}),
+        (search, {"method": "mppi", "intervals": 10, "samples": 20}),
     ],
 )
 def test_a_busy_machine_gives_the_same_plan(module, options, monkeypatch) -> None:
