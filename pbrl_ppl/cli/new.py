@@ -21,8 +21,17 @@ from pbrl_ppl.cli.options import command
 from pbrl_ppl.cli.terminal import Result, check_file
 from pbrl_ppl.errors import HistoryError, LayoutError, OutputError, RecordingWarning, SceneError
 from pbrl_ppl.files import write_text
-from pbrl_ppl.scene import WORLD, Actuator, Body, Joint, Recording, Scene, Shape, nearest
-from pbrl_ppl.scene import toml as scene_toml
+from pbrl_ppl.scene import (
+    WORLD,
+    Actuator,
+    Body,
+    Joint,
+    Recording,
+    Scene,
+    Shape,
+    nearest,
+    toml_of,
+)
 from pbrl_ppl.state import Floats
 
 if TYPE_CHECKING:
@@ -429,7 +438,7 @@ def scene_text(shapes: Mapping[str, Shape], side: bool, time_step: float, found:
         shapes={name: vars(shape) for name, shape in shapes.items()},
         side=side, time_step=time_step, joints=joints, actuators=actuators,
         recording=found.layout, said=found.said,
-        entry=lambda key, value: scene_toml.write([("", {key: value})]).strip(),
+        entry=lambda key, value: toml_of([("", {key: value})]).strip(),
     )  # fmt: skip
 
 

@@ -6,7 +6,7 @@ from .layout import JOINT_INDICES as JOINT_INDICES
 from .layout import WHEEL_PARAMETERS as WHEEL_PARAMETERS
 from .layout import Block as Block
 from .layout import Layout as Layout
-from .library import ParameterLibrary as ParameterLibrary
+from .layout import ParameterLibrary as ParameterLibrary
 from .priors import Prior as Prior
 from .priors import box as box
 from .priors import differentiate as differentiate

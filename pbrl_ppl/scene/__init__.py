@@ -1,21 +1,22 @@
 """Scenes: shapes, bodies, walls and joints as declared; TOML to `Scene` and back."""
 
-from .actuators import NUMBERS as NUMBERS
-from .actuators import Actuator as Actuator
 from .bodies import Body as Body
+from .bodies import Shape as Shape
 from .bodies import Wall as Wall
 from .checks import CONTACT_NAMES as CONTACT_NAMES
 from .checks import PLACES as PLACES
 from .checks import Point as Point
 from .checks import nearest as nearest
+from .joints import NUMBERS as NUMBERS
 from .joints import WORLD as WORLD
+from .joints import Actuator as Actuator
 from .joints import Joint as Joint
 from .recording import SEPARATORS as SEPARATORS
 from .recording import Recording as Recording
 from .recording import column_of as column_of
 from .scene import Scene as Scene
 from .scene import check_substeps as check_substeps
-from .shape import Shape as Shape
+from .scene import toml_of as toml_of
 from .units import MASS_PRIOR as MASS_PRIOR
 from .units import Units as Units
 from .units import body_sizes as body_sizes

@@ -5,14 +5,15 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from numbers import Real
-from typing import Any
+from typing import Any, TypeVar
 
 from pbrl_ppl.errors import SceneError
 
+Value = TypeVar("Value")
 Point = tuple[float, float]
 Named = tuple[tuple[str, float], ...]
 #: Takes a value and where it is; returns the value in canonical form.
-Check = Callable[[Any, str], Any]
+Check = Callable[[object, str], object]
 
 #: The parameters of Table 1 that a contact needs: all that a kinematic body has.
 CONTACT_NAMES = ("r", "mu_c")
@@ -133,7 +134,7 @@ def vector(value: object, where: str, length: int = 2) -> Any:
     return numbers
 
 
-def items(value: object, where: str) -> dict[Any, Any]:
+def items(value: object, where: str) -> dict[object, object]:
     """Return a mapping, or a tuple of pairs without repeated names, as a dict."""
     if isinstance(value, Mapping):
         return dict(value)
@@ -147,8 +148,12 @@ def items(value: object, where: str) -> dict[Any, Any]:
 
 
 def table(
-    value: object, where: str, checks: Mapping[str, Check], what: str = "key", hint: str = ""
-) -> tuple[tuple[str, Any], ...]:
+    value: object,
+    where: str,
+    checks: Mapping[str, Callable[[object, str], Value]],
+    what: str = "key",
+    hint: str = "",
+) -> tuple[tuple[str, Value], ...]:
     """Return the entries of a table in the order of the known names, each checked.
 
     Parameters

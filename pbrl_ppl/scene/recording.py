@@ -142,12 +142,12 @@ class Recording:
                 )
             positive(value, f"[recording]: cut, {name}")
 
-    def table(self) -> dict[str, Any]:
+    def table(self) -> dict[str, object]:
         """Return the entries of the TOML table: those that are not the defaults."""
         values = ((field, getattr(self, field.name)) for field in fields(self))
         return {field.name: value for field, value in values if value != field.default}
 
-    def with_entries(self, **entries: Mapping[str, Any]) -> Recording:
+    def with_entries(self, **entries: Mapping[str, object]) -> Recording:
         """Return the layout with more entries in tables, which go before those that it has."""
         tables: dict[str, Any] = {
             key: dict(getattr(self, key)) | dict(value) for key, value in entries.items()

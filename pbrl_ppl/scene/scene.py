@@ -1,30 +1,48 @@
 """Scenes: the known part of the physics (Gamma): shapes, walls, joints, gravity and the clock.
 
 Everything here is frozen and hashable, in SI units, and checked when it is built, whether it comes
-from a TOML file or from Python.
+from a TOML file, whose every key is checked, or from Python.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
+import re
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from pbrl_ppl.errors import SceneError
 from pbrl_ppl.scene import checks
-from pbrl_ppl.scene import toml as scene_toml
-from pbrl_ppl.scene.actuators import Actuator, check_actuators
-from pbrl_ppl.scene.bodies import Body, Wall, check_classes
+from pbrl_ppl.scene.bodies import Body, Shape, Wall, check_classes
 from pbrl_ppl.scene.checks import Named, Point
-from pbrl_ppl.scene.joints import WORLD, Joint
+from pbrl_ppl.scene.joints import WORLD, Actuator, Joint, check_actuators
 from pbrl_ppl.scene.recording import Recording
 from pbrl_ppl.state import STATE
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Part = TypeVar("Part", bound="DataclassInstance")
+Table = dict[str, Any]
+
+#: Fields of a scene that are arrays of tables, with the key and the class of each.
+_PARTS: Mapping[str, tuple[str, type]] = {
+    "bodies": ("body", Body),
+    "walls": ("wall", Wall),
+    "joints": ("joint", Joint),
+    "actuators": ("actuator", Actuator),
+}
+#: Keys that are not the names of the fields that they set.
+_RENAMED = {"object_class": "class", "start": "from", "end": "to"}
+#: Values that are written of a body though they are empty.
+_EMPTY: Table = {"known": {}, "prior": {}, "effects": ()}
 #: Engine steps a sample, at most: twice what `close_loop` goes to where data are that exact.
 MOST_SUBSTEPS = 1280
 
@@ -90,7 +108,7 @@ class Scene:
         checks.settle(self, "[world]", gravity=checks.vector, normal_gravity=checks.not_negative)
         checks.settle(self, "[world]", time_step=checks.positive, substeps=check_substeps)
         checks.settle(self, "[world]", test_is_later=checks.flag)
-        for key, (_, kind) in scene_toml.PARTS.items():
+        for key, (_, kind) in _PARTS.items():
             parts = tuple(getattr(self, key))
             for part in parts:
                 if not isinstance(part, kind):
@@ -179,13 +197,51 @@ class Scene:
         SceneError
             As `load`; an unknown key is named with its table and the nearest known key.
         """
-        entries, any_joints = scene_toml.read(text)
-        scene = cls(**entries)
-        return scene.with_any_joints() if any_joints else scene
+        try:
+            document = tomllib.loads(text)
+        except tomllib.TOMLDecodeError as error:
+            raise SceneError(f"not TOML: {error}") from None
+        arrays = [key for key, _ in _PARTS.values()]
+        _checked(document, "the file", ["world"], ["noise", "recording", *arrays])
+        optional = ["gravity", "normal_gravity", "substeps", "test_is_later", "joints"]
+        world = _checked(document["world"], "[world]", ["time_step"], optional)
+        if (joints := world.pop("joints", None)) not in ("any", None):
+            raise SceneError(
+                f'[world]: joints is {joints!r}, expected "any" (any two bodies, or a body and the'
+                " world, may be joined by a rod); declare those that are there as [[joint]]"
+            )
+        world["noise"] = _checked(document.get("noise", {}), "[noise]", [], STATE)
+        if "recording" in document:
+            entries = _entries(Recording, document["recording"], "[recording]")
+            world["recording"] = Recording(**entries)
+        for field, (key, kind) in _PARTS.items():
+            world[field] = tuple(_part(kind, *place) for place in _tables(document, key))
+        scene = cls(**world)
+        return scene.with_any_joints() if joints else scene
 
     def to_toml(self) -> str:
         """Return TOML text from which `from_toml` builds an equal scene."""
-        return scene_toml.write(scene_toml.sections(vars(self)))
+        return toml_of(self._sections())
+
+    def _sections(self) -> Iterator[tuple[str, Mapping[str, object]]]:
+        """Yield the header and the table of each section of its file."""
+        always = ("gravity", "normal_gravity", "time_step", "substeps")
+        world = {key: getattr(self, key) for key in always}
+        yield "[world]", world if self.test_is_later else {**world, "test_is_later": False}
+        if self.noise:
+            yield "[noise]", dict(self.noise)
+        if self.recording is not None:
+            yield "[recording]", self.recording.table()
+        for field, (key, kind) in _PARTS.items():
+            empty = _EMPTY if kind is Body else {}
+            for part in getattr(self, field):
+                table = {
+                    name: empty.get(name) if value in ((), "") else value
+                    for name, value in vars(part).items()
+                }
+                for name in filter(table.__contains__, _RENAMED):
+                    table[_RENAMED[name]] = table.pop(name)
+                yield f"[[{key}]]", table
 
     @property
     def moving(self) -> tuple[Body, ...]:
@@ -335,3 +391,88 @@ def check_substeps(value: object, where: str = "substeps") -> int:
             " prediction and take long; use fewer, or record with a shorter time_step"
         )
     return int(value)
+
+
+def toml_of(sections: Iterable[tuple[str, Mapping[str, object]]]) -> str:
+    """Return TOML text of tables with these headers; entries that are None are left out."""
+    parts = []
+    for header, table in sections:
+        lines = [f"{key} = {_value(item)}" for key, item in table.items() if item is not None]
+        parts.append("\n".join([header, *lines, ""]))
+    return "\n".join(parts)
+
+
+def _part(kind: type[Part], where: str, table: object) -> Part:
+    """Return a body, wall, joint or actuator from its table."""
+    entries = _entries(kind, table, where)
+    shape = _entries(Shape, entries["shape"], f"shape of {where}") if kind is Body else None
+    with checks.located(where):
+        if shape is not None:
+            entries["shape"] = Shape(**shape)
+        return kind(**entries)
+
+
+def _entries(kind: type[DataclassInstance], table: object, where: str) -> Table:
+    """Return values of a class's fields from a table whose keys are checked."""
+    names = {_RENAMED.get(field.name, field.name): field for field in fields(kind)}
+    required = [key for key, field in names.items() if field.default is MISSING]
+    optional = [key for key in names if key not in required]
+    checked = _checked(table, where, required, optional)
+    return {names[key].name: value for key, value in checked.items()}
+
+
+def _checked(table: object, where: str, required: Iterable[str], optional: Iterable[str]) -> Table:
+    """Return a table; refuse one with unknown keys or without the required ones."""
+    known = [*required, *optional]
+    if not isinstance(table, Mapping):
+        raise SceneError(f"{where} is {table!r}, expected a table of {', '.join(known)}")
+    for key in table:
+        if key not in known:
+            raise SceneError(f'unknown key "{key}" in {where}{checks.nearest(key, known)}')
+    for key in required:
+        if key not in table:
+            raise SceneError(f'{where} has no "{key}"; add it')
+    return dict(table)
+
+
+def _tables(document: Table, key: str) -> Iterator[tuple[str, Table]]:
+    """Yield the place and the table, for each of an array of tables."""
+    array = document.get(key, [])
+    if not isinstance(array, list):
+        raise SceneError(f"{key} is not an array of tables; write [[{key}]], with two brackets")
+    for number, table in enumerate(array, start=1):
+        where = f"[[{key}]] number {number}"
+        if isinstance(table, Mapping) and isinstance(table.get("name"), str):
+            where += f' ("{table["name"]}")'
+        yield where, table
+
+
+def _value(item: object) -> str:
+    """Return one TOML value: a string, boolean, number, list or inline table."""
+    if isinstance(item, bool):
+        return "true" if item else "false"
+    if isinstance(item, str):
+        # TOML's basic strings take JSON's escapes, except that DEL must be escaped in TOML.
+        return json.dumps(item, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(item, Shape):
+        item = vars(item)
+    if isinstance(item, tuple) and item and all(map(_is_entry, item)):
+        item = dict(item)
+    if isinstance(item, Mapping):
+        pairs = [
+            f"{_key(key)} = {_value(value)}" for key, value in item.items() if value is not None
+        ]
+        return "{ " + ", ".join(pairs) + " }" if pairs else "{}"
+    if isinstance(item, tuple | list):
+        return "[" + ", ".join(_value(part) for part in item) + "]"
+    return repr(item)
+
+
+def _is_entry(item: object) -> bool:
+    """Return whether this is an entry of a table: a name and a value."""
+    return isinstance(item, tuple) and len(item) == 2 and isinstance(item[0], str)
+
+
+def _key(name: str) -> str:
+    """Return a key, in quotes where it needs them: a body's name may be anything."""
+    return name if re.fullmatch("[A-Za-z0-9_-]+", name) else _value(name)
