@@ -14,7 +14,7 @@ import typer
 from pbrl_ppl.cli.app import app
 from pbrl_ppl.cli.options import commands
 from pbrl_ppl.effects import Effect, EffectParameter, catalogue
-from pbrl_ppl.effects.stages import STAGES
+from pbrl_ppl.effects.effect import STAGES
 
 ROOT = Path(__file__).parents[2]
 

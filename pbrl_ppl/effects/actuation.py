@@ -5,8 +5,15 @@ from dataclasses import replace
 from typing import Any
 
 from pbrl_ppl.effects.actuators import OF_COMPONENTS, of_component
-from pbrl_ppl.effects.effect import SIGNED, SIZE, Effect, EffectParameter, always, is_pivoted
-from pbrl_ppl.effects.stages import Command
+from pbrl_ppl.effects.effect import (
+    SIGNED,
+    SIZE,
+    Command,
+    Effect,
+    EffectParameter,
+    always,
+    is_pivoted,
+)
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import NUMBERS, Actuator, Scene
 from pbrl_ppl.state import WRENCH, Floats

@@ -5,8 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pbrl_ppl.effects.effect import Effect, EffectParameter, ScanWith
-from pbrl_ppl.effects.stages import Command
+from pbrl_ppl.effects.effect import Command, Effect, EffectParameter, ScanWith
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
-from pbrl_ppl.effects import actuators, drag, forces, friction, mass, obstacles, sensors, springs
+from pbrl_ppl.effects import actuators, drag, forces, friction, obstacles, sensors, springs
 from pbrl_ppl.effects.actuation import actuation, laws_of_actuators
 from pbrl_ppl.effects.effect import Attached, Effect
 from pbrl_ppl.errors import EffectError
@@ -36,8 +36,8 @@ catalogue: tuple[Effect, ...] = (
     forces.constant_torque,
     forces.push_offset,
     actuators.actuator_rotation,
-    mass.inertia_scale,
-    mass.com_offset,
+    forces.inertia_scale,
+    forces.com_offset,
     actuators.force_gain,
     actuators.torque_gain,
     actuators.anisotropic_gain,
@@ -80,8 +80,8 @@ catalogue: tuple[Effect, ...] = (
     forces.periodic_force,
     forces.periodic_torque,
     springs.point_attractor,
-    mass.sloshing,
-    mass.mass_change,
+    forces.sloshing,
+    forces.mass_change,
     obstacles.hidden_obstacle,
     springs.distance_joint,
     sensors.sensor_bias,

@@ -9,15 +9,19 @@ from pbrl_ppl.effects.effect import (
     ANY_ANGLE,
     SIGNED,
     SIZE,
+    Clock,
     Effect,
     EffectParameter,
+    Force,
+    Friction,
+    Properties,
     ScanWith,
+    Values,
     body_points,
     is_pivoted,
     is_sliding,
     is_unpivoted,
 )
-from pbrl_ppl.effects.stages import Clock, Force, Friction, Properties, Values
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene

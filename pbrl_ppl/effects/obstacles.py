@@ -4,8 +4,16 @@ from itertools import combinations
 
 import numpy as np
 
-from pbrl_ppl.effects.effect import SIGNED, SIZE, Effect, EffectParameter, is_pivoted
-from pbrl_ppl.effects.stages import Disc, Structure, Values
+from pbrl_ppl.effects.effect import (
+    SIGNED,
+    SIZE,
+    Disc,
+    Effect,
+    EffectParameter,
+    Structure,
+    Values,
+    is_pivoted,
+)
 from pbrl_ppl.history import History
 from pbrl_ppl.scene import Body, Scene, Shape
 from pbrl_ppl.state import Floats

@@ -2,8 +2,15 @@
 
 import numpy as np
 
-from pbrl_ppl.effects.effect import Effect, EffectParameter, is_pivoted, is_unpivoted
-from pbrl_ppl.effects.stages import Noise, Sensor, Values
+from pbrl_ppl.effects.effect import (
+    Effect,
+    EffectParameter,
+    Noise,
+    Sensor,
+    Values,
+    is_pivoted,
+    is_unpivoted,
+)
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.state import POSE, STATE, STATE_UNITS, Floats
 

@@ -12,12 +12,15 @@ from pbrl_ppl.effects.effect import (
     SIZE,
     Effect,
     EffectParameter,
+    Force,
+    Rod,
     ScanWith,
+    Structure,
+    Values,
     body_points,
     is_unjoined,
     is_unpivoted,
 )
-from pbrl_ppl.effects.stages import Force, Rod, Structure, Values
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene

@@ -13,7 +13,7 @@ from pbrl_ppl.physics.compilation import compiled
 #: When an interval is nearly over, as a share of it.
 LATE = 1.0 - 1e-7
 #: Columns of what acts on a body: its command, the one of the interval before, the wrench, and when
-#: it is; see :data:`pbrl_ppl.effects.stages.TIME`.
+#: it is; see :data:`pbrl_ppl.effects.effect.TIME`.
 COMMAND, PREVIOUS, WRENCHES, TIME, INTERVAL, ACTED = 0, 3, 6, 9, 10, 12
 #: Further rows of what acts: a law's command and its memory, and the wrench of a law of one number.
 MORE = 4

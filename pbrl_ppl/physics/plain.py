@@ -10,7 +10,7 @@ import numpy as np
 import pymunk
 
 from pbrl_ppl.effects import Attached, Command, Force, Friction, at_stage, holder
-from pbrl_ppl.effects.stages import INTERVAL, MEMORY, MOST_MEMORY, TIME
+from pbrl_ppl.effects.effect import INTERVAL, MEMORY, MOST_MEMORY, TIME
 from pbrl_ppl.physics.laws import LATE
 from pbrl_ppl.physics.properties import COLUMN, EngineInput
 from pbrl_ppl.physics.setters import (

@@ -20,7 +20,7 @@ from pbrl_ppl.effects import (
     Sensor,
     Structure,
 )
-from pbrl_ppl.effects.stages import INTERVAL, MEMORY, MOST_MEMORY, TIME
+from pbrl_ppl.effects.effect import INTERVAL, MEMORY, MOST_MEMORY, TIME
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.history import History
 from pbrl_ppl.physics.physics import Physics

@@ -193,15 +193,23 @@ def test_it_needs_a_floor() -> None:
         attach(scene, (BY_NAME["sliding_friction"].on("block"),))
 
 
-def test_only_it_puts_a_ring_under_a_body() -> None:
-    scene = floor()
-    others = tuple(each for each in catalogue if each.applies(scene, scene.bodies[0]))
-    for effect in others:
-        sim = simulator(scene, (effect,))
-        rings, wheels, turners = sim._properties.under
-        assert bool(rings) == (effect.name == "sliding_friction")
-        assert bool(wheels) == (effect.name == "wheel")
-        assert bool(turners) == (effect.name == "turning_friction")
+def test_dry_friction_alone_stops_a_body() -> None:
+    """Of all that may act on one that slides and turns; a rod from its centre holds that, too."""
+    scene, coasting = floor(substeps=10), state(vx=0.5, vy=0.2, omega=1.0)[None, None]
+    stopped = {}
+    for effect in catalogue:
+        if effect.applies(scene, scene.bodies[0]):
+            sim = simulator(scene, (effect,), engine="python")
+            centre = np.array([prior.centre for prior in sim.physics.layout.priors])
+            *_, vx, vy, omega = sim(centre, coasting, np.zeros((1, 10, 1, 3)))[0, -1, 0]
+            speeds = {"slides": np.hypot(vx, vy), "turns": abs(omega)}
+            stopped[effect.name] = [way for way, speed in speeds.items() if speed < 1e-9]
+    assert {name: ways for name, ways in stopped.items() if ways} == {
+        "sliding_friction": ["slides", "turns"],
+        "turning_friction": ["turns"],
+        "wheel": ["slides"],
+        "distance_joint": ["slides"],
+    }
 
 
 @pytest.mark.slow
@@ -239,7 +247,6 @@ def test_friction_of_zero_is_solved_as_any_other() -> None:
     assert 0.0 < np.abs(both[1] - both[0]).max() < 1e-6
     decayed = np.exp(-0.5 / MASS * 0.1)  # free but for the drag
     np.testing.assert_allclose(both[0, 0, 0, 0, 3], decayed, rtol=1e-8)
-    assert len(sim._worlds) == 1
 
 
 # -- a wheel that the scene does not declare -------------------------------------------------------
