@@ -7,16 +7,20 @@ arrays of its rollouts, see :func:`pbrl_ppl.from_mujoco`.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pbrl_ppl.errors import ConversionWarning, SceneError, warn
 from pbrl_ppl.history.mujoco import FLAT, FREE, HINGE, PLANES, SLIDE
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene, Shape, Wall
 from pbrl_ppl.state import Floats, Ints
+
+if TYPE_CHECKING:
+    import mujoco
 
 #: mjtGeom as numbers, as in mjmodel.h.
 _PLANE, _SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX = 0, 2, 3, 4, 5, 6
@@ -28,7 +32,7 @@ _EVEN = 0.01
 
 
 def scene_from_mjcf(
-    source: str | Path | Any,
+    source: str | Path | mujoco.MjModel,
     plane: str = "xy",
     *,
     known_mass: bool = False,
@@ -111,7 +115,7 @@ def scene_from_mjcf(
     return scene
 
 
-def _compiled(source: Any) -> Any:
+def _compiled(source: str | Path | mujoco.MjModel) -> mujoco.MjModel:
     """Return a compiled model of a file, text or model."""
     try:
         import mujoco
@@ -145,7 +149,7 @@ def rounded(value: float) -> float:
     return float(f"{float(value):.9g}") if abs(value) > 1e-12 else 0.0
 
 
-def pair(point: Any) -> tuple[float, float]:
+def pair(point: Iterable[float]) -> tuple[float, float]:
     """Return a point of the plane, rounded."""
     x, y = (rounded(round(float(value), 12)) for value in point)
     return x, y
@@ -157,7 +161,7 @@ class _View:
     ``axes`` are the plane's axes and its normal (3, 3).
     """
 
-    def __init__(self, model: Any, axes: Floats, shapes: dict[str, Shape]) -> None:
+    def __init__(self, model: mujoco.MjModel, axes: Floats, shapes: dict[str, Shape]) -> None:
         import mujoco
 
         self.model, self.data, self.axes, self.shapes = model, mujoco.MjData(model), axes, shapes
@@ -177,7 +181,7 @@ class _View:
         first = int(self.model.body_jntadr[i])
         return np.asarray(self.model.jnt_type[first : first + int(self.model.body_jntnum[i])])
 
-    def place(self, point: Any) -> Floats:
+    def place(self, point: ArrayLike) -> Floats:
         """Return a point of MuJoCo's world in the plane (2,)."""
         flat: Floats = self.axes[:2] @ np.asarray(point)
         return flat

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-import xml.etree.ElementTree as ET
 from collections.abc import Iterable
-from typing import Any
+from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.errors import ConversionWarning, SceneError, warn
@@ -16,6 +16,9 @@ from pbrl_ppl.mjcf.reading import rotation, rounded
 from pbrl_ppl.posterior import Idata, labelled_draws, layout_of, scene_of
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene
 from pbrl_ppl.state import Floats
+
+#: Attributes of an element: text, a number or several numbers.
+Attributes = dict[str, ArrayLike]
 
 
 def mjcf_ranges(
@@ -88,7 +91,7 @@ def mjcf_ranges(
     ranges: dict[str, dict[str, list[float]]] = {}
     means: dict[str, dict[str, float]] = {}
     for body in scene.moving:
-        values: dict[str, Any] = dict(body.known)
+        values: dict[str, float | Floats] = dict(body.known)
         for block in layout_of(idata, effects).blocks:
             for owner in (body.owner, body.name):
                 if block.of == "body" and f"{block.name}[{owner}]" in draws:
@@ -113,7 +116,7 @@ class _Writer:
     ) -> None:
         self.scene, self.values, self.axes, self.half = scene, values, axes, depth / 2
         self.left_out: list[str] = []
-        self.root = ET.Element("mujoco", model="scene")
+        self.root = Element("mujoco", model="scene")
         gravity = axes.T @ (*scene.gravity, -scene.normal_gravity)
         step = scene.time_step / scene.substeps
         _add(self.root, "option", timestep=step, gravity=gravity)
@@ -152,8 +155,8 @@ class _Writer:
                 self.release(self.scene.body(free.pop(0)))
         if not len(self.asset):
             self.root.remove(self.asset)
-        ET.indent(self.root)
-        return ET.tostring(self.root, encoding="unicode") + "\n", self.left_out
+        indent(self.root)
+        return tostring(self.root, encoding="unicode") + "\n", self.left_out
 
     def hinges(self) -> list[Joint]:
         """Return the known hinges and sliders; list other joints as left out."""
@@ -223,17 +226,17 @@ class _Writer:
         place = self.axes[:2].T @ (anchor or (0.0, 0.0))
         _add(equality, "connect", body1=first, anchor=place, **second)
 
-    def begin(self, body: Body, parent: str, place: Any, turn: float, **more: str) -> ET.Element:
+    def begin(self, body: Body, parent: str, place: ArrayLike, turn: float, **more: str) -> Element:
         """Add the element of a body, without content."""
         where = self.placed(place, turn)
         element = _add(self.elements[parent], "body", name=body.name, **where, **more)
         self.elements[body.name], self.angles[body.name] = element, 0.0
         return element
 
-    def fill(self, body: Body, element: ET.Element, effects: set[str] | None = None) -> None:
+    def fill(self, body: Body, element: Element, effects: set[str] | None = None) -> None:
         """Add a body's inertia and geom; list what is left out of it, but for these effects."""
         values = self.values.get(body.name, {})
-        more: dict[str, Any] = {}
+        more: Attributes = {}
         if "mass" in values:
             centre = [values.get(f"com_offset_{axis}", 0.0) for axis in "xy"]
             # in the plane, moments about its axes do not matter
@@ -260,23 +263,23 @@ class _Writer:
             lost = sorted({*body.effects} - effects - {"inertia_scale", "com_offset"})
             self.left_out += [f'effect {one} of body "{name}"' for one in lost]
 
-    def box(self, parent: ET.Element, name: str, size: Any, more: dict[str, Any]) -> None:
+    def box(self, parent: Element, name: str, size: Iterable[float], more: Attributes) -> None:
         """Add a box of these half sizes along the plane's axes."""
         sizes = np.abs(self.axes.T @ (*size, self.half))
         _add(parent, "geom", name=name, type="box", size=sizes, **more)
 
-    def placed(self, place: Any, theta: float) -> dict[str, Any]:
+    def placed(self, place: ArrayLike, theta: float) -> Attributes:
         """Return the attributes of a place in the plane, and of an angle."""
         turn = (math.cos(theta / 2), *(math.sin(theta / 2) * self.axes[2]))
         return {"pos": self.axes[:2].T @ np.asarray(place), "quat": turn}
 
 
-def _add(parent: ET.Element, tag: str, **attributes: Any) -> ET.Element:
+def _add(parent: Element, tag: str, **attributes: ArrayLike) -> Element:
     """Add an element with attributes of text, a number or several numbers."""
-    element = ET.SubElement(parent, tag)
+    element = SubElement(parent, tag)
     for name, value in attributes.items():
         if not isinstance(value, str):
-            numbers = map(rounded, value) if np.ndim(value) else [value]
+            numbers = map(rounded, np.asarray(value)) if np.ndim(value) else [value]
             value = " ".join(f"{number:.9g}" for number in numbers)
         element.set(name, value)
     return element
