@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any, ClassVar, final
+from typing import Any, ClassVar, Unpack, final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,6 +22,7 @@ from pbrl_ppl.planning import (
     ActionSet,
     Dynamics,
     Goal,
+    SearchOptions,
     TransitionModel,
     plan,
     remembered,
@@ -96,6 +97,13 @@ class Task:
         return self.actions.wrenches(self.scene, np.arange(count), heading)
 
 
+class AgentOptions(SearchOptions, total=False):
+    """Options of an :class:`Agent`."""
+
+    seed: int
+    nodes: int
+
+
 class Agent(ABC):
     """Agent that plans with a transition model; subclasses define how the model is learned.
 
@@ -133,9 +141,10 @@ class Agent(ABC):
     posterior: Idata | None = None
     added: tuple[Revision, ...] = ()
 
-    def __init__(self, task: Task, *, seed: int = 0, nodes: int = 20_000, **options: Any) -> None:
-        self.task, self.seed = task, seed
-        self._options = {"nodes": nodes, **options}
+    def __init__(
+        self, task: Task, *, seed: int = 0, nodes: int = 20_000, **options: Unpack[SearchOptions]
+    ) -> None:
+        self.task, self.seed, self._nodes, self._options = task, seed, nodes, options
         self._rng = np.random.default_rng([seed, 0])  # [seed, 1] is the world's
         self._ahead = np.empty((0, len(task.scene.moving), 3))
         # what was played, which an actuator may remember
@@ -201,7 +210,10 @@ class Agent(ABC):
             end = rollout(model.after(self._last), state, self._ahead)[:, -1]
             if float(task.goal.shortfall(task.scene, end).mean()) <= 1.0:  # false for NaN
                 return self._ahead
-        planned = plan(model, state, task.goal, task.actions, before=self._last, **self._options)
+        planned = plan(
+            model, state, task.goal, task.actions,
+            before=self._last, nodes=self._nodes, **self._options,
+        )  # fmt: skip
         if planned.stopped == "interrupted":  # the search catches it
             raise KeyboardInterrupt
         return planned.wrenches if planned.reached else planned.wrenches[:1]
@@ -266,7 +278,11 @@ class _RegressionAgent(Agent):
     _regression: ClassVar[type[LWR] | type[OOLWR]]
 
     def __init__(
-        self, task: Task, *, learner: Mapping[str, Any] | None = None, **options: Any
+        self,
+        task: Task,
+        *,
+        learner: Mapping[str, Any] | None = None,
+        **options: Unpack[AgentOptions],
     ) -> None:
         super().__init__(task, **options)
         self._learner = self._regression(task.scene, **(learner or {}))
@@ -355,7 +371,7 @@ class TrueModelAgent(Agent):
         task: Task,
         parameters: Mapping[str, object],
         effects: Iterable[Effect | Attached] = (),
-        **options: Any,
+        **options: Unpack[AgentOptions],
     ) -> None:
         super().__init__(task, **options)
         self.model = Dynamics.known(task.scene, parameters, effects, threads=1)

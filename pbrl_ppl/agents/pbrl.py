@@ -5,12 +5,12 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable
 from itertools import compress
-from typing import Any, ClassVar, final
+from typing import Any, ClassVar, Unpack, final
 
 import numpy as np
 import pandas as pd
 
-from pbrl_ppl.agents.agent import PhysicsAgent, Task, meetings, prediction_errors
+from pbrl_ppl.agents.agent import AgentOptions, PhysicsAgent, Task, meetings, prediction_errors
 from pbrl_ppl.agents.revision import revise
 from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.effects import catalogue as full_catalogue
@@ -96,7 +96,7 @@ class PBRLAgent(PhysicsAgent):
         effects: Iterable[Effect | Attached] = (),
         revise: bool = False,
         catalogue: Iterable[Effect] = full_catalogue,
-        **options: Any,
+        **options: Unpack[AgentOptions],
     ) -> None:
         if (draws is not None and draws < 1) or not growth >= 0:
             raise FitError(f"PBRL: draws is {draws}, growth {growth}; expected at least 1 and 0")

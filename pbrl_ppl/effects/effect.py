@@ -145,6 +145,29 @@ class Properties:
     timed: bool = False
 
 
+@dataclass(frozen=True)
+class Added:
+    """Modification that adds parameters to properties; equal to its copies in other processes.
+
+    Parameters
+    ----------
+    names : tuple of (str, str)
+        Names of each property and of the parameter that is added to it.
+    """
+
+    names: tuple[tuple[str, str], ...]
+
+    def __call__(self, properties: dict[str, Floats], parameters: Values, clock: Clock) -> None:
+        """Change the properties; see :class:`Properties`."""
+        for name, parameter in self.names:
+            properties[name] = properties[name] + parameters[parameter]
+
+
+def adding(**parameters: str) -> Properties:
+    """Return the stage that adds parameters to the properties of these names."""
+    return Properties(Added(tuple(parameters.items())))
+
+
 @final
 @dataclass(frozen=True)
 class Command:

@@ -15,6 +15,7 @@ from pbrl_ppl.effects.effect import (
     Properties,
     ScanWith,
     Values,
+    adding,
     is_unpivoted,
 )
 from pbrl_ppl.history import History
@@ -263,11 +264,6 @@ inertia_scale = Effect(
 )
 
 
-def _shift_centre(properties: dict[str, Floats], parameters: Values, clock: Clock) -> None:
-    properties["com_x"] = properties["com_x"] + parameters["x"]
-    properties["com_y"] = properties["com_y"] + parameters["y"]
-
-
 com_offset = Effect(
     "com_offset",
     (
@@ -276,7 +272,7 @@ com_offset = Effect(
     ),
     "the centre of mass is not in the middle of the outline: mass is not spread evenly",
     "centre of mass of a rigid body, in the body's frame",
-    Properties(_shift_centre),
+    adding(com_x="x", com_y="y"),
     log_odds=-1.0,
 )
 

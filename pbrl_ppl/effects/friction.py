@@ -9,14 +9,12 @@ from pbrl_ppl.effects.effect import (
     ANY_ANGLE,
     SIGNED,
     SIZE,
-    Clock,
     Effect,
     EffectParameter,
     Force,
     Friction,
-    Properties,
     ScanWith,
-    Values,
+    adding,
     body_points,
     is_pivoted,
     is_sliding,
@@ -48,22 +46,14 @@ _SCAN_TURN_RATES = ScanWith(_scan_speeds, ("omega",))
 _SCAN_SPEEDS = ScanWith(_scan_speeds, ("vx", "vy"))
 
 
-def _add_pivot_damping(properties: dict[str, Floats], parameters: Values, clock: Clock) -> None:
-    properties["pivot_damping"] = properties["pivot_damping"] + parameters["coefficient"]
-
-
 pivot_damping = Effect(
     "pivot_damping",
     (EffectParameter("coefficient", "N m s", SIZE, scale="torque/turn_rate"),),
     "viscous friction in the hinge: a torque against the rotation that grows with its speed",
     "viscous torque on the relative angular velocity, tau = -c omega",
-    Properties(_add_pivot_damping),
+    adding(pivot_damping="coefficient"),
     applies=is_pivoted,
 )
-
-
-def _add_pivot_torque(properties: dict[str, Floats], parameters: Values, clock: Clock) -> None:
-    properties["pivot_torque"] = properties["pivot_torque"] + parameters["torque"]
 
 
 pivot_friction = Effect(
@@ -71,7 +61,7 @@ pivot_friction = Effect(
     (EffectParameter("torque", "N m", SIZE, scale="torque"),),
     "dry friction in the hinge: a steady torque against the rotation that can also hold it still",
     "Coulomb's law of friction",
-    Properties(_add_pivot_torque),
+    adding(pivot_torque="torque"),
     applies=is_pivoted,
     family="dry friction",
 )
@@ -82,13 +72,9 @@ slider_damping = Effect(
     (EffectParameter("coefficient", "N s/m", SIZE, scale="force/speed"),),
     "viscous friction in the slider: a force against the sliding that grows with its speed",
     "viscous force on the relative velocity along the axis, F = -c v",
-    Properties(_add_pivot_damping),
+    adding(pivot_damping="coefficient"),
     applies=is_sliding,
 )
-
-
-def _add_slider_force(properties: dict[str, Floats], parameters: Values, clock: Clock) -> None:
-    properties["pivot_torque"] = properties["pivot_torque"] + parameters["force"]
 
 
 slider_friction = Effect(
@@ -96,7 +82,7 @@ slider_friction = Effect(
     (EffectParameter("force", "N", SIZE, scale="force"),),
     "dry friction in the slider: a steady force against the sliding that can also hold it still",
     "Coulomb's law of friction",
-    Properties(_add_slider_force),
+    adding(pivot_torque="force"),
     applies=is_sliding,
     family="dry friction",
 )
@@ -217,10 +203,6 @@ pivot_hysteresis = Effect(
 )
 
 
-def _add_turn_torque(properties: dict[str, Floats], parameters: Values, clock: Clock) -> None:
-    properties["turn_torque"] = properties["turn_torque"] + parameters["torque"]
-
-
 def _lies_free(scene: Scene, body: Body) -> bool:
     return scene.normal_gravity > 0 and is_unpivoted(scene, body)
 
@@ -231,15 +213,10 @@ turning_friction = Effect(
     "dry friction against turning alone: a steady torque that can also hold it, and that sliding"
     " does not weaken",
     "Coulomb's law for the torque at a single foot",
-    Properties(_add_turn_torque),
+    adding(turn_torque="torque"),
     applies=_lies_free,
     log_odds=-1.0,
 )
-
-
-def _add_patch(properties: dict[str, Floats], parameters: Values, clock: Clock) -> None:
-    properties["patch_mu"] = properties["patch_mu"] + parameters["mu"]
-    properties["patch_radius"] = properties["patch_radius"] + parameters["radius"]
 
 
 def _is_pressed(scene: Scene, body: Body) -> bool:
@@ -267,7 +244,7 @@ sliding_friction = Effect(
     "dry friction on the floor: a steady force and torque against any sliding and turning, which"
     " can also hold the body still",
     "Coulomb's law on a ring of contact (Goyal, Ruina and Papadopoulos, Wear 143, 1991)",
-    Properties(_add_patch),
+    adding(patch_mu="mu", patch_radius="radius"),
     applies=_is_pressed,
     scan=_scan_radii,
 )
@@ -349,11 +326,6 @@ friction_by_place = Effect(
 )
 
 
-def _add_wheel(properties: dict[str, Floats], parameters: Values, clock: Clock) -> None:
-    for name in ("w_x", "w_y", "w_theta", "mu_x", "mu_y"):
-        properties[name] = properties[name] + parameters[name]
-
-
 def _lacks_wheel(scene: Scene, body: Body) -> bool:
     return scene.normal_gravity > 0 and not body.wheel
 
@@ -380,7 +352,7 @@ wheel = Effect(
     "a wheel or a runner that the scene does not declare: dry friction at a point of the body,"
     " of one strength along it and another across",
     "anisotropic Coulomb friction, J_w of Scholz et al., ICML 2014, section 3.2",
-    Properties(_add_wheel),
+    adding(w_x="w_x", w_y="w_y", w_theta="w_theta", mu_x="mu_x", mu_y="mu_y"),
     applies=_lacks_wheel,
     scan=_scan_wheels,
     log_odds=-2.0,

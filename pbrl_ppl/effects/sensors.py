@@ -1,5 +1,8 @@
 """Measurement: bias, scale and rotation of what is measured, and heavy-tailed noise."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import numpy as np
 
 from pbrl_ppl.effects.effect import (
@@ -18,6 +21,24 @@ from pbrl_ppl.state import POSE, STATE, STATE_UNITS, Floats
 _SCALES = ("range", "range", "", "speed", "speed", "turn_rate")
 
 
+@dataclass(frozen=True)
+class _WithOpposites:
+    """A measurement with the opposite parameters; equal to its copies in other processes."""
+
+    measure: Callable[[Floats, Values], Floats]
+
+    def __call__(self, measured: Floats, parameters: Values) -> Floats:
+        opposite = {n: value if n == "time" else -value for n, value in parameters.items()}
+        return self.measure(measured, opposite)
+
+
+def _undone_by_opposites(
+    measure: Callable[[Floats, Values], Floats], timed: bool = False
+) -> Sensor:
+    """Return the stage of a measurement that the opposite parameters undo."""
+    return Sensor(measure, _WithOpposites(measure), timed)
+
+
 def _bias(parameters: Values) -> Floats:
     nothing = np.zeros(())  # of what the effect does not have on a hinged body
     given = (parameters.get(name, nothing) for name in STATE)
@@ -28,10 +49,6 @@ def _add_bias(state: Floats, parameters: Values) -> Floats:
     return state + _bias(parameters)
 
 
-def _subtract_bias(measured: Floats, parameters: Values) -> Floats:
-    return measured - _bias(parameters)
-
-
 sensor_bias = Effect(
     "sensor_bias",
     tuple(
@@ -40,7 +57,7 @@ sensor_bias = Effect(
     ),
     "what is measured is off by a constant: a sensor is not zeroed, or not where it is thought",
     "additive sensor bias",
-    Sensor(_add_bias, _subtract_bias),
+    _undone_by_opposites(_add_bias),
     log_odds=-2.0,
 )
 
@@ -75,19 +92,12 @@ sensor_scale = Effect(
 )
 
 
-def _turned(state: Floats, angle: Floats) -> Floats:
+def _turned(state: Floats, parameters: Values) -> Floats:
+    angle = parameters["angle"]
     c, s = np.cos(angle), np.sin(angle)
     x, y, theta, vx, vy, omega = np.moveaxis(state, -1, 0)
     parts = (c * x - s * y, s * x + c * y, theta + angle, c * vx - s * vy, s * vx + c * vy, omega)
     return np.stack(np.broadcast_arrays(*parts), axis=-1)
-
-
-def _turn(state: Floats, parameters: Values) -> Floats:
-    return _turned(state, parameters["angle"])
-
-
-def _turn_back(measured: Floats, parameters: Values) -> Floats:
-    return _turned(measured, -parameters["angle"])
 
 
 frame_rotation = Effect(
@@ -96,7 +106,7 @@ frame_rotation = Effect(
     "the measuring frame is turned against that of the scene and of the commands: the camera or"
     " the mocap is not aligned",
     "rotation between two frames",
-    Sensor(_turn, _turn_back),
+    _undone_by_opposites(_turned),
     log_odds=-2.0,
 )
 
@@ -112,11 +122,6 @@ def _seen_askew(state: Floats, parameters: Values) -> Floats:
     return np.stack(np.broadcast_arrays(*parts), axis=-1)
 
 
-def _set_straight(measured: Floats, parameters: Values) -> Floats:
-    opposite = {name: -value for name, value in parameters.items()}
-    return _seen_askew(measured, opposite)
-
-
 _TILT = Prior("normal", sigma=0.1)
 
 askew_camera = Effect(
@@ -128,7 +133,7 @@ askew_camera = Effect(
     "places are measured too small at one end of the room and too large at the other: the camera"
     " looks askew",
     "perspective of a tilted plane, x / (1 + a x + b y)",
-    Sensor(_seen_askew, _set_straight),
+    _undone_by_opposites(_seen_askew),
     applies=is_unpivoted,
     log_odds=-6.0,
     family="place and angle",
@@ -207,11 +212,6 @@ def _drift(state: Floats, parameters: Values) -> Floats:
     return np.asarray(state + np.stack(np.broadcast_arrays(*shift), axis=-1))
 
 
-def _without_drift(measured: Floats, parameters: Values) -> Floats:
-    opposite = {n: value if n == "time" else -value for n, value in parameters.items()}
-    return _drift(measured, opposite)
-
-
 sensor_drift = Effect(
     "sensor_drift",
     tuple(
@@ -225,7 +225,7 @@ sensor_drift = Effect(
     "what is measured moves away steadily from the start of each trajectory on: a gyroscope's"
     " integral, a tag that slips",
     "sensor drift, x + a t",
-    Sensor(_drift, _without_drift, timed=True),
+    _undone_by_opposites(_drift, timed=True),
     log_odds=-4.0,
 )
 

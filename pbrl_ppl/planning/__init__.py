@@ -12,5 +12,6 @@ from .experiments import suggest_actions as suggest_actions
 from .goals import Goal as Goal
 from .goals import Target as Target
 from .planner import Plan as Plan
+from .planner import SearchOptions as SearchOptions
 from .planner import plan as plan
 from .planner import start_state as start_state

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 import pandas as pd
@@ -31,8 +31,23 @@ if TYPE_CHECKING:
 METHODS: dict[str, Callable[..., SearchResult]] = {"astar": astar, "mppi": mppi}
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Plan:
+class SearchOptions(TypedDict, total=False):
+    """Options of the search of a plan, which agents pass on to :func:`plan`."""
+
+    method: str
+    tail: float
+    noise: bool
+    seconds: float | None
+    progress: Callable[[str], None] | None
+    weight: float
+    improve: bool
+    horizon: int
+    samples: int
+    iterations: int
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Plan(SearchResult):
     """Wrenches that lead to a goal, and where the model says they lead.
 
     Attributes
@@ -62,13 +77,8 @@ class Plan:
     scene: Scene
     goal: Goal
     start: Floats
-    wrenches: Floats
     predicted: xr.Dataset
-    reached: bool
-    stopped: str
     distance: float
-    nodes: int
-    seconds: float
 
     @property
     def duration(self) -> float:
@@ -261,10 +271,10 @@ def plan(
         states = np.concatenate(
             [rollout(dynamics, first, result.wrenches, rng) for _ in range(times)]
         )
+    predicted = _labelled(scene, states)
     return Plan(
-        scene, goal, first, result.wrenches, _labelled(scene, states), result.reached,
-        result.stopped, distance, result.nodes, result.seconds,
-    )  # fmt: skip
+        **vars(result), scene=scene, goal=goal, start=first, predicted=predicted, distance=distance
+    )
 
 
 def _labelled(scene: Scene, states: Floats) -> xr.Dataset:
