@@ -4,7 +4,8 @@ import ast
 import inspect
 import re
 import sys
-from collections.abc import Collection
+import textwrap
+from collections.abc import Callable, Collection
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -350,11 +351,20 @@ def _code(effect: Effect) -> str:
     """Return the functions of an effect's stage as an indented block of code."""
     made = [getattr(effect.stage, field.name) for field in fields(effect.stage)]
     code = "\n\n".join(
-        inspect.getsource(each).rstrip()
+        _source(each)
         for each in made
-        if callable(each) and each.__name__ != "_no_discs"
+        if callable(each) and getattr(each, "__name__", "") != "_no_discs"
     )
     return "\n".join(f"    {line}".rstrip() for line in ("```python", *code.split("\n"), "```"))
+
+
+def _source(part: Callable[..., object]) -> str:
+    """Return the code of a function, or of a value that is called, with its fields."""
+    if inspect.isfunction(part):
+        return inspect.getsource(part).rstrip()
+    values = {name: getattr(value, "__name__", value) for name, value in vars(part).items()}
+    said = [f"# self.{name} = {value}" for name, value in values.items()]
+    return "\n".join([*said, textwrap.dedent(inspect.getsource(type(part).__call__)).rstrip()])
 
 
 def command_page() -> str:

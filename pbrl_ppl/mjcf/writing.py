@@ -160,13 +160,13 @@ class _Writer:
 
     def hinges(self) -> list[Joint]:
         """Return the known hinges and sliders; list other joints as left out."""
-        named = list(zip(self.scene.joint_names, self.scene.joints, strict=True))
+        hung = [joint for joint in self.scene.joints if joint.traits.hangs and joint.known]
         self.left_out += [
             f'joint "{name}", which is not a hinge or slider with known anchors'
-            for name, joint in named
-            if not (joint.traits.hangs and joint.known)
+            for name, joint in zip(self.scene.joint_names, self.scene.joints, strict=True)
+            if joint not in hung
         ]
-        return [joint for _, joint in named if joint.traits.hangs and joint.known]
+        return hung
 
     def release(self, body: Body) -> None:
         """Add a free body."""
