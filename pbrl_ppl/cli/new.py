@@ -21,17 +21,7 @@ from pbrl_ppl.cli.options import command
 from pbrl_ppl.cli.terminal import Result, check_file
 from pbrl_ppl.errors import HistoryError, LayoutError, OutputError, RecordingWarning, SceneError
 from pbrl_ppl.files import write_text
-from pbrl_ppl.scene import (
-    WORLD,
-    Actuator,
-    Body,
-    Joint,
-    Recording,
-    Scene,
-    Shape,
-    nearest,
-    toml_of,
-)
+from pbrl_ppl.scene import WORLD, Actuator, Body, Joint, Recording, Scene, Shape, nearest, toml_of
 from pbrl_ppl.state import Floats
 
 if TYPE_CHECKING:

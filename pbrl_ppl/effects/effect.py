@@ -14,16 +14,7 @@ import numpy as np
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
-from pbrl_ppl.scene import (
-    PLACES,
-    WORLD,
-    Body,
-    Joint,
-    Scene,
-    Units,
-    check_product,
-    units_of,
-)
+from pbrl_ppl.scene import PLACES, WORLD, Body, Joint, Scene, Units, check_product, units_of
 from pbrl_ppl.state import Floats
 
 #: Values of an effect's parameters by name: arrays that broadcast, one entry per proposal.
