@@ -461,8 +461,7 @@ class _View:
         model = self.model
         for n in range(model.neq):
             self.left_out.append(f'equality constraint "{model.equality(n).name or n}"')
-        for n in range(model.ntendon):
-            self.left_out.append(f'tendon "{model.tendon(n).name or n}"')
+        self.left_out += [f'tendon "{model.tendon(n).name or n}"' for n in range(model.ntendon)]
         for i in np.flatnonzero(model.body_gravcomp):
             self.left_out.append(f'the gravity compensation of body "{self.name(int(i))}"')
         if model.opt.density or model.opt.viscosity or np.any(model.opt.wind):

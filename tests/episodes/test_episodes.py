@@ -188,7 +188,7 @@ def test_an_interrupted_search_ends_the_episode(monkeypatch) -> None:
     def pressed(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("pbrl_ppl.planning.astar._Search.expand", pressed)
+    monkeypatch.setattr("pbrl_ppl.planning.astar.contact_cost", pressed)
     with pytest.raises(KeyboardInterrupt):
         run_episode(known(1), puck_world())
 
