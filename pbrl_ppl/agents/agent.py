@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from typing import Any, ClassVar, Unpack, final
 
 import numpy as np
@@ -16,7 +15,6 @@ from pbrl_ppl.effects import Attached, Effect
 from pbrl_ppl.errors import GoalError
 from pbrl_ppl.history import History, from_segments
 from pbrl_ppl.oomdp import LWR, OOLWR
-from pbrl_ppl.physics import touching
 from pbrl_ppl.planning import (
     PAST,
     ActionSet,
@@ -31,7 +29,7 @@ from pbrl_ppl.planning import (
 )
 from pbrl_ppl.posterior import Idata, scene_of
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import THETA, WRENCH, Bools, Floats, wrapped
+from pbrl_ppl.state import WRENCH, Floats
 
 
 @dataclass(frozen=True)
@@ -217,59 +215,6 @@ class Agent(ABC):
         if planned.stopped == "interrupted":  # the search catches it
             raise KeyboardInterrupt
         return planned.wrenches if planned.reached else planned.wrenches[:1]
-
-
-class PhysicsAgent(Agent):
-    """Agent whose model is :class:`pbrl_ppl.Dynamics` of estimated parameters."""
-
-    model: Dynamics | None = None
-
-    @property
-    def estimates(self) -> Mapping[str, float]:
-        """Return parameters by label, SI units: the mode, or the draw nearest to the mean."""
-        if self.model is None:
-            return {}
-        middle = self.model.single()
-        return dict(zip(middle.layout.labels, middle.phi[0].tolist(), strict=True))
-
-
-def prediction_errors(
-    dynamics: Dynamics, state: Floats, action: Floats, after: Floats, previous: Floats | None = None
-) -> Floats:
-    """Return the absolute errors of the mean prediction of each transition, shape (n, body, 6).
-
-    Parameters
-    ----------
-    dynamics : Dynamics
-        Model.
-    state, after : ndarray
-        States at the ends of the intervals, shape (n, body, 6), SI units.
-    action, previous : ndarray
-        Wrenches in the intervals, and before them, shape (n, body, 3), N and N m.
-    """
-    states = np.repeat(state[None], dynamics.draws, 0)
-    error = abs(after - dynamics.step(states, action, previous).mean(axis=0))
-    error[..., THETA] = abs(wrapped(error[..., THETA]))
-    return np.asarray(error)
-
-
-def meetings(scene: Scene, moved: Bools, state: Floats, after: Floats) -> Iterator[list[int]]:
-    """Yield the places of every two moving bodies that touch in a transition, or nearly do.
-
-    Parameters
-    ----------
-    scene : Scene
-        Orders the bodies.
-    moved : ndarray of bool
-        Bodies of which one is among the two, shape (body,); what a caller adds to them counts for
-        later pairs.
-    state, after : ndarray
-        States at the ends of the intervals, shape (n, body, 6), SI units.
-    """
-    for i, j in combinations(range(len(scene.moving)), 2):
-        pair = scene.subset([scene.moving[i].name, scene.moving[j].name]).replace(walls=())
-        if moved[[i, j]].any() and touching(pair, state[:, [i, j]], after[:, [i, j]]).any():
-            yield [i, j]
 
 
 class _RegressionAgent(Agent):

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable
-from itertools import compress
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import combinations, compress
 from typing import Any, ClassVar, Unpack, final
 
 import numpy as np
 import pandas as pd
 
-from pbrl_ppl.agents.agent import AgentOptions, PhysicsAgent, Task, meetings, prediction_errors
+from pbrl_ppl.agents.agent import Agent, AgentOptions, Task
 from pbrl_ppl.agents.revision import revise
 from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.effects import catalogue as full_catalogue
@@ -23,12 +23,65 @@ from pbrl_ppl.physics import Physics, build_layout, touching
 from pbrl_ppl.planning import Dynamics
 from pbrl_ppl.posterior import group
 from pbrl_ppl.sampling import sample, try_own_effects
-from pbrl_ppl.scene import body_sizes
-from pbrl_ppl.state import Bools, Floats
+from pbrl_ppl.scene import Scene, body_sizes
+from pbrl_ppl.state import THETA, Bools, Floats, wrapped
 
 #: Prediction errors up to this share of the natural sizes carry no information: they are the
 #: engine's.
 NEGLIGIBLE = 1e-4
+
+
+class PhysicsAgent(Agent):
+    """Agent whose model is :class:`pbrl_ppl.Dynamics` of estimated parameters."""
+
+    model: Dynamics | None = None
+
+    @property
+    def estimates(self) -> Mapping[str, float]:
+        """Return parameters by label, SI units: the mode, or the draw nearest to the mean."""
+        if self.model is None:
+            return {}
+        middle = self.model.single()
+        return dict(zip(middle.layout.labels, middle.phi[0].tolist(), strict=True))
+
+
+def prediction_errors(
+    dynamics: Dynamics, state: Floats, action: Floats, after: Floats, previous: Floats | None = None
+) -> Floats:
+    """Return the absolute errors of the mean prediction of each transition, shape (n, body, 6).
+
+    Parameters
+    ----------
+    dynamics : Dynamics
+        Model.
+    state, after : ndarray
+        States at the ends of the intervals, shape (n, body, 6), SI units.
+    action, previous : ndarray
+        Wrenches in the intervals, and before them, shape (n, body, 3), N and N m.
+    """
+    states = np.repeat(state[None], dynamics.draws, 0)
+    error = abs(after - dynamics.step(states, action, previous).mean(axis=0))
+    error[..., THETA] = abs(wrapped(error[..., THETA]))
+    return np.asarray(error)
+
+
+def meetings(scene: Scene, moved: Bools, state: Floats, after: Floats) -> Iterator[list[int]]:
+    """Yield the places of every two moving bodies that touch in a transition, or nearly do.
+
+    Parameters
+    ----------
+    scene : Scene
+        Orders the bodies.
+    moved : ndarray of bool
+        Bodies of which one is among the two, shape (body,); what a caller adds to them counts for
+        later pairs.
+    state, after : ndarray
+        States at the ends of the intervals, shape (n, body, 6), SI units.
+    """
+    for i, j in combinations(range(len(scene.moving)), 2):
+        pair = scene.subset([scene.moving[i].name, scene.moving[j].name]).replace(walls=())
+        if moved[[i, j]].any() and touching(pair, state[:, [i, j]], after[:, [i, j]]).any():
+            yield [i, j]
 
 
 @final
