@@ -46,3 +46,10 @@ def wrapped(angle: Angle) -> Angle:
     """
     result: Angle = np.pi - np.mod(np.pi - angle, 2 * np.pi)
     return result
+
+
+def turned(vectors: Floats, angle: Floats) -> Floats:
+    """Return vectors (..., 2) turned by angles that broadcast with their leading axes."""
+    c, s = np.cos(angle), np.sin(angle)
+    x, y = vectors[..., 0], vectors[..., 1]
+    return np.stack([c * x - s * y, s * x + c * y], axis=-1)

@@ -14,16 +14,9 @@ from numpy.typing import ArrayLike
 from pbrl_ppl.errors import FitError, HistoryError, SimulationError
 from pbrl_ppl.history import History, check_start
 from pbrl_ppl.oomdp.regression import Experience, Regression
-from pbrl_ppl.oomdp.relations import (
-    Attributes,
-    Condition,
-    Relation,
-    SectorContacts,
-    condition,
-    turned,
-)
+from pbrl_ppl.oomdp.relations import Attributes, Condition, Relation, SectorContacts, condition
 from pbrl_ppl.scene import Scene, body_sizes, nearest
-from pbrl_ppl.state import STATE, THETA, WRENCH, Bools, Floats, wrapped
+from pbrl_ppl.state import STATE, THETA, WRENCH, Bools, Floats, turned, wrapped
 
 
 class Learner:

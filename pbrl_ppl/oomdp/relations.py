@@ -12,7 +12,7 @@ import numpy as np
 from pbrl_ppl.errors import FitError, HistoryError
 from pbrl_ppl.physics import Scenery, circles, scenery
 from pbrl_ppl.scene import WORLD, Scene, smallest_radius
-from pbrl_ppl.state import Bools, Floats
+from pbrl_ppl.state import Bools, Floats, turned
 
 #: Cond(s, a) of a body: the labels of the predicates that hold.
 Condition = frozenset[str]
@@ -349,10 +349,3 @@ def _polygon(corners: Floats, origins: Floats, directions: Floats) -> tuple[Floa
         # along the edge, and outside of it
         leave = np.where((rate == 0) & (depth < 0), -np.inf, leave)
     return enter, leave
-
-
-def turned(vectors: Floats, angle: Floats) -> Floats:
-    """Return vectors (..., 2) turned by angles that broadcast with their leading axes."""
-    c, s = np.cos(angle), np.sin(angle)
-    x, y = vectors[..., 0], vectors[..., 1]
-    return np.stack([c * x - s * y, s * x + c * y], axis=-1)

@@ -16,7 +16,7 @@ from pbrl_ppl.errors import GoalError
 from pbrl_ppl.planning.dynamics import TransitionModel, remembered
 from pbrl_ppl.planning.goals import check_pushed, read_tables
 from pbrl_ppl.scene import Scene, nearest
-from pbrl_ppl.state import THETA, WRENCH, Floats
+from pbrl_ppl.state import THETA, WRENCH, Floats, turned
 
 if TYPE_CHECKING:
     from pbrl_ppl.posterior import Idata
@@ -227,10 +227,8 @@ class ActionSet:
         turns = np.array([action.frame == "body" for action in self.actions])[which]
         rows = np.arange(len(which))
         angle = np.where(turns, heading[rows, body], 0.0)
-        c, s = np.cos(angle), np.sin(angle)
         out = np.zeros((len(which), len(names), 3))
-        out[rows, body, 0] = c * pushes[:, 0] - s * pushes[:, 1]
-        out[rows, body, 1] = s * pushes[:, 0] + c * pushes[:, 1]
+        out[rows, body, :2] = turned(pushes[:, :2], angle)
         out[rows, body, 2] = pushes[:, 2]
         return out
 
@@ -376,11 +374,7 @@ class _OfActions:
         time = np.arange(self.steps)
         piece = (time[None, :, None] >= ends[:, None, :]).sum(axis=2)
         which = np.take_along_axis(number, piece, axis=1)
-
-        def heading(angles: Floats) -> Floats:
-            return np.asarray(np.nan_to_num(angles[0]))
-
-        return play(dynamics, start, self.actions, which, heading)
+        return play(dynamics, start, self.actions, which, lambda angles: np.nan_to_num(angles[0]))
 
 
 #: A set of sequences, each made of pieces.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -59,11 +60,9 @@ class _Paths:
         lost = np.asarray(~np.isfinite(states).all(axis=(2, 3, 4)))
         states[lost] = start
         last = np.broadcast_to(dynamics.before, (len(wrenches), *dynamics.before.shape))
-        past = []
-        for wrench in np.moveaxis(wrenches, 1, 0):
-            past.append(last)
-            last = remembered(wrench, last)
-        before = np.stack(past, axis=1)
+        earlier = np.moveaxis(wrenches, 1, 0)[:-1]
+        past = accumulate(earlier, lambda last, wrench: remembered(wrench, last), initial=last)
+        before = np.stack(list(past), axis=1)
         return cls(
             states[:, :, :-1].reshape(-1, *start.shape),
             states[:, :, 1:].reshape(-1, *start.shape),
