@@ -1,13 +1,13 @@
+from .bad_frames import End as End
 from .bad_frames import bad_frames as bad_frames
+from .bad_frames import trimmed as trimmed
+from .bad_frames import unmodelled_ends as unmodelled_ends
 from .bad_frames import without_bad_frames as without_bad_frames
 from .bad_frames import without_measurements as without_measurements
 from .clocks import command_step as command_step
 from .conversion import as_history as as_history
 from .conversion import is_history as is_history
 from .cuts import propose as propose
-from .ends import End as End
-from .ends import trimmed as trimmed
-from .ends import unmodelled_ends as unmodelled_ends
 from .files import read_commands as read_commands
 from .files import read_table as read_table
 from .files import table_of_arrays as table_of_arrays

@@ -1,15 +1,28 @@
-"""Single bad frames of a recording: rows off the smooth curve through their neighbours."""
+"""Rows that belong to no model: single bad frames, and ends where a body is held or stopped."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
-from pbrl_ppl.errors import warn
-from pbrl_ppl.history.history import History
-from pbrl_ppl.history.kinematics import GAUSSIAN, RATE_REACH, finest_step
+from pbrl_ppl.errors import HistoryError, warn
+from pbrl_ppl.history.history import History, hashed
+from pbrl_ppl.history.kinematics import GAUSSIAN, RATE_REACH, column_noise, finest_step
+from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE, STATE_UNITS, THETA, VELOCITY, Bools, Floats, wrapped
+
+#: Positions of a dimension without gaps, by trajectory.
+Series = dict[int, Floats]
+#: Least rows at rest, and of a trajectory without its ends.
+LEAST = 3
+#: Least rows of motion beside those at rest.
+BESIDE = 6
+#: Rows at rest, and rows of motion, that are looked at, at most.
+LONGEST = 200
+#: Robust standard deviations, and standard errors, of a bend.
+LIMIT = 8.0
 
 
 @dataclass(frozen=True)
@@ -54,6 +67,47 @@ class BadFrame:
             f"{self.state} of {self.body} at t = {self.time:.4g} s of trajectory {self.trajectory}"
             f" is off by {abs(self.off):.2g} {self.unit} and left out (1 of {self.rows} rows)"
         )
+
+
+@dataclass(frozen=True)
+class End:
+    """Rows at one end of a trajectory that belong to no model.
+
+    Parameters
+    ----------
+    trajectory : int or str
+        Label of the trajectory.
+    first : bool
+        Whether these are its first rows; else its last.
+    rows : int
+        How many.
+    begin, end : float
+        Times of the first and the last of them (s).
+    body : str
+        Which body.
+    what : str
+        ``held`` (at rest, then moving off without a command) or ``stopped`` (after an abrupt change
+        of velocity).
+
+    Examples
+    --------
+    >>> print(End(2, True, 6, 0.0, 0.167, "ball", "held"))
+    ball is held in the first 6 rows of trajectory 2 (t = 0 to 0.167 s)
+    """
+
+    trajectory: int | str
+    first: bool
+    rows: int
+    begin: float
+    end: float
+    body: str
+    what: str
+
+    def __str__(self) -> str:
+        """Return a sentence: which rows, and why."""
+        where = f"{'first' if self.first else 'last'} {self.rows} rows of trajectory"
+        said = f"is held in the {where}" if self.first else f"stops abruptly before the {where}"
+        return f"{self.body} {said} {self.trajectory} (t = {self.begin:.4g} to {self.end:.4g} s)"
 
 
 def bad_frames(history: History) -> Bools:
@@ -313,3 +367,222 @@ def _happened(state: Floats, off: Floats, dt: float) -> Bools:
     beside = change[:, :-1] + change[:, 1:]
     # the position moves on by a quarter of what the velocity says
     return np.asarray(beside * more > dt / 4 * more**2)
+
+
+def unmodelled_ends(history: History, scene: Scene) -> list[End]:
+    """Return the ends of trajectories that neither a command nor the scene explains.
+
+    A body is held if it is at rest for three rows or more and then moves off while no command acts
+    on any body. It was stopped if its velocity changes abruptly near the end, where the commands
+    do not change and nothing in the scene is near enough to be met. Either must be far outside of
+    what all trajectories show elsewhere. Only positions and angles are looked at.
+
+    Parameters
+    ----------
+    history : History
+        What was measured.
+    scene : Scene
+        Says what a body may meet.
+
+    Returns
+    -------
+    list of End
+        By trajectory, first rows before last ones; of several bodies the one with the most rows.
+
+    Examples
+    --------
+    ::
+
+        print(*unmodelled_ends(history, scene))
+    ball is held in the first 6 rows of trajectory 2 (t = 0 to 0.167 s)
+    """
+    dataset = history.dataset
+    observed, clock = dataset["observed"].to_numpy(), dataset["clock"].to_numpy()
+    follows, labels = dataset["kinematic"].to_numpy(), dataset["trajectory"].to_numpy().tolist()
+    push = np.nan_to_num(dataset["action"].to_numpy())[:, :, ~follows]
+    found: dict[tuple[int, bool], End] = {}
+    for body, d in product(np.flatnonzero(~follows), range(3)):
+        filled = [
+            _filled(observed[t, :n, body, d], d == THETA)
+            for t, n in enumerate(dataset["n_rows"].to_numpy())
+        ]
+        series = {t: values for t, values in enumerate(filled) if values is not None}
+        if not any(len(values) > 4 and np.ptp(values) > 0 for values in series.values()):
+            continue
+        noise = column_noise(series.values(), 4, robust=True)
+        noise = max(noise, finest_step(np.concatenate([*series.values()])) / np.sqrt(12))
+        stops = _stops(series, push, noise)
+        for t, values in series.items():
+            states, n = observed[t, : len(values)], len(values)
+            held, stopped = _held(values, push[t], series, noise), stops.get(t, 0)
+            if held and _moves(np.delete(states, body, axis=1)[: 2 * held + BESIDE, :, :3]):
+                held = 0
+            if stopped and _near(scene, int(body), states, n - stopped):
+                stopped = 0
+            for last, rows, what in ((False, held, "held"), (True, stopped, "stopped")):
+                if rows > (found[t, last].rows if (t, last) in found else 0):
+                    times = clock[t, n - rows : n] if last else clock[t, :rows]
+                    where = (rows, float(times[0]), float(times[-1]), history.bodies[body])
+                    found[t, last] = End(labels[t], not last, *where, what)
+    return [found[key] for key in sorted(found)]
+
+
+def _still(values: Floats, noise: float) -> int:
+    """Return the number of rows at the beginning that stay within the noise of their mean."""
+    mean = np.cumsum(values) / np.arange(1, len(values) + 1)
+    three = np.convolve(values, np.full(3, 1 / 3), "valid")
+    off = np.abs(three - mean[1:-1]) > 4 * noise / np.sqrt(3)
+    return int(np.argmax(off)) + 1 if off.any() else len(values)
+
+
+def _windows(series: Series, n: int) -> tuple[Floats, list[tuple[int, int]]]:
+    """Return windows of all series, shape (window, n), and the trajectory and first row of each."""
+    at = [(t, i) for t, values in series.items() for i in range(len(values) - n + 1)]
+    return np.array([series[t][i : i + n] for t, i in at]).reshape(-1, n), at
+
+
+def _held(values: Floats, push: Floats, series: Series, noise: float) -> int:
+    """Return the rows at rest at the beginning, before it moves off without a command.
+
+    They are off the cubic through the rows after them, which a smooth motion from rest is not.
+    """
+    still = _still(values, noise)
+    first = max(0, still - LONGEST)  # of a long rest its last rows are enough
+    for times in (1, 2, 4) if LEAST <= still < len(values) - BESIDE else ():
+        end = still + int(np.clip(times * (still - first), BESIDE, LONGEST))
+        if end > len(values) or push[:end].any():
+            break
+        rows = np.vstack([values[first:end], _windows(series, end - first)[0]])
+        _, far, sure, _ = outliers(rows, np.eye(end - first)[:, : still - first], 3, noise)
+        if ((far[0] > 3) & (sure[0] > LIMIT)).any():
+            return still
+    return 0
+
+
+def _stops(series: Series, push: Floats, noise: float) -> dict[int, int]:
+    """Return the rows at the end after an abrupt change of velocity with constant commands.
+
+    A change of the acceleration, as where dry friction ends a motion, must fit far worse.
+    """
+    best: dict[int, tuple[float, int]] = {}
+    still = {t: _still(values[::-1], noise) for t, values in series.items()}
+    for after in (3, 6, 12, 24):
+        rows, at = _windows(series, 3 * after)
+        time, places = np.arange(3 * after)[:, None], np.linspace(1, 3 * after - 2, 6 * after)
+        for place in 2 * after - 1 + np.arange(10) / 10 if len(rows) else ():
+            _, far, sure, misfit = outliers(rows, np.maximum(time - place, 0.0), 2, noise)
+            abrupt = np.flatnonzero(np.minimum(far, sure)[:, 0] > LIMIT)
+            if not len(abrupt):
+                continue
+            bent = [np.maximum(time - other, 0.0) ** 2 for other in places]
+            smooth = np.min([outliers(rows[abrupt], part, 2, noise)[3] for part in bent], axis=0)
+            for i in abrupt[misfit[abrupt] < 0.3 * smooth]:
+                (t, first), n = at[i], len(series[at[i][0]])
+                left = n - first - 2 * after
+                constant = not np.ptp(push[t, first : n - 1], axis=0).any()
+                if constant and left <= max(n // 4, min(still[t], n - BESIDE)):
+                    best[t] = max(best.get(t, (0.0, 0)), (float(sure[i, 0]), left))
+    return {t: left for t, (_, left) in best.items()}
+
+
+def trimmed(history: History, ends: Iterable[End]) -> History:
+    """Return the history without the rows of these ends.
+
+    Parameters
+    ----------
+    history : History
+        What was measured.
+    ends : iterable of End
+        As of :func:`unmodelled_ends`.
+
+    Raises
+    ------
+    HistoryError
+        If less than three rows of a trajectory would be left.
+
+    Examples
+    --------
+    ::
+
+        trimmed(history, unmodelled_ends(history, scene)).n_transitions
+    38
+    """
+    dataset = history.dataset
+    labels, n_rows = dataset["trajectory"].to_numpy().tolist(), dataset["n_rows"].to_numpy()
+    begin, end = np.zeros_like(n_rows), n_rows.copy()
+    for bad in ends:
+        t = labels.index(bad.trajectory)
+        begin[t] = max(begin[t], bad.rows if bad.first else 0)
+        end[t] = min(end[t], n_rows[t] - (0 if bad.first else bad.rows))
+    kept = end - begin
+    for t in np.flatnonzero(kept < LEAST):
+        raise HistoryError(
+            f"history: trajectory {labels[t]} has {max(kept[t], 0)} rows without its first"
+            f" {begin[t]} and last {n_rows[t] - end[t]}; expected at least {LEAST}; drop the"
+            " trajectory"
+        )
+    if (kept == n_rows).all():
+        return history
+    each, rows = np.arange(len(labels)), begin[:, None] + np.arange(kept.max())
+    result = dataset.isel(time=slice(kept.max())).assign(n_rows=dataset["n_rows"].copy(data=kept))
+    for name in ("observed", "action", "start", "clock"):
+        values = dataset[name].to_numpy()[each[:, None], np.minimum(rows, end[:, None] - 1)]
+        values[rows >= end[:, None]] = np.nan
+        result[name] = result[name].copy(data=values)
+    result["action"].to_numpy()[each, kept - 1] = np.nan
+    # velocities estimated from positions across a stop
+    never = ~np.isfinite(dataset["observed"].to_numpy()[..., 3:]).any(axis=(0, 1))
+    for t in np.flatnonzero(end < n_rows):
+        last = slice(max(kept[t] - RATE_REACH, 1), kept[t])
+        result["start"].to_numpy()[t, last, :, 3:][:, never] = np.nan
+    before, late = dataset["before"].to_numpy().copy(), np.flatnonzero(begin)
+    before[late] = np.nan_to_num(dataset["action"].to_numpy()[late, begin[late] - 1])
+    return History(hashed(result.assign(before=dataset["before"].copy(data=before))))
+
+
+def _filled(values: Floats, angle: bool) -> Floats | None:
+    """Return values with gaps interpolated, an angle without jumps; None with too many gaps."""
+    known = np.flatnonzero(np.isfinite(values))
+    if len(known) < max(2 * BESIDE, 0.8 * len(values)):
+        return None
+    if known[0] > 0 or known[-1] < len(values) - 1:
+        return None
+    level = np.unwrap(values[known]) if angle else values[known]
+    return np.interp(np.arange(len(values)), known, level)
+
+
+def _moves(states: Floats) -> bool:
+    """Return whether any body of shape (time, body, 3) moves, and may set others moving."""
+    with np.errstate(invalid="ignore"):
+        spread = np.fmax.reduce(states, axis=0) - np.fmin.reduce(states, axis=0)
+    return bool((np.nan_to_num(spread) > 0).any())
+
+
+def _near(scene: Scene, body: int, states: Floats, row: int, slack: float = 0.25) -> bool:
+    """Return whether a wall, another body or a joint may have stopped a body at a row.
+
+    A contact reaches beyond the shapes' radii by the share ``slack`` of them.
+    """
+    moving = scene.moving
+    places = states[max(row - 2, 0) : row + 2, :, :2]
+    values = places[:, body]
+    if not np.isfinite(values).all():
+        return False  # a hinged body with a measured angle alone
+    reach = (1 + slack) * moving[body].shape.bounding_radius
+    reach += 2 * float(np.abs(np.diff(values, axis=0)).max(initial=0.0))
+    # a body is a wall without length, with a radius
+    others = [(places[:, i], other) for i, other in enumerate(moving) if i != body]
+    others += [(np.array(other.pose)[:2], other) for other in scene.bodies if other.static]
+    obstacles = [
+        (np.array(wall.start), np.subtract(wall.end, wall.start), 0.0) for wall in scene.walls
+    ]
+    obstacles += [(place, np.zeros(2), other.shape.bounding_radius) for place, other in others]
+    for start, way, radius in obstacles:
+        along = np.clip((values - start) @ way / max(way @ way, np.finfo(float).tiny), 0.0, 1.0)
+        far = np.linalg.norm(values - start - along[:, None] * way, axis=1) - (1 + slack) * radius
+        if not (far > reach).all():
+            return True
+    return any(
+        joint.traits.stops_bodies and moving[body].name in (joint.bodies or ())
+        for joint in scene.joints
+    )

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from pbrl_ppl.errors import HistoryError, LayoutError
+from pbrl_ppl.history.measures import TIME, unit_in_name
 from pbrl_ppl.history.resampling import held_means
-from pbrl_ppl.history.text import unit_in_name
 from pbrl_ppl.scene import Recording, column_of
 from pbrl_ppl.state import STATE, WRENCH, Bools, Floats, Ints
 
-#: Units of time in s.
-TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 #: Names of columns of times, in lower case.
 TIMES = ("time", "t", "stamp", "timestamp", "header.stamp", "secs", "seconds", "sec")
 #: Seconds since 1970 of the years 2001 to 2036.
@@ -187,7 +184,7 @@ def _at_rate(
 
 def _bursts(
     frame: pd.DataFrame, layout: Recording, time: Floats
-) -> tuple[str, dict[str, Any]] | None:
+) -> tuple[str, dict[str, str | float]] | None:
     """Return a message on stamps that come in bursts, with the entry that cures them."""
     whole = np.isfinite(time) & ~frame.duplicated().to_numpy()
     rows, seen = np.flatnonzero(whole), time[whole]
@@ -204,7 +201,7 @@ def _bursts(
     hair = np.abs(steps) * rate < 0.25
     if not rate > 0 or hair.mean() < 0.4 or not _moves_within(frame, layout, rows, hair):
         return None
-    entry: dict[str, Any] = {"rate": _round_rate(rate)}
+    entry: dict[str, str | float] = {"rate": _round_rate(rate)}
     if counters:
         entry["counter"] = str(counters[0])
     written = ", ".join(

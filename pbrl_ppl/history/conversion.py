@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, TypedDict, Unpack
+from typing import TypedDict, Unpack
 
 import numpy as np
 import pandas as pd
 
 from pbrl_ppl.errors import HistoryError, RecordingWarning, warn
 from pbrl_ppl.history.clocks import Say, in_order, on_one_clock
-from pbrl_ppl.history.cuts import cut
-from pbrl_ppl.history.derived import with_derived
+from pbrl_ppl.history.cuts import cut, without_lost_rows
 from pbrl_ppl.history.files import COLUMNS
-from pbrl_ppl.history.lost import without_lost_rows
-from pbrl_ppl.history.measures import in_si, stated_units
-from pbrl_ppl.history.orientation import with_zeros
+from pbrl_ppl.history.guesses import with_derived
+from pbrl_ppl.history.measures import in_si, stated_units, unit_in_name, with_zeros
 from pbrl_ppl.history.rows import with_clean_names
-from pbrl_ppl.history.text import unit_in_name
 from pbrl_ppl.scene import Recording, Scene, nearest
 from pbrl_ppl.state import STATE, WRENCH
 
@@ -93,12 +90,12 @@ def as_history(
         return _repaired(frame, scene, layout, source, said)
     frame = with_derived(frame, say)
     frame = on_one_clock(frame, layout, commands, source, say)
-    columns = _numbered(frame, dict(layout.columns), source)
-    if "time" in frame and "duration" not in columns:
-        columns["time"] = "time"  # in s by now
-    named = renamed(frame, scene, columns, source)
+    known = _numbered(frame, dict(layout.columns), source)
+    if "time" in frame and "duration" not in known:
+        known["time"] = "time"  # in s by now
+    named = renamed(frame, scene, known, source)
     named = _unseen_emptied(named, layout, source)
-    stated = stated_units(frame, columns)
+    stated = stated_units(frame, known)
     units = stated | {name: unit for name, unit in layout.units if name != "time"}
     named = with_zeros(in_si(named, units), scene, layout, source)
     return _repaired(named, scene, layout, source, said)
@@ -128,7 +125,7 @@ def with_commands(frame: pd.DataFrame, scene: Scene) -> tuple[pd.DataFrame, dict
 
 
 def renamed(
-    frame: pd.DataFrame, scene: Scene, columns: Mapping[str, Any], source: str
+    frame: pd.DataFrame, scene: Scene, columns: Mapping[str, object], source: str
 ) -> pd.DataFrame:
     """Return a table with a history's column names; others are left out.
 
@@ -155,8 +152,8 @@ def renamed(
     frame = with_clean_names(frame, source)
     bare = {unit_in_name(str(name))[0]: name for name in frame.columns}
     names = [body.name for body in scene.moving]
-    shared: dict[str, Any] = {name: name for name in COLUMNS if name in frame}
-    by_body: dict[str, dict[str, Any]] = {}
+    shared: dict[str, object] = {name: name for name in COLUMNS if name in frame}
+    by_body: dict[str, dict[str, object]] = {}
     for key, column in columns.items():
         body, dot, name = key.rpartition(".")
         if name not in (*COLUMNS, "duration") or (dot and name not in (*STATE, *WRENCH)):
@@ -194,7 +191,7 @@ def renamed(
     return _picked(frame, shared)
 
 
-def parts_of(column: Any) -> tuple[str, float, float]:
+def parts_of(column: object) -> tuple[str, float, float]:
     """Return a column's name, its sign, and the number that it has where the coordinate is 0.
 
     Examples
@@ -202,16 +199,17 @@ def parts_of(column: Any) -> tuple[str, float, float]:
     >>> parts_of("-heading"), parts_of((("column", "knee"), ("zero", 90.0)))
     (('heading', -1.0, 0.0), ('knee', 1.0, 90.0))
     """
-    table = dict(column) if isinstance(column, tuple) else {"column": column, "zero": 0.0}
+    table: dict[str, str | float] = {"column": str(column), "zero": 0.0}
+    table |= dict(column) if isinstance(column, tuple) else {}
     name, zero = str(table["column"]), table["zero"]
     sign = -1.0 if name.startswith("-") else 1.0
     return name.removeprefix("-"), sign, 0.0 if isinstance(zero, str) else float(zero)
 
 
-def _picked(frame: pd.DataFrame, columns: Mapping[str, Any]) -> pd.DataFrame:
+def _picked(frame: pd.DataFrame, columns: Mapping[str, object]) -> pd.DataFrame:
     """Return the columns by their new names; other values are the same on all rows."""
 
-    def values(column: Any) -> Any:
+    def values(column: object) -> object:
         if isinstance(column, tuple):
             name, sign, zero = column
             numbers = np.asarray(pd.to_numeric(frame[name].to_numpy(), errors="coerce"), float)
@@ -228,7 +226,7 @@ def is_history(frame: pd.DataFrame) -> bool:
     return {*COLUMNS} - {"step"} <= {str(name).strip() for name in frame.columns}
 
 
-def _numbered(frame: pd.DataFrame, columns: dict[str, Any], source: str) -> dict[str, Any]:
+def _numbered(frame: pd.DataFrame, columns: dict[str, object], source: str) -> dict[str, object]:
     """Return the columns of a table by name; of one without header they are numbered from 0.
 
     Raises
@@ -243,7 +241,7 @@ def _numbered(frame: pd.DataFrame, columns: dict[str, Any], source: str) -> dict
             f"{source}: it has no header; say which of its {len(frame.columns)} columns is which,"
             f" from 0 (--columns time=0,x=1, or columns = {{ time = 0, x = 1 }} in [recording])"
         )
-    names: dict[str, Any] = {}
+    names: dict[str, object] = {}
     for name, column in columns.items():
         text = f"{column:g}" if isinstance(column, int | float) else column
         if text not in frame:

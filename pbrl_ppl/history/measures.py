@@ -1,18 +1,20 @@
-"""Units of columns: those that a file states, those that are declared, and SI."""
+"""Columns in SI units, and angles from the scene's zero."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.history.clocks import TIME
-from pbrl_ppl.history.text import unit_in_name
-from pbrl_ppl.scene import column_of, nearest
+from pbrl_ppl.history.kinematics import joint_order
+from pbrl_ppl.scene import Recording, Scene, column_of, nearest
+from pbrl_ppl.state import wrapped
 
+#: Units of time in s.
+TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 _LENGTH = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "km": 1e3, "in": 0.0254, "ft": 0.3048,
            "yd": 0.9144}  # fmt: skip
 _ANGLE = {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180, "rev": 2 * np.pi, "turn": 2 * np.pi}
@@ -25,6 +27,9 @@ _SAME = {"\u00b0": "deg", "degree": "deg", "degrees": "deg", "radian": "rad", "r
          "second": "s", "\u00b5s": "us", "millimeters": "mm", "feet": "ft", "inches": "in",
          "rotations": "rev", "newton": "N", "\u00b0/s": "deg/s", "dps": "deg/s", "kmh": "km/h",
          "kph": "km/h", "1/min": "rpm", "RPM": "rpm"}  # fmt: skip
+_BRACKETS = re.compile(r"(.*?)\s*[\[(]\s*([^\[\]()]*)\s*[\])]")
+#: Where an arm points when its angle is 0, from the direction of gravity (rad).
+ZEROS = {"hanging": 0.0, "horizontal": np.pi / 2, "upright": np.pi}
 
 
 def _rates(units: Mapping[str, float]) -> dict[str, float]:
@@ -48,7 +53,22 @@ _UNITS: Mapping[str, Mapping[str, float]] = {
 }
 
 
-def stated_units(frame: pd.DataFrame, columns: Mapping[str, Any]) -> dict[str, str]:
+def unit_in_name(name: str) -> tuple[str, str]:
+    """Return a column's name without its unit, and the unit: of ``angle [deg]`` both.
+
+    Examples
+    --------
+    >>> unit_in_name("angle [deg]"), unit_in_name("yaw_deg"), unit_in_name("x")
+    (('angle', 'deg'), ('yaw', 'deg'), ('x', ''))
+    """
+    if found := _BRACKETS.fullmatch(name.strip()):
+        return found[1], found[2].strip()
+    stem, _, last = name.strip().rpartition("_")
+    plain = ("deg", "rad", "mrad", "mm", "cm", "ms", "us", "ns", "rpm", "kN", "Nm", "Nmm")
+    return (stem, last) if stem and last in plain else (name, "")
+
+
+def stated_units(frame: pd.DataFrame, columns: Mapping[str, object]) -> dict[str, str]:
     """Return the unit of each history's column that the file states and that is not SI.
 
     Parameters
@@ -124,4 +144,54 @@ def in_si(frame: pd.DataFrame, units: Mapping[str, str]) -> pd.DataFrame:
         scaled = values.notna() & (frame["body"] == body if body else True)
         # non-numbers are kept, for the message that names them
         frame[name] = (values * _UNITS[name][unit]).where(scaled, frame[name])
+    return frame
+
+
+def zero_angle(scene: Scene, body: str, zero: str) -> float:
+    """Return the angle theta (rad) of a hinged body whose arm points this way.
+
+    Parameters
+    ----------
+    scene : Scene
+        Has the hinge, and gravity; without gravity, down is -y.
+    body : str
+        Its arm leads from the hinge to its centre.
+    zero : str
+        ``"hanging"``, ``"horizontal"`` (a quarter turn counter-clockwise from it) or ``"upright"``.
+
+    Raises
+    ------
+    HistoryError
+        If the word is another, or the body hangs on no hinge.
+    """
+    if zero not in ZEROS:
+        raise HistoryError(
+            f"[recording]: zero of {body}'s theta is {zero!r}, expected a number or one of"
+            f" {', '.join(ZEROS)}{nearest(zero, ZEROS)}"
+        )
+    held = (edge for edge in joint_order(scene) if edge[1] == body)
+    anchor = next((edge[3] for edge in held if edge[4].traits.pins_anchors), (0.0, 0.0))
+    if not np.any(anchor):
+        raise HistoryError(
+            f'[recording]: zero of {body}\'s theta is "{zero}", and {body} hangs on no hinge beside'
+            " its centre: declare it as [[joint]], or give the number of the column at theta 0"
+        )
+    down = np.arctan2(scene.gravity[1], scene.gravity[0]) if any(scene.gravity) else -np.pi / 2
+    arm = np.arctan2(-anchor[1], -anchor[0])
+    return float(wrapped(np.asarray(down + ZEROS[zero] - arm)))
+
+
+def with_zeros(frame: pd.DataFrame, scene: Scene, layout: Recording, source: str) -> pd.DataFrame:
+    """Return a table whose angles are a body's theta, where a word says what their zero is."""
+    for key, column in layout.columns:
+        zero = dict(column).get("zero") if isinstance(column, tuple) else None
+        if not isinstance(zero, str):
+            continue
+        name, _, coordinate = key.rpartition(".")
+        if coordinate != "theta" or "body" not in frame:
+            raise HistoryError(f"{source}: {key} has a zero, which angles of bodies have alone")
+        bodies = [name] if name else list(frame["body"].dropna().unique())
+        offset = frame["body"].map({body: zero_angle(scene, body, zero) for body in bodies})
+        angle = pd.to_numeric(frame["theta"], errors="coerce")
+        frame = frame.assign(theta=angle + offset.fillna(0.0))
     return frame

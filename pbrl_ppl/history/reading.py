@@ -6,13 +6,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Unpack
 
+import numpy as np
+
 from pbrl_ppl.errors import warn
-from pbrl_ppl.history.conventions import angle_warnings
+from pbrl_ppl.history.bad_frames import trimmed, unmodelled_ends
 from pbrl_ppl.history.conversion import Reading
-from pbrl_ppl.history.ends import trimmed, unmodelled_ends
 from pbrl_ppl.history.history import History
-from pbrl_ppl.history.units import unit_mismatches
+from pbrl_ppl.history.kinematics import hung_bodies
+from pbrl_ppl.history.measures import zero_angle
+from pbrl_ppl.history.units import rate_factor, unit_mismatches
 from pbrl_ppl.scene import Scene
+from pbrl_ppl.state import THETA, Floats, wrapped
 
 
 def read_scene(
@@ -58,3 +62,72 @@ def read_recording(
     cure = "left out" if trim else "no command or contact explains it: --trim leaves the rows out"
     warn(f"history {path}: {named}{more}: {cure}", UserWarning)
     return trimmed(history, ends) if trim else history
+
+
+def angle_warnings(history: History, scene: Scene) -> list[str]:
+    """Return a sentence on each body whose angle looks like one of another convention.
+
+    Parameters
+    ----------
+    history : History
+        What was measured.
+    scene : Scene
+        Has gravity and the hinges.
+
+    Examples
+    --------
+    ::
+
+        angle_warnings(history, scene)
+        ["theta of arm swings to both sides by 23 rad: looks like deg: units = { theta = "deg" }"]
+    """
+    sentences = []
+    hung = hung_bodies(scene)
+    for i, body in enumerate(scene.moving):
+        states = history.dataset["observed"].to_numpy()[:, :, i]
+        action = np.nan_to_num(history.dataset["action"].to_numpy()[:, :, i])
+        angles = [run[np.isfinite(run)] for run in states[..., THETA]]
+        angles = [run for run in angles if len(run) > 8]
+        if not angles:
+            continue
+        if sentence := _degrees(angles, hinged=body.name in hung and bool(any(scene.gravity))):
+            sentences.append(f"theta of {body.name} {sentence}")
+        elif (rate_factor(states, THETA, scene.time_step) or 0.0) < 0:
+            sentences.append(
+                f"theta of {body.name} falls where omega is positive, and rises where it is"
+                ' negative: one of them is clockwise: theta = "-COLUMN" in columns'
+            )
+        elif body.name in hung[:1] and any(scene.gravity) and not action.any():
+            rest = _rest(angles)
+            off = float(wrapped(np.asarray(rest - zero_angle(scene, body.name, "hanging"))))
+            if abs(off) > 0.5:
+                sentences.append(
+                    f"{body.name} comes to rest {np.degrees(off):.0f} degrees from hanging: say"
+                    " what the angle's zero is: theta = { column = ..., zero = ... } in columns,"
+                    ' "hanging", "horizontal", "upright" or the number of the column at theta 0'
+                )
+    return sentences
+
+
+def _degrees(angles: list[Floats], *, hinged: bool) -> str:
+    """Return why angles in rad look like degrees; empty if they do not."""
+    steps = np.concatenate([np.abs(np.diff(run)) for run in angles])
+    wraps = (steps > 340.0) & (steps < 360.5)
+    if wraps.any() and np.median(steps) < 36.0:
+        return 'jumps by 360 between rows: looks like deg: units = { theta = "deg" }'
+    middle = float(np.median(np.concatenate(angles)))
+    size = float(np.quantile(np.abs(np.concatenate(angles) - middle), 0.9))
+    crossings = sum(int((np.diff(np.sign(run - middle)) != 0).sum()) for run in angles)
+    if hinged and size > np.pi and crossings >= 4:
+        return (
+            f'swings to both sides by {size:.2g} rad: looks like deg: units = {{ theta = "deg" }}'
+        )
+    return ""
+
+
+def _rest(angles: list[Floats], steady: float = 0.05) -> float:
+    """Return the angle that trajectories end at, at rest; NaN where they do not."""
+    ends = [run[-max(len(run) // 10, 4) :] for run in angles]
+    both = zip(angles, ends, strict=True)
+    places = [float(np.median(end)) for run, end in both if np.ptp(end) < steady * np.ptp(run)]
+    return float(np.median(places)) if places and np.ptp(places) < 0.3 else float("nan")

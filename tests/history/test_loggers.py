@@ -19,8 +19,8 @@ from pbrl_ppl.errors import (
     SceneError,
 )
 from pbrl_ppl.history import History, read_recording
-from pbrl_ppl.history.derived import planar_yaw
-from pbrl_ppl.history.lost import frozen_poses, zero_poses
+from pbrl_ppl.history.cuts import frozen_poses, zero_poses
+from pbrl_ppl.history.guesses import planar_yaw
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Body, Joint, Recording, Scene, Shape
 
