@@ -17,7 +17,8 @@ import numpy as np
 import pandas as pd
 
 from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.scene import nearest
+from pbrl_ppl.history.files import FOLDER, reads
+from pbrl_ppl.scene import Recording, nearest
 from pbrl_ppl.state import Bools, Floats
 
 if TYPE_CHECKING:
@@ -144,6 +145,18 @@ def read_bag(
     order = np.arange(len(joined)).reshape(len(whole), -1).T.ravel()  # by time, then body
     rows: pd.DataFrame = joined.iloc[order].reset_index(drop=True)
     return rows
+
+
+@reads(*SUFFIXES, FOLDER)
+def _read_topics(path: Path, layout: Recording) -> pd.DataFrame:
+    """Return the messages of a layout's topics, as :func:`read_bag` does."""
+    if layout.topics:
+        return read_bag(path, dict(layout.topics))
+    there = ", ".join(f"{topic} ({kind})" for topic, kind in bag_topics(path).items())
+    raise HistoryError(
+        f"history {path}: say which topics are whose (--topic BODY=/odom, or topics in"
+        f" [recording]); it has {there}"
+    )
 
 
 def _listed(topics: object, path: Path) -> dict[str, list[str]]:

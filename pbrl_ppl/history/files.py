@@ -1,6 +1,17 @@
-"""Files of histories to a table: by suffix; and back, written atomically."""
+"""Files of histories: formats that are read, text tables, Parquet and NetCDF; and writing.
 
-from collections.abc import Mapping, Sequence
+A format is one function that :func:`reads` declares, in any module of this room.
+"""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import io
+import pkgutil
+import re
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,16 +22,49 @@ import xarray as xr
 
 from pbrl_ppl.errors import HistoryError, OutputError
 from pbrl_ppl.files import write_atomically
-from pbrl_ppl.history import bags
-from pbrl_ppl.scene import Recording
+from pbrl_ppl.scene import SEPARATORS, Recording
 from pbrl_ppl.state import STATE, WRENCH, Floats
 
 COLUMNS = ("trajectory", "step", "time", "body", *STATE, *WRENCH)
+#: Suffixes of files that `History.save` writes.
 SUFFIXES = (".csv", ".parquet", ".nc")
-#: Suffixes of text tables that are read, and never written.
-_TEXTS = (".csv", ".txt", ".tsv", ".dat")
-#: Suffixes of other programs' tables that are read, and never written.
-_FOREIGN = (".json", ".mat")
+# pandas reads numbers exactly from 3.1 on, and warns there of the option that older ones need.
+_PANDAS = tuple(int(part) for part in pd.__version__.split(".")[:2])
+_EXACT: dict[str, Any] = {} if _PANDAS >= (3, 1) else {"float_precision": "round_trip"}
+_MISSING = ["", "nan", "NaN", "NAN", "NA", "N/A", "null", "NULL", "None"]
+#: Rows that show what the columns hold, and lines that may be above them.
+_SAMPLE, _HEAD = 200, 30
+_NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?|[-+]?(nan|inf|infinity)", re.I)
+#: In place of the suffix of a folder.
+FOLDER = "a folder"
+
+#: Takes a file and what is known of its layout; returns its rows, with the names of its columns.
+Reader = Callable[[Path, Recording], pd.DataFrame]
+#: By suffix, in lower case.
+_READERS: dict[str, Reader] = {}
+
+
+def reads(*suffixes: str) -> Callable[[Reader], Reader]:
+    """Declare a function of this room to read the files with these suffixes.
+
+    It raises a `HistoryError` where the file is damaged; errors of the operating system are turned
+    into one by :func:`read_table`. The attribute ``units`` of its table may have the units of
+    columns, and ``said`` sentences on what was left out.
+    """
+
+    def declare(reader: Reader) -> Reader:
+        _READERS.update(dict.fromkeys(suffixes, reader))
+        return reader
+
+    return declare
+
+
+def _readers() -> Mapping[str, Reader]:
+    """Return the readers of all modules of this room."""
+    package = importlib.import_module("pbrl_ppl.history")
+    for module in pkgutil.iter_modules(package.__path__):
+        importlib.import_module(f"pbrl_ppl.history.{module.name}")
+    return _READERS
 
 
 def read_table(
@@ -43,27 +87,16 @@ def read_table(
     HistoryError
         If the file is missing, of an unknown kind, or damaged.
     """
-    suffix, layout = path.suffix.lower(), layout or Recording()
-    if suffix in bags.SUFFIXES or path.is_dir():
-        return _read_bag(path, dict(layout.topics))
-    known = tuple(dict.fromkeys((*_TEXTS, *SUFFIXES, *_FOREIGN)))
-    if suffix not in known:
+    layout = (layout or Recording()).with_entries(columns=names or {})
+    suffix, readers = path.suffix.lower(), _readers()
+    reader = readers[FOLDER] if path.is_dir() else readers.get(suffix)
+    if reader is None:
         raise HistoryError(
             f"history {path}: the suffix is {path.suffix!r}, expected one of "
-            f"{', '.join(known)}; save it as one of these"
+            f"{', '.join(readers)}; save it as one of these"
         )
     try:
-        if suffix in _TEXTS:
-            columns = {**dict(layout.columns), **(names or {})}
-            named = [column for column in columns.values() if isinstance(column, str)]
-            from pbrl_ppl.history.text import read_text
-
-            return read_text(path, layout, ["step", "time", *STATE, *WRENCH, *named])
-        if suffix in _FOREIGN:
-            from pbrl_ppl.history.foreign import read_mat, read_sysid
-
-            return read_mat(path) if suffix == ".mat" else read_sysid(path)
-        return _read_parquet(path) if suffix == ".parquet" else _read_netcdf(path)
+        return reader(path, layout)
     except FileNotFoundError:
         raise HistoryError(f"history {path}: there is no such file; check the path") from None
     except OSError as error:
@@ -78,17 +111,166 @@ def read_commands(path: Path, layout: Recording | None) -> pd.DataFrame | None:
     return read_table(beside, layout=Recording(columns=layout.columns))
 
 
-def _read_bag(path: Path, topics: dict[str, Any]) -> pd.DataFrame:
-    if not topics:
-        there = ", ".join(f"{topic} ({kind})" for topic, kind in bags.bag_topics(path).items())
-        raise HistoryError(
-            f"history {path}: say which topics are whose (--topic BODY=/odom, or topics in"
-            f" [recording]); it has {there}"
+@reads(".csv", ".txt", ".tsv", ".dat")
+def read_text(path: Path, layout: Recording) -> pd.DataFrame:
+    """Return the rows of a text table, with the number of each line as its index.
+
+    Title lines above the names of columns are left out, and a last line that was cut off. The
+    attributes ``headerless`` (no line names the columns, which are called 0, 1, 2, ...), ``units``
+    (of columns, from a row of units or from names such as ``angle [deg]``) and ``said`` (sentences
+    on what was left out) hold what else was found.
+
+    Parameters
+    ----------
+    path : Path
+        The file: UTF-8, UTF-16 or Latin-1.
+    layout : Recording
+        Separator and header, if they are declared. Missing cells of the columns that it names, and
+        of numbers of a history, may be words such as ``nan``.
+
+    Raises
+    ------
+    HistoryError
+        If it is empty or no table.
+    """
+    text = _decoded(path.read_bytes())
+    lines = re.split(r"\r\n|\r|\n", text)
+    filled = [line for line in lines if line.strip()]
+    if not filled:
+        raise HistoryError(f"history {path}: the file is empty; expected a header and rows")
+    separator = SEPARATORS.get(layout.separator, layout.separator) or _separator(filled)
+    first, names, units = _head(lines, separator, layout.header)
+    width = len(_cells(lines[first], separator)) if names is None else len(names)
+    said = []
+    last = max(i for i, line in enumerate(lines) if line.strip())
+    # pandas fills short rows with blanks without a word: a file that was cut off would pass.
+    if '"' not in text:
+        cut = _NUMBER.fullmatch(lines[last].strip()[-1:]) is None or len(lines) == last + 1
+        if cut and last > first and len(_cells(lines[last], separator)) < width:
+            said.append(f"line {last + 1} is cut off and left out")
+            lines = lines[:last]
+        for number, line in enumerate(lines[first:], start=first + 1):
+            cells = len(_cells(line, separator))
+            if cells != width and line.strip():
+                raise HistoryError(
+                    f"history row {number}: {cells} cells, expected {width} as in the first"
+                    f" line; repair or drop the row (file {path})"
+                )
+    columns = [str(i) for i in range(width)] if names is None else names
+    named = [column for _, column in layout.columns if isinstance(column, str)]
+    numbers = ["step", "time", *STATE, *WRENCH, *named]
+    try:
+        frame: pd.DataFrame = pd.read_csv(
+            io.StringIO("\n".join(lines[first:])),
+            sep=separator,
+            names=columns,
+            header=None,
+            decimal="," if separator != "," and _has_commas(lines[first:]) else ".",
+            dtype={"trajectory": "str", "body": "str"},
+            keep_default_na=False,
+            na_values=dict.fromkeys((*numbers, *(columns if names is None else ())), _MISSING),
+            skipinitialspace=True,
+            skip_blank_lines=False,
+            low_memory=False,
+            **_EXACT,
         )
-    return bags.read_bag(path, topics)
+    except (ValueError, pd.errors.ParserError) as error:
+        raise HistoryError(f"history {path}: not a CSV table: {error}") from None
+    if not isinstance(frame.index, pd.RangeIndex):
+        raise HistoryError(f"history {path}: rows have more cells than the header; repair them")
+    frame.index = pd.RangeIndex(first + 1, first + 1 + len(frame))
+    frame.attrs.update(lines=True, headerless=names is None, units=units, said=said)
+    return frame
 
 
-def _read_parquet(path: Path) -> pd.DataFrame:
+def _decoded(content: bytes) -> str:
+    """Return the text of a file, by its byte order mark or by what its bytes can be."""
+    if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return content.decode("utf-16", errors="replace")
+    if content[:200].count(b"\0") > len(content[:200]) // 3:
+        return content.decode("utf-16-le" if content[1:2] == b"\0" else "utf-16-be", "replace")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("latin-1")
+
+
+def _separator(filled: list[str]) -> str:
+    """Return the mark that parts most lines below a head; a spreadsheet may write "1,5;2,0"."""
+    body = filled[len(filled) // 2 :][:_SAMPLE]
+    for mark in (";", "\t", ","):
+        if sum(mark in line for line in body) > len(body) / 2:
+            return mark
+    return "," if len(filled[-1].split()) < 2 else SEPARATORS["blank"]
+
+
+def _cells(line: str, separator: str) -> list[str]:
+    """Return the cells of a line, without blanks and quotes around them."""
+    if separator == SEPARATORS["blank"]:
+        return line.split()
+    parts = next(csv.reader([line], delimiter=separator)) if '"' in line else line.split(separator)
+    return [part.strip() for part in parts]
+
+
+def _head(
+    lines: list[str], separator: str, header: bool | None
+) -> tuple[int, list[str] | None, dict[str, str]]:
+    """Return the first line of data, the columns' names (None without), and units of columns."""
+    filled = [i for i, line in enumerate(lines) if line.strip()]
+    body = [_cells(lines[i], separator) for i in filled[1:][-_SAMPLE:]]
+    width = Counter(map(len, body)).most_common(1)[0][0] if body else 0
+    rows = [cells for cells in body if len(cells) == width]
+    numeric = [
+        sum(_is_number(row[i]) for row in rows) > sum(_is_word(row[i]) for row in rows)
+        for i in range(width)
+    ]  # fmt: skip
+
+    def is_data(cells: list[str]) -> bool:
+        """Return whether a line fits below: no words where others have numbers."""
+        fits = not any(_is_word(cell) and n for cell, n in zip(cells, numeric, strict=False))
+        return fits and any(map(_is_number, cells))
+
+    above: list[int] = []
+    if header is None:
+        for i in filled[:_HEAD]:
+            if is_data(_cells(lines[i].lstrip("#% "), separator)):
+                break
+            above.append(i)
+        else:
+            above = filled[:1]  # no line looks like data: the first one names the columns
+    elif header:
+        above = filled[:1]
+    if not above:
+        return filled[0], None, {}
+    heads = [_cells(lines[i].lstrip("#% "), separator) for i in above]
+    full = [sum(cell != "" for cell in cells) for cells in heads]
+    at = full.index(max(full))
+    names, units = heads[at], {}
+    under = heads[at + 1] if at + 1 < len(heads) else []
+    if len(under) == len(names):
+        units = {n: unit.strip("[]() ") for n, unit in zip(names, under, strict=True) if unit}
+    # the last line of a head is the last that is left out
+    return above[-1] + 1, names, units
+
+
+def _is_number(cell: str) -> bool:
+    """Return whether a cell is a number, with a point or a comma."""
+    return _NUMBER.fullmatch(cell) is not None
+
+
+def _is_word(cell: str) -> bool:
+    return cell not in _MISSING and not _is_number(cell)
+
+
+def _has_commas(lines: list[str]) -> bool:
+    """Return whether commas are decimal marks in most rows that have any mark."""
+    marks = np.array([[line.count(","), line.count(".")] for line in lines[-_SAMPLE:]])
+    return bool(marks[:, 0].sum() > marks[:, 1].sum())
+
+
+@reads(".parquet")
+def read_parquet(path: Path, layout: Recording) -> pd.DataFrame:
+    """Return the rows of a Parquet table."""
     with path.open("rb") as file:
         try:
             return pd.read_parquet(file)
@@ -96,7 +278,9 @@ def _read_parquet(path: Path) -> pd.DataFrame:
             raise HistoryError(f"history {path}: not a Parquet table: {error}") from None
 
 
-def _read_netcdf(path: Path) -> pd.DataFrame:
+@reads(".nc")
+def read_netcdf(path: Path, layout: Recording) -> pd.DataFrame:
+    """Return the rows of a NetCDF file that `History.save` wrote."""
     path.open("rb").close()
     try:
         with xr.open_dataset(path, engine="h5netcdf", decode_times=False) as stored:
@@ -128,9 +312,9 @@ def to_table(dataset: xr.Dataset) -> pd.DataFrame:
 
 
 def table_of_arrays(
-    trajectory: npt.NDArray[Any],
+    trajectory: npt.NDArray[np.generic],
     clock: Floats,
-    bodies: Sequence[str] | npt.NDArray[Any],
+    bodies: Sequence[str] | npt.NDArray[np.generic],
     states: Floats,
     wrenches: Floats,
 ) -> pd.DataFrame:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from pbrl_ppl.errors import HistoryError
+from pbrl_ppl.history.files import reads
+from pbrl_ppl.scene import Recording
+from pbrl_ppl.state import Floats
 
 #: Columns of SysId's rows by their number: one mechanism, and a drivetrain.
 _SYSID = {
@@ -21,7 +23,8 @@ _SYSID_UNITS = {"meters": "m", "feet": "ft", "inches": "in", "radians": "rad", "
                 "rotations": "rev"}  # fmt: skip
 
 
-def read_sysid(path: Path) -> pd.DataFrame:
+@reads(".json")
+def read_sysid(path: Path, layout: Recording) -> pd.DataFrame:
     """Return the rows of a WPILib SysId log, with the name of each test as ``trajectory``.
 
     Columns are ``time``, ``voltage``, ``position`` and ``velocity``, or those of a drivetrain's two
@@ -33,7 +36,7 @@ def read_sysid(path: Path) -> pd.DataFrame:
         If the file is no such log.
     """
     try:
-        log: dict[str, Any] = json.loads(path.read_bytes())
+        log: dict[str, object] = json.loads(path.read_bytes())
         tests = {k: np.array(v, float) for k, v in log.items() if isinstance(v, list) and v}
         (width,) = {rows.shape[1] for rows in tests.values()}
         names = _SYSID[width]
@@ -52,7 +55,8 @@ def read_sysid(path: Path) -> pd.DataFrame:
     return frame
 
 
-def read_mat(path: Path) -> pd.DataFrame:
+@reads(".mat")
+def read_mat(path: Path, layout: Recording) -> pd.DataFrame:
     """Return the vectors of a MATLAB file that are as long as most, a column each.
 
     Fields of structures have their path as names, ``log.theta``; columns of matrices their number,
@@ -71,7 +75,7 @@ def read_mat(path: Path) -> pd.DataFrame:
         except Exception as error:  # damaged files raise errors of many kinds
             cure = 'save it from MATLAB with "-v7", or as CSV'
             raise HistoryError(f"history {path}: not a MATLAB file ({error}); {cure}") from None
-    columns: dict[str, np.ndarray[Any, Any]] = {}
+    columns: dict[str, Floats] = {}
     for name, value in content.items():
         if not name.startswith("__"):
             _add_vectors(columns, name, value)
@@ -82,7 +86,7 @@ def read_mat(path: Path) -> pd.DataFrame:
     return pd.DataFrame({k: column for k, column in columns.items() if len(column) == longest})
 
 
-def _add_vectors(columns: dict[str, np.ndarray[Any, Any]], name: str, value: object) -> None:
+def _add_vectors(columns: dict[str, Floats], name: str, value: object) -> None:
     """Add the vectors of a MATLAB value under their names."""
     if isinstance(value, dict):
         for key, item in value.items():
