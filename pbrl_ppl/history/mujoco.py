@@ -114,13 +114,7 @@ def from_mujoco(
             " expected the same"
         )
     n, rows = positions.shape[:2]
-    step = float(model.opt.timestep if time_step is None else time_step)
-    every = round(scene.time_step / step)
-    if every < 1 or abs(every * step - scene.time_step) > 1e-6 * scene.time_step:
-        raise HistoryError(
-            f"rows are {step:g} s apart and the scene's time_step is {scene.time_step:g} s;"
-            " expected a whole number of rows a step; change the scene's, or give time_step"
-        )
+    every = _rows_in_a_step(model, scene, time_step)
     axes = PLANES[plane]
     reach = [body.shape.bounding_radius for body in scene.moving]
     joints = {
@@ -159,6 +153,18 @@ def from_mujoco(
     return History.of_arrays(
         state[:, : kept * every + 1 : every], scene, mean, estimate_velocities=estimate_velocities
     )
+
+
+def _rows_in_a_step(model: mujoco.MjModel, scene: Scene, time_step: float | None) -> int:
+    """Return the number of rows in a time step of the scene."""
+    step = float(model.opt.timestep if time_step is None else time_step)
+    every = round(scene.time_step / step)
+    if every < 1 or abs(every * step - scene.time_step) > 1e-6 * scene.time_step:
+        raise HistoryError(
+            f"rows are {step:g} s apart and the scene's time_step is {scene.time_step:g} s;"
+            " expected a whole number of rows a step; change the scene's, or give time_step"
+        )
+    return every
 
 
 def _batched(values: npt.ArrayLike, width: int, name: str, symbol: str) -> Floats:

@@ -122,6 +122,12 @@ def rows_of_arrays(
         raise HistoryError(
             f"history: trajectory {names[min(empty)]} has no times; expected at least 2; drop it"
         )
+    _check_size(rows, scene)
+    return rows
+
+
+def _check_size(rows: Rows, scene: Scene) -> None:
+    """Refuse states and wrenches of arrays that are infinite or too large."""
     for values, columns in ((rows.state, STATE), (rows.action, WRENCH)):
         for row, column in np.argwhere(np.abs(values) > _LARGEST):
             body = scene.moving[rows.body[row]].name
@@ -131,7 +137,6 @@ def rows_of_arrays(
                 f" {rows.trajectory_of(row)}; expected a finite number of at most {_LARGEST:g}; NaN"
                 " if it was not measured",
             )
-    return rows
 
 
 def with_clean_names(frame: pd.DataFrame, source: str) -> pd.DataFrame:
