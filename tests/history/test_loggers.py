@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 import scipy.io
 
+from pbrl_ppl import history as room
 from pbrl_ppl.cli import main
 from pbrl_ppl.effects import attach
 from pbrl_ppl.errors import (
@@ -23,6 +24,7 @@ from pbrl_ppl.history.cuts import frozen_poses, zero_poses
 from pbrl_ppl.history.guesses import planar_yaw
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Body, Joint, Recording, Scene, Shape
+from tests.helpers.places import ROOT
 
 pytestmark = [pytest.mark.one_stack, pytest.mark.filterwarnings("ignore::UserWarning")]
 
@@ -485,6 +487,23 @@ def test_a_log_of_sysid(tmp_path: Path) -> None:
     (tmp_path / "other.json").write_text('{"a": [1, 2]}')
     with pytest.raises(HistoryError, match="not a log of WPILib's SysId"):
         History.load(tmp_path / "other.json", PUCK)
+
+
+def test_a_format_is_one_new_file(tmp_path: Path, monkeypatch) -> None:
+    """CONTRIBUTING's first task: a module of the room, which is found by its declaration."""
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    added = re.search(r"\+\+\+ b/pbrl_ppl/history/npz.py\n@@.*\n((?:\+.*\n)+)", text)
+    (tmp_path / "npz.py").write_text(re.sub("(?m)^\\+", "", added[1]), encoding="utf-8")
+    np.savez(tmp_path / "log.npz", t=0.1 * np.arange(20), px=np.arange(20.0), y=np.ones(20))
+    scene = PUCK.replace(recording=Recording(columns={"time": "t", "x": "px"}))
+    with pytest.raises(HistoryError, match=r"suffix is '.npz', expected one of .csv"):
+        History.load(tmp_path / "log.npz", scene)
+    monkeypatch.setattr(room, "__path__", [*room.__path__, str(tmp_path)])
+    np.testing.assert_array_equal(of(History.load(tmp_path / "log.npz", scene), "x"), range(20))
+    (tmp_path / "bad.npz").write_bytes(b"PK no")
+    for name, message in (("bad", "no arrays of one length"), ("none", "no such file")):
+        with pytest.raises(HistoryError, match=message):
+            History.load(tmp_path / f"{name}.npz", scene)
 
 
 def test_a_matlab_file(tmp_path: Path) -> None:
