@@ -88,7 +88,7 @@ def recorded(
     from pbrl_ppl import history as histories
 
     source, said = f"history {path}", list[str]()
-    frame = histories.read_table(path, layout=layout)
+    frame = histories.read_table(path, layout)
     plain = histories.is_history(frame) and layout == Recording()
     commands = histories.read_commands(path, layout)
     if not plain:

@@ -1,4 +1,7 @@
-"""Rows that belong to no model: single bad frames, and ends where a body is held or stopped."""
+"""Rows that belong to no model: single bad frames, and ends where a body is held or stopped.
+
+One rule finds them: :func:`outliers`, how far rows are off the polynomial through those beside.
+"""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

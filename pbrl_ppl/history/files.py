@@ -67,27 +67,23 @@ def _readers() -> Mapping[str, Reader]:
     return _READERS
 
 
-def read_table(
-    path: Path, names: Mapping[str, object] | None = None, layout: Recording | None = None
-) -> pd.DataFrame:
+def read_table(path: Path, layout: Recording) -> pd.DataFrame:
     """Return the rows of a history file, as they are.
 
     Parameters
     ----------
     path : Path
         The suffix is its format; a folder is a ROS 2 bag.
-    names : mapping of str to object, optional
-        Its values are names of columns of numbers, as of `Reading`.
-    layout : Recording, optional
-        Separator and header of a text table; otherwise found from its lines. The columns of one
-        without header are called 0, 1, 2, ...
+    layout : Recording
+        What is known of the file: topics of a bag; separator, header and columns of a text table,
+        which are otherwise found from its lines. The columns of one without header are called 0, 1,
+        2, ...
 
     Raises
     ------
     HistoryError
         If the file is missing, of an unknown kind, or damaged.
     """
-    layout = (layout or Recording()).with_entries(columns=names or {})
     suffix, readers = path.suffix.lower(), _readers()
     reader = readers[FOLDER] if path.is_dir() else readers.get(suffix)
     if reader is None:
@@ -108,7 +104,7 @@ def read_commands(path: Path, layout: Recording | None) -> pd.DataFrame | None:
     if layout is None or not layout.commands:
         return None
     beside = path.parent / layout.commands.replace("{stem}", path.stem)
-    return read_table(beside, layout=Recording(columns=layout.columns))
+    return read_table(beside, Recording(columns=layout.columns))
 
 
 @reads(".csv", ".txt", ".tsv", ".dat")

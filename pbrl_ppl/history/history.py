@@ -131,9 +131,9 @@ class History:
         HistoryError
             If the file cannot be used; the message says where and what to do.
         """
-        path = Path(path)
+        path, columns = Path(path), reading.get("columns") or {}
         return cls.from_dataframe(
-            read_table(path, reading.get("columns"), scene.recording),
+            read_table(path, (scene.recording or Recording()).with_entries(columns=columns)),
             scene,
             estimate_velocities=estimate_velocities,
             layout=scene.recording,
