@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Iterable
 
 from pbrl_ppl.effects import actuators, drag, forces, friction, obstacles, sensors, springs
 from pbrl_ppl.effects.actuation import actuation, laws_of_actuators
 from pbrl_ppl.effects.effect import Attached, Effect
 from pbrl_ppl.errors import EffectError
-from pbrl_ppl.scene import Scene, nearest
+from pbrl_ppl.scene import Scene
 
 #: Of effects that the data cannot separate, the earlier one is named: friction of a joint before
 #: drag on a body, which looks the same on a single pendulum, and the simpler before the richer.
@@ -145,10 +146,12 @@ def attach(
                 result.append(acting.on(body.name))
         for name in body.effects:
             if name not in by_name:
+                near = difflib.get_close_matches(name, by_name, n=1)
+                hint = f"; did you mean {near[0]!r}?" if near else ""
                 raise EffectError(
                     f"body {body.name!r} declares the effect {name!r}, which is not in the"
-                    f" catalogue{nearest(name, by_name)}; give an effect of your own as an"
-                    f" argument, or with --effect-file (known: {', '.join(by_name)})"
+                    f" catalogue{hint}; give an effect of your own as an argument, or with"
+                    f" --effect-file (known: {', '.join(by_name)})"
                 )
             result.append(by_name[name].on(body.name))
     for item in extra:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -11,7 +12,6 @@ from scipy.special import i0e
 from scipy.stats import truncnorm
 
 from pbrl_ppl.errors import ParameterError
-from pbrl_ppl.scene import nearest
 from pbrl_ppl.state import Floats
 
 #: How far (in sigmas) mu may lie outside the support: farther out, densities lose their digits.
@@ -65,9 +65,10 @@ class Prior:
 
     def __post_init__(self) -> None:
         if self.family not in FAMILIES:
+            near = difflib.get_close_matches(str(self.family), FAMILIES, n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
             raise ParameterError(
-                f"prior family {self.family!r} is unknown{nearest(self.family, FAMILIES)} (known:"
-                f" {', '.join(FAMILIES)})"
+                f"prior family {self.family!r} is unknown{hint} (known: {', '.join(FAMILIES)})"
             )
         for key in ("mu", "sigma", "kappa"):
             value = getattr(self, key)

@@ -186,9 +186,7 @@ def test_a_hyper_parameter_of_another_family(prior, message) -> None:
 
 
 def test_unknown_family() -> None:
-    known = (
-        r"'normall' is unknown; did you mean \"normal\"\? \(known: log_normal, .*, categorical\)"
-    )
+    known = r"'normall' is unknown; did you mean 'normal'\? \(known: log_normal, .*, categorical\)"
     with pytest.raises(ParameterError, match=known):
         Prior("normall")
 
