@@ -5,8 +5,10 @@ from __future__ import annotations
 import contextlib
 import math
 import secrets
+import tempfile
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields, is_dataclass
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +40,50 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
 def write_text(path: Path, text: str) -> None:
     """Write a text file (UTF-8) whole or not at all; raises as :func:`write_atomically`."""
     write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+
+
+def check_folder(folder: Path, overwrite: bool, files: Iterable[str] = ()) -> Path:
+    """Check that ``files`` can be written to a folder, and return its nearest existing parent.
+
+    The folder is made and removed again, so that no trace is left.
+
+    Raises
+    ------
+    OutputError
+        If they cannot, or if the folder is not empty and ``overwrite`` is false.
+    """
+    where, missing = f"output folder {folder}:", list[Path]()
+    places = (folder, *folder.parents)
+    try:
+        # a dangling link counts as there: it cannot be made a folder
+        missing += takewhile(lambda place: not (place.exists() or place.is_symlink()), places)
+        nearest = places[len(missing)]
+        if nearest.is_dir():
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder):
+                pass
+        filled = nearest == folder and any(folder.iterdir())
+    except NotADirectoryError:
+        filled = False
+    except OSError as error:
+        raise OutputError(
+            f"{where} it cannot be made or written ({error.strerror}); choose another path"
+        ) from None
+    finally:
+        for made in missing:
+            with contextlib.suppress(OSError):
+                made.rmdir()
+    if not nearest.is_dir():
+        raise OutputError(f"{where} {nearest} is a file, expected a folder; choose another path")
+    if filled and not overwrite:
+        raise OutputError(
+            f"{where} it is not empty; choose another, or allow overwriting (overwrite,"
+            " --overwrite)"
+        )
+    for name in files:
+        if (folder / name).is_dir():
+            raise OutputError(f"{where} {name} in it is a folder; remove it")
+    return nearest
 
 
 def json_fields(value: Any) -> dict[str, Any]:

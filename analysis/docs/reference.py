@@ -13,7 +13,6 @@ from typing import Any
 import typer
 
 from pbrl_ppl.cli.app import app
-from pbrl_ppl.cli.options import commands
 from pbrl_ppl.effects import Effect, EffectParameter, catalogue
 from pbrl_ppl.effects.effect import STAGES
 
@@ -371,7 +370,8 @@ def command_page() -> str:
     """Return the page of all commands with their arguments and options."""
     text = ["# Commands", "", app.info.epilog or ""]
     made = typer.main.get_command(app).commands
-    for name, example in ((each.name, each.example) for each in commands()):
+    for each in app.registered_commands:
+        name, example = str(each.name), str(each.epilog).removeprefix("Example: ")
         text += ["", f"## pbrl-ppl {name}", "", made[name].help or "", "", f"    {example}", ""]
         text += ["| argument or option | |", "|---|---|"]
         for each in made[name].params:

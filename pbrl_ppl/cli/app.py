@@ -1,18 +1,33 @@
-"""Command-line program: its commands and exit codes."""
+"""Command-line program: how a command is declared, the commands and their exit codes."""
 
 from __future__ import annotations
 
+import inspect
 import os
+import re
 import sys
-from collections.abc import Sequence
-from typing import Annotated
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
+from copy import copy
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Annotated, TypeVar, get_args, get_origin, get_type_hints
 
 import typer
 
 from pbrl_ppl import __version__
-from pbrl_ppl.cli.options import commands
-from pbrl_ppl.cli.terminal import BAD_INPUT, in_a_line, interrupted, warnings_in_a_line
+from pbrl_ppl.cli import options
+from pbrl_ppl.cli.terminal import (
+    BAD_INPUT,
+    Result,
+    in_a_line,
+    interrupted,
+    interruptible,
+    stages,
+    warnings_in_a_line,
+)
 from pbrl_ppl.errors import PbrlError
+
+F = TypeVar("F", bound=Callable[..., Result])
 
 app = typer.Typer(
     name="pbrl-ppl",
@@ -24,8 +39,120 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-for each in commands():
-    app.command(each.name, epilog=f"Example: {each.example}")(each.function)
+
+#: Places of commands in the list of commands.
+_RANKS: dict[str | None, int] = {}
+
+
+def command(
+    name: str, rank: int, example: str, kept: str = "nothing was written"
+) -> Callable[[F], F]:
+    """Declare a function of this room to be a command, whose result is printed.
+
+    The ``rank`` is its place in the list of commands, the ``example`` is for its help. An interrupt
+    says what is ``kept``, in terms of the arguments. Every command has the options of `Printing`;
+    its function takes those and the arguments ``progress`` and ``interrupts`` where it needs them.
+
+    An argument that is a dataclass stands for the options that are its fields. The help of an
+    argument, and after a colon what stands for its value, are in the docstring of the function or
+    of the dataclass, or in that of `options`. An argument without a default is one of the command,
+    others are its options.
+    """
+
+    def declare(function: F) -> F:
+        app.command(name, epilog=f"Example: {example}")(_bound(function, kept))
+        _RANKS[name] = rank
+        app.registered_commands.sort(key=lambda each: _RANKS[each.name])
+        return function
+
+    return declare
+
+
+@dataclass(frozen=True)
+class Printing:
+    """Options of every command.
+
+    Parameters
+    ----------
+    as_json
+        Print one JSON object, and nothing else.
+    quiet
+        Show no progress.
+    """
+
+    as_json: Annotated[bool, typer.Option("--json")] = False
+    quiet: Annotated[bool, typer.Option("--quiet", "-q")] = False
+
+    def run(self, function: Callable[..., Result], kept: str, given: Mapping[str, object]) -> None:
+        """Run a command with what it takes, and print its result."""
+        taken = inspect.signature(function).parameters
+        staged = stages(self.quiet) if "progress" in taken else nullcontext()
+        with interruptible(kept.format(**given)) as interrupts, staged as progress:
+            session = {"progress": progress, "interrupts": interrupts}
+            known = {**given, **vars(self), **session}
+            result = function(**{name: known[name] for name in taken})
+        result.show(self.as_json)
+
+
+def _bound(function: Callable[..., Result], kept: str) -> Callable[..., None]:
+    """Return the function as Typer takes it: fields in place of dataclasses, each with its help."""
+    summary, documented = _documented(function.__doc__)
+    taken = inspect.signature(function, eval_str=True).parameters
+    groups: dict[str, type] = {}
+    parameters: list[inspect.Parameter] = []
+    kinds = {name: parameter.annotation for name, parameter in taken.items()}
+    for name, kind in (kinds | {"printing": Printing}).items():
+        if isinstance(kind, type) and is_dataclass(kind):
+            groups[name] = kind
+            for base in kind.__mro__:
+                documented = _documented(base.__doc__)[1] | documented
+            hints = get_type_hints(kind, include_extras=True)  # each in the module of its class
+            declared = inspect.signature(kind).parameters.values()
+            parameters += [each.replace(annotation=hints[each.name]) for each in declared]
+        elif name not in ("as_json", "quiet", "progress", "interrupts"):
+            parameters.append(taken[name])
+
+    def call(**given: object) -> None:
+        values = {
+            name: kind(**{field.name: given.pop(field.name) for field in fields(kind)})
+            for name, kind in groups.items()
+        }
+        printing: Printing = values.pop("printing")
+        printing.run(function, kept, given | values)
+
+    documented = _documented(options.__doc__)[1] | documented
+    parameters = [_declared(each, *documented.get(each.name, ("", ""))) for each in parameters]
+    call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    call.__doc__ = summary
+    return call
+
+
+def _declared(parameter: inspect.Parameter, metavar: str, said: str) -> inspect.Parameter:
+    """Return a parameter with the declaration, metavar and help of an option or argument."""
+    kind = parameter.annotation
+    optional = [each for each in get_args(kind) if get_origin(each) is Annotated]
+    if get_origin(kind) is Annotated:
+        kind, info = get_args(kind)
+    elif optional:  # Annotated[...] | None
+        kind, info = get_args(optional[0])
+        kind |= None
+    elif kind is typer.Context:
+        return parameter.replace(kind=parameter.KEYWORD_ONLY)
+    elif parameter.default is parameter.empty:
+        info = typer.Argument()
+    else:
+        info = typer.Option(f"--{parameter.name.replace('_', '-')}")
+    info = copy(info)
+    info.metavar, info.help = info.metavar or metavar or None, info.help or said or None
+    return parameter.replace(annotation=Annotated[kind, info], kind=parameter.KEYWORD_ONLY)
+
+
+def _documented(docstring: str | None) -> tuple[str, dict[str, tuple[str, str]]]:
+    """Return a docstring up to its parameters, and the metavar and help of each of them."""
+    text = inspect.cleandoc(docstring or "")
+    summary, _, listed = text.partition("\n\nParameters\n----------\n")
+    entries = re.findall(r"^(\w+)(?: : (.+))?\n((?:    .+(?:\n|$))+)", listed, re.MULTILINE)
+    return summary, {name: (metavar, " ".join(said.split())) for name, metavar, said in entries}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -7,9 +7,10 @@ import platform
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import typer
@@ -17,7 +18,7 @@ from rich.console import Console
 from rich.table import Column, Table
 
 from pbrl_ppl.cli import options
-from pbrl_ppl.cli.options import command
+from pbrl_ppl.cli.app import command
 from pbrl_ppl.cli.terminal import FAILED, Progress, Result, sizes, table
 from pbrl_ppl.state import STATE
 
@@ -185,12 +186,15 @@ def criticise(
     from pbrl_ppl.files import json_fields
     from pbrl_ppl.physics import check_history
 
-    settings: dict[str, Any] = {"catalogue": catalogue, "seed": seed, "progress": progress}
     if simulate:
-        attribution = criticism.attribute(declared, loaded, **settings)
+        attribution = criticism.attribute(
+            declared, loaded, catalogue=catalogue, seed=seed, progress=progress
+        )
         return Result(json_fields(attribution), _shown_laws(attribution))
     check_history(declared, loaded, loaded.segments(1))
-    ranking = criticism.criticise(declared, loaded, **settings)
+    ranking = criticism.criticise(
+        declared, loaded, catalogue=catalogue, seed=seed, progress=progress
+    )
     columns = {"effect": "<", "body": "<", "S": ".1f", "dof": "", "p (corrected)": ".2g"}
     candidates = table(
         "what the declared model might lack, by the score test",
@@ -235,13 +239,13 @@ def _shown_laws(attribution: Attribution) -> Iterator[str | Table]:
     yield from (f"rejected {law}: {why}" for law, why in attribution.rejected.items())
 
 
-def _law_row(law: Law) -> list[Any]:
+def _law_row(law: Law) -> list[object]:
     numbers = ((name, f"{value:.3g} ± {law.sd[name]:.2g}") for name, value in law.estimate.items())
     kind, share = "main" if law.main else "small", f"{100 * law.share:.2g} %"
     return [law.effect, law.body, kind, law.nats, share, sizes(numbers, law.units)]
 
 
-def _candidate_row(one: Candidate) -> list[Any]:
+def _candidate_row(one: Candidate) -> list[object]:
     numbers = ((name, f"{value:.3g}") for name, value in one.estimate.items())
     # where the declared parameters absorb the effect, its size is not identifiable
     seen = sizes(numbers, one.units) if one.statistic > 0 else ""
@@ -259,17 +263,27 @@ def doctor(progress: Progress) -> Result:
 
     from pbrl_ppl.posterior import versions
 
-    facts: dict[str, Any] = {"versions": versions(), "platform": platform.platform()}
+    found, system = versions(), platform.platform()
     progress("trying the engine")
-    facts["engine"] = _engine()
+    engine = _tried_engine()
     pools = threadpoolctl.threadpool_info()
-    threads = {str(pool["user_api"]): int(pool["num_threads"]) for pool in pools}
-    facts["threads"] = {"processors": _processors(), **threads}
-    facts["package"] = str(Path(__file__).parents[1])
-    wrong = facts["engine"]["difference"] > 1e-9  # the paths agree to rounding
+    counted = {str(pool["user_api"]): int(pool["num_threads"]) for pool in pools}
+    threads = {"processors": _processors(), **counted}
+    package = str(Path(__file__).parents[1])
+    slow = "" if engine.path == "compiled" else ": a Python loop, slow; no compiled one here"
+    shown = found | {
+        "platform": system,
+        "engine": f"{engine.path}{slow}, {engine.microseconds_per_transition:.1f} us a"
+        f" transition, {engine.difference:.1g} from the plain loop",
+        "threads": ", ".join(f"{number} {name}" for name, number in threads.items()),
+        "package": package,
+    }
+    wrong = engine.difference > 1e-9  # the paths agree to rounding
     error = "error: the compiled engine loop is wrong here; please report this" if wrong else ""
-    code = FAILED if wrong else 0
-    return Result(facts | {"ok": not wrong}, _doctor_lines(facts), code, error)
+    facts = {"versions": found, "platform": system, "engine": engine, "threads": threads}
+    facts |= {"package": package, "ok": not wrong}
+    lines = [f"{name:12} {text}" for name, text in shown.items()]
+    return Result(facts, lines, FAILED if wrong else 0, error)
 
 
 def _processors() -> int:
@@ -279,12 +293,21 @@ def _processors() -> int:
     return os.cpu_count() or 1
 
 
-def _engine() -> dict[str, Any]:
-    """Return the engine loop's kind, its difference from the plain loop, and its speed."""
+@dataclass(frozen=True)
+class TriedEngine:
+    """The engine loop's kind, its difference from the plain loop, and its speed."""
+
+    path: str
+    difference: float
+    microseconds_per_transition: float
+
+
+def _tried_engine() -> TriedEngine:
+    """Simulate a puck that hits a wall in both loops, and compare."""
     from pbrl_ppl.physics import Physics, calls
     from pbrl_ppl.scene import Body, Scene, Shape, Wall
 
-    # a puck that hits a wall, so that there are contacts
+    # so that there are contacts
     puck = Body("puck", Shape.circle(0.1), known=(("r", 0.5), ("mu_c", 0.3)))
     scene = Scene(time_step=0.1, bodies=(puck,), walls=(Wall((1.0, -1.0), (1.0, 1.0)),))
     start = np.zeros((100, 1, 6))
@@ -295,22 +318,6 @@ def _engine() -> dict[str, Any]:
     begin = time.perf_counter()
     fast.predict(np.ones(1), start, actions)
     spent = time.perf_counter() - begin
-    return {
-        "path": "compiled" if calls.AVAILABLE else "plain",
-        "difference": float(np.abs(states[0] - states[1]).max()),
-        "microseconds_per_transition": 1e6 * spent / len(start),
-    }
-
-
-def _doctor_lines(facts: dict[str, Any]) -> list[str]:
-    """Return what was found as lines of text."""
-    engine = facts["engine"]
-    slow = "" if engine["path"] == "compiled" else ": a Python loop, slow; no compiled one here"
-    shown = facts["versions"] | {
-        "platform": facts["platform"],
-        "engine": f"{engine['path']}{slow}, {engine['microseconds_per_transition']:.1f} us a"
-        f" transition, {engine['difference']:.1g} from the plain loop",
-        "threads": ", ".join(f"{number} {name}" for name, number in facts["threads"].items()),
-        "package": facts["package"],
-    }
-    return [f"{name:12} {text}" for name, text in shown.items()]
+    path = "compiled" if calls.AVAILABLE else "plain"
+    difference = float(np.abs(states[0] - states[1]).max())
+    return TriedEngine(path, difference, 1e6 * spent / len(start))

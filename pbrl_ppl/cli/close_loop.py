@@ -1,26 +1,38 @@
-"""``pbrl-ppl close-loop``, and ``pbrl-ppl demo``, which runs it on a recording of the package."""
+"""The loop: ``pbrl-ppl close-loop``; ``demo`` on the package's recording; ``close-logs``."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+import pickle
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ParamSpec, TypeVar
 
+import cloudpickle
 import typer
 
 from pbrl_ppl.cli import options, terminal
+from pbrl_ppl.cli.app import command
 from pbrl_ppl.cli.new import models_folder
-from pbrl_ppl.cli.options import command
 from pbrl_ppl.cli.terminal import Progress, Result
+from pbrl_ppl.errors import OutputError
+from pbrl_ppl.files import check_folder
 
 if TYPE_CHECKING:
     from pbrl_ppl.criticism import Loop
+    from pbrl_ppl.effects import Effect
     from pbrl_ppl.history import History
     from pbrl_ppl.reporting import Source
     from pbrl_ppl.scene import Scene
 
+P = ParamSpec("P")
+T = TypeVar("T")
 
 #: How a sentence on laws that were found begins.
 _FOUND = "simulations name"
@@ -34,7 +46,26 @@ class Method(StrEnum):
     LAPLACE = "laplace"
 
 
-Draws = Annotated[int | None, typer.Option(min=100)]
+@dataclass(frozen=True)
+class Sampler:
+    """Options of a command that samples the posteriors of a loop.
+
+    Parameters
+    ----------
+    draws
+        Posterior draws of each chain.
+    method
+        importance weights proposals by the engine; metropolis runs chains; laplace takes Gaussians
+        at the modes, on which the verdict then stands.
+    """
+
+    seed: options.Seed = 1
+    draws: Annotated[int | None, typer.Option(min=100)] = None
+    method: Method = Method.IMPORTANCE
+
+    def settings(self) -> dict[str, Any]:
+        """Return arguments of `criticism.close_loop`."""
+        return vars(self) | {"method": self.method.value}
 
 
 @command("close-loop", 5, "pbrl-ppl close-loop scene.toml train.csv -o report/")
@@ -42,14 +73,11 @@ def close_loop(
     context: typer.Context,
     scene: Path,
     train: Path,
-    output: options.OutputFolder,
+    to: options.FolderOutput,
     reading: options.SceneReading,
+    sampler: Sampler,
     progress: Progress,
     test: Path | None = None,
-    seed: options.Seed = 1,
-    overwrite: bool = False,
-    draws: Draws = None,
-    method: Method = Method.IMPORTANCE,
     learn_remainder: bool = False,
 ) -> Result:
     """Find what the declared model lacks, add it, refit, and report before and after.
@@ -60,21 +88,11 @@ def close_loop(
     ----------
     train : TRAIN
         Measured history (.csv, .parquet, .nc).
-    output
-        Folder for the results.
     test : TEST
         Held-out history; without it, a quarter of TRAIN's trajectories.
-    overwrite
-        Write to a folder that is not empty.
-    draws
-        Posterior draws of each chain.
-    method
-        importance weights proposals by the engine; metropolis runs chains; laplace takes Gaussians
-        at the modes, on which the verdict then stands.
     learn_remainder
         Where something stays unexplained, learn a force for it, into remainder.nc; it gets no name.
     """
-    terminal.check_can_make(output)  # before the long work, which would be lost
     progress("reading the scene and the histories")
     paths = [train] if test is None else [train, test]
     declared, histories = reading.read(scene, paths)
@@ -83,18 +101,18 @@ def close_loop(
     import pbrl_ppl.reporting as report
     from pbrl_ppl import criticism
 
-    criticism.check_folder(output, overwrite)
+    output = to.output
+    check_folder(output, True, (*criticism.FILES, criticism.REMAINDER))
     if learn_remainder:
         criticism.check_scikit_learn()
-    settings = {"seed": seed, "draws": draws, "method": method.value, "catalogue": catalogue}
-    loop, stopped = _finished(declared, histories, progress, **settings)
+    loop, stopped = _finished(declared, histories, sampler, catalogue, progress)
     progress("writing the report")
     files = str(scene), str(train), str(test or "")
     source = report.Source(*files, options.command_line(context))
-    loop.save(output, overwrite, page=report.render(loop, source))
+    loop.save(output, to.overwrite, page=report.render(loop, source))
     contents, words = loop.to_dict() | {"report": output / "report.html"}, ""
     if learn_remainder:
-        words, path = _remainder(loop, output, source, seed, progress)
+        words, path = _remainder(loop, output, source, sampler.seed, progress)
         contents["learned_remainder"] = {"words": words, "posterior": path}
     undecided = terminal.UNDECIDED if loop.verdict == criticism.NOT_CONVERGED else 0
     code = terminal.INTERRUPTED if stopped else undecided
@@ -102,7 +120,11 @@ def close_loop(
 
 
 def _finished(
-    scene: Scene, histories: Sequence[History], progress: Progress, **settings: Any
+    scene: Scene,
+    histories: Sequence[History],
+    sampler: Sampler,
+    catalogue: Sequence[Effect],
+    progress: Progress,
 ) -> tuple[Loop, bool]:
     """Return the loop, with Gaussians at the modes if it is interrupted while it samples.
 
@@ -118,8 +140,9 @@ def _finished(
         if stage.startswith(_FOUND):
             names.append(stage)
 
+    settings = sampler.settings() | {"catalogue": catalogue, "progress": noted}
     try:
-        return criticism.close_loop(scene, *histories, progress=noted, **settings), False
+        return criticism.close_loop(scene, *histories, **settings), False
     except criticism.LoopInterrupted as interrupt:
         progress("interrupted: Gaussians at the modes instead; once more ends without a report")
         return interrupt.finish(), True
@@ -175,17 +198,134 @@ def demo(
         Write to a folder that is not empty.
     """
     cart = models_folder() / "shopping_cart"
+    to, sampler = options.FolderOutput(output, overwrite), Sampler(seed, method=method)
     if not (as_json or quiet):
         typer.echo(
             "A shopping cart is pushed; the scene does not declare that its castor resists turning."
             "\nThis takes some 30 s on an idle machine, the first time a minute more to compile."
         )
+    train, test = (cart / "recorded" / f"{name}.csv" for name in ("train", "test"))
     result = close_loop(
-        context, cart / "scene.toml", cart / "recorded" / "train.csv", output,
-        options.SceneReading(), progress, cart / "recorded" / "test.csv", method=method, seed=seed,
-        overwrite=overwrite,
-    )  # fmt: skip
+        context, cart / "scene.toml", train, to, options.SceneReading(), sampler, progress, test
+    )
     if quiet or result.code:
         return result
     last = "With a recording of yours: pbrl-ppl new scene.toml --history train.csv"
     return replace(result, shown=[*result.shown, last])
+
+
+@command(
+    "close-logs", 6, "pbrl-ppl close-logs logs.csv -o results/ --jobs 4",
+    kept="finished logs are in {output}; the same command goes on",
+)  # fmt: skip
+def close_logs(
+    context: typer.Context,
+    manifest: Path,
+    output: options.OutputFolder,
+    reading: options.SceneReading,
+    sampler: Sampler,
+    progress: Progress,
+    overwrite: bool = False,
+    jobs: options.Count = 1,
+    scheduler: str | None = None,
+) -> Result:
+    """Close the loop on each log of a manifest, and report which effects are where.
+
+    The same command goes on after an interrupt. Exits with 1 if some logs failed.
+
+    Parameters
+    ----------
+    manifest : MANIFEST
+        A CSV file with the columns name, scene, train, test, kind.
+    output
+        Folder for the results.
+    overwrite
+        Run finished logs again.
+    jobs
+        Logs at a time.
+    scheduler : ADDRESS
+        A Dask scheduler that has the workers.
+    """
+    check_folder(output, overwrite=True)
+    progress("reading the manifest")
+    import pbrl_ppl.reporting as report
+
+    catalogue = reading.catalogue() if reading.effect_file else None
+    logs = report.read_manifest(manifest)  # its errors come before a cluster is sought
+    with _executor(jobs, scheduler) as executor:
+        loops = report.close_loop_many(
+            logs, output, executor=executor, progress=progress, again=overwrite,
+            source=report.Source(command=options.command_line(context)), catalogue=catalogue,
+            **sampler.settings(), **reading.scene_settings(), **reading.settings(),
+        )  # fmt: skip
+    effects = loops.effects().drop_duplicates(["name", "effect", "body"])
+    lines = [
+        f"{effect}[{body}]: {', '.join(rows['name'])}"
+        for (effect, body), rows in effects.groupby(["effect", "body"], sort=False)
+    ]
+    page = output / "index.html"
+    lines += [report.in_words(loops.rows), f"page: {page}"]
+    return Result({"page": page, "logs": loops.rows}, lines, terminal.FAILED if loops.failed else 0)
+
+
+def _executor(jobs: int, scheduler: str | None) -> AbstractContextManager[Executor | None]:
+    """Return the executor of a Dask cluster, processes of this machine, or None, as a context."""
+    if scheduler is not None:
+        return _cluster(scheduler)
+    # close_loop_many cancels what has not begun
+    return nullcontext() if jobs == 1 else OneProcessEach(jobs)
+
+
+@contextmanager
+def _cluster(scheduler: str) -> Iterator[Executor]:
+    """Yield the executor of a running Dask scheduler."""
+    try:
+        from distributed import Client
+    except ImportError:
+        raise OutputError(
+            "--scheduler needs Dask distributed, which is not installed: pip install"
+            " 'pbrl_ppl[many]', here and where the workers run"
+        ) from None
+    try:
+        client = Client(scheduler, timeout=10)
+    except (OSError, ValueError) as error:
+        raise OutputError(
+            f"--scheduler {scheduler}: no Dask scheduler answers there ({error}); expected an"
+            " address such as tcp://host:8786"
+        ) from None
+    with client:
+        if not client.scheduler_info()["workers"]:
+            typer.echo(f"no worker at {scheduler} yet; waiting for one", err=True)
+        yield client.get_executor(pure=False)
+
+
+class OneProcessEach(ThreadPoolExecutor):
+    """Executor that runs each call in a fresh process.
+
+    A process that dies, out of memory for instance, does not take others with it, as in a pool; its
+    call is tried once more. PyMC's threads do not survive a fork, so processes are spawned.
+    """
+
+    def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
+        """Schedule a call."""
+        return super().submit(_in_a_process, partial(fn, *args, **kwargs))
+
+
+def _in_a_process(function: partial[T]) -> T:
+    # the laws of an effect file are functions of no module that another process could import
+    call = cloudpickle.dumps(function)
+    made: T
+    try:
+        made = _in_a_new_one(call)
+    except BrokenProcessPool:
+        made = _in_a_new_one(call)
+    return made
+
+
+def _in_a_new_one(call: bytes) -> Any:
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        return pool.submit(_called, call).result()
+
+
+def _called(call: bytes) -> object:
+    return pickle.loads(call)()

@@ -1,9 +1,12 @@
-"""Posterior files: ``pbrl-ppl fit``, ``pbrl-ppl update`` and ``pbrl-ppl report``."""
+"""Posterior files: ``pbrl-ppl fit``, ``update`` and ``report``; and ``calibrate`` of samplers."""
 
 from __future__ import annotations
 
 import sys
-from contextlib import redirect_stdout
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import nullcontext, redirect_stdout
+from dataclasses import dataclass
+from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,50 +14,37 @@ import typer
 from rich.table import Table
 
 from pbrl_ppl.cli import options, terminal
-from pbrl_ppl.cli.options import command
+from pbrl_ppl.cli.app import command
 from pbrl_ppl.cli.terminal import Progress, Result, check_file
-from pbrl_ppl.errors import ConvergenceWarning, FitError, LinearisationWarning, PosteriorError
-from pbrl_ppl.files import write_text
+from pbrl_ppl.errors import (
+    ConvergenceWarning,
+    FitError,
+    LinearisationWarning,
+    PbrlError,
+    PosteriorError,
+)
+from pbrl_ppl.files import check_folder, write_atomically, write_text
 
 if TYPE_CHECKING:
     import pandas as pd
+    import pymc as pm
 
+    from pbrl_ppl.effects import Attached, Effect
+    from pbrl_ppl.history import History
     from pbrl_ppl.posterior import Idata
+    from pbrl_ppl.sampling import Calibration
+    from pbrl_ppl.scene import Scene
 
 #: Formats of a summary's columns; of others, four digits.
 _DIGITS = {"ess": ".0f", "r_hat": ".3f"}
 
 
-@command("fit", 3, "pbrl-ppl fit scene.toml train.csv -o cart.nc")
-def fit(
-    scene: Path,
-    history: Path,
-    output: options.OutputFile,
-    reading: options.SceneReading,
-    quiet: bool,
-    interrupts: list[int],
-    likelihood: str = "trajectories",
-    horizon: options.Count = 1,
-    scalar: Annotated[bool, typer.Option("--scalar-sigma")] = False,
-    nu: Annotated[float | None, typer.Option(min=0.1)] = None,
-    method: str = "importance",
-    draws: Annotated[int | None, typer.Option(min=1, max=1_000_000)] = None,
-    tune: Annotated[int | None, typer.Option(min=0, max=1_000_000)] = None,
-    chains: Annotated[int | None, typer.Option(min=1, max=1000)] = None,
-    thin: Annotated[int | None, typer.Option(min=1, max=10_000)] = None,
-    resume: Path | None = None,
-    seed: options.Seed = 1,
-    overwrite: bool = False,
-) -> Result:
-    """Fit the declared model to a history: a posterior file, and a table of it.
-
-    Exits with 3 if chains have not converged or draws are too few, and with 130 if it was
-    interrupted; the draws of chains so far are kept.
+@dataclass(frozen=True)
+class Model:
+    """Options of the model that is fitted.
 
     Parameters
     ----------
-    output
-        The posterior file (.nc).
     likelihood : NAME
         trajectories (whole ones with process noise, as of close-loop), transitions (single ones
         from exact states, the paper's Eq. 11) or simulation (trajectories without process noise, as
@@ -65,6 +55,46 @@ def fit(
         One sigma for all, with --likelihood transitions.
     nu
         Degrees of freedom of Student-t noise; else Gaussian.
+    """
+
+    likelihood: str = "trajectories"
+    horizon: options.Count = 1
+    scalar: Annotated[bool, typer.Option("--scalar-sigma")] = False
+    nu: Annotated[float | None, typer.Option(min=0.1)] = None
+
+    def __post_init__(self) -> None:
+        if self.likelihood != "transitions" and (self.horizon > 1 or self.scalar):
+            raise FitError(
+                "--horizon and --scalar-sigma are of single transitions: --likelihood transitions"
+            )
+
+    def declare(
+        self,
+        scene: Scene,
+        history: History,
+        effects: tuple[Effect | Attached, ...],
+        earlier: Idata | None,
+        seed: int,
+    ) -> pm.Model:
+        """Return the model; of whole trajectories, linearised where an earlier posterior says."""
+        from pbrl_ppl.sampling import physics_model
+
+        try:
+            return physics_model(
+                scene, history, effects, likelihood=self.likelihood, horizon=self.horizon,
+                nu=self.nu, seed=seed, sigma="scalar" if self.scalar else "per_dimension",
+                around=None if self.likelihood == "transitions" else earlier,
+            )  # fmt: skip
+        except ValueError as error:  # an option that the model refuses
+            raise FitError(f"fit: {error}") from None
+
+
+@dataclass(frozen=True)
+class Sampler:
+    """Options of the sampler, arguments of `sampling.fit`.
+
+    Parameters
+    ----------
     method
         importance, metropolis, paper, demetropolisz, smc, nuts, laplace or map.
     draws
@@ -75,42 +105,64 @@ def fit(
         Chains.
     thin
         Steps a draw.
+    """
+
+    method: str = "importance"
+    draws: Annotated[int | None, typer.Option(min=1, max=1_000_000)] = None
+    tune: Annotated[int | None, typer.Option(min=0, max=1_000_000)] = None
+    chains: Annotated[int | None, typer.Option(min=1, max=1000)] = None
+    thin: Annotated[int | None, typer.Option(min=1, max=10_000)] = None
+    seed: options.Seed = 1
+
+
+@command("fit", 3, "pbrl-ppl fit scene.toml train.csv -o cart.nc")
+def fit(
+    scene: Path,
+    history: Path,
+    to: options.PosteriorOutput,
+    reading: options.SceneReading,
+    model: Model,
+    sampler: Sampler,
+    quiet: bool,
+    interrupts: list[int],
+    resume: Path | None = None,
+) -> Result:
+    """Fit the declared model to a history: a posterior file, and a table of it.
+
+    Exits with 3 if chains have not converged or draws are too few, and with 130 if it was
+    interrupted; the draws of chains so far are kept.
+
+    Parameters
+    ----------
     resume : FILE
         Go on with this posterior: its chains, or more draws.
     """
     with terminal.stages(quiet) as progress:
-        check_file(output, (".nc",), overwrite)
-        if likelihood != "transitions" and (horizon > 1 or scalar):
-            raise FitError(
-                "--horizon and --scalar-sigma are of single transitions: --likelihood transitions"
-            )
         progress("reading the scene and the history")
         declared, (loaded,) = reading.read(scene, [history])
         declared, effects = reading.with_effects(declared)
         progress("loading the sampler")
         from pbrl_ppl import sampling
         from pbrl_ppl.physics import check_history
-        from pbrl_ppl.posterior import PosteriorRecord, group, load_posterior, save_posterior
+        from pbrl_ppl.posterior import load_posterior, save_posterior
 
         check_history(declared, loaded, loaded.segments(1))
         earlier = None if resume is None else load_posterior(resume)
         progress("looking for the mode, then sampling")
-        try:
-            model = sampling.physics_model(
-                declared, loaded, effects, likelihood=likelihood, horizon=horizon, nu=nu,
-                sigma="scalar" if scalar else "per_dimension",
-            )  # fmt: skip
-        except ValueError as error:  # an option that the model refuses
-            raise FitError(f"fit: {error}") from None
+        made = model.declare(declared, loaded, effects, earlier, sampler.seed)
     # the sampler shows its own progress
     with terminal.noted_warnings("was interrupted") as caught, redirect_stdout(sys.stderr):
-        idata = sampling.fit(
-            model, method=method, seed=seed, draws=draws, tune=tune, chains=chains, thin=thin,
-            resume=earlier, progress=not quiet,
-        )  # fmt: skip
-        save_posterior(idata, output)
+        idata = sampling.fit(made, resume=earlier, progress=not quiet, **vars(sampler))
+        save_posterior(idata, to.output)
+    return _fitted(idata, to.output, {type(warning) for warning in caught}, bool(interrupts))
+
+
+def _fitted(idata: Idata, output: Path, warned: set[type], interrupted: bool) -> Result:
+    """Return what is printed of a posterior in a file, of which there were warnings."""
+    from pbrl_ppl.posterior import PosteriorRecord, group
+
     record = PosteriorRecord.of(idata)
-    undecided = any(isinstance(warning, ConvergenceWarning) for warning in caught)
+    undecided = ConvergenceWarning in warned
     rows = _summary(idata)
     contents = {
         "posterior": output,
@@ -123,10 +175,10 @@ def fit(
     formats = {str(name): _DIGITS.get(str(name), ".4g") for name in rows.columns}
     listed = terminal.table(None, {"parameter": "<"} | formats, rows.itertuples(name=None))
     shown: list[str | Table] = [listed]
-    if any(isinstance(warning, LinearisationWarning) for warning in caught):
+    if LinearisationWarning in warned:
         shown += ["intervals: not to be trusted, the likelihood does not hold (warning above)"]
     shown += [f"posterior: {output}"]
-    if not interrupts and record.interrupted is None:
+    if not interrupted and record.interrupted is None:
         return Result(contents, shown, terminal.UNDECIDED if undecided else 0)
     kept = group(idata, "posterior").sizes
     warning = (
@@ -152,11 +204,10 @@ def _summary(idata: Idata) -> pd.DataFrame:
 def update(
     posterior: Path,
     history: Path,
-    output: options.OutputFile,
+    to: options.PosteriorOutput,
     reading: options.PosteriorReading,
     progress: Progress,
     seed: options.Seed = 1,
-    overwrite: bool = False,
 ) -> Result:
     """Bring a posterior up to date with new transitions, without a fit from scratch.
 
@@ -171,7 +222,6 @@ def update(
     output
         The new posterior file.
     """
-    check_file(output, (".nc",), overwrite)
     catalogue = reading.catalogue()
     progress("reading the posterior and the history")
     from pbrl_ppl import posterior as posteriors
@@ -187,14 +237,14 @@ def update(
     record = posteriors.PosteriorRecord.of(idata)
     if record.interrupted is not None:  # half a posterior is no prior for the next update
         raise KeyboardInterrupt
-    posteriors.save_posterior(idata, output)
+    posteriors.save_posterior(idata, to.output)
     (*_, last) = record.updates or ()
     converged = not any(isinstance(warning, ConvergenceWarning) for warning in caught)
     share = last["share"]
     worth = f", the weights worth {share:.0%} of the draws" if share is not None else ""
     return Result(
-        {**last, "posterior": output, "converged": converged},
-        [f"{last['did']}: {last['transitions']} transitions{worth}", f"posterior: {output}"],
+        {**last, "posterior": to.output, "converged": converged},
+        [f"{last['did']}: {last['transitions']} transitions{worth}", f"posterior: {to.output}"],
         0 if converged else terminal.UNDECIDED,
     )
 
@@ -228,3 +278,86 @@ def report(
         raise PosteriorError(f"{posterior}: {error}") from error
     write_text(page, text)
     return Result({"report": page}, [f"report: {page}"])
+
+
+@command(
+    "calibrate", 12, "pbrl-ppl calibrate scene.toml train.csv -o ranks/ --jobs 4",
+    kept="finished replications are in {output}; the same command goes on",
+)  # fmt: skip
+def calibrate(
+    scene: Path,
+    history: Path,
+    output: options.OutputFolder,
+    reading: options.SceneReading,
+    quiet: bool,
+    likelihood: str = "transitions",
+    colour: Annotated[float, typer.Option(min=0.0)] = 0.0,
+    replications: Annotated[int, typer.Option(min=2)] = 200,
+    seed: options.Seed = 1,
+    jobs: options.Count = 1,
+    draws: Annotated[int, typer.Option(min=100)] = 1500,
+) -> Result:
+    """Simulate from the prior, fit, and test whether the true values' ranks are uniform.
+
+    Parameters
+    ----------
+    history : HISTORY
+        History whose design is kept (.csv, ...).
+    output
+        Folder for results; goes on there.
+    likelihood : NAME
+        transitions (single ones from exact states, the paper's Eq. 11), trajectories (whole ones
+        with process noise, as of close-loop; it takes several times as long) or simulation
+        (trajectories without process noise, as of criticise --simulate).
+    colour
+        Correlation of neighbouring rows' errors, with --likelihood simulation.
+    replications
+        Simulated histories.
+    jobs
+        Processes.
+    draws
+        Posterior draws of each chain.
+    """
+    check_folder(output, overwrite=True)
+    declared, (design,) = reading.read(scene, [history])
+    declared, effects = reading.with_effects(declared)
+    import pbrl_ppl.reporting as reporting
+    from pbrl_ppl.sampling import calibration
+
+    # fresh processes: PyMC's threads do not survive a fork
+    with ProcessPoolExecutor(jobs, get_context("spawn")) if jobs > 1 else nullcontext() as pool:
+        try:
+            result = calibration.calibrate(
+                declared, design, effects=effects, likelihood=likelihood, colour=colour,
+                seed=seed, draws=draws, replications=replications, folder=output,
+                executor=pool, progress=not quiet,
+            )  # fmt: skip
+        except PbrlError:
+            raise
+        except ValueError as error:  # an option that calibrate refuses
+            raise FitError(f"calibrate: {error}") from None
+    result.save(output / "ranks.nc")
+    write_atomically(output / "table.csv", result.table().to_csv)
+    picture = reporting.png(reporting.plot_calibration(result))
+    write_atomically(output / "ranks.png", lambda to: to.write_bytes(picture))
+    table, page = result.table().to_dict("index"), output / "ranks.png"
+    contents = {"passed": result.passed, "parameters": table, "picture": page}
+    verdict = f"{'passed' if result.passed else 'failed'}: {page}"
+    return Result(contents, [_calibrated(result), verdict], 0 if result.passed else terminal.FAILED)
+
+
+def _calibrated(calibration: Calibration) -> str:
+    """Return the columns of the table that matter, and what they should be."""
+    rows, data = calibration.table(), calibration.dataset
+    head = rows.iloc[0]
+    columns = ["p_holm", "coverage_50", "coverage_90", "ess", "r_hat", "passed"]
+    short = int((data["size"] < data["size"].max()).any("parameter").sum())
+    apart = ", ".join(rows.index[~rows["judged"]])
+    ranges = (f"{head[f'low_{level}']:.3g} to {head[f'high_{level}']:.3g}" for level in (50, 90))
+    return (
+        rows[columns].to_string(float_format="{:.4g}".format, index_names=False)
+        + f"\n{data.sizes['replication']} replications, {short} with too few effective draws;"
+        " expected of a right sampler: p_holm at least 0.01, coverages in "
+        + ", ".join(ranges)
+        + (f"\nnot judged, for errors are coloured: {apart}" if apart else "")
+    )

@@ -17,7 +17,7 @@ import numpy as np
 import typer
 
 from pbrl_ppl.cli import options
-from pbrl_ppl.cli.options import command
+from pbrl_ppl.cli.app import command
 from pbrl_ppl.cli.terminal import Result, check_file
 from pbrl_ppl.errors import HistoryError, LayoutError, OutputError, RecordingWarning, SceneError
 from pbrl_ppl.files import write_text

@@ -1,4 +1,4 @@
-"""How a command is declared, and the options that commands share.
+"""Options that commands share: of a recording, of a scene, of effect files and of an output.
 
 Parameters
 ----------
@@ -28,23 +28,18 @@ overwrite
 
 from __future__ import annotations
 
-import importlib
-import inspect
-import pkgutil
-import re
 import shlex
+import traceback
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
-from copy import copy
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar
 
 import typer
 
-from pbrl_ppl.cli import effect_files
-from pbrl_ppl.cli.terminal import Result, interruptible, stages
-from pbrl_ppl.errors import GoalError
+from pbrl_ppl.cli.terminal import check_file
+from pbrl_ppl.errors import EffectError, GoalError
+from pbrl_ppl.files import check_folder
 
 if TYPE_CHECKING:
     from pbrl_ppl.effects import Attached, Effect
@@ -52,138 +47,88 @@ if TYPE_CHECKING:
     from pbrl_ppl.scene import Scene
 
 T = TypeVar("T")
-F = TypeVar("F", bound=Callable[..., Result])
-
-
-@dataclass(frozen=True)
-class Command:
-    """A command: its name, its place in the list of commands, and an example for its help."""
-
-    name: str
-    rank: int
-    example: str
-    function: Callable[..., None]
-
-
-_COMMANDS: dict[str, Command] = {}
-
-
-def command(
-    name: str, rank: int, example: str, kept: str = "nothing was written"
-) -> Callable[[F], F]:
-    """Declare a function of this room to be a command, whose result is printed.
-
-    An interrupt says what is ``kept``, in terms of the arguments. Every command has the options of
-    `Printing`; its function takes those and the arguments ``progress`` and ``interrupts`` where it
-    needs them.
-
-    An argument that is a dataclass stands for the options that are its fields. The help of an
-    argument, and after a colon what stands for its value, are in the docstring of the function or
-    of the dataclass, or in that of this module. An argument without a default is one of the
-    command, others are its options.
-    """
-
-    def declare(function: F) -> F:
-        _COMMANDS[name] = Command(name, rank, example, _bound(function, kept))
-        return function
-
-    return declare
-
-
-def commands() -> list[Command]:
-    """Return the commands of all modules of this room, in the order of use."""
-    package = importlib.import_module("pbrl_ppl.cli")
-    for module in pkgutil.iter_modules(package.__path__):
-        importlib.import_module(f"pbrl_ppl.cli.{module.name}")
-    return sorted(_COMMANDS.values(), key=lambda command: command.rank)
-
-
-@dataclass(frozen=True)
-class Printing:
-    """Options of every command.
-
-    Parameters
-    ----------
-    as_json
-        Print one JSON object, and nothing else.
-    quiet
-        Show no progress.
-    """
-
-    as_json: Annotated[bool, typer.Option("--json")] = False
-    quiet: Annotated[bool, typer.Option("--quiet", "-q")] = False
-
-    def run(self, function: Callable[..., Result], kept: str, given: Mapping[str, Any]) -> None:
-        """Run a command with what it takes, and print its result."""
-        taken = inspect.signature(function).parameters
-        staged = stages(self.quiet) if "progress" in taken else nullcontext()
-        with interruptible(kept.format(**given)) as interrupts, staged as progress:
-            session = {"progress": progress, "interrupts": interrupts}
-            known = {**given, **vars(self), **session}
-            result = function(**{name: known[name] for name in taken})
-        result.show(self.as_json)
-
-
-def _bound(function: Callable[..., Result], kept: str) -> Callable[..., None]:
-    """Return the function as Typer takes it: fields in place of dataclasses, each with its help."""
-    summary, documented = _documented(function.__doc__)
-    taken = inspect.signature(function, eval_str=True).parameters
-    groups: dict[str, type] = {}
-    parameters: list[inspect.Parameter] = []
-    kinds = {name: parameter.annotation for name, parameter in taken.items()}
-    for name, kind in (kinds | {"printing": Printing}).items():
-        if isinstance(kind, type) and is_dataclass(kind):
-            groups[name] = kind
-            for base in kind.__mro__:
-                documented = _documented(base.__doc__)[1] | documented
-            parameters += inspect.signature(kind, eval_str=True).parameters.values()
-        elif name not in ("as_json", "quiet", "progress", "interrupts"):
-            parameters.append(taken[name])
-
-    def call(**given: Any) -> None:
-        for name, kind in groups.items():
-            given[name] = kind(**{field.name: given.pop(field.name) for field in fields(kind)})
-        given.pop("printing").run(function, kept, given)
-
-    documented = _documented(__doc__)[1] | documented
-    declared = [_declared(each, *documented.get(each.name, ("", ""))) for each in parameters]
-    call.__signature__ = inspect.Signature(declared)  # type: ignore[attr-defined]
-    call.__doc__ = summary
-    return call
-
-
-def _declared(parameter: inspect.Parameter, metavar: str, said: str) -> inspect.Parameter:
-    """Return a parameter with the declaration, metavar and help of an option or argument."""
-    kind = parameter.annotation
-    optional = [each for each in get_args(kind) if get_origin(each) is Annotated]
-    if get_origin(kind) is Annotated:
-        kind, info = get_args(kind)
-    elif optional:  # Annotated[...] | None
-        kind, info = get_args(optional[0])
-        kind |= None
-    elif kind is typer.Context:
-        return parameter.replace(kind=parameter.KEYWORD_ONLY)
-    elif parameter.default is parameter.empty:
-        info = typer.Argument()
-    else:
-        info = typer.Option(f"--{parameter.name.replace('_', '-')}")
-    info = copy(info)
-    info.metavar, info.help = info.metavar or metavar or None, info.help or said or None
-    return parameter.replace(annotation=Annotated[kind, info], kind=parameter.KEYWORD_ONLY)
-
-
-def _documented(docstring: str | None) -> tuple[str, dict[str, tuple[str, str]]]:
-    """Return a docstring up to its parameters, and the metavar and help of each of them."""
-    text = inspect.cleandoc(docstring or "")
-    summary, _, listed = text.partition("\n\nParameters\n----------\n")
-    entries = re.findall(r"^(\w+)(?: : (.+))?\n((?:    .+(?:\n|$))+)", listed, re.MULTILINE)
-    return summary, {name: (metavar, " ".join(said.split())) for name, metavar, said in entries}
-
 
 OutputFile = Annotated[Path, typer.Option("-o", "--output", metavar="FILE")]
 OutputFolder = Annotated[Path, typer.Option("-o", "--output", metavar="DIR")]
 Seed = Annotated[int, typer.Option(min=0)]
 Count = Annotated[int, typer.Option(min=1)]
+
+
+@dataclass(frozen=True)
+class Output:
+    """Options of each command that can write a file; its path is checked before any work."""
+
+    endings: ClassVar[tuple[str, ...]] = (".csv", ".parquet", ".nc")
+
+    output: OutputFile | None = None
+    overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        if self.output is not None:
+            check_file(self.output, self.endings, self.overwrite)
+
+
+@dataclass(frozen=True)
+class RecordingOutput(Output):
+    """Options of a command that writes a recording."""
+
+    output: OutputFile = field()
+
+
+@dataclass(frozen=True)
+class PosteriorOutput(RecordingOutput):
+    """Options of a command that writes a posterior file.
+
+    Parameters
+    ----------
+    output
+        The posterior file (.nc).
+    """
+
+    endings = (".nc",)
+
+
+@dataclass(frozen=True)
+class TableOutput(Output):
+    """Options of a command that can write a table."""
+
+    endings = (".csv",)
+
+
+@dataclass(frozen=True)
+class FolderOutput:
+    """Options of a command that writes to a folder, which is checked before any work.
+
+    Parameters
+    ----------
+    output
+        Folder for the results.
+    overwrite
+        Write to a folder that is not empty.
+    """
+
+    output: OutputFolder
+    overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        check_folder(self.output, self.overwrite)
+
+
+@dataclass(frozen=True)
+class EffectFiles:
+    """Option of each command that looks effects up."""
+
+    effect_file: list[Path] | None = None
+
+    def catalogue(self) -> tuple[Effect, ...]:
+        """Return the catalogue and after it the effects of effect files."""
+        from pbrl_ppl.effects import catalogue
+
+        return (*catalogue, *own_effects(self.effect_file))
+
+    def with_effects(self, scene: Scene) -> tuple[Scene, tuple[Effect | Attached, ...]]:
+        """Return a scene and the effects of effect files on its bodies."""
+        return added_effects(scene, own_effects(self.effect_file))
 
 
 @dataclass(frozen=True)
@@ -202,7 +147,7 @@ class Columns:
 
 
 @dataclass(frozen=True)
-class Reading(Columns):
+class Reading(EffectFiles, Columns):
     """Options of each command that reads a recording.
 
     Each is in place of what the scene file's ``[recording]`` says.
@@ -218,7 +163,6 @@ class Reading(Columns):
 
     estimate_velocities: bool = False
     trim: bool = False
-    effect_file: list[Path] | None = None
 
     def __post_init__(self) -> None:
         self.settings()  # bad usage is reported before any file is read
@@ -233,14 +177,6 @@ class Reading(Columns):
         from pbrl_ppl.history import read_recording
 
         return read_recording(path, scene, resample=resample, **self.settings())
-
-    def catalogue(self) -> tuple[Effect, ...]:
-        """Return the catalogue and after it the effects of effect files."""
-        return effect_files.with_catalogue(self.effect_file)
-
-    def with_effects(self, scene: Scene) -> tuple[Scene, tuple[Effect | Attached, ...]]:
-        """Return a scene and the effects of effect files on its bodies."""
-        return effect_files.added_effects(scene, effect_files.own_effects(self.effect_file))
 
 
 @dataclass(frozen=True)
@@ -304,7 +240,7 @@ def command_line(context: typer.Context) -> str:
     return shlex.join([*words, *options])
 
 
-def given(**values: Any) -> dict[str, Any]:
+def given(values: Mapping[str, T | None]) -> dict[str, T]:
     """Return the options that were given: all but None."""
     return {name: value for name, value in values.items() if value is not None}
 
@@ -368,3 +304,87 @@ def starts_of(texts: list[str] | None, bodies: Sequence[str]) -> dict[str, list[
         if None in values:
             raise GoalError(f"--start {text}: a start has no free coordinates; give a number for -")
     return starts
+
+
+def own_effects(paths: Sequence[Path] | None) -> tuple[Effect, ...]:
+    """Return the effects that effect files define, in their order.
+
+    Raises
+    ------
+    EffectError
+        If there is no such file, its code raises, it defines no effect, an effect has the name of
+        a catalogue effect, or two have one name.
+    """
+    from pbrl_ppl.effects import catalogue
+
+    effects: dict[str, Effect] = {}
+    for path in paths or ():
+        for effect in _defined(path):
+            if effect in catalogue:  # imported by the file
+                continue
+            if effects.setdefault(effect.name, effect) is not effect:
+                raise EffectError(
+                    f"effect file {path}: there are two effects {effect.name}; rename one"
+                )
+    return tuple(effects.values())
+
+
+def added_effects(
+    scene: Scene, effects: Sequence[Effect]
+) -> tuple[Scene, tuple[Effect | Attached, ...]]:
+    """Return a scene without its own effects' names, and these effects on their bodies.
+
+    An effect that the scene declares by name acts on those bodies, another one on every body that
+    it applies to.
+    """
+    added: list[Effect | Attached] = []
+    for effect in effects:
+        declared = [body.name for body in scene.bodies if effect.name in body.effects]
+        added += [effect.on(body) for body in declared] or [effect]
+    names = {effect.name for effect in effects}
+    bodies = tuple(
+        replace(body, effects=tuple(name for name in body.effects if name not in names))
+        for body in scene.bodies
+    )
+    return scene.replace(bodies=bodies), tuple(added)
+
+
+def _defined(path: Path) -> list[Effect]:
+    """Run a file, and return its effects at module level."""
+    from pbrl_ppl.effects import Effect, check_names
+
+    try:
+        source = path.read_bytes()
+    except OSError as error:
+        raise EffectError(
+            f"effect file {path}: it cannot be read ({error.strerror}); give the path of a Python"
+            " file"
+        ) from None
+    # no module of the program: where effects are pickled, their laws go along
+    names: dict[str, object] = {"__name__": f"effect_file_{path.stem}", "__file__": str(path)}
+    try:
+        exec(compile(source, str(path), "exec", dont_inherit=True), names)
+    except Exception as error:
+        raise EffectError(
+            f"effect file {path}{_line(error, path)}: {type(error).__name__}: {error}; fix the file"
+        ) from error
+    effects = [*dict.fromkeys(value for value in names.values() if isinstance(value, Effect))]
+    if not effects:
+        raise EffectError(
+            f"effect file {path}: it has no Effect at module level, such as tether ="
+            " pp.Effect(...); define one"
+        )
+    try:
+        check_names(effects)
+    except EffectError as error:
+        raise EffectError(f"effect file {path}: {error}") from None
+    return effects
+
+
+def _line(error: Exception, path: Path) -> str:
+    """Return the line of a file at which an error was raised, in words; none if it is unknown."""
+    if isinstance(error, SyntaxError) and error.filename == str(path):
+        return f", line {error.lineno}"
+    frames = traceback.extract_tb(error.__traceback__)
+    lines = [frame.lineno for frame in frames if frame.filename == str(path)]
+    return f", line {lines[-1]}" if lines else ""

@@ -3,47 +3,59 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from pbrl_ppl.cli import effect_files, options
-from pbrl_ppl.cli.options import command
+from pbrl_ppl.cli import options
+from pbrl_ppl.cli.app import command
 from pbrl_ppl.cli.terminal import FAILED, Progress, Result, check_file
 from pbrl_ppl.errors import EffectError, GoalError
 
+if TYPE_CHECKING:
+    from pbrl_ppl.planning import Goal
 
-@command("plan", 10, "pbrl-ppl plan cart.nc --start -2,0,0 --goal 2,1,1.57 -o plan.csv")
-def plan(
-    posterior: Path,
-    progress: Progress,
-    start: list[str] | None = None,
-    goal: list[str] | None = None,
-    output: options.OutputFile | None = None,
-    actions: Path | None = None,
-    method: str = "astar",
-    draws: options.Count | None = None,
-    weight: float | None = None,
-    tail: float = 1.0,
-    noise: bool = False,
-    tolerance: float | None = None,
-    angle_tolerance: float | None = None,
-    contact_penalty: float | None = None,
-    nodes: options.Count | None = None,
-    seconds: float | None = None,
-    effect_file: list[Path] | None = None,
-    seed: options.Seed = 1,
-    animate: Path | None = None,
-    overwrite: bool = False,
-) -> Result:
-    """Plan from a start to a goal with a posterior file alone.
+
+@dataclass(frozen=True)
+class Wanted:
+    """Options of a goal.
 
     Parameters
     ----------
     goal : BODY=X,Y,THETA
         Where a body should be, - where free; once a body. Or a goal file (.toml).
-    output
-        The plan (.csv).
-    actions
-        Actions (.toml); such as the posterior's data were recorded with.
+    tolerance
+        Position tolerance (m); by default a fifth of the body's bounding radius.
+    angle_tolerance
+        Angle tolerance (rad).
+    contact_penalty
+        Cost of a second in contact (s); inf forbids it.
+    """
+
+    goal: list[str] | None = None
+    tolerance: float | None = None
+    angle_tolerance: float | None = None
+    contact_penalty: float | None = None
+
+    def of(self, bodies: Sequence[str]) -> Goal:
+        """Return the goal of bodies, or of a file."""
+        from pbrl_ppl.planning import Goal
+
+        weights = options.given(vars(self) | {"goal": None})
+        if not (self.goal and self.goal[0].endswith(".toml")):
+            targets = dict(options.pose(text, bodies, "--goal") for text in self.goal or ())
+            return Goal.of(targets, **weights)
+        if len(self.goal) > 1 or weights:
+            raise GoalError("--goal: a file has the whole goal; drop the other options of it")
+        return Goal.load(self.goal[0])
+
+
+@dataclass(frozen=True)
+class Search:
+    """Options of the search for a plan, arguments of `planning.plan`.
+
+    Parameters
+    ----------
     method
         astar or mppi.
     draws
@@ -54,60 +66,88 @@ def plan(
         Share of the worst draws that count; 1 is the expectation.
     noise
         Plan with Eq. 13's noise.
-    tolerance
-        Position tolerance (m); by default a fifth of the body's bounding radius.
-    angle_tolerance
-        Angle tolerance (rad).
-    contact_penalty
-        Cost of a second in contact (s); inf forbids it.
     nodes
         States that the search generates at most.
     seconds
         Another limit (s); the plan then depends on the machine's load.
+    """
+
+    method: str = "astar"
+    draws: options.Count | None = None
+    weight: float | None = None
+    tail: float = 1.0
+    noise: bool = False
+    nodes: options.Count | None = None
+    seconds: float | None = None
+    seed: options.Seed = 1
+
+
+@dataclass(frozen=True)
+class PlanOutput(options.TableOutput):
+    """Options of a plan's files.
+
+    Parameters
+    ----------
+    output
+        The plan (.csv).
     animate : FILE
         Show the plan as a picture that moves (.gif).
     """
-    if output is None and animate is None:
-        raise GoalError("plan: say where it should be written: -o plan.csv")
-    for path, ending in ((output, ".csv"), (animate, ".gif")):
-        if path is not None:
-            check_file(path, (ending,), overwrite)
-    catalogue = effect_files.with_catalogue(effect_file)
+
+    animate: Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.output is None and self.animate is None:
+            raise GoalError("plan: say where it should be written: -o plan.csv")
+        super().__post_init__()
+        if self.animate is not None:
+            check_file(self.animate, (".gif",), self.overwrite)
+
+
+@command("plan", 10, "pbrl-ppl plan cart.nc --start -2,0,0 --goal 2,1,1.57 -o plan.csv")
+def plan(
+    posterior: Path,
+    wanted: Wanted,
+    search: Search,
+    laws: options.EffectFiles,
+    to: PlanOutput,
+    progress: Progress,
+    start: list[str] | None = None,
+    actions: Path | None = None,
+) -> Result:
+    """Plan from a start to a goal with a posterior file alone.
+
+    Parameters
+    ----------
+    actions
+        Actions (.toml); such as the posterior's data were recorded with.
+    """
+    catalogue = laws.catalogue()
     progress("reading the posterior")
-    from pbrl_ppl.planning import ActionSet, Goal
+    from pbrl_ppl.planning import ActionSet
     from pbrl_ppl.planning import plan as make_plan
     from pbrl_ppl.posterior import load_posterior, scene_of
 
     idata = load_posterior(posterior)
     bodies = [body.name for body in scene_of(idata).dynamic]
-    weights = options.given(
-        tolerance=tolerance, angle_tolerance=angle_tolerance, contact_penalty=contact_penalty
-    )
-    if goal and goal[0].endswith(".toml"):
-        if len(goal) > 1 or weights:
-            raise GoalError("--goal: a file has the whole goal; drop the other options of it")
-        wanted = Goal.load(goal[0])
-    else:
-        targets = dict(options.pose(text, bodies, "--goal") for text in goal or ())
-        wanted = Goal.of(targets, **weights)
+    goal = wanted.of(bodies)
     starts = options.starts_of(start, bodies)
     allowed = None if actions is None else ActionSet.load(actions)
-    if weight is not None and method != "astar":
-        raise GoalError(f"--weight: it is for astar, not --method {method}; omit it")
+    if search.weight is not None and search.method != "astar":
+        raise GoalError(f"--weight: it is for astar, not --method {search.method}; omit it")
     progress("planning")
     result = make_plan(
-        idata, starts, wanted, allowed, method=method, draws=draws, tail=tail, noise=noise,
-        seconds=seconds, effects=catalogue, seed=seed, progress=progress,
-        **options.given(nodes=nodes, weight=weight),
+        idata, starts, goal, allowed, effects=catalogue, progress=progress,
+        **options.given(vars(search)),
     )  # fmt: skip
-    if output is not None:
-        result.save(output)
-    if animate is not None:
+    if to.output is not None:
+        result.save(to.output)
+    if to.animate is not None:
         progress("drawing")
         from pbrl_ppl.reporting import animate_plan
 
-        animate_plan(result, animate)
-    written = [path for path in (output, animate) if path is not None]
+        animate_plan(result, to.animate)
+    written = [path for path in (to.output, to.animate) if path is not None]
     words = result.in_words()
     contents = {"reached": result.reached, "duration": result.duration, "words": words}
     shown = [words, *(f"plan: {path}" for path in written)]
@@ -117,18 +157,17 @@ def plan(
 @command("suggest", 7, "pbrl-ppl suggest report/after.nc --start 0,0,0 -o next.csv")
 def suggest(
     posterior: Path,
+    to: options.TableOutput,
+    laws: options.EffectFiles,
     progress: Progress,
     start: list[str] | None = None,
-    output: options.OutputFile | None = None,
     effect: list[str] | None = None,
     bounds: list[str] | None = None,
     actions: Path | None = None,
     steps: options.Count = 20,
     hold: options.Count | None = None,
     draws: options.Count = 16,
-    effect_file: list[Path] | None = None,
     seed: options.Seed = 1,
-    overwrite: bool = False,
 ) -> Result:
     """Suggest the actions that tell apart effects which the data so far cannot separate.
 
@@ -152,12 +191,12 @@ def suggest(
     draws
         Posterior draws of each effect's model.
     """
+    output = to.output
     if output is None:
         raise GoalError("suggest: say where it should be written: -o next.csv")
     if bounds and actions is not None:
         raise GoalError("suggest: --bounds and --actions both say what is allowed; drop one")
-    check_file(output, (".csv",), overwrite)
-    catalogue = effect_files.with_catalogue(effect_file)
+    catalogue = laws.catalogue()
     progress("reading the posterior")
     from pbrl_ppl.criticism import kept_groups
     from pbrl_ppl.planning import ActionSet, suggest_actions

@@ -1,8 +1,10 @@
-"""``pbrl-ppl simulate``."""
+"""Simulated recordings: ``pbrl-ppl simulate`` and ``pbrl-ppl rehearse``."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,12 +12,15 @@ import numpy as np
 import typer
 
 from pbrl_ppl.cli import options
-from pbrl_ppl.cli.options import command
-from pbrl_ppl.cli.terminal import Progress, Result, check_file
+from pbrl_ppl.cli.app import command
+from pbrl_ppl.cli.terminal import Progress, Result, sizes, table
 from pbrl_ppl.errors import ParameterError, PosteriorError
+from pbrl_ppl.files import json_values, write_text
+from pbrl_ppl.scene import Scene, nearest
 from pbrl_ppl.state import STATE, Floats
 
 if TYPE_CHECKING:
+    from pbrl_ppl.criticism import RehearsedLaw
     from pbrl_ppl.effects import Effect
     from pbrl_ppl.history import History
     from pbrl_ppl.parameters import Layout
@@ -26,14 +31,13 @@ if TYPE_CHECKING:
 def simulate(
     source: Path,
     history: Path,
-    output: options.OutputFile,
+    to: options.RecordingOutput,
     reading: options.PosteriorReading,
     progress: Progress,
     given: Annotated[list[str] | None, typer.Option("--set")] = None,
     draws: options.Count | None = None,
     noise: list[str] | None = None,
     seed: options.Seed = 1,
-    overwrite: bool = False,
 ) -> Result:
     """Simulate a recording: its initial states and wrenches, under parameters that are given.
 
@@ -51,7 +55,6 @@ def simulate(
     draws
         Posterior draws, a copy of each trajectory for each; else MAP.
     """
-    check_file(output, (".csv", ".parquet", ".nc"), overwrite)
     values = options.pairs(given, "--set", "mass=8", float)
     errors = options.noise_of(noise)
     progress("reading the parameters and the history")
@@ -65,14 +68,14 @@ def simulate(
 
     simulated = simulated_recording(physics, phi, recorded)
     result = _history(recorded, simulated, errors, seed, labelled=draws is not None)
-    result.save(output)
+    result.save(to.output)
     contents = {
-        "history": output,
+        "history": to.output,
         "trajectories": result.n_trajectories,
         "transitions": result.n_transitions,
         "parameters": dict(zip(physics.layout.labels, phi.T, strict=True)),
     }
-    return Result(contents, [f"history: {output} ({result.n_trajectories} trajectories)"])
+    return Result(contents, [f"history: {to.output} ({result.n_trajectories} trajectories)"])
 
 
 def _parameters(
@@ -96,8 +99,6 @@ def _parameters(
     elif draws is not None:
         raise PosteriorError(f"--draws: {source} is no posterior file (.nc), and has no draws")
     else:
-        from pbrl_ppl.scene import Scene
-
         scene, dynamics = Scene.load(source), None
         substeps = scene.substeps
     physics = Physics(scene, attach(scene, (), catalogue), substeps, threads=2)
@@ -108,8 +109,6 @@ def _parameters(
 
 def _set(layout: Layout, phi: Floats, values: Mapping[str, float]) -> None:
     """Set values in parameter vectors, in place: by label, or by name for all bodies."""
-    from pbrl_ppl.scene import nearest
-
     labels = np.array(layout.labels)
     names = np.array([label.partition("[")[0] for label in layout.labels])
     for name, value in values.items():
@@ -145,3 +144,83 @@ def _history(
         labels = [f"{name}/draw {draw}" for draw in range(len(states)) for name in names]
         copies = copies.assign_coords(trajectory=labels)
     return History(copies)
+
+
+@dataclass(frozen=True)
+class RehearsalOutput(options.Output):
+    """Options of an answer, or of a recording."""
+
+    endings = (".json", *options.Output.endings)
+
+
+@command("rehearse", 2, "pbrl-ppl rehearse scene.toml commands.csv --noise x=0.002,y=0.002")
+def rehearse(
+    scene: Path,
+    to: RehearsalOutput,
+    reading: options.SceneReading,
+    progress: Progress,
+    commands: Annotated[Path | None, typer.Argument()] = None,
+    given: Annotated[list[str] | None, typer.Option("--set")] = None,
+    seed: options.Seed = 0,
+) -> Result:
+    """Find out before a recording is made which laws it would name, and from which size on.
+
+    The declared model is simulated with the commands and with measurement noise, and each law of
+    the catalogue is added in turn.
+
+    Parameters
+    ----------
+    commands : COMMANDS
+        Initial states and wrenches (.csv, .parquet, .nc), as of simulate; proposed if not given.
+    output
+        The answer (.json), or the simulated recording with its commands (.csv, .parquet, .nc).
+    given : NAME=VALUE
+        A declared parameter (SI units): mass=8 for all bodies, or 'mass[cart]=8'; repeat. The
+        prior's centre if not given.
+    """
+    output = to.output
+    values = options.pairs(given, "--set", "mass=8", float)
+    progress("reading the scene and the commands")
+    declared, histories = reading.read(scene, [] if commands is None else [commands])
+    catalogue = reading.catalogue()
+    progress("loading the model")
+    from pbrl_ppl import criticism
+    from pbrl_ppl.posterior import versions
+
+    found = criticism.rehearse(
+        declared, *histories, parameters=values, catalogue=catalogue, seed=seed,
+        progress=progress,
+    )  # fmt: skip
+    contents = {key: value for key, value in vars(found).items() if key != "history"}
+    contents = {"versions": versions(), **contents}
+    if output is not None and output.suffix == ".json":
+        write_text(output, json.dumps(json_values(contents), indent=1, allow_nan=False) + "\n")
+    elif output is not None:
+        found.history.save(output)
+    noise = ", ".join(f"{name} {sd:.2g}" for name, sd in found.noise.items())
+    columns = {"law": "<", "body": "<", "named from": "<", "of typical": "", "named as": "<"}
+    laws = table(
+        f"laws that a recording would show; measurement noise (SI): {noise}",
+        columns | {"confounded with": "<", "note": "<"},
+        (_row(law) for law in found.laws if law.named),
+    )
+    unseen: dict[str, list[str]] = {}
+    for law in found.laws:
+        if not law.named:
+            unseen.setdefault(law.note, []).append(f"{law.effect} on {law.body}")
+    lines = [f"unseen, {why}: {', '.join(names)}" for why, names in unseen.items()]
+    lines += [f"written: {output}"] if output is not None else []
+    return Result(contents, [laws, *lines])
+
+
+def _row(law: RehearsedLaw) -> list[str]:
+    """Return a law's row of the table."""
+    null = {name: f"{law.null[name]:g} ± " for name in law.sizes if law.null[name]}
+    found = (*law.sizes.items(), *law.levels.items())
+    numbers = ((name, f"{null.get(name, '')}{size:.3g}") for name, size in found)
+    typical = f"{100 * law.share:.2g} %" if law.sizes else ""
+    named = law.named if law.named != law.effect else ""
+    return [
+        law.effect, law.body, sizes(numbers, law.units), typical, named,
+        ", ".join(law.confounded), law.note,
+    ]  # fmt: skip

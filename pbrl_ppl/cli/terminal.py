@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import signal
 import sys
@@ -15,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import TextIO
 
 import typer
 from rich.console import Console
@@ -121,16 +120,19 @@ def warnings_in_a_line() -> Iterator[None]:
 
 
 @contextmanager
-def noted_warnings(hidden: str | None = None) -> Iterator[list[Warning]]:
+def noted_warnings(hidden: str | None = None) -> Iterator[list[Warning | str]]:
     """Yield the warnings so far; show each at once, but those with the `hidden` text."""
-    noted: list[Warning] = []
+    noted: list[Warning | str] = []
     with warnings.catch_warnings():
         show = warnings.showwarning
 
-        def note(message: Any, category: type[Warning], *place: Any, **more: Any) -> None:
+        def note(
+            message: Warning | str, category: type[Warning], filename: str, lineno: int,
+            file: TextIO | None = None, line: str | None = None,
+        ) -> None:  # fmt: skip
             noted.append(message)
             if hidden is None or hidden not in str(message):
-                show(message, category, *place, **more)
+                show(message, category, filename, lineno, file, line)
 
         warnings.showwarning = note
         yield noted
@@ -152,7 +154,7 @@ class Result:
         A last line on stderr.
     """
 
-    contents: Mapping[str, Any]
+    contents: Mapping[str, object]
     shown: Iterable[str | Table]
     code: int = 0
     warning: str = ""
@@ -174,7 +176,7 @@ class Result:
             raise typer.Exit(self.code)
 
 
-def table(title: str | None, columns: Mapping[str, str], rows: Iterable[Sequence[Any]]) -> Table:
+def table(title: str | None, columns: Mapping[str, str], rows: Iterable[Sequence[object]]) -> Table:
     """Return a table whose columns have a format each; those that begin with < are text."""
     made = Table(title=title, title_justify="left", box=None, pad_edge=False)
     for name, form in columns.items():
@@ -214,30 +216,3 @@ def check_file(path: Path, endings: tuple[str, ...], overwrite: bool) -> None:
         raise OutputError(
             f"{path}: cannot be written ({error.strerror}); choose another file"
         ) from None
-
-
-def check_can_make(folder: Path) -> None:
-    """Raise if a folder cannot be made or written; leave no trace of the attempt.
-
-    Raises
-    ------
-    OutputError
-        If it cannot.
-    """
-    missing: list[Path] = []
-    try:
-        missing += [place for place in (folder, *folder.parents) if not place.exists()]
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except (NotADirectoryError, FileExistsError):
-        pass  # a file is in the way, and `criticism.check_folder` says which
-    except OSError as error:
-        raise OutputError(
-            f"output folder {folder}: it cannot be made or written ({error.strerror}); choose"
-            " another path"
-        ) from None
-    finally:
-        for place in missing:
-            with contextlib.suppress(OSError):
-                place.rmdir()

@@ -11,10 +11,11 @@ from .dependence import recorded_quantities as recorded_quantities
 from .forecast import whole_rollouts as whole_rollouts
 from .loop import ADEQUATE as ADEQUATE
 from .loop import EFFECTS_ADDED as EFFECTS_ADDED
+from .loop import FILES as FILES
 from .loop import NOT_CONVERGED as NOT_CONVERGED
+from .loop import REMAINDER as REMAINDER
 from .loop import UNEXPLAINED as UNEXPLAINED
 from .loop import Loop as Loop
-from .loop import check_folder as check_folder
 from .misfit import LARGEST_SHARE as LARGEST_SHARE
 from .misfit import acceleration_in_words as acceleration_in_words
 from .misfit import share_in_words as share_in_words

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -31,7 +30,7 @@ from pbrl_ppl.criticism.results import (
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import FitError, OutputError
-from pbrl_ppl.files import json_fields, json_values
+from pbrl_ppl.files import check_folder, json_fields, json_values
 from pbrl_ppl.history import History, UnusedVelocity
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.posterior import Comparison, Fit, Idata, Identifiability, save_posterior
@@ -315,7 +314,7 @@ class Loop:
             pp.report(loop, "out/report.html")
         """
         folder = Path(folder)
-        nearest = check_folder(folder, overwrite)
+        nearest = check_folder(folder, overwrite, (*FILES, REMAINDER))
         try:
             # on the same file system as the folder, so that only a rename is left at the end
             with tempfile.TemporaryDirectory(prefix=".pbrl-ppl-", dir=nearest) as temporary:
@@ -341,37 +340,6 @@ class Loop:
         except OSError as error:
             raise OutputError(f"{folder}: cannot be written: {error}") from error
         return folder
-
-
-def check_folder(folder: Path, overwrite: bool) -> Path:
-    """Check that results can be written to ``folder``, and return its nearest existing parent.
-
-    Raises
-    ------
-    OutputError
-        If they cannot, or if the folder is not empty and ``overwrite`` is false.
-    """
-    nearest = folder
-    # a dangling link counts as there: it cannot be made a folder
-    while not (nearest.exists() or nearest.is_symlink()) and nearest != nearest.parent:
-        nearest = nearest.parent
-    if not nearest.is_dir():
-        raise OutputError(
-            f"output folder {folder}: {nearest} is a file, expected a folder; choose another path"
-        )
-    if not os.access(nearest, os.W_OK | os.X_OK):
-        raise OutputError(f"output folder {folder}: no permission to write in {nearest}")
-    if nearest != folder:
-        return nearest
-    if not overwrite and any(folder.iterdir()):
-        raise OutputError(
-            f"output folder {folder}: it is not empty; choose another, or allow"
-            " overwriting (overwrite, --overwrite)"
-        )
-    for name in (*FILES, REMAINDER):
-        if (folder / name).is_dir():
-            raise OutputError(f"output folder {folder}: {name} in it is a folder; remove it")
-    return folder
 
 
 def _fields(value: Any, *left_out: str) -> dict[str, Any]:

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pandas as pd
 
-from pbrl_ppl.criticism import ADEQUATE, EFFECTS_ADDED, check_folder
+from pbrl_ppl.criticism import ADEQUATE, EFFECTS_ADDED
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.errors import OutputError, PbrlError
-from pbrl_ppl.files import write_text
+from pbrl_ppl.files import check_folder, write_text
 from pbrl_ppl.posterior import load_posterior
 from pbrl_ppl.reporting import many_page
 from pbrl_ppl.reporting.logs import (

@@ -22,7 +22,6 @@ import typer
 from pbrl_ppl import criticism, sampling
 from pbrl_ppl.cli import main
 from pbrl_ppl.cli.app import app
-from pbrl_ppl.cli.options import commands
 from pbrl_ppl.errors import ConvergenceWarning, FitError
 from pbrl_ppl.history import History
 from pbrl_ppl.model import problem_in
@@ -71,7 +70,7 @@ def message(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
     return captured.err
 
 
-NAMES = [each.name for each in commands()]
+NAMES = [str(each.name) for each in app.registered_commands]
 
 
 # what all have alike

@@ -9,8 +9,8 @@ import pytest
 import pbrl_ppl as pp
 from pbrl_ppl import criticism, planning, posterior, reporting
 from pbrl_ppl.cli import main
-from pbrl_ppl.cli.close_logs import OneProcessEach
-from pbrl_ppl.cli.effect_files import added_effects, own_effects
+from pbrl_ppl.cli.close_loop import OneProcessEach
+from pbrl_ppl.cli.options import added_effects, own_effects
 from pbrl_ppl.posterior import load_posterior, scene_of
 from tests.helpers.histories import simulated_history
 from tests.helpers.places import ROOT

@@ -10,7 +10,7 @@ import pytest
 
 from pbrl_ppl import criticism
 from pbrl_ppl.cli import main
-from pbrl_ppl.cli.close_logs import OneProcessEach
+from pbrl_ppl.cli.close_loop import OneProcessEach
 from pbrl_ppl.reporting import many
 from pbrl_ppl.reporting.logs import Settings, close_log, settle
 from tests.helpers.fleet import made_logs, pretend

@@ -546,8 +546,12 @@ def test_folder_that_cannot_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     (tmp_path / "out" / "after.nc").mkdir(parents=True)
     with pytest.raises(OutputError, match=r"after\.nc in it is a folder"):
         made_up().save(tmp_path / "out", overwrite=True)
-    monkeypatch.setattr("os.access", lambda path, mode: False)
-    with pytest.raises(OutputError, match="no permission to write"):
+
+    def refuse(*args: Any, **options: Any) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    with pytest.raises(OutputError, match=r"made or written \(Permission denied\)"):
         made_up().save(tmp_path / "new")
 
 
