@@ -15,16 +15,8 @@ from typing import Annotated, TypeVar, get_args, get_origin, get_type_hints
 import typer
 
 from pbrl_ppl import __version__
-from pbrl_ppl.cli import options
-from pbrl_ppl.cli.terminal import (
-    BAD_INPUT,
-    Result,
-    in_a_line,
-    interrupted,
-    interruptible,
-    stages,
-    warnings_in_a_line,
-)
+from pbrl_ppl.cli import options, terminal
+from pbrl_ppl.cli.terminal import Result, in_a_line
 from pbrl_ppl.errors import PbrlError
 
 F = TypeVar("F", bound=Callable[..., Result])
@@ -86,8 +78,8 @@ class Printing:
     def run(self, function: Callable[..., Result], kept: str, given: Mapping[str, object]) -> None:
         """Run a command with what it takes, and print its result."""
         taken = inspect.signature(function).parameters
-        staged = stages(self.quiet) if "progress" in taken else nullcontext()
-        with interruptible(kept.format(**given)) as interrupts, staged as progress:
+        staged = terminal.stages(self.quiet) if "progress" in taken else nullcontext()
+        with terminal.interruptible(kept.format(**given)) as interrupts, staged as progress:
             session = {"progress": progress, "interrupts": interrupts}
             known = {**given, **vars(self), **session}
             result = function(**{name: known[name] for name in taken})
@@ -173,15 +165,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     os.environ.setdefault("MPLBACKEND", "Agg")  # commands show no windows
     argv = sys.argv[1:] if argv is None else list(argv)
     try:
-        with warnings_in_a_line():
+        with terminal.warnings_in_a_line():
             app(args=argv, prog_name="pbrl-ppl")
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
     except KeyboardInterrupt:
-        return interrupted()
+        return terminal.interrupted()
     except PbrlError as error:
         print(f"error: {in_a_line(error)}", file=sys.stderr)  # noqa: T201
-        return BAD_INPUT
+        return terminal.BAD_INPUT
     return 0
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -26,10 +26,7 @@ from pbrl_ppl.files import check_folder
 
 if TYPE_CHECKING:
     from pbrl_ppl.criticism import Loop
-    from pbrl_ppl.effects import Effect
-    from pbrl_ppl.history import History
     from pbrl_ppl.reporting import Source
-    from pbrl_ppl.scene import Scene
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -105,7 +102,9 @@ def close_loop(
     check_folder(output, True, (*criticism.FILES, criticism.REMAINDER))
     if learn_remainder:
         criticism.check_scikit_learn()
-    loop, stopped = _finished(declared, histories, sampler, catalogue, progress)
+    settings = sampler.settings() | {"catalogue": catalogue}
+    run = partial(criticism.close_loop, declared, *histories, **settings)
+    loop, stopped = _finished(run, progress)
     progress("writing the report")
     files = str(scene), str(train), str(test or "")
     source = report.Source(*files, options.command_line(context))
@@ -119,13 +118,7 @@ def close_loop(
     return Result(contents, report.in_brief(loop, output, words), code)
 
 
-def _finished(
-    scene: Scene,
-    histories: Sequence[History],
-    sampler: Sampler,
-    catalogue: Sequence[Effect],
-    progress: Progress,
-) -> tuple[Loop, bool]:
+def _finished(run: Callable[..., Loop], progress: Progress) -> tuple[Loop, bool]:
     """Return the loop, with Gaussians at the modes if it is interrupted while it samples.
 
     The second value is whether it was. An earlier interrupt ends the command, and says what was
@@ -140,9 +133,8 @@ def _finished(
         if stage.startswith(_FOUND):
             names.append(stage)
 
-    settings = sampler.settings() | {"catalogue": catalogue, "progress": noted}
     try:
-        return criticism.close_loop(scene, *histories, **settings), False
+        return run(progress=noted), False
     except criticism.LoopInterrupted as interrupt:
         progress("interrupted: Gaussians at the modes instead; once more ends without a report")
         return interrupt.finish(), True

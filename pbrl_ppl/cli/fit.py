@@ -13,27 +13,17 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.table import Table
 
+from pbrl_ppl import errors
 from pbrl_ppl.cli import options, terminal
 from pbrl_ppl.cli.app import command
 from pbrl_ppl.cli.terminal import Progress, Result, check_file
-from pbrl_ppl.errors import (
-    ConvergenceWarning,
-    FitError,
-    LinearisationWarning,
-    PbrlError,
-    PosteriorError,
-)
 from pbrl_ppl.files import check_folder, write_atomically, write_text
 
 if TYPE_CHECKING:
     import pandas as pd
-    import pymc as pm
 
-    from pbrl_ppl.effects import Attached, Effect
-    from pbrl_ppl.history import History
     from pbrl_ppl.posterior import Idata
     from pbrl_ppl.sampling import Calibration
-    from pbrl_ppl.scene import Scene
 
 #: Formats of a summary's columns; of others, four digits.
 _DIGITS = {"ess": ".0f", "r_hat": ".3f"}
@@ -64,29 +54,9 @@ class Model:
 
     def __post_init__(self) -> None:
         if self.likelihood != "transitions" and (self.horizon > 1 or self.scalar):
-            raise FitError(
+            raise errors.FitError(
                 "--horizon and --scalar-sigma are of single transitions: --likelihood transitions"
             )
-
-    def declare(
-        self,
-        scene: Scene,
-        history: History,
-        effects: tuple[Effect | Attached, ...],
-        earlier: Idata | None,
-        seed: int,
-    ) -> pm.Model:
-        """Return the model; of whole trajectories, linearised where an earlier posterior says."""
-        from pbrl_ppl.sampling import physics_model
-
-        try:
-            return physics_model(
-                scene, history, effects, likelihood=self.likelihood, horizon=self.horizon,
-                nu=self.nu, seed=seed, sigma="scalar" if self.scalar else "per_dimension",
-                around=None if self.likelihood == "transitions" else earlier,
-            )  # fmt: skip
-        except ValueError as error:  # an option that the model refuses
-            raise FitError(f"fit: {error}") from None
 
 
 @dataclass(frozen=True)
@@ -149,7 +119,13 @@ def fit(
         check_history(declared, loaded, loaded.segments(1))
         earlier = None if resume is None else load_posterior(resume)
         progress("looking for the mode, then sampling")
-        made = model.declare(declared, loaded, effects, earlier, sampler.seed)
+        try:
+            made = sampling.physics_model(
+                declared, loaded, effects, likelihood=model.likelihood, horizon=model.horizon,
+                nu=model.nu, sigma="scalar" if model.scalar else "per_dimension",
+            )  # fmt: skip
+        except ValueError as error:  # an option that the model refuses
+            raise errors.FitError(f"fit: {error}") from None
     # the sampler shows its own progress
     with terminal.noted_warnings("was interrupted") as caught, redirect_stdout(sys.stderr):
         idata = sampling.fit(made, resume=earlier, progress=not quiet, **vars(sampler))
@@ -162,7 +138,7 @@ def _fitted(idata: Idata, output: Path, warned: set[type], interrupted: bool) ->
     from pbrl_ppl.posterior import PosteriorRecord, group
 
     record = PosteriorRecord.of(idata)
-    undecided = ConvergenceWarning in warned
+    undecided = errors.ConvergenceWarning in warned
     rows = _summary(idata)
     contents = {
         "posterior": output,
@@ -175,7 +151,7 @@ def _fitted(idata: Idata, output: Path, warned: set[type], interrupted: bool) ->
     formats = {str(name): _DIGITS.get(str(name), ".4g") for name in rows.columns}
     listed = terminal.table(None, {"parameter": "<"} | formats, rows.itertuples(name=None))
     shown: list[str | Table] = [listed]
-    if LinearisationWarning in warned:
+    if errors.LinearisationWarning in warned:
         shown += ["intervals: not to be trusted, the likelihood does not hold (warning above)"]
     shown += [f"posterior: {output}"]
     if not interrupted and record.interrupted is None:
@@ -239,7 +215,7 @@ def update(
         raise KeyboardInterrupt
     posteriors.save_posterior(idata, to.output)
     (*_, last) = record.updates or ()
-    converged = not any(isinstance(warning, ConvergenceWarning) for warning in caught)
+    converged = not any(isinstance(warning, errors.ConvergenceWarning) for warning in caught)
     share = last["share"]
     worth = f", the weights worth {share:.0%} of the draws" if share is not None else ""
     return Result(
@@ -274,8 +250,8 @@ def report(
     progress("computing and drawing")
     try:
         text = render_posterior(idata, source=Source(command=options.command_line(context)))
-    except PosteriorError as error:
-        raise PosteriorError(f"{posterior}: {error}") from error
+    except errors.PosteriorError as error:
+        raise errors.PosteriorError(f"{posterior}: {error}") from error
     write_text(page, text)
     return Result({"report": page}, [f"report: {page}"])
 
@@ -332,10 +308,10 @@ def calibrate(
                 seed=seed, draws=draws, replications=replications, folder=output,
                 executor=pool, progress=not quiet,
             )  # fmt: skip
-        except PbrlError:
+        except errors.PbrlError:
             raise
         except ValueError as error:  # an option that calibrate refuses
-            raise FitError(f"calibrate: {error}") from None
+            raise errors.FitError(f"calibrate: {error}") from None
     result.save(output / "ranks.nc")
     write_atomically(output / "table.csv", result.table().to_csv)
     picture = reporting.png(reporting.plot_calibration(result))

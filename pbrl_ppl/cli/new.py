@@ -32,6 +32,61 @@ SHAPES = "box:0.9x0.55, circle:0.1 or polygon:0,2/-1,-1/1,-1, in m"
 
 
 @dataclass(frozen=True)
+class Hinges:
+    """Bodies of a recording that hang in hinges; by default none.
+
+    Parameters
+    ----------
+    angles : tuple of str
+        Bodies of which angles alone were measured: a chain, each hung by its upper end.
+    circles : dict of str to (float, float, float)
+        Centre and radius (m) of bodies that swing on a circle, and whose angle was not measured.
+    """
+
+    angles: tuple[str, ...] = ()
+    circles: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+
+    @classmethod
+    def seen_in(cls, table: pd.DataFrame, names: Sequence[str]) -> Hinges:
+        """Return the hinges that the measurements of bodies show."""
+        measured = table.reindex(columns=["x", "y", "theta"]).notna().groupby(table["body"]).any()
+        tracks = table.reindex(columns=["x", "y"]).groupby(table["body"])
+        angles = measured["theta"] & ~measured["x"] & ~measured["y"]
+        circles = {
+            name: circle
+            for name, track in tracks
+            if not measured["theta"][name] and (circle := _circle(track.to_numpy(float)))
+        }
+        return cls(tuple(name for name in names if angles.get(name, False)), circles)
+
+    def in_words(self) -> list[str]:
+        """Return sentences on what was seen, and what to correct."""
+        said = [
+            f"{name} swings on a circle of {radius:g} m about ({x:g}, {y:g}): hung on a hinge there"
+            for name, (x, y, radius) in self.circles.items()
+        ]
+        if not self.angles:
+            return said
+        return [
+            f"only the angle of {' and '.join(self.angles)} was measured: hung by the upper end;"
+            " correct the places of [[joint]]",
+            *said,
+        ]
+
+    def joints(self, shapes: Mapping[str, Shape]) -> list[Joint]:
+        """Return the hinges of bodies with these outlines."""
+        joints: list[Joint] = []
+        above, end = WORLD, (0.0, 0.0)
+        for name in self.angles:
+            *_, low, high = shapes[name].bounds
+            joints.append(Joint("hinge", (name, above), (0.0, high), end))
+            above, end = name, (0.0, low)
+        for name, (x, y, radius) in self.circles.items():
+            joints.append(Joint("hinge", (name, WORLD), (0.0, radius), (x, y)))
+        return joints
+
+
+@dataclass(frozen=True)
 class Recorded:
     """Bodies and time steps of a recording; by default of none.
 
@@ -45,10 +100,8 @@ class Recorded:
         How it is laid out; None where it is a history's.
     said : list of str
         What was seen in it.
-    angles : tuple of str
-        Bodies of which angles alone were measured, which must be hinged.
-    circles : dict of str to (float, float, float)
-        Centre and radius (m) of bodies that swing on a circle, and whose angle was not measured.
+    hinges : Hinges
+        Those that it shows.
     actuators : callable
         Takes the outline of the one body; returns actuators that columns' names give away.
     """
@@ -57,8 +110,7 @@ class Recorded:
     time_step: float | None = None
     layout: Recording | None = None
     said: Sequence[str] = ()
-    angles: tuple[str, ...] = ()
-    circles: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    hinges: Hinges = Hinges()
     actuators: Callable[[Shape], tuple[Actuator, ...]] = lambda shape: ()
 
 
@@ -124,29 +176,13 @@ def recorded(
             " correct them, or give --time-step; times since the row before are a column duration"
         )
     step = time_step or _longer_step(float(f"{step:.4g}"), commands, layout, said)
-    measured = table.reindex(columns=["x", "y", "theta"]).notna().groupby(table["body"]).any()
-    tracks = table.reindex(columns=["x", "y"]).groupby(table["body"])
-    circles = {
-        name: circle
-        for name, track in tracks
-        if not measured["theta"][name] and (circle := _circle(track.to_numpy(float)))
-    }
-    proposed, shown = histories.propose(table, layout, step, jumps=not circles)
-    angles = measured["theta"] & ~measured["x"] & ~measured["y"]
-    hung = tuple(name for name in names if angles.get(name, False))
-    if hung:
-        shown.append(
-            f"only the angle of {' and '.join(hung)} was measured: hung by the upper end; correct"
-            " the places of [[joint]]"
-        )
-    shown += [
-        f"{name} swings on a circle of {radius:g} m about ({x:g}, {y:g}): hung on a hinge there"
-        for name, (x, y, radius) in circles.items()
-    ]
+    hinges = Hinges.seen_in(table, names)
+    proposed, shown = histories.propose(table, layout, step, jumps=not hinges.circles)
+    shown += hinges.in_words()
     acting: Callable[[Shape], tuple[Actuator, ...]] = Recorded.actuators
     if not plain and len(names) == 1:
-        pivoted = bool(hung or circles)
-        acting = partial(histories.guessed_actuators, frame, proposed, hung=pivoted)
+        hung = hinges != Hinges()
+        acting = partial(histories.guessed_actuators, frame, proposed, hung=hung)
     sent = [one.column or one.name for one in acting(Shape.circle(1.0))]
     if sent:
         shown.append(f"commands by their names: {', '.join(sent)}; correct [[actuator]]")
@@ -155,7 +191,7 @@ def recorded(
     if unused:
         shown.append(f"columns that are not used: {', '.join(unused)}")
     layout_found = None if plain and not shown else proposed
-    return Recorded(tuple(names), step, layout_found, [*said, *shown], hung, circles, acting)
+    return Recorded(tuple(names), step, layout_found, [*said, *shown], hinges, acting)
 
 
 def _read_with_cures(
@@ -410,14 +446,6 @@ def scene_text(shapes: Mapping[str, Shape], side: bool, time_step: float, found:
     >>> Scene.from_toml(text).moving[0].shape
     Shape(kind='box', size=(0.9, 0.55), radius=None, vertices=None)
     """
-    joints: list[Joint] = []
-    above, end = WORLD, (0.0, 0.0)
-    for name in found.angles:
-        *_, low, high = shapes[name].bounds
-        joints.append(Joint("hinge", (name, above), (0.0, high), end))
-        above, end = name, (0.0, low)
-    for name, (x, y, radius) in found.circles.items():
-        joints.append(Joint("hinge", (name, WORLD), (0.0, radius), (x, y)))
     name, shape = next(iter(shapes.items()))
     actuators = [replace(one, body=name) for one in found.actuators(shape)]
     environment = jinja2.Environment(
@@ -426,8 +454,8 @@ def scene_text(shapes: Mapping[str, Shape], side: bool, time_step: float, found:
     )  # fmt: skip
     return environment.get_template("scene.toml.jinja").render(
         shapes={name: vars(shape) for name, shape in shapes.items()},
-        side=side, time_step=time_step, joints=joints, actuators=actuators,
-        recording=found.layout, said=found.said,
+        side=side, time_step=time_step, joints=found.hinges.joints(shapes),
+        actuators=actuators, recording=found.layout, said=found.said,
         entry=lambda key, value: toml_of([("", {key: value})]).strip(),
     )  # fmt: skip
 
