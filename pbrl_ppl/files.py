@@ -62,9 +62,7 @@ def check_folder(folder: Path, overwrite: bool, files: Iterable[str] = ()) -> Pa
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder):
                 pass
-        filled = nearest == folder and any(folder.iterdir())
-    except NotADirectoryError:
-        filled = False
+        filled = folder.is_dir() and any(folder.iterdir())
     except OSError as error:
         raise OutputError(
             f"{where} it cannot be made or written ({error.strerror}); choose another path"
