@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -30,10 +29,14 @@ from pbrl_ppl.likelihood import (
 )
 from pbrl_ppl.modes import evidence_warning
 from pbrl_ppl.parameters import Prior, by_prior, nearest, prior_draws
-from pbrl_ppl.posterior.data import placed, places, record_of, recording
+from pbrl_ppl.posterior.data import parameter_draws, placed, places, record_of, recording
 from pbrl_ppl.posterior.identifiability import uninformed
-from pbrl_ppl.posterior.mode import ParameterPoint, packed_mode
-from pbrl_ppl.posterior.record import Linearisation, PosteriorRecord, vectors
+from pbrl_ppl.posterior.record import (
+    Linearisation,
+    ParameterPoint,
+    PosteriorRecord,
+    packed_mode,
+)
 from pbrl_ppl.posterior.store import SIZE, Idata, convergence, from_groups, group, groups
 from pbrl_ppl.state import Floats, Ints
 
@@ -133,7 +136,7 @@ def complete(
     return checked(problem, record, idata, asked)
 
 
-def _next_state(dims: tuple[str, ...], values: Floats, coords: Any) -> xr.Dataset:
+def _next_state(dims: tuple[str, ...], values: Floats, coords: Mapping[str, object]) -> xr.Dataset:
     return xr.Dataset({"next_state": (dims, values)}, coords)
 
 
@@ -141,7 +144,7 @@ def evaluate(
     problem: Problem,
     phi: Floats,
     sigma: Floats,
-    rows: Any,
+    rows: Sequence[int] | Ints,
     rng: np.random.Generator,
     known: Floats | None = None,
 ) -> tuple[Floats, Floats]:
@@ -184,11 +187,6 @@ def evaluate(
             states = parallel.predict(phi[i], parallel.physics.one_world)
             predictive.append(problem.next_states(states, sigma[i], rng, phi[i]))
     return likelihood, np.array(predictive)
-
-
-def parameter_draws(problem: Problem, trace: Idata) -> tuple[Floats, Floats]:
-    """Return a problem's draws as vectors: phi, shape (draw, p), and sigma, shape (draw, state)."""
-    return vectors(trace, problem.layout, problem.noise_variables)
 
 
 def predictive_rows(chains: int, draws: int, cells: int) -> Ints:

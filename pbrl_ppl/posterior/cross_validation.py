@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -74,7 +75,7 @@ class Comparison:
         plural = {"trajectory": "trajectories", "transition": "transitions"}[self.left_out]
         return f"Leave-one-{out}out cross-validation on the {self.count} {plural} of the fit"
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the contents of ``loo`` in ``report.json``."""
         return vars(self) | {"before": vars(self.before), "after": vars(self.after)}
 
@@ -125,7 +126,7 @@ def compare(before: Idata, after: Idata) -> Comparison | None:
     return comparison if np.isfinite(numbers).all() else None
 
 
-def _gain(az: Any, first: Any, second: Any) -> tuple[float, float]:
+def _gain(az: ModuleType, first: object, second: object) -> tuple[float, float]:
     """Return the difference of elpd, second less first model, and its standard error."""
     exact = {"round_to": "none"} if DATATREE else {}
     table = az.compare({"before": first, "after": second}, **exact)

@@ -1,12 +1,12 @@
-"""Data of a posterior file, the record of a problem, and the problem rebuilt from both."""
+"""Data of a posterior file, the record of a problem, and the fit rebuilt from both."""
 
 from __future__ import annotations
 
 import importlib.metadata
 import sys
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import xarray as xr
@@ -16,6 +16,7 @@ from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.history import History, Segments, from_segments
 from pbrl_ppl.likelihood import (
     NEXT_STATE_DIMS,
+    Coordinates,
     Problem,
     Sensitivity,
     TransitionLikelihood,
@@ -31,7 +32,7 @@ from pbrl_ppl.likelihood import (
 from pbrl_ppl.posterior.record import PosteriorRecord, vectors
 from pbrl_ppl.posterior.store import Idata, best_draw, from_groups, group, groups
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import INPUT, STATE
+from pbrl_ppl.state import INPUT, STATE, Floats
 
 PACKAGES = ("pbrl_ppl", "pymc", "pytensor", "arviz", "pymunk", "numpy", "numba", "xarray")
 #: Name of the smoothed or simulated states; a posterior of single transitions has none.
@@ -137,11 +138,71 @@ def problem_of(
     if not other or not is_filtered(stored):
         return stored if not other or SMOOTHED not in constants else problem
     # linearised at the posterior's best draw
-    phi, sigma = vectors(idata, problem.layout, stored.noise_variables)
+    phi, sigma = parameter_draws(stored, idata)
     best = best_draw(idata)
     coordinates = stored.likelihood.noise.coordinates
     whole = along_trajectories(problem, phi[best], sigma[best], coordinates)
     return with_sensitivity(whole, phi[best], sigma[best])
+
+
+def parameter_draws(problem: Problem, trace: Idata) -> tuple[Floats, Floats]:
+    """Return a problem's draws as vectors: phi, shape (draw, p), and sigma, shape (draw, state)."""
+    return vectors(trace, problem.layout, problem.noise_variables)
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A fitted model.
+
+    Parameters
+    ----------
+    problem : Problem
+        What was sampled; trajectories are linearised as in the posterior.
+    posterior : InferenceData or DataTree
+        As made by :func:`pbrl_ppl.fit`.
+    """
+
+    problem: Problem
+    posterior: Idata
+
+    @classmethod
+    def of(cls, posterior: Fit | Idata, effects: Iterable[Effect] = catalogue) -> Fit:
+        """Return the fit that a posterior holds; one that is a fit already is returned itself.
+
+        Parameters
+        ----------
+        posterior : InferenceData, DataTree or Fit
+            As made by :func:`pbrl_ppl.fit`.
+        effects : iterable of Effect
+            Where the names of its effects are looked up.
+
+        Raises
+        ------
+        PosteriorError
+            If it has another schema version or lacks a group.
+        EffectError
+            If an effect is not among ``effects``.
+        """
+        if isinstance(posterior, Fit):
+            return posterior
+        return cls(problem_of(posterior, effects), posterior)
+
+    @cached_property
+    def record(self) -> PosteriorRecord:
+        """The record of the fit: model, data, method and diagnostics."""
+        return PosteriorRecord.of(self.posterior)
+
+    @cached_property
+    def draws(self) -> tuple[Floats, Floats]:
+        """Posterior draws as vectors: phi, shape (draw, p), and sigma, shape (draw, parameter)."""
+        return parameter_draws(self.problem, self.posterior)
+
+    @cached_property
+    def best(self) -> tuple[Floats, Floats]:
+        """The draw of the highest density: phi, shape (p,), and sigma, shape (parameter,)."""
+        phi, sigma = self.draws
+        place = best_draw(self.posterior)
+        return phi[place], sigma[place]
 
 
 def linearised_as(problem: Problem, idata: Idata) -> Problem:
@@ -249,7 +310,7 @@ def recorded(scene: Scene, constants: xr.Dataset, data_sha256: str = "") -> Hist
     return History(dataset)
 
 
-def recorded_coordinates(scene: Scene, constants: xr.Dataset) -> Any:
+def recorded_coordinates(scene: Scene, constants: xr.Dataset) -> Coordinates:
     """Return the coordinates of the history that a posterior's constant data hold."""
     return observed_coordinates(scene, recorded(scene, constants))
 
@@ -299,7 +360,7 @@ def both_places(earlier: xr.Dataset, segments: Segments) -> dict[str, xr.Variabl
     }
 
 
-def placed(idata: Idata, coords: Mapping[Any, Any]) -> Idata:
+def placed(idata: Idata, coords: xr.Coordinates | Mapping[str, xr.Variable]) -> Idata:
     """Return the posterior with the trajectory and time of these coordinates, and no others."""
     chosen = {name: coords[name] for name in _PLACES}
     data = {

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -111,7 +110,7 @@ class Identifiability:
         columns = [field.name for field in fields(Width)]
         return pd.DataFrame(map(asdict, self.parameters), columns=columns).set_index("parameter")
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return plain values for ``report.json``."""
         return {
             "parameters": [asdict(width) for width in self.parameters],
@@ -124,7 +123,7 @@ class Identifiability:
 
 
 def identify(
-    fitted: Any,
+    fitted: Idata | Mode,
     *,
     mode: Mode | None = None,
     effects: Iterable[Effect] = catalogue,
@@ -171,12 +170,11 @@ def identify(
         said.sentences  # ('The data say nothing about r[cart] and mu_c[cart]: record ...',)
     """
     posterior = None if isinstance(fitted, Mode) else labelled_draws(fitted)
-    if isinstance(fitted, Mode):
-        mode = fitted
-    if mode is not None:
-        layout, phi, jacobian = mode.problem.layout, mode.phi, mode.jacobian
+    at = fitted if isinstance(fitted, Mode) or mode is None else mode
+    if isinstance(at, Mode):
+        layout, phi, jacobian = at.problem.layout, at.phi, at.jacobian
     else:
-        layout, phi, jacobian = _linearised(fitted, tuple(effects))
+        layout, phi, jacobian = _linearised(at, tuple(effects))
     prior = _prior_draws(layout)
     kept = [i for i, label in enumerate(layout.labels) if label in prior]
     labels, priors = [layout.labels[i] for i in kept], [layout.priors[i] for i in kept]

@@ -14,15 +14,23 @@ from pbrl_ppl.effects import Attached, Effect, attach, catalogue, learned_remain
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.likelihood import (
     Coordinates,
+    Problem,
     TrajectoryLikelihood,
     TransitionLikelihood,
+    log_posterior,
     noise_labels,
 )
-from pbrl_ppl.parameters import Layout, ParameterLibrary
+from pbrl_ppl.modes import find_mode
+from pbrl_ppl.parameters import Layout, ParameterLibrary, nearest
 from pbrl_ppl.physics import Physics, build_layout
 from pbrl_ppl.posterior.store import SCHEMA, Idata, check_schema, draws
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats, Ints
+
+#: A JSON object.
+JsonObject = Mapping[str, Any]
+#: Rounds of a climb that starts near the mode.
+_CLIMB = 5
 
 
 @dataclass(frozen=True)
@@ -45,6 +53,25 @@ class StoredMode:
     noise: Mapping[str, float]
     log_posterior: float
     sets: Mapping[str, str] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ParameterPoint:
+    """A point of the parameter space.
+
+    Parameters
+    ----------
+    phi : ndarray
+        Parameters in the layout's order, shape (p,), SI units.
+    sigma : ndarray
+        Noise parameters, shape (state,).
+    choice : ndarray of int, optional
+        Index of each owner's parameter set in the library, shape (owner,), if there is one.
+    """
+
+    phi: Floats
+    sigma: Floats
+    choice: Ints | None = None
 
 
 @dataclass(frozen=True)
@@ -163,8 +190,8 @@ class PosteriorRecord:
     cells: Coordinates | None = None
     mode: StoredMode | None = None
     linearisation: Linearisation | None = None
-    configurations: tuple[Mapping[str, Any], ...] | None = None
-    updates: tuple[Mapping[str, Any], ...] | None = None
+    configurations: tuple[JsonObject, ...] | None = None
+    updates: tuple[JsonObject, ...] | None = None
     max_rhat: float | None = None
     min_ess: float | None = None
     warnings: tuple[str, ...] | None = None
@@ -195,7 +222,7 @@ class PosteriorRecord:
             )
         return cls(**stored_fields(idata))
 
-    def attributes(self) -> dict[str, Any]:
+    def attributes(self) -> dict[str, object]:
         """Return the attributes of the file: plain text, numbers and JSON."""
         written = {
             name: _written(kind, value)
@@ -275,6 +302,112 @@ def vectors(
     return layout.to_vectors(named, n), np.broadcast_to(sigma, (n, width))
 
 
+def packed_mode(
+    problem: Problem, mode: ParameterPoint, phi: Floats, sigma: Floats, likelihood: Floats
+) -> StoredMode:
+    """Return a posterior's mode for its record.
+
+    Where a draw is higher by 0.1 nats, the mode is climbed to again from that draw. Wheels are
+    described as in the draws.
+
+    Parameters
+    ----------
+    problem : Problem
+        What was fitted.
+    mode : ParameterPoint
+        The mode as it was found.
+    phi, sigma : ndarray
+        Posterior draws, shapes (draw, p) and (draw, state).
+    likelihood : ndarray
+        Log-likelihood of each draw, shape (draw,).
+    """
+    value = float(log_posterior(problem, mode.phi, mode.sigma, mode.choice))
+    if problem.library is None and not problem.layout.discrete.any():
+        draws = log_posterior(problem, phi, sigma, log_likelihood=likelihood)
+        best = int(np.argmax(draws))
+        if draws[best] > value + 0.1:
+            climbed = find_mode(problem, initial=phi[best], rounds=_CLIMB)
+            if climbed.log_posterior > value:
+                mode, value = ParameterPoint(climbed.phi, climbed.sigma), climbed.log_posterior
+    return _packed(problem, mode, value, phi)
+
+
+def updated_mode(
+    problem: Problem,
+    earlier: ParameterPoint,
+    draws: tuple[Floats, Floats, Ints | None],
+    likelihood: Floats,
+) -> StoredMode:
+    """Return the mode of an updated posterior.
+
+    It is climbed to from the earlier mode. Over a library or joints of unknown bodies there is no
+    climb: there it is the draw of highest density.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of all data.
+    earlier : ParameterPoint
+        The mode of the earlier data.
+    draws : tuple
+        Phi, shape (draw, p), sigma, shape (draw, state), and over a library the index of each
+        owner's parameter set, shape (draw, owner).
+    likelihood : ndarray
+        Log-likelihood of each draw, shape (draw,).
+    """
+    phi, sigma, choice = draws
+    if problem.library is None and not problem.layout.discrete.any():
+        mode = find_mode(problem, initial=earlier.phi, rounds=_CLIMB)
+        return _packed(problem, ParameterPoint(mode.phi, mode.sigma), mode.log_posterior, phi)
+    value = log_posterior(problem, phi, sigma, choice, log_likelihood=likelihood)
+    i = int(np.argmax(value))
+    best = ParameterPoint(phi[i], sigma[i], None if choice is None else choice[i])
+    return _packed(problem, best, float(value[i]))
+
+
+def _packed(
+    problem: Problem, mode: ParameterPoint, value: float, draws: Floats | None = None
+) -> StoredMode:
+    """Return a point for a record, its wheels described as in draws (draw, p)."""
+    layout, point, sets = problem.layout, mode.phi, None
+    if problem.library is None and draws is not None:
+        point = nearest(layout, point[None], draws)[0]
+    if problem.library is not None and mode.choice is not None:
+        names = problem.library.names
+        chosen = zip(problem.scene.owners, mode.choice.tolist(), strict=True)
+        sets = {owner: names[i] for owner, i in chosen}
+    return StoredMode(
+        dict(zip(layout.labels, point.tolist(), strict=True)),
+        dict(zip(problem.noise_labels, mode.sigma.tolist(), strict=False)),  # a scalar is repeated
+        value,
+        sets,
+    )
+
+
+def stored_mode(problem: Problem, idata: Idata) -> ParameterPoint:
+    """Return the mode that a posterior holds, in the order of the problem's layout.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of the posterior.
+    idata : InferenceData or DataTree
+        As made by :func:`pbrl_ppl.fit`, or loaded.
+
+    Raises
+    ------
+    PosteriorError
+        If it holds no mode, or the mode lacks a parameter of the problem.
+    """
+    record = PosteriorRecord.of(idata)
+    phi, sigma = record.mode_vectors(problem.layout)
+    choice = None
+    if problem.library is not None and record.mode is not None and record.mode.sets is not None:
+        names = [record.mode.sets[owner] for owner in problem.scene.owners]
+        choice = np.array([problem.library.names.index(name) for name in names], dtype=np.intp)
+    return ParameterPoint(phi, sigma, choice)
+
+
 def _attached(scene: Scene, table: str | None, effects: Iterable[Effect]) -> tuple[Attached, ...]:
     """Return the effects of a scene, and the learned remainder of a table where there is one."""
     learned = () if table is None else (learned_remainder(str(table)),)
@@ -313,7 +446,7 @@ def stored_fields(idata: Idata, names: Iterable[str] | None = None) -> dict[str,
 
 
 @cache
-def _kinds(record: type) -> dict[str, Any]:
+def _kinds(record: type) -> dict[str, object]:
     """Return the types of a dataclass's fields, without the None of an optional one."""
     hints = {field.name: get_type_hints(record)[field.name] for field in fields(record)}
     optional = {name: set(get_args(kind)) - {type(None)} for name, kind in hints.items()}
@@ -324,7 +457,7 @@ def _kinds(record: type) -> dict[str, Any]:
 
 
 #: How fields of these types are read from an attribute, and written to one.
-_PLAIN: Mapping[type, tuple[Callable[[Any], Any], Callable[[Any], Any]]] = {
+_PLAIN: Mapping[object, tuple[Callable[..., object], Callable[..., object]]] = {
     Scene: (Scene.from_toml, Scene.to_toml),
     ParameterLibrary: (ParameterLibrary.from_json, ParameterLibrary.to_json),
     bool: (bool, int),  # NetCDF has no such attribute
@@ -334,21 +467,21 @@ _PLAIN: Mapping[type, tuple[Callable[[Any], Any], Callable[[Any], Any]]] = {
 }
 
 
-def _read(kind: Any, value: Any) -> Any:
+def _read(kind: object, value: object) -> object:
     """Return a field from its attribute, by its type."""
     return _PLAIN[kind][0](value) if kind in _PLAIN else _from_json(kind, json.loads(str(value)))
 
 
-def _from_json(kind: Any, value: Any) -> Any:
+def _from_json(kind: object, value: Any) -> Any:
     """Return a value of a type from what JSON holds of it."""
-    if is_dataclass(kind):
-        kinds = _kinds(kind)  # type: ignore[arg-type]  # a type, not an instance
+    if isinstance(kind, type) and is_dataclass(kind):
+        kinds = _kinds(kind)
         values = {
             name: _from_json(kinds[name], entry) for name, entry in value.items() if name in kinds
         }  # of earlier versions there may be more
         if kind is Coordinates:  # no row has no columns in JSON
             values["push"] = values["push"].reshape(-1, len(values["places"]))
-        return kind(**values)  # type: ignore[operator]
+        return kind(**values)
     if kind in (Ints, Floats):
         return np.array(value, dtype=np.int64 if kind == Ints else float)
     if get_origin(kind) is tuple:
@@ -356,7 +489,7 @@ def _from_json(kind: Any, value: Any) -> Any:
     return value
 
 
-def _written(kind: Any, value: Any) -> Any:
+def _written(kind: object, value: object) -> object:
     """Return a field as an attribute, by its type."""
     if kind in _PLAIN:
         return _PLAIN[kind][1](value)

@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Protocol, cast
 
 import h5py
@@ -21,7 +22,7 @@ import xarray as xr
 
 from pbrl_ppl.errors import OutputError, PosteriorError
 from pbrl_ppl.files import write_atomically
-from pbrl_ppl.state import Floats
+from pbrl_ppl.state import Floats, Ints
 
 #: ArviZ 1.x stores groups in an xarray.DataTree, 0.x in an InferenceData.
 DATATREE = not version("arviz").startswith("0.")
@@ -40,9 +41,9 @@ _NEEDED = ("posterior", "sample_stats", "log_likelihood", "observed_data", "cons
 class Idata(Protocol):
     """A posterior or a trace: an InferenceData of ArviZ 0.x, or a DataTree of ArviZ 1.x."""
 
-    attrs: dict[Any, Any]
+    attrs: dict[str, Any]
 
-    def sel(self, **indexers: Any) -> Idata:
+    def sel(self, **indexers: object) -> Idata:
         """Select by labels in all groups."""
 
     def copy(self) -> Idata:
@@ -52,12 +53,13 @@ class Idata(Protocol):
         """Return a group, in 1.x a node of the tree."""
 
 
-def arviz() -> Any:
+def arviz() -> ModuleType:
     """Return ArviZ, imported without the warning by which 0.23 announces 1.0."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)
         import arviz
-    return arviz
+    module: ModuleType = arviz
+    return module
 
 
 def groups(idata: Idata) -> dict[str, xr.Dataset]:
@@ -90,7 +92,7 @@ def group(idata: Idata, name: str) -> xr.Dataset:
     return stored[name]
 
 
-def from_groups(datasets: Mapping[str, xr.Dataset], attrs: Mapping[str, Any]) -> Idata:
+def from_groups(datasets: Mapping[str, xr.Dataset], attrs: Mapping[str, object]) -> Idata:
     """Build an InferenceData (ArviZ 0.x) or DataTree (1.x) from datasets by name."""
     if DATATREE:
         tree = xr.DataTree.from_dict({f"/{name}": data for name, data in datasets.items()})
@@ -172,7 +174,7 @@ def load_posterior(path: str | Path) -> Idata:
     return from_groups(loaded, attrs)
 
 
-def check_schema(attrs: Mapping[str, Any], where: str) -> None:
+def check_schema(attrs: Mapping[str, object], where: str) -> None:
     """Refuse attributes that are not a posterior's, or of another schema version.
 
     Raises
@@ -218,7 +220,7 @@ def draws(idata: Idata, n: int | None = None, seed: int = 0) -> dict[str, Floats
     total = stacked.sizes["sample"]
     if n is not None and n > total:
         raise PosteriorError(f"posterior: {n} draws were asked for, it has {total}")
-    chosen: Any = slice(None)
+    chosen: slice | Ints = slice(None)
     if n is not None:
         chosen = np.random.default_rng(seed).choice(total, n, replace=False)
     return {str(name): stacked[name].values[chosen] for name in stacked.data_vars}
@@ -331,11 +333,11 @@ def smoothed(log_weights: Floats) -> tuple[Floats, float]:
     return weights / weights.sum(), np.inf if np.isnan(k) else float(k)
 
 
-def _dataset(value: Any) -> xr.Dataset:
+def _dataset(value: xr.Dataset | xr.DataTree) -> xr.Dataset:
     """Return the result of a diagnostic as a dataset, in both generations."""
-    if "posterior" in getattr(value, "children", {}):
-        value = value["posterior"]
-    return value if isinstance(value, xr.Dataset) else xr.Dataset(value.to_dataset())
+    if isinstance(value, xr.Dataset):
+        return value
+    return value.children.get("posterior", value).to_dataset()
 
 
 def interval(values: Floats, prob: float = HDI_PROB) -> tuple[float, float]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -237,7 +236,7 @@ def _parent(mean: float, sd: float, lower: float, upper: float) -> tuple[float, 
 
 
 def learned_library(
-    posteriors: Mapping[str, Any], probabilities: Mapping[str, Any] | None = None
+    posteriors: Mapping[str, Idata], probabilities: Mapping[str, object] | None = None
 ) -> ParameterLibrary:
     """Return the means of posteriors as parameter sets to choose among.
 

@@ -21,7 +21,7 @@ from pbrl_ppl.posterior import (
     save_posterior,
     stored_mode,
 )
-from pbrl_ppl.posterior.mode import ParameterPoint, packed_mode
+from pbrl_ppl.posterior.record import ParameterPoint, packed_mode
 from pbrl_ppl.sampling import fit, physics_model, update
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
