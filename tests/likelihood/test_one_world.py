@@ -17,8 +17,8 @@ from pbrl_ppl.modes import Mode
 from pbrl_ppl.physics import Physics, Simulator
 from pbrl_ppl.posterior import Fit, evaluate, from_groups, group, problem_of
 from pbrl_ppl.sampling import fit, physics_model
+from pbrl_ppl.sampling.calibration import draw_truths
 from pbrl_ppl.sampling.fitting import joined_at
-from pbrl_ppl.sampling.replication import draw_truths
 from pbrl_ppl.scene import Body, Scene, Shape
 from pbrl_ppl.state import STATE
 

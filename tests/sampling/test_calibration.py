@@ -21,9 +21,9 @@ from pbrl_ppl.likelihood import Problem, TransitionLikelihood, declared_problem
 from pbrl_ppl.model import build_model, problem_in
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.reporting import plot_calibration, png
-from pbrl_ppl.sampling import calibrate, calibration, physics_model, replication
+from pbrl_ppl.sampling import calibrate, calibration, physics_model
+from pbrl_ppl.sampling.calibration import Record, Truth, draw_truths, simulated
 from pbrl_ppl.sampling.ranks import MOST_DRAWS, Calibration, bins, holm, rank, uniformity
-from pbrl_ppl.sampling.replication import Record, Truth, draw_truths, simulated
 from pbrl_ppl.scene import Body, Joint, Scene, Shape
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
@@ -204,7 +204,7 @@ def test_simulated_noise_is_sigma(cart: tuple[Scene, History]) -> None:
 
 def test_coloured_errors_are_correlated_as_stated() -> None:
     """Standard errors of the autocorrelations of 200,000 numbers are below 0.005."""
-    errors = replication.coloured((1000, 100, 2), 0.8, np.random.default_rng(1))
+    errors = calibration.coloured((1000, 100, 2), 0.8, np.random.default_rng(1))
     for lag, expected in enumerate((1.0, 0.8, 0.64, 0.512)):
         product = errors[:, lag:] * errors[:, : 100 - lag]
         assert np.mean(product) == pytest.approx(expected, abs=0.02)
@@ -213,7 +213,7 @@ def test_coloured_errors_are_correlated_as_stated() -> None:
     assert np.mean(errors[..., 0] * errors[..., 1]) == pytest.approx(0.0, abs=0.02)
     rng = np.random.default_rng(1)
     np.testing.assert_array_equal(
-        replication.coloured((2, 3), 0.0, np.random.default_rng(1)), rng.standard_normal((2, 3))
+        calibration.coloured((2, 3), 0.0, np.random.default_rng(1)), rng.standard_normal((2, 3))
     )
 
 
@@ -340,15 +340,15 @@ def test_equal_wheels_have_equal_quantities(cart: tuple[Scene, History]) -> None
     turned = design.layout.to_vector(
         CART | {"w_theta": CART["w_theta"] - np.pi / 2, "mu_x": CART["mu_y"], "mu_y": CART["mu_x"]}
     )
-    rows = replication.quantities(
+    rows = calibration.quantities(
         design, np.stack([phi, turned]), np.ones((2, 6)), np.array([3.0, 3.0])
     )
     np.testing.assert_allclose(rows[0], rows[1])
     np.testing.assert_allclose(rows[0], [*phi, *np.ones(6), 3.0])
     known = design_of(cart[1], cart_scene(prior=PRIOR))
-    two = replication.quantities(known, np.stack([phi, turned]), np.ones((2, 6)), np.zeros(2))
+    two = calibration.quantities(known, np.stack([phi, turned]), np.ones((2, 6)), np.zeros(2))
     np.testing.assert_array_equal(two[:, : len(phi)], [phi, turned])
-    assert len(replication.labels(design)) == rows.shape[1]
+    assert len(calibration.labels(design)) == rows.shape[1]
 
 
 # bookkeeping: the fit itself is left out
@@ -660,7 +660,7 @@ def test_command_interrupted(
 
 def test_whole_trajectories(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two replications: each noise is drawn, simulated along trajectories, fitted and ranked."""
-    once = partial(replication.replicate, most_repeats=0)
+    once = partial(calibration.replicate, most_repeats=0)
     monkeypatch.setattr("pbrl_ppl.sampling.calibration.replicate", once)
     quick = QUICK | {"draws": 50, "tune": 50}
     prior = {"mass": {"mu": 0.7, "sigma": 0.3}}
