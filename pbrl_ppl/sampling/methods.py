@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
@@ -21,7 +21,7 @@ from pbrl_ppl.likelihood import (
     variable_coords,
     variable_dims,
 )
-from pbrl_ppl.modes import Mode, Space
+from pbrl_ppl.modes import Mode, Space, library_of
 from pbrl_ppl.parameters import nearest
 from pbrl_ppl.posterior import (
     LIKELIHOOD,
@@ -35,8 +35,7 @@ from pbrl_ppl.posterior import (
 )
 from pbrl_ppl.sampling.ensemble import Ensemble, Reference
 from pbrl_ppl.sampling.importance import draw_proposals, resample, stream
-from pbrl_ppl.sampling.starts import dispersed, last_draws, prior_starts
-from pbrl_ppl.state import Floats
+from pbrl_ppl.state import Floats, Ints
 
 if TYPE_CHECKING:
     import pymc as pm
@@ -103,7 +102,7 @@ class SamplerRun:
             return self.method.chains
         return int(group(self.resume, "posterior").sizes["chain"])
 
-    def starts(self) -> list[dict[str, Any]]:
+    def starts(self) -> list[dict[str, Floats]]:
         """Return starts of PyMC's chains, and of the stream of random numbers."""
         rng = np.random.default_rng(self.seed)
         if self.resume is not None:
@@ -136,7 +135,7 @@ class SamplerRun:
             raise FitError("fit: this method begins at a mode, and there is none")
         return self.mode
 
-    def sample(self, step: Any) -> Idata:
+    def sample(self, step: object) -> Idata:
         """Run ``pm.sample`` from the starts, without its checks of convergence."""
         import pymc as pm
 
@@ -268,9 +267,8 @@ def _smc(job: SamplerRun) -> Idata:
 def _map(job: SamplerRun) -> Idata:
     """Return the mode alone, as a posterior of one draw."""
     mode = job.at_mode
-    values = mode.problem.named(mode.phi, mode.sigma)
-    draws = {name: np.asarray(value)[None, None] for name, value in values.items()}
-    return as_trace(job.problem, draws, {"lp": np.array([[mode.log_posterior]])})
+    values = mode.problem.named(mode.phi[None, None], mode.sigma[None, None])
+    return as_trace(job.problem, values, {"lp": np.array([[mode.log_posterior]])})
 
 
 def _laplace(job: SamplerRun) -> Idata:
@@ -285,7 +283,49 @@ def _laplace(job: SamplerRun) -> Idata:
     return as_trace(job.problem, values, {"accept": np.ones(shape)})
 
 
-def as_trace(problem: Problem, draws: Mapping[str, Any], stats: Mapping[str, Any]) -> Idata:
+def dispersed(
+    mode: Mode, rng: np.random.Generator, chains: int, *, away: float = 2.0
+) -> list[dict[str, Floats]]:
+    """Draw starts about two posterior standard deviations from the mode, one a chain.
+
+    ``away``: distance from the mode in posterior standard deviations.
+    """
+    space = Space.of(mode)
+    mean, covariance = space.laplace(mode)
+    factor = np.linalg.cholesky(covariance + 1e-12 * np.diag(np.diag(covariance)))
+    q = mean + away * rng.standard_normal((chains, len(mean))) @ factor.T
+    return [mode.problem.named(space.possible(one), space.split(one)[1]) for one in q]
+
+
+def last_draws(problem: Problem, idata: Idata, walkers: int = 1) -> tuple[Floats, Floats]:
+    """Return the last draws of each chain's walkers, which stand one after another in it.
+
+    Shapes (chain * walker, p) and (chain * walker, parameter).
+    """
+    sizes = group(idata, "posterior").sizes
+    last = np.arange(1, walkers + 1) * sizes["draw"] // walkers - 1
+    chosen = (np.arange(sizes["chain"])[:, None] * sizes["draw"] + last).ravel()
+    phi, sigma = parameter_draws(problem, idata)
+    return phi[chosen], sigma[chosen]
+
+
+def prior_starts(
+    problem: Problem, rng: np.random.Generator, chains: int
+) -> list[dict[str, Floats]]:
+    """Draw starts of chains over a library: each owner's set from the prior, the median sigma."""
+    library = library_of(problem)
+    median = problem.noise_prior[0]
+    sigma = np.exp(np.log(median).mean()) if problem.likelihood.scalar else median
+    laws = [library.prior(owner) for owner in problem.scene.owners]
+    return [
+        {"library_index": np.array([rng.choice(len(p), p=p) for p in laws]), "sigma": sigma}
+        for _ in range(chains)
+    ]
+
+
+def as_trace(
+    problem: Problem, draws: Mapping[str, Floats | Ints], stats: Mapping[str, Floats]
+) -> Idata:
     """Return a trace in PyMC's form, of draws made without PyMC.
 
     Parameters
@@ -315,7 +355,7 @@ def as_trace(problem: Problem, draws: Mapping[str, Any], stats: Mapping[str, Any
     )
 
 
-def posterior_dataset(problem: Problem, values: Mapping[str, Floats]) -> xr.Dataset:
+def posterior_dataset(problem: Problem, values: Mapping[str, Floats | Ints]) -> xr.Dataset:
     """Return draws, shape (chain, draw, ...), with the problem's dimensions and coordinates."""
     dims = variable_dims(problem)
     data = {name: (("chain", "draw", *dims[name]), value) for name, value in values.items()}
@@ -323,7 +363,9 @@ def posterior_dataset(problem: Problem, values: Mapping[str, Floats]) -> xr.Data
     return labelled(problem, data).assign_coords(chain=np.arange(chains), draw=np.arange(draws))
 
 
-def labelled(problem: Problem, variables: Mapping[str, Any]) -> xr.Dataset:
+def labelled(
+    problem: Problem, variables: Mapping[str, tuple[tuple[str, ...], Floats | Ints]]
+) -> xr.Dataset:
     """Return variables (dims, values) with the coordinates of their dimensions."""
     coords = variable_coords(problem)
     used = {dim for dims, _ in variables.values() for dim in dims if dim in coords}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -222,9 +221,8 @@ def summed(problem: Problem, draws: int, chains: int, seed: int) -> tuple[Idata,
         As for :func:`pbrl_ppl.fit`.
     """
     phi, sigma, index, best = choose_from_library(problem, draws, chains, seed)
-    values: dict[str, Any] = problem.layout.to_dict(phi)
-    sigma = sigma[..., 0] if problem.likelihood.scalar else sigma
-    values |= {"library_index": index, "sigma": sigma}
+    values: dict[str, Floats | Ints] = {**problem.layout.to_dict(phi), "library_index": index}
+    values["sigma"] = sigma[..., 0] if problem.likelihood.scalar else sigma
     return as_trace(problem, values, {"accept": np.ones((chains, draws))}), _point(problem, best)
 
 

@@ -8,9 +8,9 @@ its maximum of likelihood would.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -162,6 +162,11 @@ def _quantile(
     return float(brentq(excess, low, high, xtol=1e-9 * (high - low)))
 
 
+def _interval(quantile: Callable[[float], float], labels: tuple[str, str, str]) -> dict[str, float]:
+    """Return the median and the ends of the 94 % interval under these labels."""
+    return {label: quantile(q) for label, q in zip(labels, (_MIDDLE, *_ENDS), strict=True)}
+
+
 @dataclass(frozen=True, eq=False)
 class Pooled:
     """Robots of one kind: what they share, each one given the others, and the next.
@@ -193,19 +198,14 @@ class Pooled:
         ``mean`` is the median of the kind's mean, ``next`` that of a further robot; with 94 %
         intervals. ``p_same`` as of :class:`Population`, ``informed`` how many robots inform.
         """
-        rows = []
-        for name, pooled in self.populations.items():
-            row: dict[str, Any] = {"parameter": name, "scale": self._families[name][0]}
-            for key, of, natural in (
-                ("mean", pooled.mean, True),
-                ("spread", pooled.deviation, False),
-                ("next", pooled.next, True),
-            ):
-                middle = "next_median" if key == "next" else key
-                for label, q in ((middle, _MIDDLE), (f"{key}_low", _ENDS[0]),
-                                 (f"{key}_high", _ENDS[1])):  # fmt: skip
-                    row[label] = self._natural(name, of(q)) if natural else of(q)
-            rows.append(row | {"informed": int(pooled.informed.sum()), "p_same": pooled.p_same})
+        rows = [
+            {"parameter": name, "scale": self._families[name][0]}
+            | self._natural(name, pooled.mean, ("mean", "mean_low", "mean_high"))
+            | _interval(pooled.deviation, ("spread", "spread_low", "spread_high"))
+            | self._natural(name, pooled.next, ("next_median", "next_low", "next_high"))
+            | {"informed": int(pooled.informed.sum()), "p_same": pooled.p_same}
+            for name, pooled in self.populations.items()
+        ]
         return pd.DataFrame(rows)
 
     def robots(self) -> pd.DataFrame:
@@ -217,17 +217,14 @@ class Pooled:
                 "single_mean": self._single[name][number, 0],
                 "single_sd": self._single[name][number, 1],
                 "informed": bool(pooled.informed[number]),
-                **{
-                    label: self._natural(name, pooled.robot(number, q))
-                    for label, q in (("median", _MIDDLE), ("low", _ENDS[0]), ("high", _ENDS[1]))
-                },
+                **self._natural(name, partial(pooled.robot, number), ("median", "low", "high")),
             }
             for name, pooled in self.populations.items()
             for number, robot in enumerate(self.names)
         ]
         return pd.DataFrame(rows)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return plain values for JSON; not a number is None."""
         table = self.table().astype(object)
         return {
@@ -236,12 +233,17 @@ class Pooled:
             "left_out": list(self.left_out),
         }
 
-    def _natural(self, name: str, value: float) -> float:
-        """Return a value on the scale of the prior, in the parameter's unit and support."""
+    def _natural(
+        self, name: str, quantile: Callable[[float], float], labels: tuple[str, str, str]
+    ) -> dict[str, float]:
+        """Return an interval from the scale of the prior, in the parameter's unit and support."""
         scale, reference = self._families[name]
+        found = _interval(quantile, labels)
         if scale == "logarithm":
-            return float(np.exp(value))
-        return float(wrapped(value + reference)) if scale == "angle" else value
+            return {label: float(np.exp(value)) for label, value in found.items()}
+        if scale == "angle":
+            return {label: float(wrapped(value + reference)) for label, value in found.items()}
+        return found
 
 
 def pool(

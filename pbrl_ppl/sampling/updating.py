@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,8 +13,8 @@ from scipy.special import logsumexp
 
 from pbrl_ppl import posterior as files
 from pbrl_ppl.effects import Effect, catalogue
-from pbrl_ppl.errors import RefitWarning, warn
-from pbrl_ppl.history import History
+from pbrl_ppl.errors import HistoryError, PosteriorError, RefitWarning, warn
+from pbrl_ppl.history import History, check_start, measured_alone, unused_velocities
 from pbrl_ppl.likelihood import (
     OutputErrorLikelihood,
     Problem,
@@ -24,16 +23,17 @@ from pbrl_ppl.likelihood import (
     single_transitions,
 )
 from pbrl_ppl.modes import systematic
-from pbrl_ppl.posterior import Idata, PosteriorRecord, from_groups, group, groups, parameter_draws
-from pbrl_ppl.sampling.fitting import joined_at, sample
-from pbrl_ppl.sampling.update_checks import (
-    as_recorded,
-    check_engine,
-    check_history,
-    check_posterior,
-    judgement,
+from pbrl_ppl.posterior import (
+    Idata,
+    PosteriorRecord,
+    from_groups,
+    group,
+    groups,
+    parameter_draws,
+    problem_of,
 )
-from pbrl_ppl.state import Floats
+from pbrl_ppl.sampling.fitting import DEFAULT, joined_at, sample
+from pbrl_ppl.state import STATE, Floats
 
 
 def update(
@@ -104,19 +104,18 @@ def update(
         json.loads(idata.attrs["updates"])[-1]["did"]  # 'reweighted'
     """
     effects = tuple(effects)
-    record = check_posterior(idata, history)
-    history = as_recorded(idata, history)
-    check_history(idata, record, history)
-    entry: dict[str, Any] = {"seed": seed, "did": "refitted"}
-    options: dict[str, Any] = {"chains": group(idata, "posterior").sizes["chain"]}
-    places = None
+    record = _check_posterior(idata, history)
+    history = _as_recorded(idata, history)
+    _check_history(idata, record, history)
+    entry: dict[str, object] = {"seed": seed, "did": "refitted"}
+    chains, method, places = group(idata, "posterior").sizes["chain"], DEFAULT, None
     if record.likelihood == OutputErrorLikelihood.name:
-        check_engine(idata, files.problem_of(idata, effects))
+        _check_engine(idata, problem_of(idata, effects))
         entry |= {"transitions": history.n_transitions, "share": None, "pareto_k": None}
         why = "initial states of simulations are fitted with the parameters, so that all data"
         advice = ""
         whole = _simulated(idata, record, history, effects)
-        options["method"] = record.method
+        method = record.method
     else:
         new = _weighted(idata, record, history, effects)
         entry |= {"transitions": new.likelihood.shape[1], "share": new.share}
@@ -125,17 +124,18 @@ def update(
         if result is not None:
             return _entered(result, record, history, entry | {"did": "reweighted"})
         why, whole = new.why_not, new.problem
-        advice = f"; {judgement(new.earlier, new.likelihood)}"
+        advice = f"; {_judgement(new.earlier, new.likelihood)}"
         places = new.data["observed_data"].coords
     warn(f"update: {why} are refitted, which takes as long as a fit{advice}", RefitWarning)
-    result = sample(whole, seed=seed, progress=progress, **options).posterior
+    fitted = sample(whole, seed=seed, progress=progress, method=method, chains=chains)
+    result = fitted.posterior
     if places is not None:
         result = files.placed(result, places)
     return _entered(result, record, history, entry)
 
 
 def _entered(
-    result: Idata, record: PosteriorRecord, history: History, entry: dict[str, Any]
+    result: Idata, record: PosteriorRecord, history: History, entry: dict[str, object]
 ) -> Idata:
     """Return an updated posterior, with the update entered in its record."""
     hashes = {"data_sha256": history.data_sha256, "before_sha256": record.data_sha256}
@@ -160,6 +160,124 @@ def _simulated(
     both = History.from_dataframe(pd.concat([rows, new]), record.scene)
     problem = declared_problem(record.physics(effects), both, kind=OutputErrorLikelihood.name)
     return problem.with_likelihood(prior=record.sigma_prior)
+
+
+def _check_posterior(idata: Idata, history: History) -> PosteriorRecord:
+    """Return the record of a posterior; refuse posteriors and data that an update cannot use."""
+    for name in ("log_likelihood", "posterior_predictive", "observed_data", "constant_data"):
+        group(idata, name)
+    record = PosteriorRecord.of(idata)
+    known = [record.data_sha256]
+    for entry in record.updates or ():
+        known += [entry["data_sha256"], entry["before_sha256"]]
+    if history.data_sha256 in known:
+        raise PosteriorError(
+            "update: these data are in the posterior already, and would count twice; pass only"
+            " what was recorded since"
+        )
+    return record
+
+
+def _as_recorded(idata: Idata, history: History) -> History:
+    """Return the history without the unused velocities that the posterior leaves out."""
+    constants = group(idata, "constant_data")
+    if "recorded_observed" not in constants:
+        return history
+    recorded = constants["recorded_observed"].to_numpy()
+    left_out = ~np.isfinite(recorded).any(axis=(0, 1))
+    unused = [
+        velocity
+        for velocity in unused_velocities(history)
+        if left_out[history.bodies.index(velocity.body), STATE.index(velocity.state)]
+    ]
+    return measured_alone(history, unused)
+
+
+def _check_history(idata: Idata, record: PosteriorRecord, history: History) -> None:
+    """Refuse a history of other bodies, dimensions or time step, or without usable start."""
+    scene, measured = record.scene, record.measured
+    names = tuple(body.name for body in scene.moving)
+    if history.bodies != names:
+        raise HistoryError(
+            f"update: the history is of {', '.join(history.bodies)}, the posterior of"
+            f" {', '.join(names)}; load it with the posterior's scene"
+        )
+    step = float(history.dataset.attrs["time_step"])
+    if not np.isclose(step, scene.time_step, atol=0.0):
+        raise HistoryError(
+            f"update: the history has a row each {step:g} s, the posterior's each"
+            f" {scene.time_step:g} s; load it with the posterior's scene"
+        )
+    if "smoothed" not in group(idata, "constant_data"):
+        check_start(history, scene)
+    segments = history.segments(record.horizon)
+    extra = [
+        name
+        for i, name in enumerate(STATE)
+        if name not in measured and np.isfinite(segments.observed[..., i]).any()
+    ]
+    if extra:
+        raise HistoryError(
+            f"update: the history measures {', '.join(extra)}, of which the posterior knows no"
+            f" noise, only of {', '.join(measured)}; leave those columns empty, or refit all"
+            " data"
+        )
+
+
+def _check_engine(
+    idata: Idata, problem: Problem, *, transitions: int = 50, tolerance: float = 0.01
+) -> None:
+    """Refuse a posterior whose stored likelihoods are not what this problem's engine gives.
+
+    Parameters
+    ----------
+    idata : InferenceData or DataTree
+        The posterior.
+    problem : Problem
+        Of the same parameters; its data do not matter.
+    transitions : int
+        How many likelihoods are computed again, at the first draw.
+    tolerance : float
+        Largest median difference from the stored ones (nats).
+    """
+    whole = "smoothed" in group(idata, "constant_data")  # neighbours depend on each other
+    some = {"transition": slice(None if whole else transitions)}
+    few = {name: group(idata, name).isel(some) for name in ("observed_data", "constant_data")}
+    earlier = from_groups(few | {"posterior": group(idata, "posterior")}, idata.attrs)
+    first = problem_of(earlier, {attached.effect for attached in problem.physics.effects})
+    phi, sigma = parameter_draws(problem, idata)
+    now = first.log_density(first.residual(phi[0]), sigma[0], phi[0])
+    then = group(idata, "log_likelihood")["next_state"].isel(chain=0, draw=0).to_numpy()
+    off = float(np.median(np.abs(now - then[: len(now)])))
+    if not off < tolerance:
+        raise PosteriorError(
+            f"update: the posterior's likelihoods are not what this engine gives (half of them are"
+            f" off by {off:.2g} or more): it was made with other effects or another"
+            " version; refit all data"
+        )
+
+
+def _judgement(earlier: Floats, new: Floats, worse: float = 3.0) -> str:
+    """Return a text on whether new transitions may be of the same bodies as the posterior's.
+
+    Parameters
+    ----------
+    earlier, new : ndarray
+        Log-likelihoods of transitions, shape (..., transition), the draws first.
+    worse : float
+        Fall of the mean log-likelihood, in standard errors, from which new data are predicted
+        worse.
+    """
+    old, others = (
+        densities.reshape(-1, densities.shape[-1]).mean(axis=0) for densities in (earlier, new)
+    )
+    error = float(np.sqrt(old.var() / len(old) + others.var() / len(others)))
+    if not float(old.mean() - others.mean()) < worse * error:
+        return "look whether they are of the same bodies, under the same conditions"
+    return (
+        "the posterior predicts them as well as its own data, so they may well be of the same"
+        " bodies: it is narrower than all of the data allow"
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,8 +335,8 @@ def _weighted(
     idata: Idata, record: PosteriorRecord, history: History, effects: tuple[Effect, ...]
 ) -> _Weighted:
     """Weight the draws by the new transitions of a history."""
-    problem = files.problem_of(idata, effects, history)
-    check_engine(idata, problem)
+    problem = problem_of(idata, effects, history)
+    _check_engine(idata, problem)
     phi, sigma = parameter_draws(problem, idata)
     problem = joined_at(problem, phi, sigma)
     likelihood, _ = files.evaluate(problem, phi, sigma, (), np.random.default_rng(0))
@@ -234,7 +352,7 @@ def _weighted(
     more_noise = [label for label in changed.noise_labels if label not in problem.noise_labels]
     both = from_groups(groups(idata) | data, dict(idata.attrs) | changed.attributes())
     earlier = group(idata, "log_likelihood")["next_state"].transpose("chain", "draw", "transition")
-    whole = files.problem_of(both, effects)
+    whole = problem_of(both, effects)
     if more_noise:
         whole = along_trajectories(single_transitions(whole), np.median(phi, axis=0))
     known = earlier.to_numpy().reshape(len(phi), -1)

@@ -10,7 +10,8 @@ from scipy.special import logsumexp
 from pbrl_ppl.likelihood import TransitionLikelihood
 from pbrl_ppl.modes import systematic
 from pbrl_ppl.modes.space import Independent
-from pbrl_ppl.sampling.ensemble import Ensemble, Reference, Tempered, anneal
+from pbrl_ppl.sampling.ensemble import Ensemble, Reference
+from pbrl_ppl.sampling.importance import Tempered, anneal
 
 pytestmark = pytest.mark.one_stack
 

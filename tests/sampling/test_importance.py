@@ -8,6 +8,7 @@ import sys
 import time
 import warnings
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -37,7 +38,7 @@ from pbrl_ppl.posterior import (
 )
 from pbrl_ppl.sampling import fit, physics_model, update
 from pbrl_ppl.sampling.ensemble import Reference
-from pbrl_ppl.sampling.importance import draw_proposals, resample
+from pbrl_ppl.sampling.importance import anneal, draw_proposals, resample
 from pbrl_ppl.scene import Body, Scene, Shape, Wall
 from pbrl_ppl.threads import background
 from tests.helpers.carts import CART, cart_scene
@@ -142,17 +143,15 @@ def simple():
     return mode, *grid_moments(problem, mode)
 
 
-def never(log_weight, worth) -> bool:
-    """Return that weights are not good enough to end with."""
-    return False
-
+#: Annealing whose weights never suffice: the engine moves the particles to the end.
+TO_THE_END = partial(anneal, worth=np.inf)
 
 #: What particles go through, or how often the engine must move them, by patches.
 ANNEALED = {"importance.adaptive_importance": no_weights}
 WAYS = {
     "Gaussians": {},
     "annealed": ANNEALED,
-    "annealed by engine moves": ANNEALED | {"ensemble._suffices": never},
+    "annealed by engine moves": ANNEALED | {"importance.anneal": TO_THE_END},
 }
 
 
@@ -523,7 +522,7 @@ def test_weights_of_which_one_is_all_have_an_infinite_tail() -> None:
 def test_engine_moves_are_counted(model, mode, monkeypatch) -> None:
     """Where weights do not suffice the engine moves the particles, which then weigh alike."""
     monkeypatch.setattr("pbrl_ppl.sampling.importance.adaptive_importance", no_weights)
-    monkeypatch.setattr("pbrl_ppl.sampling.ensemble._suffices", never)
+    monkeypatch.setattr("pbrl_ppl.sampling.importance.anneal", TO_THE_END)
     idata = quiet(fit, model, seed=1, start=mode, **QUICK)
     assert idata.attrs["rungs"] >= 1
     assert 0.0 < idata.attrs["acceptance"] <= 1.0

@@ -11,7 +11,7 @@ from pbrl_ppl.parameters import ParameterLibrary
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.posterior import parameter_draws
 from pbrl_ppl.sampling import fit, physics_model
-from pbrl_ppl.sampling.starts import dispersed, last_draws, prior_starts
+from pbrl_ppl.sampling.methods import dispersed, last_draws, prior_starts
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
 
