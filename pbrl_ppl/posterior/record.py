@@ -246,21 +246,17 @@ class PosteriorRecord:
         """Variables of the noise, and the state dimensions of each, in the order of sigma."""
         return {"sigma": self.measured} if self.cells is None else self.cells.variables
 
-    def attached(self, effects: Iterable[Effect]) -> tuple[Attached, ...]:
-        """Return the model's effects, looked up among ``effects`` by name.
+    def physics(self, effects: Iterable[Effect], threads: int = 1) -> Physics:
+        """Return the physics that was fitted, its effects looked up among ``effects`` by name.
 
         Raises
         ------
         EffectError
             If one is not among them.
         """
-        return _attached(self.scene, self.learned_remainder, effects)
-
-    def physics(self, effects: Iterable[Effect], threads: int = 1) -> Physics:
-        """Return the physics that was fitted, its effects looked up among ``effects`` by name."""
         return Physics(
             self.scene,
-            self.attached(effects),
+            _attached(self.scene, self.learned_remainder, effects),
             self.substeps,
             threads,
             tolerance=Physics.tolerance if self.tolerance is None else self.tolerance,

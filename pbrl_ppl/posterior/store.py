@@ -16,7 +16,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Protocol, cast
 
-import h5py
 import numpy as np
 import xarray as xr
 
@@ -156,14 +155,9 @@ def load_posterior(path: str | Path) -> Idata:
     if not path.is_file():
         raise PosteriorError(f"{path}: there is no such file")
     try:
-        with xr.open_dataset(path, engine="h5netcdf") as root:
-            attrs = dict(root.attrs)
-        with h5py.File(path) as file:
-            names = [name for name, item in file.items() if isinstance(item, h5py.Group)]
-        loaded = {}
-        for name in names:
-            with xr.open_dataset(path, group=name, engine="h5netcdf") as data:
-                loaded[name] = data.load()
+        with contextlib.closing(xr.open_datatree(path, engine="h5netcdf")) as tree:
+            loaded = {name: node.to_dataset().load() for name, node in tree.children.items()}
+            attrs = {str(name): value for name, value in tree.attrs.items()}
     except (OSError, ValueError, KeyError) as error:
         raise PosteriorError(
             f"{path}: this is not a NetCDF file; pass one that fit saved"

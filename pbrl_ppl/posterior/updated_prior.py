@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
@@ -19,7 +18,7 @@ from pbrl_ppl.parameters import JOINT_INDICES, ParameterLibrary, Prior, nearest
 from pbrl_ppl.physics import index_priors
 from pbrl_ppl.posterior.record import layout_of, scene_of, stored_fields
 from pbrl_ppl.posterior.store import Idata, group, labelled_draws, scalars
-from pbrl_ppl.scene import Joint, Scene
+from pbrl_ppl.scene import Body, Joint, Scene
 from pbrl_ppl.state import Floats
 
 #: Limits of a truncated normal: it is exponential with mu this many sigmas outside its support, and
@@ -66,7 +65,7 @@ def updated_scene(idata: Idata, *, effects: Iterable[Effect] = catalogue) -> Sce
     draws = labelled_draws(idata)
     folded = nearest(layout, layout.columns(draws))
     draws |= {x: folded[:, i] for i, x in enumerate(layout.labels) if x in draws}
-    priors: defaultdict[str, dict[str, dict[str, float]]] = defaultdict(dict)
+    priors: dict[str, dict[str, float]] = {}
     for block in layout.blocks:
         # a learned remainder belongs to one recording and cannot be declared in a scene
         if block.of != "body" or LEARNED_REMAINDER in block.name:
@@ -81,15 +80,30 @@ def updated_scene(idata: Idata, *, effects: Iterable[Effect] = catalogue) -> Sce
                     " give no width to a prior; fit again, with more draws"
                 )
             matched = moment_matched(prior, draws[label])
-            priors[owner][block.name] = {k: getattr(matched, k) for k in matched.hyper_names}
+            priors[label] = {k: getattr(matched, k) for k in matched.hyper_names}
     bodies = []
     for body in scene.bodies:
-        both = priors[body.owner] | priors[body.name]  # those that it shares, and its effects'
-        new = {name: tuple(hyper.items()) for name, hyper in both.items()}
         laws = tuple(name for name in body.effects if name != LEARNED_REMAINDER)
-        known = tuple((dict(body.prior) | new).items())
-        bodies.append(replace(body, prior=known, effects=laws))
+        bodies.append(with_priors(replace(body, effects=laws), priors))
     return scene.replace(bodies=tuple(bodies), joints=_joints(idata, scene))
+
+
+def with_priors(body: Body, priors: Mapping[str, Mapping[str, float]]) -> Body:
+    """Return a body with new hyper-parameters, its class's and its effects' among them.
+
+    Parameters
+    ----------
+    body : Body
+        Keeps its other priors.
+    priors : mapping of str to mapping
+        Hyper-parameters by label, such as ``mass[cart]``, of all bodies.
+    """
+    known = dict(body.prior)
+    for label, hyper in priors.items():
+        name, _, owner = label.rstrip("]").partition("[")
+        if owner in (body.owner, body.name):
+            known[name] = tuple(hyper.items())
+    return replace(body, prior=tuple(known.items()))
 
 
 def _joints(idata: Idata, scene: Scene) -> tuple[Joint, ...]:

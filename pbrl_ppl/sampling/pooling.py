@@ -21,7 +21,15 @@ from scipy.stats import chi2, norm
 from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.parameters import Layout, Prior, nearest, prior_draws, wheels
-from pbrl_ppl.posterior import HDI_PROB, Idata, labelled_draws, layout_of, moment_matched, scene_of
+from pbrl_ppl.posterior import (
+    HDI_PROB,
+    Idata,
+    labelled_draws,
+    layout_of,
+    moment_matched,
+    scene_of,
+    with_priors,
+)
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Bools, Floats, wrapped
 
@@ -434,11 +442,6 @@ def _scene(
         others = [set(scene.body(body.name).effects) for scene in scenes]
         kept = tuple(name for name in body.effects if all(name in effects for effects in others))
         gone = {name for name, owner in dropped if owner in owners}
-        prior = {name: hyper for name, hyper in body.prior if name not in gone}
-        prior |= {
-            label.partition("[")[0]: tuple(hyper.items())
-            for label, hyper in priors.items()
-            if label.partition("[")[2].rstrip("]") in owners
-        }
-        bodies.append(replace(body, effects=kept, prior=tuple(prior.items())))
+        prior = tuple((name, hyper) for name, hyper in body.prior if name not in gone)
+        bodies.append(with_priors(replace(body, effects=kept, prior=prior), priors))
     return scenes[0].replace(bodies=tuple(bodies))

@@ -23,15 +23,7 @@ from pbrl_ppl.likelihood import (
     single_transitions,
 )
 from pbrl_ppl.modes import systematic
-from pbrl_ppl.posterior import (
-    Idata,
-    PosteriorRecord,
-    from_groups,
-    group,
-    groups,
-    parameter_draws,
-    problem_of,
-)
+from pbrl_ppl.posterior import Idata, PosteriorRecord, from_groups, group, groups, parameter_draws
 from pbrl_ppl.sampling.fitting import DEFAULT, joined_at, sample
 from pbrl_ppl.state import STATE, Floats
 
@@ -110,7 +102,7 @@ def update(
     entry: dict[str, object] = {"seed": seed, "did": "refitted"}
     chains, method, places = group(idata, "posterior").sizes["chain"], DEFAULT, None
     if record.likelihood == OutputErrorLikelihood.name:
-        _check_engine(idata, problem_of(idata, effects))
+        _check_engine(idata, files.problem_of(idata, effects))
         entry |= {"transitions": history.n_transitions, "share": None, "pareto_k": None}
         why = "initial states of simulations are fitted with the parameters, so that all data"
         advice = ""
@@ -244,7 +236,7 @@ def _check_engine(
     some = {"transition": slice(None if whole else transitions)}
     few = {name: group(idata, name).isel(some) for name in ("observed_data", "constant_data")}
     earlier = from_groups(few | {"posterior": group(idata, "posterior")}, idata.attrs)
-    first = problem_of(earlier, {attached.effect for attached in problem.physics.effects})
+    first = files.problem_of(earlier, {attached.effect for attached in problem.physics.effects})
     phi, sigma = parameter_draws(problem, idata)
     now = first.log_density(first.residual(phi[0]), sigma[0], phi[0])
     then = group(idata, "log_likelihood")["next_state"].isel(chain=0, draw=0).to_numpy()
@@ -335,7 +327,7 @@ def _weighted(
     idata: Idata, record: PosteriorRecord, history: History, effects: tuple[Effect, ...]
 ) -> _Weighted:
     """Weight the draws by the new transitions of a history."""
-    problem = problem_of(idata, effects, history)
+    problem = files.problem_of(idata, effects, history)
     _check_engine(idata, problem)
     phi, sigma = parameter_draws(problem, idata)
     problem = joined_at(problem, phi, sigma)
@@ -352,7 +344,7 @@ def _weighted(
     more_noise = [label for label in changed.noise_labels if label not in problem.noise_labels]
     both = from_groups(groups(idata) | data, dict(idata.attrs) | changed.attributes())
     earlier = group(idata, "log_likelihood")["next_state"].transpose("chain", "draw", "transition")
-    whole = problem_of(both, effects)
+    whole = files.problem_of(both, effects)
     if more_noise:
         whole = along_trajectories(single_transitions(whole), np.median(phi, axis=0))
     known = earlier.to_numpy().reshape(len(phi), -1)
