@@ -1,4 +1,4 @@
-"""Record of a fit: everything in a posterior file but its arrays, in one versioned schema."""
+"""Record of a fit: all but arrays that a posterior file holds, and the mode that it stores."""
 
 from __future__ import annotations
 

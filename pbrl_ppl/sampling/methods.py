@@ -1,4 +1,4 @@
-"""Samplers of `fit`, each with its default schedule."""
+"""Samplers of `fit`, where they begin, and their default schedules."""
 
 from __future__ import annotations
 
