@@ -1,6 +1,7 @@
 """Rehearsals of recordings, against recordings with the law that are searched in earnest."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -36,9 +37,14 @@ def offered(scene: Scene) -> list:
     return [effect for effect in catalogue if effect.name in OFFERED[scene]]
 
 
+@cache
+def rehearsal_of(scene: Scene) -> Rehearsal:
+    return rehearse(scene, catalogue=offered(scene), seed=1)
+
+
 @pytest.fixture(scope="module", params=[PENDULUM, PUCK], ids=["pendulum", "puck"])
 def rehearsed(request) -> tuple[Scene, Rehearsal]:
-    return request.param, rehearse(request.param, catalogue=offered(request.param), seed=1)
+    return request.param, rehearsal_of(request.param)
 
 
 def law_of(rehearsal: Rehearsal, effect: str) -> RehearsedLaw:
@@ -80,7 +86,7 @@ def test_a_law_is_named_from_the_stated_size_on(rehearsed, place) -> None:
 @pytest.mark.slow
 def test_confounded_laws_are_worth_as_much() -> None:
     """Two dampings of one pendulum: each explains the recording, alone in the catalogue."""
-    rehearsal = rehearse(PENDULUM, catalogue=offered(PENDULUM), seed=1)
+    rehearsal = rehearsal_of(PENDULUM)
     law = law_of(rehearsal, "angular_drag")
     assert law.named == "pivot_damping" and "pivot_damping" in law.confounded
     assert "angular_drag" in law_of(rehearsal, "pivot_damping").confounded
@@ -116,11 +122,11 @@ def test_a_law_that_changes_nothing_is_unseen() -> None:
 
 def test_twice_the_noise_hides_twice_as_much_and_one_trajectory_more() -> None:
     drag = [effect for effect in catalogue if effect.name == "pivot_damping"]
-    (law,) = rehearse(PENDULUM, catalogue=drag).laws
+    rehearsal = rehearse(PENDULUM, catalogue=drag)
+    (law,) = rehearsal.laws
     (noisy,) = rehearse(PENDULUM.replace(noise={"theta": 2e-3}), catalogue=drag).laws
     assert noisy.sizes["coefficient"] == pytest.approx(2 * law.sizes["coefficient"], rel=0.35)
-    commands = rehearse(PENDULUM, catalogue=drag).history
-    single = History(commands.dataset.isel(trajectory=[0]))
+    single = History(rehearsal.history.dataset.isel(trajectory=[0]))
     (alone,) = rehearse(PENDULUM, single, catalogue=drag).laws
     assert alone.sizes["coefficient"] > 3 * law.sizes["coefficient"]
 
