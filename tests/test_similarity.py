@@ -24,6 +24,8 @@ from tests.helpers.similar import (
     similar_phi,
 )
 
+pytestmark = pytest.mark.first(4)
+
 CART = Path("models/shopping_cart")
 UNITS = {"kg": "kg", "m": "m", "1": "1", "rad": "rad"}
 SCALES = st.tuples(
@@ -149,30 +151,6 @@ def test_candidates_are_ranked_as_on_the_similar_rig(scales) -> None:
     for name, value in first.estimate.items():
         expected = factor(first.units[name], *scales) * value
         assert same.estimate[name] == pytest.approx(expected, rel=0.02)
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:the likelihood is linearised where it does not hold")
-def test_the_loop_of_a_ship_is_that_of_the_cart() -> None:
-    """The demo's recording: the same name, and its size within 1 %; as a ship, and as it is.
-
-    Modes differ by friction's grain, and with them how well 16 draws are linearised: 0.5 nats at
-    one of them, 2.9 at one that is 1.7 nats higher.
-    """
-    scene, _ = cart()
-    files = [CART / "recorded" / f"{part}.csv" for part in ("train", "test")]
-    train, test = (pp.History.load(file, scene) for file in files)
-    found = []
-    for scales in ((1.0, 1.0, 1.0), (100.0, 1e6, 10.0)):
-        histories = (similar_history(each, scene, *scales) for each in (train, test))
-        loop = pp.close_loop(similar(scene, *scales), *histories, seed=1, method="laplace")
-        (added,) = loop.added
-        (estimate,) = added.parameters.values()
-        size = estimate.mean / factor(estimate.unit, *scales)
-        found.append((loop.verdict, added.effect, size, loop.after.normalised_rmse))
-    here, there = found
-    assert here[:2] == there[:2] == ("effects-added", "angular_drag")
-    assert there[2:] == pytest.approx(here[2:], rel=0.01)
 
 
 def _in_frame(history: pp.History, scene: Scene, turn: float, shift, later: float, turns: int):
