@@ -42,6 +42,8 @@ pytestmark = [
 DRAWS = 300
 #: The Gaussian at the mode will do where the claim is a verdict's, not that of the chains.
 GAUSSIAN = "laplace"
+#: Enough to search where the claim is of the draws.
+DRAGS = tuple(effect for effect in pp.catalogue if effect.name.endswith("drag"))
 
 
 def without(*names: str) -> tuple[pp.Effect, ...]:
@@ -153,8 +155,7 @@ def test_what_comes_by_chance_takes_no_name_away() -> None:
     rng = np.random.default_rng(2)
     noise = rng.normal(0.0, (0.45, 0.45, 0.0), disc.pushes.shape)
     train, test = disc.frame(rng, pushed=noise), disc.frame(rng, pushed=noise[::-1])
-    drags = [effect for effect in pp.catalogue if effect.name.endswith("drag")]
-    found = loop((train, test), DISC, catalogue=drags)
+    found = loop((train, test), DISC, catalogue=DRAGS)
     assert found.verdict == "unexplained"  # and that something remains is said
     assert [one.effect for one in found.added] == ["linear_drag"]
     estimate = found.added[0].parameters["coefficient"]
@@ -229,7 +230,7 @@ def test_wrong_units_are_told_before_the_fit(clean) -> None:
 
 @pytest.mark.slow
 def test_too_few_draws_give_no_verdict(clean) -> None:
-    found = loop(clean, method="metropolis", draws=5)
+    found = loop(clean, method="metropolis", draws=5, catalogue=DRAGS)
     assert found.verdict == "not-converged"
     assert found.unexplained is None  # the tests are of the mode, and passed
 
@@ -245,7 +246,7 @@ def test_weights_that_miss_a_part_give_no_verdict(clean, monkeypatch) -> None:
 
     sample = loop_module.sample
     monkeypatch.setattr(loop_module, "sample", weighted)
-    assert loop(clean).verdict == "not-converged"
+    assert loop(clean, catalogue=DRAGS).verdict == "not-converged"
 
 
 def test_a_users_effect_that_fails_says_so_at_once(clean) -> None:
