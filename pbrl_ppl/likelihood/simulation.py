@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from pbrl_ppl.history import History
-from pbrl_ppl.likelihood.problem import FilteredProblem
+from pbrl_ppl.likelihood.output_error import in_pieces, is_simulated
+from pbrl_ppl.likelihood.problem import FilteredProblem, Problem, is_filtered
 from pbrl_ppl.likelihood.smoothing import along_trajectories
 from pbrl_ppl.physics import touching
 from pbrl_ppl.state import Floats
@@ -53,23 +54,26 @@ def simulated_trajectories(
     return np.where(np.isfinite(observed), measured, np.nan)
 
 
-def with_measurements(problem: FilteredProblem, observed: Floats) -> FilteredProblem:
-    """Return the problem of whole trajectories with other measurements.
+def with_measurements(problem: Problem, observed: Floats) -> Problem:
+    """Return the problem of filtered or simulated trajectories with other measurements.
 
     Parameters
     ----------
     problem : Problem
-        Of whole trajectories; its noise prior and its coordinates stay.
+        Its noise prior stays, and the coordinates of filtered trajectories.
     observed : ndarray
         Shape (trajectory, time, body, 6), SI units, NaN where missing.
     """
-    noise = problem.likelihood.noise
     dataset = problem.data.history.dataset.copy()
     start = np.where(np.isfinite(observed), observed, dataset["start"])
     for name, values in (("observed", observed), ("start", start)):
         dataset[name] = dataset[name].copy(data=values)
     history = History(dataset)
     centre = np.array([prior.centre for prior in problem.layout.priors])
-    return along_trajectories(
-        problem.with_data(history=history, states=None), centre, None, noise.coordinates
-    )
+    coordinates = problem.likelihood.noise.coordinates if is_filtered(problem) else None
+    other = problem.with_data(history=history, states=None)
+    whole = along_trajectories(other, centre, None, coordinates)
+    if not is_simulated(problem):
+        return whole
+    pieces = in_pieces(whole, problem.data.horizon, whole.data.smoothed_states)
+    return pieces.with_likelihood(prior=problem.likelihood.prior)

@@ -31,9 +31,8 @@ from pbrl_ppl.likelihood import (
     OutputErrorLikelihood,
     Problem,
     TransitionLikelihood,
-    along_trajectories,
     declared_problem,
-    in_pieces,
+    is_filtered,
     simulated_trajectories,
     with_measurements,
 )
@@ -378,7 +377,10 @@ def draw_truths(
 def _trajectories(design: Problem, phi: Floats, sigma: Floats, seed: int, colour: float) -> Floats:
     """Return measured states of whole trajectories, one set a draw; 0 where nothing is measured."""
     rngs = [np.random.default_rng([seed, i]) for i in range(len(phi))]
-    if design.likelihood.simulated:
+    if is_filtered(design):
+        drawn = zip(phi, sigma, rngs, strict=True)
+        every = np.array([simulated_trajectories(design, *draw) for draw in drawn])
+    else:
         every = np.repeat(design.data.smoothed_states[None], len(phi), axis=0)
         # without process noise; each piece of the design is a whole trajectory
         simulated_states = design.physics.one_world(phi, design.segments.start, design.inputs)
@@ -386,9 +388,6 @@ def _trajectories(design: Problem, phi: Floats, sigma: Floats, seed: int, colour
         columns = list(design.observations.columns)
         for states, noise, rng in zip(every, sigma, rngs, strict=True):
             states[..., columns] += noise * coloured((*states.shape[:3], len(columns)), colour, rng)
-    else:
-        drawn = zip(phi, sigma, rngs, strict=True)
-        every = np.array([simulated_trajectories(design, *draw) for draw in drawn])
     measured = np.isfinite(design.data.history.dataset["observed"].to_numpy())
     return np.where(measured, every, 0.0)
 
@@ -426,28 +425,12 @@ def simulated(design: Problem, values: Floats) -> Problem:
     """
     if not design.likelihood.independent:
         measured = np.isfinite(design.data.history.dataset["observed"].to_numpy())
-        values = np.where(measured, values, np.nan)
-        simulation = design.likelihood.simulated
-        return (_remeasured if simulation else with_measurements)(design, values)
+        return with_measurements(design, np.where(measured, values, np.nan))
     segments, observations = design.segments, design.observations
     observed = np.full((*segments.actions.shape[:3], len(STATE)), np.nan)
     observed[..., list(observations.columns)] = np.where(observations.measured, values, np.nan)
     history = from_segments(design.scene, segments.start, segments.inputs, observed)
     return design.with_data(history=history)
-
-
-def _remeasured(design: Problem, observed: Floats) -> Problem:
-    """Return the problem of simulations with other measurements, its noise prior the design's."""
-    dataset = design.data.history.dataset
-    start = np.where(np.isfinite(observed), observed, dataset["start"])
-    copies = {"observed": observed, "start": start}
-    history = History(
-        dataset.assign({key: dataset[key].copy(data=value) for key, value in copies.items()})
-    )
-    centre = np.array([prior.centre for prior in design.layout.priors])
-    problem = along_trajectories(design.with_data(history=history, states=None), centre)
-    problem = in_pieces(problem, design.data.horizon, problem.data.smoothed_states)
-    return problem.with_likelihood(prior=design.likelihood.prior)
 
 
 def replicate(
