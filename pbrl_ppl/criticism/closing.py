@@ -492,41 +492,30 @@ def _converged(fit: Fit, criteria: Criteria) -> bool:
 def _put_together(task: _Task, judged: _Judged, before: Fit, after: Fit, recorded: History) -> Loop:
     """Return the result of the stages; errors are forecasts of ``judged.rollout`` intervals."""
     cleaned, misfit, rollout = judged.cleaned, judged.misfit, judged.rollout
-    declared, revised, laws = judged.declared, judged.revised, judged.searched.laws
-    scene, held_out = task.scene, revised.held_out
-    test = held_out.problem.data.history
-    unit = noise_without_unexplained(revised.innovations, revised.excess)
-    errors = [
-        model.held_out.errors(held_out, fit, rollout, task.seed, unit)
-        for model, fit in ((declared, before), (revised, after))[revised is declared :]
-    ]
-    first = declared.held_out.simulated() if laws and judged.simulated else judged.simulated
-    both = (first, judged.simulated)
-    errors = [
-        replace(error, simulated_rmse=simulated)
-        for error, simulated in zip(errors, both[revised is declared :], strict=True)
-    ]
+    declared, revised = judged.declared, judged.revised
+    held_out = revised.held_out
+    error_before, error_after = _errors(judged, before, after, task.seed)
+    converged = all(_converged(fit, task.criteria) for fit in (before, after))
     verdict, unexplained = _verdict(
-        misfit, len(laws), errors[0], errors[-1],
-        all(_converged(fit, task.criteria) for fit in (before, after)), task.criteria,
-    )  # fmt: skip
+        misfit, len(judged.searched.laws), error_before, error_after, converged, task.criteria
+    )
     added = _added(judged, after)
     keep_groups(after.posterior, added)
-    excess, last = declared.excess, revised.excess
+    alone = noise_alone(revised.innovations, revised.excess)
     return Loop(
-        scene=scene,
+        scene=task.scene,
         verdict=verdict,
         numerical=Numerical(
-            scene.substeps,
+            task.scene.substeps,
             revised.innovations.problem.physics.substeps,
             shift(revised.innovations),
         ),
         candidates=_explained(judged),
         added=added,
         unexplained=unexplained,
-        before=errors[0],
-        after=errors[-1],
-        noise_floor=held_out.noise_floor(noise_alone(revised.innovations, last), rollout),
+        before=error_before,
+        after=error_after,
+        noise_floor=held_out.noise_floor(alone, rollout),
         declared=before,
         revised=after,
         innovations=(declared.innovations, revised.innovations),
@@ -534,25 +523,9 @@ def _put_together(task: _Task, judged: _Judged, before: Fit, after: Fit, recorde
         residuals_after=held_out.residuals(held_out),
         rollout=example_rollout(declared.held_out, held_out),
         rollout_horizon=rollout,
-        provenance={
-            "seed": task.seed,
-            "versions": versions(),
-            "data_sha256": cleaned.train.data_sha256,
-            "test_sha256": test.data_sha256,
-            "transitions": cleaned.train.n_transitions,
-            "trajectories": cleaned.train.n_trajectories,
-            "test_transitions": test.n_transitions,
-            "rollout_horizon": rollout,
-            "rollout_seconds": rollout * scene.time_step,
-        },
+        provenance=_provenance(task, judged),
         tests=misfit.tests,
-        acceleration=Acceleration(
-            excess.by_name(excess.size),
-            last.by_name(last.size),
-            excess.by_name(excess.relative),
-            last.by_name(last.relative),
-            last.by_name(last.certain),
-        ),
+        acceleration=_acceleration(declared.excess, revised.excess),
         correlations=misfit.correlations,
         growth=misfit.growth,
         search=judged.searched.found.lengths,
@@ -565,6 +538,48 @@ def _put_together(task: _Task, judged: _Judged, before: Fit, after: Fit, recorde
         held_out=recorded,
         catalogue=task.catalogue,
     )
+
+
+def _errors(judged: _Judged, before: Fit, after: Fit, seed: int) -> tuple[Errors, Errors]:
+    """Return the held-out errors of both models, in units of the revised model's noise."""
+    declared, revised = judged.declared, judged.revised
+    unit = noise_without_unexplained(revised.innovations, revised.excess)
+
+    def of(model: _Model, fit: Fit, simulated: Mapping[str, float]) -> Errors:
+        errors = model.held_out.errors(revised.held_out, fit, judged.rollout, seed, unit)
+        return replace(errors, simulated_rmse=simulated)
+
+    last = of(revised, after, judged.simulated)
+    if declared is revised:
+        return last, last
+    return of(declared, before, declared.held_out.simulated() if judged.simulated else {}), last
+
+
+def _acceleration(before: UnexplainedAcceleration, after: UnexplainedAcceleration) -> Acceleration:
+    """Return the unexplained acceleration of both models by velocity."""
+    return Acceleration(
+        before.by_name(before.size),
+        after.by_name(after.size),
+        before.by_name(before.relative),
+        after.by_name(after.relative),
+        dict(zip(after.names, after.certain.tolist(), strict=True)),
+    )
+
+
+def _provenance(task: _Task, judged: _Judged) -> dict[str, object]:
+    """Return what the result was made with and of."""
+    train, test = judged.cleaned.train, judged.revised.held_out.problem.data.history
+    return {
+        "seed": task.seed,
+        "versions": versions(),
+        "data_sha256": train.data_sha256,
+        "test_sha256": test.data_sha256,
+        "transitions": train.n_transitions,
+        "trajectories": train.n_trajectories,
+        "test_transitions": test.n_transitions,
+        "rollout_horizon": judged.rollout,
+        "rollout_seconds": judged.rollout * task.scene.time_step,
+    }
 
 
 def _compared(declared: Mode, revised: Mode, before: Fit, after: Fit) -> Comparison | None:

@@ -123,7 +123,7 @@ class Loop:
     residuals_after: Mapping[str, Floats]
     rollout: Rollout
     rollout_horizon: int
-    provenance: Mapping[str, Any]
+    provenance: Mapping[str, object]
     tests: tuple[ResidualTest, ...]
     acceleration: Acceleration
     correlations: Correlations
@@ -137,7 +137,7 @@ class Loop:
     criteria: Criteria = DEFAULT
     held_out: History | None = None
     catalogue: tuple[Effect, ...] = tuple(full_catalogue)
-    remainder: Any = None
+    remainder: Idata | None = None
 
     def __repr__(self) -> str:
         added = [f"{one.effect} on {one.body}" for one in self.added]
@@ -342,6 +342,6 @@ class Loop:
         return folder
 
 
-def _fields(value: Any, *left_out: str) -> dict[str, Any]:
+def _fields(value: object, *left_out: str) -> dict[str, object]:
     """Return the fields of a dataclass by their keys in JSON, without those named."""
     return {name: item for name, item in json_fields(value).items() if name not in left_out}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
@@ -43,7 +42,7 @@ class UnexplainedAcceleration:
     numerical: Floats
     criteria: Criteria = DEFAULT
 
-    def by_name(self, values: Floats | Bools) -> dict[str, Any]:
+    def by_name(self, values: Floats) -> dict[str, float]:
         """Return values of the velocities, shape (velocity,), by name."""
         return dict(zip(self.names, values.tolist(), strict=True))
 
