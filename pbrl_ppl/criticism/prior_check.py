@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -101,7 +100,7 @@ class PriorCheck:
 
 
 def prior_predictive_check(
-    model: Any,
+    model: object,
     *,
     draws: int = 400,
     seed: int = 0,
@@ -172,7 +171,6 @@ def prior_predictive_check(
     unused = unused_velocities(problem.data.history)
     history = measured_alone(problem.data.history, unused)
     recorded = np.isfinite(history.dataset["observed"].to_numpy()).any(axis=(0, 1))
-    noise = problem.noise_prior[0]
     first = segments.start[..., columns]
     # of bodies that are seen now and then, the last measured row counts
     steps = np.arange(1, observations.values.shape[1] + 1)[:, None, None]
@@ -185,25 +183,9 @@ def prior_predictive_check(
     phi = draw_prior(problem, rng, draws)
     for label, value in (fixed or {}).items():
         phi[:, problem.layout.labels.index(label)] = value
-    ends = np.concatenate(
-        [
-            _at(problem.predict(phi[i : i + chunk], problem.physics.one_world)[..., columns], last)
-            for i in range(0, len(phi), chunk)
-        ]
-    )
-    good = np.isfinite(ends).all(axis=(1, 2, 3))
-    if good.sum() < 2:
-        raise FitError(
-            f"prior check: the engine diverged on {len(good) - good.sum()} of {len(good)} draws"
-            " from the prior; narrow the prior's hyper-parameters, or use more substeps"
-        )
-    exact = observations.wrapped(ends[good] - first)
-    # sensors may be worse than the prior's median; both ends of a change have an error
-    known = _measurement_noise(history, dict(problem.scene.noise))
-    noisy = np.sqrt(2.0) * known
-    seconds = problem.data.horizon * problem.scene.time_step
-    noisy[:, : len(POSE)] = np.hypot(noisy[:, : len(POSE)], seconds * known[:, len(POSE) :])
-    predicted = ends[good] + np.maximum(noise, noisy[:, columns]) * rng.standard_normal(exact.shape)
+    ends = _predicted_ends(problem, phi, last, chunk)
+    exact = observations.wrapped(ends - first)
+    predicted = ends + _noise_of_changes(problem, history) * rng.standard_normal(exact.shape)
     derived = np.ones(measured.shape[1:])
     for i, d in enumerate(columns):
         derived[:, i] = ~recorded[:, d if d >= len(POSE) else d + len(POSE)]
@@ -218,8 +200,48 @@ def prior_predictive_check(
         dataset.assign_coords(coords),
         problem.data.horizon * problem.scene.time_step,
         draws,
-        int(draws - good.sum()),
+        draws - len(ends),
         criteria,
+    )
+
+
+def _predicted_ends(problem: Problem, phi: Floats, last: Ints, chunk: int) -> Floats:
+    """Return what is predicted at the last measured rows, (draw, transition, body, state).
+
+    Draws on which the engine diverges are left out.
+
+    Raises
+    ------
+    FitError
+        If fewer than two are left.
+    """
+    columns = list(problem.observations.columns)
+    ends = np.concatenate(
+        [
+            _at(problem.predict(phi[i : i + chunk], problem.physics.one_world)[..., columns], last)
+            for i in range(0, len(phi), chunk)
+        ]
+    )
+    good = np.isfinite(ends).all(axis=(1, 2, 3))
+    if good.sum() < 2:
+        raise FitError(
+            f"prior check: the engine diverged on {len(good) - good.sum()} of {len(good)} draws"
+            " from the prior; narrow the prior's hyper-parameters, or use more substeps"
+        )
+    return np.asarray(ends[good])
+
+
+def _noise_of_changes(problem: Problem, history: History) -> Floats:
+    """Return the standard deviation of errors of measured changes, shape (body, state).
+
+    Sensors may be worse than the prior's median; both ends of a change have an error.
+    """
+    known = _measurement_noise(history, dict(problem.scene.noise))
+    noisy = np.sqrt(2.0) * known
+    seconds = problem.data.horizon * problem.scene.time_step
+    noisy[:, : len(POSE)] = np.hypot(noisy[:, : len(POSE)], seconds * known[:, len(POSE) :])
+    return np.asarray(
+        np.maximum(problem.noise_prior[0], noisy[:, list(problem.observations.columns)])
     )
 
 
