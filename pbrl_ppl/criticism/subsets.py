@@ -180,52 +180,96 @@ def best_subsets(
             columns = np.arange(width, width + linear.basis.shape[1])
             terms.append(Term(law, linear, columns, float(price)))
             width += len(columns)
-    basis = np.hstack([term.linear.basis for term in terms])
-    gram, towards = basis.T @ basis, basis.T @ residual
+    equations = _NormalEquations.of(tuple(terms), residual, n, criteria.far_out, independent)
+    order = {law: place for place, law in enumerate(candidates)}
+    tried = equations.search([order[term.law] for term in terms], beam, largest)
+    best = sorted(tried, key=lambda subset: -subset.nats)
+    return Regression(tuple(best), same, tuple(signatures))
 
-    def joint(chosen: tuple[int, ...]) -> Subset | None:
-        columns = np.concatenate([terms[i].columns for i in chosen])
-        square = gram[np.ix_(columns, columns)]
-        values, vectors = np.linalg.eigh(square)
-        if values[0] < independent * values[-1]:
+
+@dataclass(frozen=True, eq=False)
+class _NormalEquations:
+    """Normal equations of the regression of a residual on the columns of terms.
+
+    Parameters
+    ----------
+    terms : tuple of Term
+        Laws at one point each.
+    gram, towards : ndarray
+        Products of all columns with each other and with the residual, shapes (column, column) and
+        (column,).
+    total : float
+        Squared size of the residual.
+    n : float
+        Measurements over their autocorrelation times.
+    far_out : float
+        Prior scales beyond which sizes are clipped.
+    independent : float
+        Least ratio of the eigenvalues of a subset's equations.
+    """
+
+    terms: tuple[Term, ...]
+    gram: Floats
+    towards: Floats
+    total: float
+    n: float
+    far_out: float
+    independent: float
+
+    @classmethod
+    def of(
+        cls, terms: tuple[Term, ...], residual: Floats, n: float, far_out: float, independent: float
+    ) -> _NormalEquations:
+        """Return the equations of terms, the columns of which are in their order."""
+        basis = np.hstack([term.linear.basis for term in terms])
+        total = float(residual @ residual)
+        return cls(terms, basis.T @ basis, basis.T @ residual, total, n, far_out, independent)
+
+    def solved(self, chosen: Sequence[int]) -> Subset | None:
+        """Return the subset of some terms; None if they are collinear, or a size is impossible."""
+        terms = [self.terms[i] for i in chosen]
+        columns = np.concatenate([term.columns for term in terms])
+        values, vectors = np.linalg.eigh(self.gram[np.ix_(columns, columns)])
+        if values[0] < self.independent * values[-1]:
             return None
-        coordinates = vectors @ ((vectors.T @ towards[columns]) / values)
+        coordinates = vectors @ ((vectors.T @ self.towards[columns]) / values)
         sizes, begin = {}, 0
-        for i in chosen:
-            term = terms[i]
+        for term in terms:
             end = begin + len(term.columns)
-            size = term.sizes(coordinates[begin:end], criteria.far_out)
+            size = term.sizes(coordinates[begin:end], self.far_out)
             if size is None:
                 return None
             sizes[term.law], begin = size, end
-        share = min(float(coordinates @ towards[columns]) / total, 1.0 - 1e-12)
-        prices = {terms[i].law: terms[i].price for i in chosen}
-        return Subset(sizes, worth(share, len(columns), n) - sum(prices.values()), share, prices)
+        share = min(float(coordinates @ self.towards[columns]) / self.total, 1.0 - 1e-12)
+        prices = {term.law: term.price for term in terms}
+        nats = worth(share, len(columns), self.n) - sum(prices.values())
+        return Subset(sizes, nats, share, prices)
 
-    order = {law: place for place, law in enumerate(candidates)}
-    level: dict[tuple[int, ...], Subset] = {
-        (i,): one for i in range(len(terms)) if (one := joint((i,))) is not None
-    }
-    tried = dict(level)
-    for _ in range(largest - 1):
-        grown: dict[tuple[int, ...], Subset] = {}
-        # all pairs are tried
-        best = sorted(level, key=lambda chosen: -level[chosen].nats)
-        for chosen in best if len(next(iter(level), ())) == 1 else best[:beam]:
-            laws = {terms[i].law for i in chosen}
-            for i, term in enumerate(terms):
-                more = tuple(sorted((*chosen, i), key=lambda i: (order[terms[i].law], i)))
-                if term.law in laws or more in tried or more in grown:
-                    continue
-                if (one := joint(more)) is not None:
-                    grown[more] = one
-        if not grown:
-            break
-        tried |= grown
-        level = grown
-    return Regression(
-        tuple(sorted(tried.values(), key=lambda subset: -subset.nats)), same, tuple(signatures)
-    )
+    def search(self, order: Sequence[int], beam: int, largest: int) -> list[Subset]:
+        """Return the subsets tried: all of one or two laws, then the best with one more law.
+
+        ``order`` is the place of each term's law in the catalogue.
+        """
+        level: dict[tuple[int, ...], Subset] = {
+            (i,): one for i in range(len(self.terms)) if (one := self.solved((i,))) is not None
+        }
+        tried = dict(level)
+        for _ in range(largest - 1):
+            grown: dict[tuple[int, ...], Subset] = {}
+            best = sorted(level, key=lambda chosen: -level[chosen].nats)
+            for chosen in best if len(next(iter(level), ())) == 1 else best[:beam]:
+                laws = {self.terms[i].law for i in chosen}
+                for i, term in enumerate(self.terms):
+                    more = tuple(sorted((*chosen, i), key=lambda i: (order[i], i)))
+                    if term.law in laws or more in tried or more in grown:
+                        continue
+                    if (one := self.solved(more)) is not None:
+                        grown[more] = one
+            if not grown:
+                break
+            tried |= grown
+            level = grown
+        return list(tried.values())
 
 
 def _distinct(
