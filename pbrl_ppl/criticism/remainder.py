@@ -6,7 +6,6 @@ import json
 import warnings
 from collections.abc import Callable, Iterable
 from importlib.util import find_spec
-from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -158,7 +157,7 @@ def _learned(
     chosen = np.sort(rng.permutation(len(x))[:most_transitions])
     low, high = x.min(axis=0), x.max(axis=0)
     size = np.maximum(high - low, 1e-9 * state_sizes(mode.problem.scene)[3:])
-    table: dict[str, list[Any]] = {"centre": [], "width": [], "output": []}
+    centres_of, widths, outputs = list[list[float]](), list[list[float]](), list[int]()
     blocks = []
     excess = unexplained_acceleration(mode, criteria)
     missing = {name for name, matters in zip(excess.names, excess.matters, strict=True) if matters}
@@ -176,15 +175,17 @@ def _learned(
         enough = int(np.searchsorted(np.cumsum(values) / values.sum(), variance_share)) + 1
         kept = slice(0, min(enough, most_forms))
         blocks.append(sd * vectors[:, kept].T / np.sqrt(values[kept])[:, None])
-        table["centre"] += (low + size * centre).tolist()
-        table["width"] += [(size * lengths).tolist()] * centres
-        table["output"] += [output] * centres
+        centres_of += (low + size * centre).tolist()
+        widths += [(size * lengths).tolist()] * centres
+        outputs += [output] * centres
     if not blocks:
         raise FitError(
             f"nothing to learn: the unexplained force on {body} is negligible, or does not depend"
             " on its velocity"
         )
-    return learned_remainder(json.dumps(table | {"forms": block_diag(*blocks).tolist()}))
+    forms = block_diag(*blocks).tolist()
+    table = {"centre": centres_of, "width": widths, "output": outputs, "forms": forms}
+    return learned_remainder(json.dumps(table))
 
 
 def _process(

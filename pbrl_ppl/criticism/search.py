@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Any
 
 import numpy as np
 from scipy.stats import norm
@@ -690,12 +689,15 @@ def _with_contacts(
     for law in gone:
         after = drop(after, law) if len(gone) < len(found.laws) else declared
     why = "small, and not significant with collisions"
-    left: dict[str, Any] = {
-        name: {law: one for law, one in getattr(found, name).items() if law not in gone}
-        for name in ("laws", "gains", "confounded")
-    }
-    rejected = {**found.rejected, **dict.fromkeys(gone, why)}
-    return replace(found, declared=declared, after=after, rejected=rejected, **left)
+    return replace(
+        found,
+        declared=declared,
+        after=after,
+        laws={law: one for law, one in found.laws.items() if law not in gone},
+        gains={law: one for law, one in found.gains.items() if law not in gone},
+        confounded={law: one for law, one in found.confounded.items() if law not in gone},
+        rejected={**found.rejected, **dict.fromkeys(gone, why)},
+    )
 
 
 def _is_null(mode: Mode, law: Attached, *, significant: float = 3.0) -> bool:
