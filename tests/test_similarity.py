@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pbrl_ppl as pp
-from pbrl_ppl.criticism.ranking import criticise, declared_mode
+from pbrl_ppl.criticism.attribution import criticise
+from pbrl_ppl.criticism.refinement import declared_mode
 from pbrl_ppl.effects import attach, catalogue
 from pbrl_ppl.history import with_units
 from pbrl_ppl.likelihood import Problem

@@ -1,7 +1,9 @@
 """Model criticism: residual, score, effect, refit, verdict, held-out error."""
 
 from .attribution import Attribution as Attribution
+from .attribution import Ranking as Ranking
 from .attribution import attribute as attribute
+from .attribution import criticise as criticise
 from .closing import LoopInterrupted as LoopInterrupted
 from .closing import close_loop as close_loop
 from .criteria import DEFAULT as DEFAULT
@@ -22,8 +24,6 @@ from .misfit import share_in_words as share_in_words
 from .prior_check import PriorCheck as PriorCheck
 from .prior_check import informative_horizon as informative_horizon
 from .prior_check import prior_predictive_check as prior_predictive_check
-from .ranking import Ranking as Ranking
-from .ranking import criticise as criticise
 from .rehearsal import Rehearsal as Rehearsal
 from .rehearsal import RehearsedLaw as RehearsedLaw
 from .rehearsal import rehearse as rehearse

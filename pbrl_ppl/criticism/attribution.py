@@ -1,4 +1,4 @@
-"""Attribution by simulation error alone: laws of a recording, without a verdict."""
+"""What a declared model lacks, without a verdict: by simulation error, or by score tests."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
-from pbrl_ppl.criticism.ranking import checked_mode
-from pbrl_ppl.criticism.results import ONE_TRAJECTORY, Law, SearchLength, Stage
+from pbrl_ppl.criticism.refinement import checked_mode
+from pbrl_ppl.criticism.results import ONE_TRAJECTORY, Candidate, Law, SearchLength, Stage
+from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.criticism.search import Search
+from pbrl_ppl.criticism.unexplained import unexplained_acceleration
 from pbrl_ppl.effects import Attached, Effect, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.history import History
@@ -136,4 +138,86 @@ def attribute(
         trajectories=problem.data.history.n_trajectories,
         search=found.lengths,
         rejected={f"{law.effect.name} on {law.body}": why for law, why in found.rejected.items()},
+    )
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """Score tests of all candidate effects, at the mode of the declared model.
+
+    Parameters
+    ----------
+    candidates : tuple of Candidate
+        Best first.
+    mode : dict of str to float
+        The declared model's parameters there, by label, SI units.
+    unexplained_acceleration : dict of str to float
+        Standard deviation of the declared model's process noise, m/s^2 and rad/s^2.
+    substeps : int
+        Engine steps an interval that were needed.
+    """
+
+    candidates: tuple[Candidate, ...]
+    mode: dict[str, float]
+    unexplained_acceleration: dict[str, float]
+    substeps: int
+
+
+@one_blas_thread
+def criticise(
+    scene: Scene,
+    history: History,
+    *,
+    catalogue: Iterable[Effect] = full_catalogue,
+    seed: int = 0,
+    substeps: int | None = None,
+    criteria: Criteria = DEFAULT,
+    progress: Callable[[str], None] | None = None,
+) -> Ranking:
+    """Rank the effects that a declared model might lack by their score tests, without a refit.
+
+    A statistic says that the residual looks like the effect's signature; whether the effect
+    explains it, and helps on other data, :func:`pbrl_ppl.close_loop` finds out.
+
+    Parameters
+    ----------
+    scene : Scene
+        The declared model.
+    history : History
+        Measured transitions.
+    catalogue : iterable of Effect
+        Effects to consider.
+    seed : int
+        Seed of the search for the mode.
+    substeps : int, optional
+        Engine steps an interval to begin with; the scene's by default.
+    criteria : Criteria
+        When the engine's error is small enough.
+    progress : callable, optional
+        Called with the name of each stage.
+
+    Returns
+    -------
+    Ranking
+        The candidates, best first.
+
+    Raises
+    ------
+    HistoryError
+        If the history does not fit the scene.
+    EffectError
+        If the scene declares an unknown effect.
+    """
+    say = progress or (lambda stage: None)
+    catalogue = tuple(catalogue)
+    mode = checked_mode(scene, history, catalogue, seed, substeps, criteria, say)
+    scene, effects = mode.problem.scene, mode.problem.physics.effects
+    say(Stage.SCORE)
+    ranked = rank_candidates(mode, candidates(scene, effects, catalogue), criteria)
+    excess = unexplained_acceleration(mode, criteria)
+    return Ranking(
+        tuple(signature.candidate for signature in ranked),
+        dict(zip(mode.problem.layout.labels, mode.phi.tolist(), strict=True)),
+        excess.by_name(excess.size),
+        mode.problem.physics.substeps,
     )

@@ -1,4 +1,4 @@
-"""Engine steps: doubled until neither predictions nor accelerations move."""
+"""Mode of a declared model: its recording checked, with enough engine steps."""
 
 from __future__ import annotations
 
@@ -7,8 +7,63 @@ from collections.abc import Callable
 import numpy as np
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
+from pbrl_ppl.criticism.recordings import checked_histories
+from pbrl_ppl.criticism.results import Stage
 from pbrl_ppl.criticism.unexplained import unexplained_acceleration
-from pbrl_ppl.modes import Mode, nearby_mode, trajectory_mode
+from pbrl_ppl.effects import Attached, Effect, attach
+from pbrl_ppl.history import History, with_units
+from pbrl_ppl.likelihood import Problem, single_transitions
+from pbrl_ppl.modes import Mode, find_mode, nearby_mode, trajectory_mode
+from pbrl_ppl.physics import Physics
+from pbrl_ppl.scene import Scene, check_substeps
+
+
+def checked_mode(
+    scene: Scene,
+    history: History,
+    catalogue: tuple[Effect, ...],
+    seed: int,
+    substeps: int | None,
+    criteria: Criteria,
+    say: Callable[[str], None],
+) -> Mode:
+    """Return the declared model's mode on a history without bad frames and unused velocities.
+
+    Raises
+    ------
+    HistoryError
+        If the history does not fit the scene.
+    EffectError
+        If the scene declares an unknown effect.
+    """
+    if substeps is not None:
+        check_substeps(substeps)
+    history, _, unused, bad = checked_histories(scene, history, history)
+    for sentence in (*(velocity.sentence for velocity in unused), *bad):
+        say(sentence)
+    scene = with_units(scene, history)
+    effects = attach(scene, (), catalogue)
+    say(Stage.FIT)
+    return declared_mode(scene, history, effects, seed, substeps, say, criteria)
+
+
+def declared_mode(
+    scene: Scene,
+    history: History,
+    effects: tuple[Attached, ...],
+    seed: int,
+    substeps: int | None,
+    say: Callable[[str], None],
+    criteria: Criteria = DEFAULT,
+) -> Mode:
+    """Return the declared model's mode on whole trajectories, with enough substeps."""
+    steps = scene.substeps if substeps is None else substeps
+    problem = Problem.of(Physics(scene, effects, steps, threads=2), history)
+    if substeps is None:
+        physics = problem.physics
+        problem = problem.with_physics(substeps=max(physics.substeps, physics.fine_enough))
+    mode = find_mode(single_transitions(problem), seed=seed)
+    return with_enough_substeps(trajectory_mode(problem, mode.phi), say, criteria)
 
 
 def with_enough_substeps(

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pbrl_ppl.criticism.ranking import criticise
+from pbrl_ppl.criticism.attribution import criticise
 from pbrl_ppl.criticism.recordings import checked_histories
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.history import History, without_bad_frames
