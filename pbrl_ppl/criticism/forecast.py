@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pbrl_ppl.likelihood import Problem, TrajectoryNoise
-from pbrl_ppl.state import STATE, Bools, Floats, Ints
+from pbrl_ppl.state import STATE, Floats, Ints
 
 #: Rows after which a filter's covariance is in steady state.
 _STEADY_STATE_ROWS = 5
@@ -51,12 +51,6 @@ class Forecast:
             if not np.isnan(columns).all():
                 result[STATE[d]] = float(np.sqrt(np.nanmean(columns)))
         return result
-
-
-def longest_forecast(problem: Problem) -> int:
-    """Return the length of the longest forecasts that all trajectories have, in intervals."""
-    shortest = int(problem.data.history.dataset["n_rows"].min()) - 1
-    return max(1, shortest - min(_STEADY_STATE_ROWS, shortest // 2))
 
 
 def filtered_states(problem: Problem, phi: Floats, sigma: Floats) -> Floats:
@@ -152,7 +146,6 @@ def forecast(
     sigma: Floats,
     intervals: int,
     *,
-    within: Bools | None = None,
     allowed: Floats | None = None,
 ) -> Forecast:
     """Predict several intervals from filtered states all along the trajectories.
@@ -165,8 +158,6 @@ def forecast(
         Parameters and noise parameters, shapes (p,) and (parameter,).
     intervals : int
         Length of a forecast.
-    within : ndarray of bool, optional
-        Transitions in which forecasts may begin, shape (transition,).
     allowed : ndarray, optional
         Constant accelerations that count as noise in the expected square, shape (velocity,),
         m/s^2 and rad/s^2.
@@ -183,8 +174,6 @@ def forecast(
             measured = noise.seen[rows + intervals - 1].any(axis=1)
             starts.append(rows[measured][:: max(1, intervals // 2)])
     at = np.concatenate(starts) if starts else np.zeros(0, dtype=np.intp)
-    if within is not None:
-        at = at[within[at]]
     if not len(at):
         none = np.zeros((0, len(coordinates.places)))
         return Forecast(none, none, none, coordinates.places % len(STATE))

@@ -46,8 +46,6 @@ class Signature:
         Orthonormal basis of the projected signature, shape (n, q).
     direction : ndarray
         Unit vector of the fitted signature, shape (n,); zero if there is none.
-    absorbed : ndarray
-        Change of the declared parameters with the effect of the estimated size, shape (p,).
     linear : tuple of Linearisation
         At the null value, or at the leading grid points of a scan, best first.
     """
@@ -57,7 +55,6 @@ class Signature:
     log_p: float
     basis: Floats
     direction: Floats
-    absorbed: Floats
     linear: tuple[Linearisation, ...]
 
 
@@ -169,8 +166,8 @@ def _score_test(mode: Mode, candidates: int, criteria: Criteria) -> ScoreTest:
     q, r = np.linalg.qr(jacobian * scale)
     # a parameter that neither the data nor the prior inform has no direction
     informed = np.abs(np.diag(r)) > 1e-10 * np.abs(np.diag(r)).max(initial=0.0)
-    back, q = scale[:, None] * np.linalg.pinv(r)[:, informed], q[:, informed]
-    return ScoreTest(q, back, residual - q @ (q.T @ residual), candidates, criteria)
+    q = q[:, informed]
+    return ScoreTest(q, residual - q @ (q.T @ residual), candidates, criteria)
 
 
 def _points(mode: Mode, attached: Attached) -> list[GridPoint]:
@@ -221,7 +218,6 @@ class _Evidence:
     basis: Floats
     direction: Floats
     unit: Floats
-    absorbed: Floats
     back: Floats
 
     def about(self, point: GridPoint) -> Linearisation:
@@ -229,9 +225,9 @@ class _Evidence:
         return Linearisation(point.values, point.columns, self.basis, self.back)
 
 
-def _none(n: int, p: int) -> _Evidence:
-    """Return no evidence for one column, over n whitened residuals and p parameters."""
-    nothing = np.zeros(1), np.zeros((n, 0)), np.zeros(n), np.zeros(1), np.zeros(p)
+def _none(n: int) -> _Evidence:
+    """Return no evidence for one column, over n whitened residuals."""
+    nothing = np.zeros(1), np.zeros((n, 0)), np.zeros(n), np.zeros(1)
     return _Evidence(0.0, 0.0, 0.0, *nothing, np.zeros((1, 0)))
 
 
@@ -243,8 +239,6 @@ class ScoreTest:
     ----------
     q : ndarray
         Orthonormal directions that the declared parameters absorb, shape (n, direction).
-    back : ndarray
-        From these directions to the declared parameters, shape (p, direction).
     residual : ndarray
         Whitened residual without these directions, shape (n,).
     candidates : int
@@ -254,7 +248,6 @@ class ScoreTest:
     """
 
     q: Floats
-    back: Floats
     residual: Floats
     candidates: int
     criteria: Criteria
@@ -311,8 +304,7 @@ class ScoreTest:
                 log_p = log_p + np.log(0.5) if allowed else 0.0
             if statistic > 0:
                 direction = basis @ coordinates / np.sqrt(statistic)
-        absorbed = -self.back @ (self.q.T @ (signature @ (size / scales)))
-        return _Evidence(statistic, log_p, share, size, basis, direction, unit, absorbed, back)
+        return _Evidence(statistic, log_p, share, size, basis, direction, unit, back)
 
 
 def null_sides(attached: Attached) -> Ints:
@@ -356,9 +348,7 @@ def _signature(
         detectable=detection_limits(effect, tried, units, test.candidates, test.criteria.residual),
         is_upper_limit=is_upper_limit(effect, tried),
     )
-    return Signature(
-        attached, candidate, log_p, evidence.basis, evidence.direction, evidence.absorbed, linear
-    )
+    return Signature(attached, candidate, log_p, evidence.basis, evidence.direction, linear)
 
 
 def _best_grid_point(mode: Mode, attached: Attached, test: ScoreTest, again: int = 4) -> Signature:
@@ -378,7 +368,7 @@ def _best_grid_point(mode: Mode, attached: Attached, test: ScoreTest, again: int
         judged = sorted(
             ((test.at(point, attached), point) for point in finer), key=lambda x: x[0].log_p
         )
-    best, values = _none(len(test.residual), len(test.back)), np.array(attached.effect.null)
+    best, values = _none(len(test.residual)), np.array(attached.effect.null)
     if judged:
         best, point = judged[0]
         values = point.values.copy()
@@ -414,7 +404,7 @@ def _tail_score(mode: Mode, attached: Attached, test: ScoreTest) -> Signature:
     score, variance = float((z**4 - 6 * z**2 + 3).sum() / 4), 1.5 * max(len(z), 1)
     heavier = score > 0
     evidence = replace(
-        _none(len(test.residual), len(test.back)),
+        _none(len(test.residual)),
         statistic=score**2 / variance if heavier else 0.0,
         log_p=float(norm.logsf(score / np.sqrt(variance))) if heavier else 0.0,
         share=1.0,

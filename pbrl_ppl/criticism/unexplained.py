@@ -81,11 +81,6 @@ class UnexplainedAcceleration:
         """Return the largest relative one among those that are significant; 0 without any."""
         return float(np.where(self.certain, self.relative, 0.0).max(initial=0.0))
 
-    @property
-    def square(self) -> float:
-        """Return the sum of squares of the relative ones that are significant."""
-        return float((np.where(self.certain, self.relative, 0.0) ** 2).sum())
-
 
 def unexplained_acceleration(mode: Mode, criteria: Criteria = DEFAULT) -> UnexplainedAcceleration:
     """Return the acceleration that a fitted model leaves unexplained."""
