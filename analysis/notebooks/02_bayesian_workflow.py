@@ -103,9 +103,8 @@ print(worst.round(3))
 tables["with drag"].round(4)
 
 # %% [markdown]
-# Trace plot: chains that mix look like noise about one level, and all alike. This is ArviZ's
-# picture, with the same layout on its two generations; `az.plot_trace(idata, var_names=["mass"])`
-# works too.
+# Trace plot: chains that mix look like noise about one level, and all alike. It is the same
+# picture on both generations of ArviZ; `az.plot_trace(idata, var_names=["mass"])` works too.
 
 # %%
 shown = ["mass[cart]", "w_x[cart]", "mu_x[cart]", "angular_drag_coefficient[cart]"]

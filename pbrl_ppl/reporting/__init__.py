@@ -5,9 +5,6 @@ from pbrl_ppl.reporting.error_plots import plot_errors as plot_errors
 from pbrl_ppl.reporting.error_plots import plot_rollout as plot_rollout
 from pbrl_ppl.reporting.logs import Log as Log
 from pbrl_ppl.reporting.logs import read_manifest as read_manifest
-from pbrl_ppl.reporting.loop_report import in_brief as in_brief
-from pbrl_ppl.reporting.loop_report import render as render
-from pbrl_ppl.reporting.loop_report import report as report
 from pbrl_ppl.reporting.many import ManyLoops as ManyLoops
 from pbrl_ppl.reporting.many import close_loop_many as close_loop_many
 from pbrl_ppl.reporting.many_page import in_words as in_words
@@ -16,8 +13,11 @@ from pbrl_ppl.reporting.posterior_plots import plot_calibration as plot_calibrat
 from pbrl_ppl.reporting.posterior_plots import plot_prior_check as plot_prior_check
 from pbrl_ppl.reporting.posterior_plots import plot_rank as plot_rank
 from pbrl_ppl.reporting.posterior_plots import plot_trace as plot_trace
-from pbrl_ppl.reporting.posterior_report import render_posterior as render_posterior
 from pbrl_ppl.reporting.posterior_summary import summary as summary
+from pbrl_ppl.reporting.reports import in_brief as in_brief
+from pbrl_ppl.reporting.reports import render as render
+from pbrl_ppl.reporting.reports import render_posterior as render_posterior
+from pbrl_ppl.reporting.reports import report as report
 from pbrl_ppl.reporting.scene_plots import animate_plan as animate_plan
 from pbrl_ppl.reporting.scene_plots import draw_goal as draw_goal
 from pbrl_ppl.reporting.scene_plots import draw_motion as draw_motion

@@ -46,7 +46,7 @@ def plot_candidates(loop: Loop, width: float = style.WIDE, level: float = 0.01) 
         [c.statistic for c in shown],
         [style.AFTER if (c.effect, c.body) in added else style.PLAIN for c in shown],
         [f"{c.statistic:.3g}{', hardly identifiable' * (c.identifiable < HARDLY)}" for c in shown],
-        height=0.7, edgecolor="white", hatch=["////" * (c.identifiable < HARDLY) for c in shown],
+        height=0.7, hatch=["////" * (c.identifiable < HARDLY) for c in shown],
     )  # fmt: skip
     places = np.arange(len(shown))
     axes.vlines(thresholds, places - 0.45, places + 0.45, color=style.BEFORE, linewidth=2)
@@ -116,7 +116,7 @@ def _mark_null(axes: Axes, null: float, mean: float, sd: float) -> None:
     """Draw a line at the value that means no effect, or an arrow where that is far away."""
     if abs(null - mean) < 25 * sd:
         axes.axvline(null, color="black", linestyle="--", linewidth=1.2)
-        style.label(axes, "no effect", (null, 1.05), xytext=(3, 0))
+        style.label(axes, "no effect", (null, 1.05), (3, 0))
         return
     text, x, side = f"no effect ({null:g}) →", 0.98, "right"
     if null < mean:
@@ -194,7 +194,7 @@ def _shares(axes: Axes, evidence: Evidence) -> None:
     axes.plot(np.linspace(0, 100, len(shares)), shares, color=style.AFTER)
     axes.plot([0, 100], [0, 100], color=style.PLAIN, linestyle=":", linewidth=1)
     axes.plot(*at, "o", color=style.BEFORE)
-    style.label(axes, f"{count} transitions\nhold 80 %", at, xytext=(8, -24))
+    style.label(axes, f"{count} transitions\nhold 80 %", at, (8, -24))
     x = "transitions, largest gain first (%)"
     style.name_axes(axes, "by transition", x, "share of the gains (%)")
 

@@ -15,7 +15,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from pbrl_ppl import __version__
 from pbrl_ppl.criticism import Loop, close_loop
@@ -23,7 +23,7 @@ from pbrl_ppl.criticism.loop import FILES
 from pbrl_ppl.errors import ManifestError, PbrlError
 from pbrl_ppl.files import write_text
 from pbrl_ppl.history import read_recording, read_scene
-from pbrl_ppl.reporting.loop_report import render
+from pbrl_ppl.reporting.reports import render
 from pbrl_ppl.scene import nearest
 
 _NEEDED, _OPTIONAL = ("name", "scene", "train"), ("test", "kind")
@@ -134,6 +134,8 @@ DONE, FAILED = "report.json", "error.json"
 #: Warnings and figures belong to a process, not a thread: a process works on one log at a time.
 _ONE = threading.Lock()
 _MAKING = ".making-"
+#: Values by name: the summary of one log, of values that JSON has, or arguments.
+Row = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -148,9 +150,9 @@ class Settings:
         Of :func:`pbrl_ppl.close_loop`; the whole catalogue without one.
     """
 
-    scene: Mapping[str, Any]
-    recording: Mapping[str, Any]
-    loop: Mapping[str, Any]
+    scene: Row
+    recording: Row
+    loop: Row
 
     def to_dict(self) -> dict[str, object]:
         """Return the settings as JSON values."""
@@ -159,10 +161,15 @@ class Settings:
         return {**self.scene, **self.recording, **self.loop, "catalogue": effects}
 
 
-#: Summary of one log, of values that JSON has.
-Row = Mapping[str, Any]
-#: Closes the loop on one log; its result has a ``save(folder)`` that writes a loop's files.
-Run = Callable[[Log, Settings], Any]
+class Saves(Protocol):
+    """A result that writes a loop's files into a folder."""
+
+    def save(self, folder: Path) -> None:
+        """Write the files."""
+
+
+#: Closes the loop on one log.
+Run = Callable[[Log, Settings], Saves]
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,7 +252,7 @@ def settle(log: Log, folder: Path, settings: Settings, inputs: str, run: Run) ->
     return row or failed(log, folder, OSError(f"{place / DONE}: missing after it was written"))
 
 
-def _keep(loop: Any, place: Path, about: Row) -> None:
+def _keep(loop: Saves, place: Path, about: Row) -> None:
     """Write a loop's files into a log's folder, ``report.json`` last."""
     with tempfile.TemporaryDirectory(prefix=_MAKING, dir=place) as aside:
         made = Path(aside) / "result"

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from functools import partial
-from itertools import pairwise
 from typing import Any
 
 import pandas as pd
@@ -79,13 +78,7 @@ def page(
     source: Source,
 ) -> str:
     """Render one page of HTML with links to each log's report."""
-    found: dict[tuple[str, str], list[str]] = {}
-    for row in rows:
-        for effect in row.get("effects", ()):
-            found.setdefault((effect["effect"], effect["body"]), []).append(row["name"])
-    # more than four effects side by side would not fit beside the names of the logs
-    pairs, tables = list(found), -(-len(found) // 4)
-    parts = pairwise(i * len(pairs) // tables for i in range(tables + 1)) if pairs else ()
+    found = _found(rows)
     return render_page(
         f"{len(rows)} logs",
         "logs_header",
@@ -94,7 +87,7 @@ def page(
         headline=in_words(rows).replace("-", " "),
         found={_title(*pair): names for pair, names in found.items()},
         logs=_logs(rows),
-        effects=[_effects(rows, pairs[i:j]) for i, j in parts],
+        effects=_effects(rows, list(found)),
         kinds={kind: (each.names, _pooled(each, kind)) for kind, each in pooled.items()},
         not_pooled=not_pooled,
         warnings={row["name"]: row["warnings"] for row in rows if row.get("warnings")},
@@ -127,17 +120,36 @@ def _logs(rows: Iterable[Row]) -> Table:
     )
 
 
-def _effects(rows: Iterable[Row], pairs: Sequence[tuple[str, str]]) -> Table:
-    """Tabulate the effects, one row a finished log, one column an effect."""
-    done = (row for row in rows if row["status"] == "done")
+def _found(rows: Iterable[Row]) -> dict[tuple[str, str], list[str]]:
+    """Return the names of the logs in which each effect of a body was found."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for row in rows:
+        for effect in row.get("effects", ()):
+            found.setdefault((effect["effect"], effect["body"]), []).append(row["name"])
+    return found
+
+
+def _effects(rows: Iterable[Row], pairs: Sequence[tuple[str, str]], most: int = 4) -> list[Table]:
+    """Tabulate the effects, one row a finished log, one column an effect.
+
+    More than ``most`` effects side by side would not fit beside the names of the logs.
+    """
+    done = [row for row in rows if row["status"] == "done"]
     columns = {_title(*pair): partial(_cell, effect=pair[0], body=pair[1]) for pair in pairs}
-    return tabulate("Effects found, by log", done, {"Log": _link, **columns}, columns)
+    heads, count = list(columns), -(-len(columns) // most)
+    parts = [heads[i * len(heads) // count : (i + 1) * len(heads) // count] for i in range(count)]
+    return [
+        tabulate(
+            "Effects found, by log", done, {"Log": _link, **{h: columns[h] for h in part}}, part
+        )
+        for part in parts
+    ]
 
 
 def _pooled(pooled: Pooled, kind: str) -> Table:
     """Tabulate the hyper-parameters of a kind, one row a parameter."""
 
-    def interval(middle: str, name: str) -> Callable[[Mapping[Any, Any]], Cell]:
+    def interval(middle: str, name: str) -> Callable[[Mapping[Hashable, Any]], Cell]:
         return lambda row: (
             number(row[middle]),
             f"{number(row[f'{name}_low'])} to {number(row[f'{name}_high'])}",

@@ -130,14 +130,14 @@ def render_page(title: str, header: str, sections: Sequence[Section], **context:
 
 def _drawn(draws: Sequence[Callable[..., Figure]]) -> list[Mapping[str, str]]:
     """Return pictures in both widths, drawn by two processes."""
-    with background(lambda: [_picture(draw) for draw in draws[1::2]]) as others:
-        pictures = {2 * i: _picture(draw) for i, draw in enumerate(draws[::2])}
-        pictures |= {2 * i + 1: picture for i, picture in enumerate(others())}
+    with background(lambda: [picture(draw) for draw in draws[1::2]]) as others:
+        pictures = {2 * i: picture(draw) for i, draw in enumerate(draws[::2])}
+        pictures |= {2 * i + 1: drawn for i, drawn in enumerate(others())}
     return [pictures[i] for i in range(len(draws))]
 
 
-def _picture(draw: Callable[..., Figure]) -> Mapping[str, str]:
-    """Return a picture in both widths, as data URLs."""
+def picture(draw: Callable[..., Figure]) -> Mapping[str, str]:
+    """Return a picture in both widths, ``wide`` and ``narrow``, as data URLs."""
     sizes = {"wide": WIDE, "narrow": NARROW}
     data = {name: base64.b64encode(png(draw(width=width))) for name, width in sizes.items()}
     return {name: f"data:image/png;base64,{code.decode('ascii')}" for name, code in data.items()}

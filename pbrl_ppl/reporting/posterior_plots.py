@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 
-import arviz as az
 import numpy as np
 import xarray as xr
-from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from scipy.stats import binom, rankdata
 
 from pbrl_ppl.criticism import PriorCheck
-from pbrl_ppl.posterior import DATATREE, Idata, convergence, from_groups, scalars
+from pbrl_ppl.posterior import Idata, convergence, from_groups, scalars
 from pbrl_ppl.reporting import style
 from pbrl_ppl.reporting.posterior_summary import (
     most_interesting,
@@ -30,7 +27,7 @@ from pbrl_ppl.state import Floats
 def plot_trace(
     posterior: Idata, parameters: Sequence[str] | None = None, width: float = style.WIDE
 ) -> Figure:
-    """Plot ArviZ's trace of some parameters, laid out alike on every ArviZ.
+    """Plot the draws of each chain of some parameters, one after the other.
 
     Parameters
     ----------
@@ -43,30 +40,11 @@ def plot_trace(
     """
     draws = _chosen(posterior, parameters)
     count = len(draws.data_vars)
-    with warnings.catch_warnings(), np.errstate(all="ignore"):
-        # ArviZ uses what newer Matplotlib deprecates, and a constant parameter makes it complain
-        warnings.simplefilter("ignore")
-        if not DATATREE:
-            figure, panels = style.blank_figure(width, 1.5, 2 * count, 2, None, spare=0.6)
-            grid = np.array(panels, dtype=object).reshape(count, 2)
-            az.plot_trace(draws, axes=grid, compact=False, trace_kwargs={"linewidth": 0.5})
-            for axes in panels:
-                for text in (axes.title, axes.xaxis.label, axes.yaxis.label):
-                    text.set_fontsize(9)
-            return figure
-        columns = 1 if count == 1 or width <= style.NARROW else 2
-        size = (width, 0.6 + 1.7 * -(-count // columns))
-        trace = {"alpha": 0.5, "width": 0.5}
-        collection = az.plot_trace(
-            draws,
-            backend="matplotlib",
-            visuals={"title": {"size": 9}, "xlabel": {"size": 8}, "trace": trace},
-            col_wrap=columns,
-            figure_kwargs={"figsize": size, "layout": "constrained"},
-        )
-    result: Figure = collection.viz["figure"].item()
-    plt.close(result)  # ArviZ 1.x registers it with pyplot, which would never release it
-    return result
+    figure, panels = style.blank_figure(width, 1.7, count, min(count, 2), None, spare=0.6)
+    for axes, (name, values) in zip(panels, draws.items(), strict=False):
+        axes.plot(values.transpose("draw", "chain"), linewidth=0.5, alpha=0.5)
+        style.name_axes(axes, str(name), "draw", small=True)
+    return figure
 
 
 def plot_rank(

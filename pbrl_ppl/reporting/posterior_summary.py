@@ -6,7 +6,6 @@ import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import arviz as az
 import numpy as np
@@ -80,7 +79,7 @@ class Parameters:
     first: tuple[str, ...] = ()
 
     @cached_property
-    def sampler(self) -> dict[str, Any]:
+    def sampler(self) -> dict[str, object]:
         """What the posterior's record says of its draws: method, weights and proposals."""
         return stored_fields(self.posterior, ("method", "pareto_k", "importance_ess", "proposals"))
 

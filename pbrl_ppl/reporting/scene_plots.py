@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.animation import FuncAnimation, PillowWriter
@@ -45,12 +44,12 @@ def draw_scene(
         axes.plot(*zip(wall.start, wall.end, strict=True), color="black", linewidth=2.0, zorder=3)
     for body in scene.bodies:
         if body.static and body.pose is not None:
-            axes.add_patch(_outline(body, np.array(body.pose), color=_STATIC))
+            axes.add_patch(_outline(body, np.array(body.pose))).set(color=_STATIC)
     for i, (body, state) in enumerate(zip(scene.moving, states, strict=True)):
-        how: dict[str, Any] = {"facecolor": _colour(i), "edgecolor": "black", "zorder": 2}
+        patch = axes.add_patch(_outline(body, state[:3]))
+        patch.set(facecolor=_colour(i), edgecolor="black", linewidth=0.8, zorder=2)
         if faded:
-            how = {"facecolor": "none", "edgecolor": _colour(i), "linestyle": "--", "zorder": 1}
-        axes.add_patch(_outline(body, state[:3], linewidth=0.8, **how))
+            patch.set(facecolor="none", edgecolor=_colour(i), linestyle="--", zorder=1)
         if names:
             axes.annotate(
                 body.name, state[:2], ha="center", va="center", fontsize=8, zorder=4,
@@ -141,21 +140,21 @@ def draw_goal(axes: Axes, scene: Scene, goal: Goal) -> None:
     for place, target, tolerance in every:
         if target.x is None or target.y is None:
             continue
-        how: dict[str, Any] = {"fill": False, "color": _colour(place), "hatch": "////"}
-        axes.add_patch(Circle((target.x, target.y), tolerance, **how))
+        circle = axes.add_patch(Circle((target.x, target.y), tolerance))
+        circle.set(fill=False, color=_colour(place), hatch="////")
 
 
 def _colour(index: int) -> str:
     return _COLOURS[index % len(_COLOURS)]
 
 
-def _outline(body: Body, pose: Floats, **how: Any) -> Patch:
+def _outline(body: Body, pose: Floats) -> Patch:
     """Return a body's outline at a pose (x, y, theta)."""
     corners = body.shape.outline
     if corners is None:
-        return Circle((pose[0], pose[1]), float(body.shape.radius or 0.0), **how)
+        return Circle((pose[0], pose[1]), float(body.shape.radius or 0.0))
     c, s = np.cos(pose[2]), np.sin(pose[2])
-    return Polygon(np.array(corners) @ np.array([[c, s], [-s, c]]) + pose[:2], **how)
+    return Polygon(np.array(corners) @ np.array([[c, s], [-s, c]]) + pose[:2])
 
 
 def animate_plan(plan: Plan, path: str | Path, *, frames: int = 20, draws: int = 12) -> None:
@@ -199,5 +198,5 @@ def animate_plan(plan: Plan, path: str | Path, *, frames: int = 20, draws: int =
         axes.set_title(f"{time * plan.scene.time_step:.3g} s")
 
     moving = FuncAnimation(figure, draw, frames=times, init_func=lambda: None)
-    rate: Any = 1.0 / (every * step)  # pictures a second; fractions are right
-    write_atomically(Path(path), lambda to: moving.save(to, PillowWriter(fps=rate), dpi=80))
+    writer = PillowWriter(fps=1.0 / (every * step))
+    write_atomically(Path(path), lambda to: moving.save(to, writer, dpi=80))

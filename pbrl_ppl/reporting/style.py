@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from cycler import cycler
@@ -86,10 +86,15 @@ def legend(figure: Figure, handles: Sequence[Artist]) -> None:
     )  # fmt: skip
 
 
-def label(axes: Axes, text: str, at: tuple[float, float], **options: Any) -> None:
-    """Write a label beside a point of the data, by default 4 points to its right."""
-    how: dict[str, Any] = {"xytext": (4, 0), "textcoords": "offset points", "fontsize": 8}
-    axes.annotate(text, at, **how | options)
+def label(
+    axes: Axes,
+    text: str,
+    at: tuple[float, float],
+    shift: tuple[float, float] = (4, 0),
+    **options: object,
+) -> None:
+    """Write a label beside a point of the data, shifted by some typographic points."""
+    axes.annotate(text, at, shift, textcoords="offset points", fontsize=8).set(**options)
 
 
 def zero_line(axes: Axes) -> None:
@@ -105,7 +110,8 @@ def bars(
     texts: Sequence[str] = (),
     *,
     shift: float = 0.0,
-    **options: Any,
+    height: float = 0.8,
+    hatch: Sequence[str] | None = None,
 ) -> None:
     """Draw horizontal bars from the top down, with their names, and a text beside each.
 
@@ -117,14 +123,17 @@ def bars(
         One a bar.
     shift : float
         Places by which the bars are lower than their names.
-    **options
-        Of the bars.
+    height : float
+        Of each bar, in places.
+    hatch : sequence of str, optional
+        Pattern of each bar; without one, bars have no edges either.
     """
     places = np.arange(len(names)) + shift
-    axes.barh(places, values, color=colours, **options)
+    edge = None if hatch is None else "white"
+    axes.barh(places, values, height, color=colours, edgecolor=edge, hatch=hatch)
     for at in zip(values, places, strict=True):
         text = texts[round(at[1] - shift)] if texts else ""
-        label(axes, text, at, xytext=(3, 0), va="center", bbox=BOX)
+        label(axes, text, at, (3, 0), va="center", bbox=BOX)
     axes.set_yticks(range(len(names)), names)
     axes.yaxis.set_inverted(True)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import cache
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import xarray as xr
@@ -217,7 +217,7 @@ def residual_test_table(loop: Loop) -> Table:
     )
 
 
-def yes_or_no(said: Any) -> str:
+def yes_or_no(said: object) -> str:
     """Write yes or no."""
     return "yes" if said else "no"
 

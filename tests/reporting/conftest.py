@@ -9,4 +9,4 @@ from pbrl_ppl.reporting import page
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """A page without its pictures, which take nearly all of its time."""
     nothing = "data:image/png;base64,"
-    monkeypatch.setattr(page, "_picture", lambda draw: {"wide": nothing, "narrow": nothing})
+    monkeypatch.setattr(page, "picture", lambda draw: {"wide": nothing, "narrow": nothing})
