@@ -14,7 +14,7 @@ from pbrl_ppl.criticism.unexplained import unexplained_acceleration
 from pbrl_ppl.effects import Attached, Effect, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.history import History
-from pbrl_ppl.likelihood import output_error
+from pbrl_ppl.likelihood import is_simulated
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.threads import one_blas_thread
@@ -128,12 +128,13 @@ def attribute(
 
     found = Search(missing, criteria, say)(mode)
     problem = found.after.problem
-    names, likelihood = problem.observations.names, output_error(problem)
+    names = problem.observations.names
+    times = problem.likelihood.tau if is_simulated(problem) else (1.0,) * len(names)
     return Attribution(
         laws=tuple(found.laws.values()),
         before=dict(zip(names, found.declared.sigma.tolist(), strict=True)),
         after=dict(zip(names, found.after.sigma.tolist(), strict=True)),
-        correlated=dict(zip(names, likelihood.tau, strict=True)),
+        correlated=dict(zip(names, times, strict=True)),
         seconds=problem.data.horizon * problem.scene.time_step,
         trajectories=problem.data.history.n_trajectories,
         search=found.lengths,

@@ -56,8 +56,15 @@ from pbrl_ppl.errors import (
     warn,
 )
 from pbrl_ppl.history import History, UnusedVelocity, with_units, without_measurements
-from pbrl_ppl.likelihood import Problem, output_error, single_transitions
-from pbrl_ppl.modes import Mode, filtered_mode, find_mode, tempered_mode
+from pbrl_ppl.likelihood import Problem, single_transitions
+from pbrl_ppl.modes import (
+    FilteredMode,
+    Mode,
+    filtered_mode,
+    find_mode,
+    is_simulated_mode,
+    tempered_mode,
+)
 from pbrl_ppl.physics import Physics, try_effect
 from pbrl_ppl.posterior import MAX_PARETO_K, Comparison, Fit, compare, identify, interval, versions
 from pbrl_ppl.posterior import draws as posterior_draws
@@ -214,7 +221,7 @@ class _Fitted:
     """The declared model: test of its prior, and its mode of whole trajectories."""
 
     prior: ResidualTest
-    mode: Mode
+    mode: FilteredMode
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,12 +255,12 @@ class _Model:
     """
 
     mode: Mode
-    innovations: Mode
+    innovations: FilteredMode
     excess: UnexplainedAcceleration
     held_out: HeldOut
 
     @classmethod
-    def of(cls, mode: Mode, innovations: Mode, test: History, criteria: Criteria) -> _Model:
+    def of(cls, mode: Mode, innovations: FilteredMode, test: History, criteria: Criteria) -> _Model:
         """Test a mode's innovations, and linearise it along the test history."""
         if not mode.problem.likelihood.simulated:  # single transitions
             mode = innovations
@@ -376,7 +383,7 @@ def _tested(task: _Task, cleaned: _Cleaned, searched: _Searched) -> _Judged:
     return _Judged(cleaned, searched, declared, revised, misfit, small, rollout, simulated)
 
 
-def _innovations(searched: _Searched) -> Mode:
+def _innovations(searched: _Searched) -> FilteredMode:
     """Return the filtered whole trajectories of the model found."""
     if not searched.laws:
         return searched.declared.mode
@@ -457,7 +464,7 @@ def _fit(task: _Task, mode: Mode) -> tuple[Fit, list[Warning], list[str]]:
     """
     # one thread a chain: more would wait for each other
     mode = replace(mode, problem=mode.problem.with_physics(threads=1))
-    if mode.problem.likelihood.simulated:
+    if is_simulated_mode(mode):
         mode = tempered_mode(mode)
     method, said = task.method, []
     for n in _DRAWS.get(method, _CHAIN_DRAWS) if task.draws is None else (task.draws,):
@@ -584,9 +591,7 @@ def _provenance(task: _Task, judged: _Judged) -> dict[str, object]:
 def _compared(declared: Mode, revised: Mode, before: Fit, after: Fit) -> Comparison | None:
     """Compare the posteriors by cross-validation, where both temper their densities alike."""
     times = [
-        np.array(output_error(mode.problem).tau)
-        if mode.problem.likelihood.simulated
-        else np.ones(1)
+        np.array(mode.problem.likelihood.tau) if is_simulated_mode(mode) else np.ones(1)
         for mode in (declared, revised)
     ]
     alike = times[0].shape == times[1].shape and np.allclose(times[0], times[1], rtol=0.1)

@@ -15,7 +15,7 @@ from scipy.stats import chi2
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.results import Correlations, KindOfTest, ResidualTest
 from pbrl_ppl.criticism.unexplained import innovations_over_steps
-from pbrl_ppl.modes import Mode
+from pbrl_ppl.modes import FilteredMode
 from pbrl_ppl.state import STATE, WRENCH, Bools, Floats, Ints
 
 #: Intervals up to which innovations are correlated with earlier ones and with commands; a
@@ -69,13 +69,13 @@ class _Correlation:
 
 
 def correlation_tests(
-    mode: Mode, criteria: Criteria = DEFAULT
+    mode: FilteredMode, criteria: Criteria = DEFAULT
 ) -> tuple[tuple[ResidualTest, ...], Correlations]:
     """Test whiteness over lags, and correlation with present and past commands.
 
     Parameters
     ----------
-    mode : Mode
+    mode : FilteredMode
         Fitted to whole trajectories.
     criteria : Criteria
         Thresholds of significant and of negligible.
@@ -87,7 +87,7 @@ def correlation_tests(
     correlations : Correlations
         For a picture.
     """
-    noise = mode.problem.trajectory_noise
+    noise = mode.problem.likelihood.noise
     white, seen = mode.whitened_residual, noise.seen
     number = np.cumsum(noise.first.astype(np.intp))
     share = innovations_over_steps(mode)
@@ -133,7 +133,7 @@ def _lagged(
     return _Correlation(np.array(values), np.array(pairs), criteria)
 
 
-def _commands(mode: Mode) -> tuple[Floats, list[str]]:
+def _commands(mode: FilteredMode) -> tuple[Floats, list[str]]:
     """Return the commands that vary, standardised, shape (transition, series), and their names."""
     segments, scene = mode.problem.segments, mode.problem.scene
     columns, names = [], []

@@ -11,7 +11,7 @@ from pbrl_ppl.criticism.criteria import Criteria
 from pbrl_ppl.criticism.results import KindOfTest, ResidualTest, Unexplained
 from pbrl_ppl.criticism.unexplained import innovations_over_steps
 from pbrl_ppl.likelihood import Problem
-from pbrl_ppl.modes import Mode
+from pbrl_ppl.modes import FilteredMode
 from pbrl_ppl.state import STATE, Floats, Ints
 
 #: Ridge of the regression, over the kernel's variance of each term.
@@ -59,7 +59,7 @@ PRODUCTS = {
 QUANTITIES = FEATURES | {name: f"{FEATURES[a]} {FEATURES[b]}" for name, (a, b) in PRODUCTS.items()}
 
 
-def folds(mode: Mode, least: int = 8) -> Ints:
+def folds(mode: FilteredMode, least: int = 8) -> Ints:
     """Return the fold of each transition, shape (transition,): its trajectory, or a run of it.
 
     Given the measurements before, innovations of different runs are independent. There are at
@@ -77,7 +77,7 @@ def folds(mode: Mode, least: int = 8) -> Ints:
 
 
 def find_dependence(
-    mode: Mode,
+    mode: FilteredMode,
     criteria: Criteria,
     *,
     seed: int = 0,
@@ -93,7 +93,7 @@ def find_dependence(
 
     Parameters
     ----------
-    mode : Mode
+    mode : FilteredMode
         A fitted model.
     criteria : Criteria
         Thresholds of significant and of negligible.
@@ -121,7 +121,7 @@ def find_dependence(
     tests = len(problem.scene.dynamic)
     permutations = permutations_a_body * tests - 1
     chosen = np.sort(rng.permutation(n)[:most_transitions])
-    places = mode.problem.trajectory_noise.coordinates.places
+    places = mode.problem.likelihood.noise.coordinates.places
     innovations = mode.whitened_residual[chosen]
     groups = folds(mode)[chosen]
     relative = innovations_over_steps(mode)

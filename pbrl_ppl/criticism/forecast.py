@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pbrl_ppl.likelihood import Problem, TrajectoryNoise
+from pbrl_ppl.likelihood import FilteredProblem, TrajectoryNoise
 from pbrl_ppl.state import STATE, Floats, Ints
 
 #: Rows after which a filter's covariance is in steady state.
@@ -53,9 +53,9 @@ class Forecast:
         return result
 
 
-def filtered_states(problem: Problem, phi: Floats, sigma: Floats) -> Floats:
+def filtered_states(problem: FilteredProblem, phi: Floats, sigma: Floats) -> Floats:
     """Return the filtered states, shape (trajectory, time, body, 6), SI units."""
-    noise = problem.trajectory_noise
+    noise = problem.likelihood.noise
     coordinates, segments = noise.coordinates, problem.segments
     residual = coordinates.of_residual(problem.residual(phi))
     deviation = noise.filtered(residual[None], sigma)[1][0]
@@ -70,12 +70,12 @@ def filtered_states(problem: Problem, phi: Floats, sigma: Floats) -> Floats:
     return coordinates.completed(problem.scene, states)
 
 
-def rollout(problem: Problem, phi: Floats, start: Floats, inputs: Floats) -> Floats:
+def rollout(problem: FilteredProblem, phi: Floats, start: Floats, inputs: Floats) -> Floats:
     """Return predicted states after each interval, NaN from where a prediction diverges.
 
     Parameters
     ----------
-    problem : Problem
+    problem : FilteredProblem
         A problem of whole trajectories.
     phi : ndarray
         Shape (p,).
@@ -96,7 +96,7 @@ def rollout(problem: Problem, phi: Floats, start: Floats, inputs: Floats) -> Flo
     return states
 
 
-def whole_rollouts(problem: Problem, phi: Floats, sigma: Floats) -> dict[int, Floats]:
+def whole_rollouts(problem: FilteredProblem, phi: Floats, sigma: Floats) -> dict[int, Floats]:
     """Predict whole trajectories, each from its filtered first state.
 
     That state is as measured, or fitted to the first rows where its velocities were not measured.
@@ -107,7 +107,7 @@ def whole_rollouts(problem: Problem, phi: Floats, sigma: Floats) -> dict[int, Fl
         By trajectory: predicted states from the first one on, shape (time, body, 6), SI units; NaN
         from where the prediction diverges.
     """
-    noise, segments = problem.trajectory_noise, problem.segments
+    noise, segments = problem.likelihood.noise, problem.segments
     begins = np.flatnonzero(noise.first)
     lengths = np.diff(np.append(begins, segments.n))
     trajectory = segments.trajectory[begins]
@@ -123,7 +123,7 @@ def whole_rollouts(problem: Problem, phi: Floats, sigma: Floats) -> dict[int, Fl
     return {which: paths[: length + 1] for which, paths, length in whole}
 
 
-def _finite_part(problem: Problem, phi: Floats, start: Floats, inputs: Floats) -> Floats:
+def _finite_part(problem: FilteredProblem, phi: Floats, start: Floats, inputs: Floats) -> Floats:
     """Return a prediction that diverges up to there, shape (H, body, 6), then NaN.
 
     The engine returns none of it: the longest prediction that it returns is found by bisection.
@@ -141,7 +141,7 @@ def _finite_part(problem: Problem, phi: Floats, start: Floats, inputs: Floats) -
 
 
 def forecast(
-    problem: Problem,
+    problem: FilteredProblem,
     phi: Floats,
     sigma: Floats,
     intervals: int,
@@ -152,7 +152,7 @@ def forecast(
 
     Parameters
     ----------
-    problem : Problem
+    problem : FilteredProblem
         A problem of whole trajectories.
     phi, sigma : ndarray
         Parameters and noise parameters, shapes (p,) and (parameter,).
@@ -162,7 +162,7 @@ def forecast(
         Constant accelerations that count as noise in the expected square, shape (velocity,),
         m/s^2 and rad/s^2.
     """
-    noise = problem.trajectory_noise
+    noise = problem.likelihood.noise
     coordinates, segments = noise.coordinates, problem.segments
     begins = np.flatnonzero(noise.first)
     lengths = np.diff(np.append(begins, segments.n))

@@ -12,8 +12,8 @@ from pbrl_ppl.criticism.forecast import forecast, whole_rollouts
 from pbrl_ppl.criticism.results import Errors, Rollout
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History, longest_gap
-from pbrl_ppl.likelihood import Problem, along_trajectories, in_pieces, observed_coordinates
-from pbrl_ppl.modes import MOST_GROWTH, Mode, fit_pieces, growth
+from pbrl_ppl.likelihood import FilteredProblem, along_trajectories, in_pieces, observed_coordinates
+from pbrl_ppl.modes import MOST_GROWTH, FilteredMode, fit_pieces, growth
 from pbrl_ppl.posterior import Fit
 from pbrl_ppl.scene import Scene, motion_time, state_sizes
 from pbrl_ppl.state import STATE, STATE_UNITS, THETA, Floats
@@ -39,17 +39,17 @@ class HeldOut:
 
     Parameters
     ----------
-    mode : Mode
+    mode : FilteredMode
         The fitted model, with its training data.
-    problem : Problem
+    problem : FilteredProblem
         The same model on the held-out trajectories, linearised there.
     """
 
-    mode: Mode
-    problem: Problem
+    mode: FilteredMode
+    problem: FilteredProblem
 
     @classmethod
-    def of(cls, mode: Mode, history: History) -> HeldOut:
+    def of(cls, mode: FilteredMode, history: History) -> HeldOut:
         """Linearise a fitted model along held-out trajectories.
 
         Raises
@@ -57,7 +57,7 @@ class HeldOut:
         HistoryError
             If they measure what the training history does not.
         """
-        coordinates = mode.problem.trajectory_noise.coordinates
+        coordinates = mode.problem.likelihood.noise.coordinates
         measured = observed_coordinates(mode.problem.scene, history).sensors
         if not set(measured) <= set(coordinates.sensors):
             names = [
@@ -79,7 +79,7 @@ class HeldOut:
 
     def residuals(self, unit: HeldOut) -> dict[str, Floats]:
         """Return innovations in units of another model's noise, by state dimension."""
-        noise = unit.problem.trajectory_noise
+        noise = unit.problem.likelihood.noise
         z = self.whitened(unit)
         dimension, seen = noise.coordinates.places % len(STATE), noise.seen
         return {
@@ -115,7 +115,7 @@ class HeldOut:
         most_draws : int
             Posterior draws of the predictive density, at most.
         """
-        mode, of_unit = self.mode, unit.problem.trajectory_noise
+        mode, of_unit = self.mode, unit.problem.likelihood.noise
         seen = of_unit.seen
         whitened = self.whitened(unit) * of_unit.scale(unit.mode.sigma) / of_unit.scale(noise)
         phi = fit.draws[0]
@@ -152,7 +152,7 @@ class HeldOut:
 
         ``sigma`` are the noise parameters of :func:`pbrl_ppl.criticism.unexplained.noise_alone`.
         """
-        noise, phi = self.problem.trajectory_noise, self.mode.phi
+        noise, phi = self.problem.likelihood.noise, self.mode.phi
         at_best, cells = -noise.log_scale(self.mode.sigma).sum(), noise.seen.sum()
         return Errors(
             one_step_rmse=forecast(self.problem, phi, sigma, 1).floor(),
@@ -174,7 +174,7 @@ class HeldOut:
 
     def measurement_errors(self, sigma: Floats) -> dict[str, float]:
         """Return the standard deviation of each measured state dimension's errors, in its unit."""
-        sensors = self.problem.trajectory_noise.coordinates.sensors
+        sensors = self.problem.likelihood.noise.coordinates.sensors
         return {STATE[d]: float(sd) for d, sd in zip(sensors, sigma, strict=False)}
 
 
@@ -185,7 +185,7 @@ def example_rollout(declared: HeldOut, revised: HeldOut) -> Rollout:
     length = int(dataset["n_rows"].min()) - 1
     measured = dataset["observed"].to_numpy()[0, : length + 1]
     columns = [d for d in range(len(STATE)) if np.isfinite(measured[..., d]).any()]
-    sensors = revised.mode.problem.trajectory_noise.coordinates.sensors
+    sensors = revised.mode.problem.likelihood.noise.coordinates.sensors
     noise = dict(zip(sensors, revised.mode.sigma.tolist(), strict=False))
     sizes = state_sizes(scene)
     seen = measured[..., columns]

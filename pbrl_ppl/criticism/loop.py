@@ -32,7 +32,7 @@ from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import FitError, OutputError
 from pbrl_ppl.files import check_folder, json_fields, json_values
 from pbrl_ppl.history import History, UnusedVelocity
-from pbrl_ppl.modes import Mode
+from pbrl_ppl.modes import FilteredMode
 from pbrl_ppl.posterior import Comparison, Fit, Idata, Identifiability, save_posterior
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats
@@ -67,7 +67,7 @@ class Loop:
         Held-out errors of the declared model, of the revised one, and of the noise alone.
     declared, revised : Fit
         Both models with their posteriors; the same object twice if nothing was added.
-    innovations : tuple of Mode
+    innovations : tuple of FilteredMode
         Both models with whole trajectories filtered, which the tests are made with.
     residuals_before, residuals_after : dict of str to ndarray
         Held-out residuals in units of noise per state dimension, 1-d arrays.
@@ -118,7 +118,7 @@ class Loop:
     noise_floor: Errors
     declared: Fit
     revised: Fit
-    innovations: tuple[Mode, Mode]
+    innovations: tuple[FilteredMode, FilteredMode]
     residuals_before: Mapping[str, Floats]
     residuals_after: Mapping[str, Floats]
     rollout: Rollout

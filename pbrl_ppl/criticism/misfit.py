@@ -28,7 +28,7 @@ from pbrl_ppl.criticism.unexplained import (
 )
 from pbrl_ppl.effects import Noise
 from pbrl_ppl.likelihood import bodies_acceleration
-from pbrl_ppl.modes import Mode
+from pbrl_ppl.modes import FilteredMode
 from pbrl_ppl.state import STATE, STATE_UNITS, Floats, acceleration_unit
 
 #: Shares of the bodies' acceleration from here on are of bodies that hardly accelerate.
@@ -79,7 +79,7 @@ class Misfit:
 
 
 def with_negligible_acceleration(
-    misfit: Misfit, mode: Mode, excess: UnexplainedAcceleration
+    misfit: Misfit, mode: FilteredMode, excess: UnexplainedAcceleration
 ) -> Misfit:
     """Return a revised model's misfit, with a negligible acceleration as unexplained if it has one.
 
@@ -91,13 +91,13 @@ def with_negligible_acceleration(
 
 
 def find_misfit(
-    mode: Mode, excess: UnexplainedAcceleration, *, horizon: int, seed: int = 0
+    mode: FilteredMode, excess: UnexplainedAcceleration, *, horizon: int, seed: int = 0
 ) -> Misfit:
     """Test the residual of a fitted model on the data that it was fitted to.
 
     Parameters
     ----------
-    mode : Mode
+    mode : FilteredMode
         Fitted to whole trajectories.
     excess : UnexplainedAcceleration
         Its unexplained acceleration, with the criteria.
@@ -124,7 +124,7 @@ def _unexplained(test: ResidualTest) -> Unexplained:
     )
 
 
-def _acceleration(mode: Mode, excess: UnexplainedAcceleration) -> ResidualTest:
+def _acceleration(mode: FilteredMode, excess: UnexplainedAcceleration) -> ResidualTest:
     """Return the test of unexplained accelerations against none."""
     passed, largest = not excess.matters.any(), excess.largest
     name, relative = excess.names[largest], float(excess.relative[largest])
@@ -145,9 +145,9 @@ def _acceleration(mode: Mode, excess: UnexplainedAcceleration) -> ResidualTest:
     )
 
 
-def _most_unexplained(mode: Mode, name: str) -> str:
+def _most_unexplained(mode: FilteredMode, name: str) -> str:
     """Return the body with the largest innovations of a velocity, or of its position."""
-    d, places = STATE.index(name), mode.problem.trajectory_noise.coordinates.places
+    d, places = STATE.index(name), mode.problem.likelihood.noise.coordinates.places
     columns = np.flatnonzero(np.isin(places % len(STATE), (d, d - 3)))
     size = (mode.whitened_residual[:, columns] ** 2).mean(axis=0)
     body = int(places[columns[int(np.argmax(size))]] // len(STATE))
@@ -178,7 +178,9 @@ def share_in_words(relative: float) -> str:
     return "more than the bodies' acceleration itself"
 
 
-def held_out_forecasts(mode: Mode, sigma: Floats, horizon: int, criteria: Criteria) -> ResidualTest:
+def held_out_forecasts(
+    mode: FilteredMode, sigma: Floats, horizon: int, criteria: Criteria
+) -> ResidualTest:
     """Return the test of forecasts on held-out trajectories.
 
     Arguments as of :func:`find_misfit`; ``mode`` has the problem of the held-out trajectories, and
@@ -229,7 +231,7 @@ def simulation_test(
     )
 
 
-def score_test(mode: Mode, ranked: Sequence[Signature], criteria: Criteria) -> ResidualTest:
+def score_test(mode: FilteredMode, ranked: Sequence[Signature], criteria: Criteria) -> ResidualTest:
     """Return the test of the innovations for effects of the catalogue that the model lacks.
 
     It fails where one is significant and changes a step by more than a negligible share.
@@ -254,7 +256,7 @@ def score_test(mode: Mode, ranked: Sequence[Signature], criteria: Criteria) -> R
 
 
 def _forecasts(
-    mode: Mode,
+    mode: FilteredMode,
     sigma: Floats,
     horizon: int,
     criteria: Criteria,
@@ -268,7 +270,7 @@ def _forecasts(
     than ``most_error`` times its expected size: a single one that a bad frame or a grazing contact
     spoils is no misfit.
     """
-    noise = mode.problem.trajectory_noise
+    noise = mode.problem.likelihood.noise
     lengths = np.diff(np.append(np.flatnonzero(noise.first), len(noise.first)))
     longest = min(horizon, int(lengths.max()))
     steps = np.unique(np.geomspace(1, longest, min(longest, most_lengths)).round().astype(int))

@@ -17,7 +17,7 @@ from pbrl_ppl.history import (
     without_bad_frames,
 )
 from pbrl_ppl.likelihood import check_moves, observed_coordinates
-from pbrl_ppl.modes import Mode
+from pbrl_ppl.modes import FilteredMode
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE, Floats, Ints
 
@@ -88,7 +88,7 @@ def checked_histories(
 
 
 def outliers(
-    mode: Mode,
+    mode: FilteredMode,
     criteria: Criteria = DEFAULT,
     *,
     errors_off: float = 4.0,
@@ -104,7 +104,7 @@ def outliers(
 
     Parameters
     ----------
-    mode : Mode
+    mode : FilteredMode
         Fitted to whole trajectories.
     criteria : Criteria
         How far off a measurement is to be left out.
@@ -123,7 +123,7 @@ def outliers(
         Measured minus smoothed, shape (trajectory, time, body, 6), SI units; NaN elsewhere.
     """
     problem = mode.problem
-    noise, segments = problem.trajectory_noise, problem.segments
+    noise, segments = problem.likelihood.noise, problem.segments
     residual = noise.coordinates.of_residual(problem.residual(mode.phi))
     sigma = without_acceleration(mode).sigma
     both, error = noise.auxiliary(residual, sigma), noise.coordinates.errors(sigma)

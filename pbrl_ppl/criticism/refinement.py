@@ -13,7 +13,7 @@ from pbrl_ppl.criticism.unexplained import unexplained_acceleration
 from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.history import History, with_units
 from pbrl_ppl.likelihood import Problem, single_transitions
-from pbrl_ppl.modes import Mode, find_mode, nearby_mode, trajectory_mode
+from pbrl_ppl.modes import FilteredMode, find_mode, nearby_mode, trajectory_mode
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Scene, check_substeps
 
@@ -26,7 +26,7 @@ def checked_mode(
     substeps: int | None,
     criteria: Criteria,
     say: Callable[[str], None],
-) -> Mode:
+) -> FilteredMode:
     """Return the declared model's mode on a history without bad frames and unused velocities.
 
     Raises
@@ -55,7 +55,7 @@ def declared_mode(
     substeps: int | None,
     say: Callable[[str], None],
     criteria: Criteria = DEFAULT,
-) -> Mode:
+) -> FilteredMode:
     """Return the declared model's mode on whole trajectories, with enough substeps."""
     steps = scene.substeps if substeps is None else substeps
     problem = Problem.of(Physics(scene, effects, steps, threads=2), history)
@@ -67,14 +67,14 @@ def declared_mode(
 
 
 def with_enough_substeps(
-    mode: Mode,
+    mode: FilteredMode,
     say: Callable[[str], None],
     criteria: Criteria = DEFAULT,
     *,
     better_mode: float = 5.0,
     large: float = 0.1,
     still: float = 0.1,
-) -> Mode:
+) -> FilteredMode:
     """Double the substeps until neither predictions nor the acceleration test move, and refit.
 
     The engine's error hardly depends on the parameters, so it is measured at the mode found with
@@ -110,18 +110,18 @@ def with_enough_substeps(
         mode = finer
 
 
-def _refined(mode: Mode, substeps: int, say: Callable[[str], None]) -> Mode:
+def _refined(mode: FilteredMode, substeps: int, say: Callable[[str], None]) -> FilteredMode:
     """Return the mode refitted with more substeps."""
     say(f"using {substeps} engine steps an interval")
     return nearby_mode(mode.problem.with_physics(substeps=substeps), mode.phi, mode.sigma)
 
 
-def shift(mode: Mode, substeps: int | None = None) -> float:
+def shift(mode: FilteredMode, substeps: int | None = None) -> float:
     """Return the rms change of the innovations, over the noise, if substeps are doubled.
 
     Parameters
     ----------
-    mode : Mode
+    mode : FilteredMode
         Fitted to whole trajectories.
     substeps : int, optional
         The number to double; the mode's by default.

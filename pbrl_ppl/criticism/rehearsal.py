@@ -18,8 +18,8 @@ from pbrl_ppl.criticism.trial_recording import measured, parameters_of, simulate
 from pbrl_ppl.effects import Attached, Effect, Noise, attach, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.history import History, with_units
-from pbrl_ppl.likelihood import Problem, in_pieces, output_error
-from pbrl_ppl.modes import MOST_GROWTH, Mode, corrected, fit_pieces, growth, piece_lengths
+from pbrl_ppl.likelihood import Problem, in_pieces
+from pbrl_ppl.modes import MOST_GROWTH, SimulatedMode, corrected, fit_pieces, growth, piece_lengths
 from pbrl_ppl.physics import Physics, touching
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats
@@ -198,13 +198,13 @@ def _apart(problem: Problem, states: Floats) -> Problem:
     return problem.with_data(breaks=touched) if 0.0 < touched.mean() < 0.5 else problem
 
 
-def _known_modes(problem: Problem, phi: Floats, states: Floats) -> list[Mode]:
+def _known_modes(problem: Problem, phi: Floats, states: Floats) -> list[SimulatedMode]:
     """Return the modes of a simulated recording at its true parameters and states.
 
     On pieces, the shortest first, up to where an initial state is magnified.
     """
 
-    def at(length: int) -> Mode:
+    def at(length: int) -> SimulatedMode:
         return fit_pieces(in_pieces(problem, length, states), phi, rounds=0)
 
     longest = at(max(states.shape[1] - 1, 2))
@@ -246,7 +246,7 @@ class _Regression:
 
     Parameters
     ----------
-    mode : Mode
+    mode : SimulatedMode
         Of the declared model.
     tests : ScoreTest
         Its residual, and what parameters absorb.
@@ -262,7 +262,7 @@ class _Regression:
         That on longer pieces.
     """
 
-    mode: Mode
+    mode: SimulatedMode
     tests: ScoreTest
     terms: tuple[Term, ...]
     basis: Floats
@@ -272,7 +272,11 @@ class _Regression:
 
     @classmethod
     def of(
-        cls, mode: Mode, tried: Sequence[Attached], criteria: Criteria, longer: _Regression | None
+        cls,
+        mode: SimulatedMode,
+        tried: Sequence[Attached],
+        criteria: Criteria,
+        longer: _Regression | None,
     ) -> _Regression:
         """Linearise candidates at a mode."""
         tests, linear = linearised(mode, tried, criteria)
@@ -293,7 +297,7 @@ class _Regression:
     @cached_property
     def counts(self) -> Floats:
         """Degrees of freedom of each dimension, shape (state,)."""
-        return np.maximum(output_error(self.mode.problem).initial_states.counts, 1.0)
+        return np.maximum(self.mode.problem.likelihood.initial_states.counts, 1.0)
 
     def ways(self, law: Attached) -> list[_Way]:
         """Return the sizes of a law that pay its price in white noise, the least share first."""
@@ -321,7 +325,7 @@ class _Regression:
         """
         n, sigma = self.counts, self.mode.sigma
         residual, square = self.refitted(size * way.direction)
-        likelihood = output_error(self.mode.problem)
+        likelihood = self.mode.problem.likelihood
         tau = likelihood.correlation_times(residual * sigma, sigma * np.sqrt(square))
         share = min(float((n / tau * (1.0 - 1.0 / square)).sum() / (n / tau).sum()), 1.0 - 1e-12)
         gain, total, q = (
@@ -365,7 +369,7 @@ class _Regression:
         """
         pieces = self.mode.whitened_residual.shape
         shape = self.mode.problem.observations.values.shape
-        column = output_error(self.mode.problem).initial_states.column
+        column = self.mode.problem.likelihood.initial_states.column
         weight = 1.0 / np.sqrt(square)
         begin = np.where(column < 0, 1.0, weight[column])
         rows = np.concatenate([np.tile(weight, shape[1] * shape[2]), begin])

@@ -19,7 +19,7 @@ from pbrl_ppl.effects import LEARNED_REMAINDER, Effect, LearnedRemainder, learne
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import ACCELERATION
-from pbrl_ppl.modes import Mode, trajectory_evidence, trajectory_mode
+from pbrl_ppl.modes import FilteredMode, trajectory_evidence, trajectory_mode
 from pbrl_ppl.posterior import Fit, Idata, group
 from pbrl_ppl.posterior import draws as posterior_draws
 from pbrl_ppl.sampling import sample
@@ -121,9 +121,9 @@ def learn_remainder(
     return fit.posterior
 
 
-def remainder_in_words(before: Mode, after: Idata) -> str:
+def remainder_in_words(before: FilteredMode, after: Idata) -> str:
     """Return a sentence on what a learned remainder does, from the innovations before it."""
-    places = before.problem.trajectory_noise.coordinates.accelerations
+    places = before.problem.likelihood.noise.coordinates.accelerations
     sizes = before.sigma[places], posterior_draws(after)[ACCELERATION].mean(axis=0)
     names = group(after, "posterior")[ACCELERATION]
     worst = int(np.argmax(sizes[0] - sizes[1]))
@@ -135,7 +135,7 @@ def remainder_in_words(before: Mode, after: Idata) -> str:
 
 
 def _learned(
-    mode: Mode,
+    mode: FilteredMode,
     body: str,
     seed: int,
     criteria: Criteria,
@@ -221,7 +221,7 @@ def _process(
     return scale * float(np.sqrt(fitted.k1.constant_value)), np.atleast_1d(fitted.k2.length_scale)
 
 
-def residual_forces(mode: Mode, body: str) -> tuple[Floats, dict[int, Floats]]:
+def residual_forces(mode: FilteredMode, body: str) -> tuple[Floats, dict[int, Floats]]:
     """Return the residual accelerations of steps as forces in a body's frame.
 
     Returns
@@ -241,7 +241,7 @@ def residual_forces(mode: Mode, body: str) -> tuple[Floats, dict[int, Floats]]:
     if body not in names:
         raise FitError(f"remainder: there is no moving body {body!r}, only {', '.join(names)}")
     index = [moving.name for moving in problem.scene.moving].index(body)
-    coordinates = problem.trajectory_noise.coordinates
+    coordinates = problem.likelihood.noise.coordinates
     added = coordinates.of_residual(problem.residual(mode.phi)) / problem.scene.time_step
     column = {int(place): i for i, place in enumerate(coordinates.places)}
     places = [column.get(index * len(STATE) + d) for d in (3, 4, 5)]

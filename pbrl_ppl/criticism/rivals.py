@@ -13,7 +13,7 @@ from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.criticism.search import with_effects
 from pbrl_ppl.effects import Attached, Effect, Noise
 from pbrl_ppl.errors import EffectError, PosteriorError
-from pbrl_ppl.modes import Mode, trajectory_mode
+from pbrl_ppl.modes import FilteredMode, trajectory_mode
 from pbrl_ppl.posterior import Fit, Idata, PosteriorRecord, stored_fields
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats
@@ -29,7 +29,7 @@ class Rival:
     ----------
     attached : Attached
         The effect.
-    mode : Mode
+    mode : FilteredMode
         Of the model with this effect and without the others, fitted to whole trajectories.
     draws : ndarray
         Draws from its posterior, shape (draw, p).
@@ -38,7 +38,7 @@ class Rival:
     """
 
     attached: Attached
-    mode: Mode
+    mode: FilteredMode
     draws: Floats
     sigma: Floats
 
@@ -106,7 +106,7 @@ def named_effects(
     return named
 
 
-def posterior_mode(fit: Fit) -> Mode:
+def posterior_mode(fit: Fit) -> FilteredMode:
     """Return the mode of a fitted model, found from its draw of the highest density.
 
     Raises

@@ -18,7 +18,7 @@ from pbrl_ppl.criticism.scan import (
     is_upper_limit,
 )
 from pbrl_ppl.effects import Attached, Noise
-from pbrl_ppl.likelihood import Problem
+from pbrl_ppl.likelihood import Problem, is_filtered
 from pbrl_ppl.modes import Mode, posterior_slopes
 from pbrl_ppl.parameters import box, prior_residual, prior_slopes
 from pbrl_ppl.state import Floats, Ints
@@ -394,8 +394,8 @@ def _tail_score(mode: Mode, attached: Attached, test: ScoreTest) -> Signature:
     polynomial over 4, of variance 3/2.
     """
     problem = mode.problem
-    along = problem.likelihood.filtered
-    seen = problem.trajectory_noise.seen if along else problem.observations.measured
+    filtered = is_filtered(problem)
+    seen = problem.likelihood.noise.seen if filtered else problem.observations.measured
     whitened = test.residual[: seen.size].reshape(seen.shape)
     # coordinates that never move have no noise, and would make all others look heavy-tailed
     moving = seen & (np.abs(whitened).max(axis=0) > VISIBLE)

@@ -21,7 +21,7 @@ from pbrl_ppl.criticism.score import named_beside, rank_candidates
 from pbrl_ppl.criticism.subsets import Regression, Subset, best_subsets, worth
 from pbrl_ppl.effects import Attached, Noise, Structure
 from pbrl_ppl.history import History
-from pbrl_ppl.likelihood import Problem, in_pieces, output_error
+from pbrl_ppl.likelihood import LikelihoodT, Problem, in_pieces, is_filtered, is_simulated
 from pbrl_ppl.modes import (
     MOST_GROWTH,
     Mode,
@@ -31,6 +31,8 @@ from pbrl_ppl.modes import (
     fit_pieces,
     fit_pieces_closely,
     growth,
+    is_filtered_mode,
+    is_simulated_mode,
     piece_lengths,
     simulated_states,
     with_robust_covariance,
@@ -123,10 +125,10 @@ def _gained(mode: Mode, other: Mode) -> float:
 
 
 def with_effects(
-    mode: Mode,
+    mode: Mode[LikelihoodT],
     effects: tuple[Attached, ...],
     sizes: Mapping[Attached, Floats] | None = None,
-) -> tuple[Problem, Floats]:
+) -> tuple[Problem[LikelihoodT], Floats]:
     """Return a mode's problem with other effects, and where a search for its mode begins.
 
     Parameters
@@ -149,9 +151,9 @@ def with_effects(
 def refit(mode: Mode, effects: tuple[Attached, ...], sizes: Mapping[Attached, Floats]) -> Mode:
     """Return the mode with other effects, under the same likelihood, from first sizes."""
     problem, phi = with_effects(mode, effects, sizes)
-    if not problem.likelihood.simulated:
-        return find_mode(problem, initial=phi)
-    return fit_pieces(problem, phi, rounds=8, tolerance=0.5)
+    if is_simulated(problem):
+        return fit_pieces(problem, phi, rounds=8, tolerance=0.5)
+    return find_mode(problem, initial=phi)
 
 
 def drop(mode: Mode, law: Attached) -> Mode:
@@ -215,7 +217,7 @@ class SearchResult:
 
         def refitted(mode: Mode) -> Mode:
             problem = mode.problem.with_data(history=history)
-            if not problem.likelihood.simulated:
+            if not is_simulated_mode(mode):
                 return find_mode(problem, initial=mode.phi)
             pieces = in_pieces(problem, problem.data.horizon, problem.data.smoothed_states)
             return with_robust_covariance(fit_pieces_closely(pieces, mode.phi))
@@ -397,7 +399,7 @@ class Search:
             model = better
             regression = self._regression(model.mode)
         data, mode = model.mode.problem.data, model.mode
-        times = output_error(mode.problem).tau if mode.problem.likelihood.simulated else ()
+        times = mode.problem.likelihood.tau if is_simulated_mode(mode) else ()
         here = SearchLength(
             rows=data.horizon,
             seconds=data.horizon * mode.problem.scene.time_step,
@@ -415,7 +417,7 @@ class Search:
         """Return the subsets of what a model lacks, the noise's shape aside."""
         missing = self.missing(mode) if missing is None else missing
         candidates = [one for one in missing if not isinstance(one.effect.stage, Noise)]
-        cheap = corrected(mode) if mode.problem.likelihood.simulated else mode
+        cheap = corrected(mode) if is_simulated_mode(mode) else mode
         return best_subsets(cheap, candidates, self.criteria, largest=largest)
 
     def _grown(self, model: _Model, regression: Regression, least_share: float) -> _Model:
@@ -540,7 +542,7 @@ class Search:
         absorbed = {one.attached for one in regression.signatures if not one.basis.shape[1]}
         model, confounded = self._confounded(model, absorbed)
         worth, main, mode = model.evidence, self._main(without, model), model.mode
-        if mode.problem.likelihood.simulated:
+        if is_simulated_mode(mode):
             mode = with_robust_covariance(fit_pieces_closely(mode.problem, mode.phi))
         laws = {
             law: law_of(mode, law, worth[law], law in main, confounded[law])
@@ -571,7 +573,7 @@ class Search:
         ``contradicted``: p-value of such a law's score above which they do not show it; one of 40
         that are there has a larger one.
         """
-        if not whole.problem.likelihood.filtered:
+        if not is_filtered_mode(whole):
             return None, ""
         limits = self.criteria.residual
         power = (norm.isf(limits.detection_p) + norm.ppf(limits.detection_power)) ** 2
@@ -625,9 +627,9 @@ def _apart(mode: Mode, length: int, *, most: float = 0.5) -> Problem:
     more than a share of ``most`` of the measurements out, contacts are simulated.
     """
     problem = mode.problem
-    if not problem.likelihood.filtered:
+    if not is_filtered(problem):
         return problem
-    touched, segments = problem.trajectory_noise.touching, problem.segments
+    touched, segments = problem.likelihood.noise.touching, problem.segments
     if not touched.any():
         return problem
     states, history = problem.data.smoothed_states, problem.data.history
@@ -660,6 +662,8 @@ def _with_contacts(
         return found
 
     def refitted(mode: Mode) -> Mode:
+        if not is_simulated_mode(mode):
+            return mode
         data, states = mode.problem.data, simulated_states(mode)
         problem = mode.problem.with_data(breaks=None)
         physics = problem.physics.changed(substeps=whole.problem.physics.substeps)
@@ -707,7 +711,7 @@ def _is_null(mode: Mode, law: Attached, *, significant: float = 3.0) -> bool:
     return bool((np.abs(mode.phi[places] - law.effect.null) < significant * sd).all())
 
 
-def _carried(mode: Mode, length: int) -> Mode:
+def _carried(mode: Mode, length: int) -> SimulatedMode:
     """Return the mode on longer pieces, which begin on the simulations of shorter ones."""
     return fit_pieces(in_pieces(mode.problem, length, simulated_states(mode)), mode.phi)
 
@@ -730,7 +734,7 @@ def _proposals(
 def _without_all(model: _Model, begin: Floats) -> Mode:
     """Return the mode without any law, from where it was on the shortest pieces or is with them."""
     mode = model.mode
-    if not model.earlier:
+    if not (model.earlier and is_simulated_mode(mode)):
         return mode
     kept = tuple(one for one in mode.problem.physics.effects if one not in model.earlier)
     problem, near = with_effects(mode, kept)
@@ -752,10 +756,10 @@ def elpd_gain(before: Mode, after: Mode) -> tuple[float, float]:
     def densities(mode: Mode) -> Floats:
         problem = mode.problem
         residual = problem.residual(mode.phi)
-        if not problem.likelihood.simulated:
+        if not (is_simulated(problem) and is_simulated_mode(after)):
             return np.asarray(problem.log_density(residual, mode.sigma, mode.phi))
-        likelihood = output_error(problem)
-        initial, tau = likelihood.initial_states, np.array(output_error(after.problem).tau)
+        likelihood = problem.likelihood
+        initial, tau = likelihood.initial_states, np.array(after.problem.likelihood.tau)
         rows, begin = likelihood.unwhitened(residual, mode.sigma)
         sensed = initial.column >= 0
         of_start = np.eye(len(mode.sigma))[initial.column[sensed]]
@@ -896,7 +900,7 @@ def _alone(regression: Regression) -> dict[Attached, Evidence]:
     return alone
 
 
-def _is_lost(shorter: Mode, mode: Mode) -> bool:
+def _is_lost(shorter: Mode, mode: SimulatedMode) -> bool:
     """Return whether pieces are too long to tell a law from.
 
     Their initial states are magnified, or the error nears the motion's size, where it is out of

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.likelihood import bodies_acceleration
-from pbrl_ppl.modes import NOTHING, Mode, profile_sigma
+from pbrl_ppl.modes import NOTHING, FilteredMode, profile_sigma
 from pbrl_ppl.state import STATE, Bools, Floats
 
 
@@ -82,9 +82,11 @@ class UnexplainedAcceleration:
         return float(np.where(self.certain, self.relative, 0.0).max(initial=0.0))
 
 
-def unexplained_acceleration(mode: Mode, criteria: Criteria = DEFAULT) -> UnexplainedAcceleration:
+def unexplained_acceleration(
+    mode: FilteredMode, criteria: Criteria = DEFAULT
+) -> UnexplainedAcceleration:
     """Return the acceleration that a fitted model leaves unexplained."""
-    noise = mode.problem.trajectory_noise
+    noise = mode.problem.likelihood.noise
     coordinates = noise.coordinates
     size = mode.sigma[coordinates.accelerations]
     relative = size / np.maximum(bodies_acceleration(mode.problem), 1e-300)
@@ -94,43 +96,43 @@ def unexplained_acceleration(mode: Mode, criteria: Criteria = DEFAULT) -> Unexpl
     )
 
 
-def noise_alone(mode: Mode, excess: UnexplainedAcceleration) -> Floats:
+def noise_alone(mode: FilteredMode, excess: UnexplainedAcceleration) -> Floats:
     """Return noise parameters without accelerations that are not significant, shape (parameter,).
 
     Few data do not tell measurement noise from process noise: the mode gives all to one of them.
     """
-    places = mode.problem.trajectory_noise.coordinates.accelerations
+    places = mode.problem.likelihood.noise.coordinates.accelerations
     pairs = zip(places, excess.certain, strict=True)
     negligible = [place for place, certain in pairs if not certain]
     return _without(mode, negligible, mode.problem.residual(mode.phi))
 
 
-def noise_without_unexplained(mode: Mode, excess: UnexplainedAcceleration) -> Floats:
+def noise_without_unexplained(mode: FilteredMode, excess: UnexplainedAcceleration) -> Floats:
     """Return the noise parameters without accelerations that matter, shape (parameter,)."""
     sigma = mode.sigma.copy()
-    places = np.array(mode.problem.trajectory_noise.coordinates.accelerations)
+    places = np.array(mode.problem.likelihood.noise.coordinates.accelerations)
     sigma[places[excess.matters]] = NOTHING
     return sigma
 
 
-def without_acceleration(mode: Mode) -> Mode:
+def without_acceleration(mode: FilteredMode) -> FilteredMode:
     """Return the mode with the noise parameters that it has without unexplained acceleration.
 
     A random force follows smooth effects: their scores are small beside it.
     """
-    places = mode.problem.trajectory_noise.coordinates.accelerations
+    places = mode.problem.likelihood.noise.coordinates.accelerations
     return replace(mode, sigma=_without(mode, places, mode.problem.residual(mode.phi)))
 
 
-def _without(mode: Mode, places: Iterable[int], residual: Floats) -> Floats:
+def _without(mode: FilteredMode, places: Iterable[int], residual: Floats) -> Floats:
     """Return the noise parameters that are best if those at some places are next to nothing."""
     fixed = {place: NOTHING * mode.problem.noise_prior[0][place] for place in places}
     return profile_sigma(mode.problem, residual, mode.phi, fixed)
 
 
-def innovations_over_steps(mode: Mode) -> Floats:
+def innovations_over_steps(mode: FilteredMode) -> Floats:
     """Return the typical innovations over the change in a step, shape (coordinate,)."""
-    noise, segments = mode.problem.trajectory_noise, mode.problem.segments
+    noise, segments = mode.problem.likelihood.noise, mode.problem.segments
     coordinates, dt = noise.coordinates, mode.problem.scene.time_step
     change = segments.observed[:, 0] - segments.start
     body, dimension = np.divmod(coordinates.places, len(STATE))
@@ -140,9 +142,9 @@ def innovations_over_steps(mode: Mode) -> Floats:
     return np.asarray(np.median(noise.scale(mode.sigma), axis=0) / np.maximum(step, 1e-300))
 
 
-def _numerical(mode: Mode) -> Floats:
+def _numerical(mode: FilteredMode) -> Floats:
     """Return the rms change of accelerations if the substeps are doubled, shape (velocity,)."""
-    problem, coordinates = mode.problem, mode.problem.trajectory_noise.coordinates
+    problem, coordinates = mode.problem, mode.problem.likelihood.noise.coordinates
     finer = problem.with_physics(substeps=2 * problem.physics.substeps)
     change = coordinates.of((finer.predict(mode.phi) - problem.predict(mode.phi))[:, 0])
     square = np.nanmean(change**2, axis=0) / problem.scene.time_step**2
@@ -150,7 +152,7 @@ def _numerical(mode: Mode) -> Floats:
     return np.array([np.sqrt(square[dimension == d].mean()) for d in coordinates.rates])
 
 
-def _p_values(mode: Mode) -> Floats:
+def _p_values(mode: FilteredMode) -> Floats:
     """Return p-values of the likelihood ratio of each acceleration against none.
 
     The other noises are free. At the bound of a variance: half a chi-squared with one degree.
@@ -162,6 +164,6 @@ def _p_values(mode: Mode) -> Floats:
         return float(problem.log_density(residual, sigma, mode.phi).sum())
 
     here = best(mode.sigma)
-    places = problem.trajectory_noise.coordinates.accelerations
+    places = problem.likelihood.noise.coordinates.accelerations
     gains = [here - best(_without(mode, [place], residual)) for place in places]
     return np.asarray([0.5 * chi2.sf(max(2 * gain, 0.0), 1) for gain in gains])

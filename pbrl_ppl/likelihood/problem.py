@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any, Generic, Self, TypeGuard, cast
+from typing import Any, Generic, Self, TypeGuard
 
 import numpy as np
 
@@ -217,10 +217,6 @@ class Problem(Generic[LikelihoodT]):
             return sigma_prior(self.observations, self.segments, self.scene)
         median, spread = self.likelihood.prior
         return np.array(median), spread
-
-    @property
-    def trajectory_noise(self) -> TrajectoryNoise:
-        return cast(TrajectoryLikelihood, self.likelihood).noise
 
     @property
     def noise_variables(self) -> dict[str, tuple[str, ...]]:

@@ -455,7 +455,7 @@ class _Step:
         return phi, coordinates.completed(self.problem.scene, states)
 
 
-def simulated_states(mode: SimulatedMode) -> Floats:
+def simulated_states(mode: Mode) -> Floats:
     """Return the states along the simulated pieces, shape (trajectory, time, body, 6)."""
     problem, segments = mode.problem, mode.problem.segments
     ends = problem.medium.physics.simulator(mode.phi, segments.start, problem.inputs)

@@ -160,7 +160,7 @@ class Separation:
         """
         rival = self.rivals[number]
         mode, problem = rival.mode, rival.mode.problem
-        coordinates, bounds = problem.trajectory_noise.coordinates, problem.layout.bounds
+        coordinates, bounds = problem.likelihood.noise.coordinates, problem.layout.bounds
 
         def predict(phi: Floats, states: Floats) -> Floats:
             """Return the states after an interval, shape (point, transition, body, 6)."""
@@ -183,10 +183,10 @@ class Separation:
         slope = coordinates.slopes(problem.scene, paths.begin, size, by_state)
         nothing = np.zeros(residual.shape)
         noise = replace(
-            problem.trajectory_noise,
+            problem.likelihood.noise,
             slope=np.ascontiguousarray(slope),
             first=np.arange(len(residual)) % paths.intervals == 0,
-            seen=np.tile(problem.trajectory_noise.seen.any(axis=0), (len(residual), 1)),
+            seen=np.tile(problem.likelihood.noise.seen.any(axis=0), (len(residual), 1)),
             measured=nothing,
             begin=nothing,
             initial_variance=nothing,

@@ -10,8 +10,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from pbrl_ppl.criticism import QUANTITIES, Loop, recorded_quantities
-from pbrl_ppl.likelihood import Problem
-from pbrl_ppl.modes import Mode
+from pbrl_ppl.likelihood import FilteredProblem
+from pbrl_ppl.modes import FilteredMode
 from pbrl_ppl.state import STATE, Bools, Floats, Ints, acceleration_unit
 
 
@@ -83,7 +83,7 @@ def find_evidence(loop: Loop) -> Evidence | None:
         return None
     after = last.problem
     nats = _log_density(last) - _log_density(before)
-    noise, segments = after.trajectory_noise, after.segments
+    noise, segments = after.likelihood.noise, after.segments
     moving = [body.name for body in after.scene.moving]
     body = loop.added[0].body
     index = moving.index(body)
@@ -107,10 +107,10 @@ def find_evidence(loop: Loop) -> Evidence | None:
     )
 
 
-def _log_density(mode: Mode) -> Floats:
+def _log_density(mode: FilteredMode) -> Floats:
     """Return the log-likelihood of each measured number given those before it."""
     problem, phi, sigma = mode.problem, mode.phi, mode.sigma
-    noise = problem.trajectory_noise
+    noise = problem.likelihood.noise
     cells = -0.5 * problem.robust(phi, sigma) ** 2 - np.log(noise.scale(sigma))
     whole = problem.log_density(problem.residual(phi), sigma, phi)
     # the density's constant, shared evenly
@@ -231,10 +231,10 @@ def find_laws(loop: Loop, most: int = 3, least: float = 0.02) -> list[Law]:
 
 
 def _residual_force(
-    problem: Problem, phi: Floats, body: int, dimension: str
+    problem: FilteredProblem, phi: Floats, body: int, dimension: str
 ) -> ResidualForce | None:
     """Return the process noise of a body's velocity over the time step, times its inertia."""
-    coordinates = problem.trajectory_noise.coordinates
+    coordinates = problem.likelihood.noise.coordinates
     added = coordinates.of_residual(problem.residual(phi)) / problem.scene.time_step
     places = zip(*np.divmod(coordinates.places, len(STATE)), strict=True)
     parts = {STATE[cell]: added[:, i] for i, (which, cell) in enumerate(places) if which == body}

@@ -10,7 +10,7 @@ import numpy as np
 from pbrl_ppl.criticism import Loop, diverged_after, whole_rollouts
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import along_trajectories
-from pbrl_ppl.modes import Mode
+from pbrl_ppl.modes import FilteredMode
 from pbrl_ppl.reporting.words import number
 from pbrl_ppl.scene import Scene, Shape
 from pbrl_ppl.state import Bools, Floats, wrapped
@@ -107,11 +107,11 @@ def divergence_in_words(motions: Sequence[Motion]) -> str:
     return f"{text[:1].upper()}{text[1:]}." if text else ""
 
 
-def _predicted(mode: Mode, history: History) -> dict[int, Floats]:
+def _predicted(mode: FilteredMode, history: History) -> dict[int, Floats]:
     """Return the poses that a model predicts of whole trajectories, by trajectory."""
-    cells = mode.problem.trajectory_noise.coordinates
-    problem = mode.problem.with_data(history=history, states=None)
-    problem = along_trajectories(problem, mode.phi, mode.sigma, cells)
+    cells = mode.problem.likelihood.noise.coordinates
+    other = mode.problem.with_data(history=history, states=None)
+    problem = along_trajectories(other, mode.phi, mode.sigma, cells)
     whole = whole_rollouts(problem, mode.phi, mode.sigma)
     return {trajectory: states[..., :3] for trajectory, states in whole.items()}
 
