@@ -1,25 +1,25 @@
 """The physics engine: worlds, joints and batched rollouts; the only room that imports pymunk."""
 
-from .coupling import Parts as Parts
-from .coupling import independent_parts as independent_parts
-from .coupling import joined_parts as joined_parts
 from .parts import Memory as Memory
 from .parts import OneWorld as OneWorld
 from .parts import Part as Part
 from .parts import PartedSimulator as PartedSimulator
+from .parts import independent_parts as independent_parts
+from .parts import joined_parts as joined_parts
 from .physics import Physics as Physics
-from .placement import check_history as check_history
-from .placement import check_placement as check_placement
-from .placement import overlap as overlap
-from .recording import simulated_recording as simulated_recording
+from .physics import Transition as Transition
+from .physics import simulated_recording as simulated_recording
+from .settings import Parts as Parts
 from .simulator import Simulator as Simulator
 from .simulator import after_recording as after_recording
 from .solids import Scenery as Scenery
+from .solids import check_history as check_history
+from .solids import check_placement as check_placement
 from .solids import circles as circles
 from .solids import depth_of as depth_of
+from .solids import overlap as overlap
 from .solids import scenery as scenery
 from .solids import touching as touching
 from .table1 import build_layout as build_layout
 from .table1 import index_priors as index_priors
-from .transition import Transition as Transition
 from .trial import try_effect as try_effect

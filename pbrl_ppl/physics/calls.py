@@ -1,4 +1,4 @@
-"""Calls of the engine's C functions and of effects' laws by address, from compiled code.
+"""Machine code: compilation with a cache on disk, and calls of C functions and laws by address.
 
 A vector argument of the C functions is a struct of two doubles passed by value. Under the System V
 and AArch64 calling conventions that is the same as two doubles, which is what is passed here; on
@@ -7,11 +7,14 @@ other platforms :data:`AVAILABLE` is false and the reference path serves.
 
 from __future__ import annotations
 
+import hashlib
 import platform
 import sys
 from collections import namedtuple
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from itertools import chain
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numba
@@ -19,14 +22,79 @@ import numpy as np
 import pymunk
 from llvmlite import ir
 from numba import types
+from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.types import unliteral
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 from pymunk import _chipmunk_cffi
 
 from pbrl_ppl.effects import Law
 from pbrl_ppl.errors import EffectError
+from pbrl_ppl.parameters import BODY_PARAMETERS, JOINT_ANCHORS
 from pbrl_ppl.physics.joints import JOINT_KINDS
 from pbrl_ppl.physics.world import BODY_CONSTRAINTS, RING, Placed, World
+
+
+def sources_digest(folder: Path) -> str:
+    """Return a digest of a folder's Python files and of the columns that they index by number."""
+    digest = hashlib.sha256(repr((BODY_PARAMETERS, JOINT_ANCHORS)).encode())
+    for path in sorted(folder.glob("*.py")):
+        digest.update(f"{path.name}\0".encode() + path.read_bytes() + b"\0")
+    return digest.hexdigest()
+
+
+SOURCES = sources_digest(Path(__file__).parent)
+
+
+def disk_cache(function: Callable[..., object], digest: str) -> FunctionCache:
+    """Return numba's cache of a function, in files that are named by a digest of the sources.
+
+    Numba itself compares the time and size of the file that defines the function, and misses
+    changes of the functions and constants that it uses from other files. Files of other digests
+    are deleted: numba would fail to read one that mentions a module which is gone.
+
+    Raises
+    ------
+    RuntimeError
+        If neither the package's folder nor the user's cache folder can be written to.
+    """
+    cache = FunctionCache(function)
+    base = cache._impl.filename_base
+    named, folder = f"{base}.{digest[:16]}", Path(cache.cache_path)
+    if not (folder / f"{named}.nbi").exists():  # the first use of these sources
+        for path in folder.glob(f"{base}.*"):
+            if not path.name.startswith(named):
+                with suppress(OSError):
+                    path.unlink()
+    cache._cache_file = IndexDataCacheFile(cache.cache_path, named, digest)
+    return cache
+
+
+def compiled(function: Callable[..., object]) -> Any:
+    """Return a function as numba compiles it, without the GIL and with a cache on disk.
+
+    A division by zero is infinite: a test for it would keep loops from being vectorised.
+    Where no folder can be written to, each process compiles it again.
+    """
+    dispatcher = numba.njit(nogil=True, error_model="numpy")(function)
+    template = dispatcher.get_call_template
+    # not again for each constant that is passed
+    dispatcher.get_call_template = lambda args, kws: template(tuple(map(unliteral, args)), kws)
+    with suppress(RuntimeError):
+        dispatcher._cache = disk_cache(function, SOURCES)
+    return dispatcher
+
+
+@compiled
+def copy(source, target):  # type: ignore[no-untyped-def]
+    """Copy an array with two axes to another.
+
+    An assignment of arrays would add seconds to the compilation, for the message of one that fails.
+    """
+    for i in range(source.shape[0]):
+        for j in range(source.shape[1]):
+            target[i, j] = source[i, j]
+
 
 #: Addresses of the engine's C functions, by their names. Those that set properties of constraints
 #: are in the settings of `Pointers`.
@@ -137,20 +205,22 @@ def call_law(typing, function, a, b, c, d):  # type: ignore[no-untyped-def]
 
 
 _DOUBLES = types.CPointer(types.float64)
-_LAWS: dict[Law, Any] = {}
+#: Address of each compiled law, and the C function itself, which must be kept.
+_LAWS: dict[Law, tuple[int, object]] = {}
 
 
 def law_address(law: Law) -> int:
     """Return the address of an effect's law, compiled to a C function once."""
     if law not in _LAWS:
         try:
-            _LAWS[law] = numba.cfunc(types.void(_DOUBLES, _DOUBLES, _DOUBLES, _DOUBLES))(law)
+            compiled_law = numba.cfunc(types.void(_DOUBLES, _DOUBLES, _DOUBLES, _DOUBLES))(law)
         except numba.core.errors.NumbaError as error:
             raise EffectError(
                 f"the law {law.__name__} cannot be compiled: use plain arithmetic and math alone"
                 f" ({' '.join(str(error).split())[:200]})"
             ) from None
-    return int(_LAWS[law].address)
+        _LAWS[law] = compiled_law.address, compiled_law
+    return _LAWS[law][0]
 
 
 #: A property of a constraint: the C function that sets it, and where in a row its number or vector
@@ -216,7 +286,7 @@ def pointers(world: World) -> Pointers:
     """Return the addresses of a world's C objects; the world must be kept alive."""
     ffi = _chipmunk_cffi.ffi
 
-    def at(*objects: Any) -> NDArray[np.int64]:
+    def at(*objects: object) -> NDArray[np.int64]:
         places = [int(ffi.cast("intptr_t", c_object)) for c_object in objects]
         return np.array(places, dtype=np.int64)
 

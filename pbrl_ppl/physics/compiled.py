@@ -1,16 +1,13 @@
-"""The compiled rollout: a loop in machine code that steps the engine without the GIL."""
+"""The compiled rollout: what a world gets in a substep, and the loop, in machine code."""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
-from pbrl_ppl.physics.calls import call1, call2, call_int, call_pointer, get1, get2
-from pbrl_ppl.physics.compilation import compiled, copy
+from pbrl_ppl.physics.calls import call1, call2, call_int, call_pointer, compiled, copy, get1, get2
 from pbrl_ppl.physics.laws import (
     ACTED,
     COMMAND,
@@ -18,38 +15,246 @@ from pbrl_ppl.physics.laws import (
     MORE,
     WRENCHES,
     act,
-    begin_held,
+    begin_laws,
+    bound,
     laws_of,
-    set_memory,
+    states_before,
 )
 from pbrl_ppl.physics.properties import COLUMN
-from pbrl_ppl.physics.setters import (
-    arm,
-    drive,
-    iterations,
-    place_bodies,
-    place_patches,
-    place_wheels,
-    set_brakes,
-    set_discs,
-    set_properties,
-    set_strengths,
-)
 from pbrl_ppl.physics.solids import near_contact
-from pbrl_ppl.physics.world import FINER, TINY
+from pbrl_ppl.physics.world import FINER, STICKING, TINY
 
 _FREE, _TOUCHED, _LOST = 0, 1, 2
 
 
-class Scratch(NamedTuple):
-    """Arrays of a transition."""
+@compiled
+def iterations(fewest, chained, bodies, a_ratio=2, most=2000):  # type: ignore[no-untyped-def]
+    """Return the solver iterations for the masses of these bodies: in proportion to their ratio.
 
-    state: NDArray[np.float64]  # (body, 6)
-    axes: NDArray[np.float64]  # (wheel, 2): cos and sin of the wheel's angle on the body
-    acted: NDArray[np.float64]  # (body + 4, 12), see `act`
-    memory: NDArray[np.float64]  # (2, slot), see `set_memory`
-    at: NDArray[np.int64]  # (2,), the same
-    held: NDArray[np.float64]  # (2, slot), see `act`
+    With fewer, a heavy link below a light one gains energy.
+    """
+    lightest, heaviest = np.inf, 0.0
+    for i in range(len(chained)):
+        if chained[i]:
+            lightest = min(lightest, bodies[i, COLUMN.mass])
+            heaviest = max(heaviest, bodies[i, COLUMN.mass])
+    enough = min(a_ratio * (heaviest / lightest), most)
+    return max(fewest, int(enough))
+
+
+@compiled
+def _apply(settings, rows, normal_gravity):  # type: ignore[no-untyped-def]
+    """Set properties of constraints by their rows of numbers."""
+    for j in range(len(settings)):
+        setting = settings[j]
+        row, column = rows[setting.row], setting.column
+        if setting.vector:
+            x, y = row[column] * setting.scale_x, row[setting.column_y] * setting.scale_y
+            call2(setting.function, setting.constraint, x, y)
+        else:
+            weight = row[COLUMN.mass] * normal_gravity if setting.weighted else 1.0
+            call1(setting.function, setting.constraint, row[column] * weight)
+
+
+@compiled
+def set_properties(fn, world, bodies, joints):  # type: ignore[no-untyped-def]
+    """Set masses, moments, surfaces and anchors, but no strengths of constraints."""
+    for i in range(len(world.bodies)):
+        if world.kinematic[i]:
+            continue
+        body, row = world.bodies[i], bodies[i]
+        call1(fn.cpBodySetMass, body, row[COLUMN.mass])
+        call1(fn.cpBodySetMoment, body, row[COLUMN.moment])
+        call2(fn.cpBodySetCenterOfGravity, body, row[COLUMN.com_x], row[COLUMN.com_y])
+    for j in range(len(world.shapes)):
+        row = bodies[world.shape_body[j]]
+        call1(fn.cpShapeSetElasticity, world.shapes[j], row[COLUMN.r])
+        call1(fn.cpShapeSetFriction, world.shapes[j], row[COLUMN.mu_c])
+    _apply(world.body_settings, bodies, world.still.normal_gravity)
+    _apply(world.joint_settings, joints, world.still.normal_gravity)
+
+
+@compiled
+def set_strengths(fn, world, bodies, on):  # type: ignore[no-untyped-def]
+    """Set the constraints' greatest forces, or set them to zero; patches get theirs as placed."""
+    for constraint in world.unlimited:
+        call1(fn.cpConstraintSetMaxForce, constraint, np.inf if on else 0.0)
+    for constraint in world.limited:
+        call1(fn.cpConstraintSetMaxForce, constraint, 0.0)
+    if on:
+        _apply(world.strengths, bodies, world.still.normal_gravity)
+
+
+@compiled
+def arm(row, theta):  # type: ignore[no-untyped-def]
+    """Return the arm from a body's origin to its centre of mass, in the world's frame."""
+    x, y = row[COLUMN.com_x], row[COLUMN.com_y]
+    if x == 0.0 and y == 0.0:
+        return 0.0, 0.0
+    c, s = math.cos(theta), math.sin(theta)
+    return c * x - s * y, s * x + c * y
+
+
+@compiled
+def glide(row, state, step):  # type: ignore[no-untyped-def]
+    """Return where a substep without forces takes a body: heading, centre of mass, its velocity."""
+    x, y = arm(row, state[2])
+    v_x, v_y = state[3] - state[5] * y, state[4] + state[5] * x
+    theta = state[2] + state[5] * step
+    x, y = state[0] + x + v_x * step, state[1] + y + v_y * step
+    return math.cos(theta), math.sin(theta), x, y, v_x, v_y
+
+
+@compiled
+def wheel_ends(row, after, axis_cos, axis_sin):  # type: ignore[no-untyped-def]
+    """Return the far ends of a wheel's rods: x and y of the one along it, of the one across."""
+    c, s, x, y, _, _ = after
+    w_x, w_y = row[COLUMN.w_x] - row[COLUMN.com_x], row[COLUMN.w_y] - row[COLUMN.com_y]
+    x, y = x + c * w_x - s * w_y, y + s * w_x + c * w_y
+    c, s = c * axis_cos - s * axis_sin, s * axis_cos + c * axis_sin
+    return x + c, y + s, x - s, y + c
+
+
+@compiled
+def patch_point(row, after, omega, point, step, most):  # type: ignore[no-untyped-def]
+    """Return the far end of a point's rod, along its velocity, and the rod's share of the friction.
+
+    ``point`` is in units of the ring's radius; ``most`` is the deceleration by friction (m/s^2).
+    """
+    c, s, at_x, at_y, v_x, v_y = after
+    x = point[0] * row[COLUMN.patch_radius] - row[COLUMN.com_x]
+    y = point[1] * row[COLUMN.patch_radius] - row[COLUMN.com_y]
+    x, y = c * x - s * y, s * x + c * y
+    along_x, along_y = v_x - omega * y, v_y + omega * x
+    speed = math.sqrt(along_x * along_x + along_y * along_y)
+    slow = STICKING * most * step
+    share = 1.0 if speed >= slow else speed / slow
+    if speed == 0.0:  # at rest any direction will do
+        along_x, speed = 1.0, 1.0
+    return at_x + x + along_x / speed, at_y + y + along_y / speed, share
+
+
+@compiled
+def hinge_signal(pivots, gravity, row, joints, state, command, i):  # type: ignore[no-untyped-def]
+    """Return what laws of friction see in the hinge or slider of body ``i``, by its row and state.
+
+    The commanded torque, that of the weight, and the speed. Of a slider the commanded force and the
+    speed alone. ``pivots`` have a hinge's body, its joint and the column of its anchor on the body.
+    """
+    torque, rest = math.sqrt(command[0] ** 2 + command[1] ** 2), 0.0
+    speed = math.sqrt(state[3] ** 2 + state[4] ** 2)
+    for hinge in pivots:
+        if hinge[0] == i:
+            x = row[COLUMN.com_x] - joints[hinge[1], hinge[2]]
+            y = row[COLUMN.com_y] - joints[hinge[1], hinge[2] + 1]
+            c, s = math.cos(state[2]), math.sin(state[2])
+            x, y = c * x - s * y, s * x + c * y
+            weight_x = gravity[0] + row[COLUMN.extra_gravity_x]
+            weight_y = gravity[1] + row[COLUMN.extra_gravity_y]
+            rest = row[COLUMN.mass] * (x * weight_y - y * weight_x)
+            torque, speed = command[2], abs(state[5])
+    return torque, rest, speed
+
+
+@compiled
+def patch_signal(row, state, normal_gravity):  # type: ignore[no-untyped-def]
+    """Return the greatest friction under a body but for laws, and the speed that they see."""
+    turned = state[5] * row[COLUMN.patch_radius]
+    speed = math.sqrt(state[3] ** 2 + state[4] ** 2 + turned**2)
+    return row[COLUMN.patch_mu] * row[COLUMN.mass] * normal_gravity, speed
+
+
+@compiled
+def place_bodies(fn, world, bodies, state):  # type: ignore[no-untyped-def]
+    """Set the bodies' states; the engine's velocity is that of the centre of mass."""
+    for i in range(len(world.bodies)):
+        body, (x, y) = world.bodies[i], arm(bodies[i], state[i, 2])
+        call1(fn.cpBodySetAngle, body, state[i, 2])  # first: the centre's place depends on it
+        call2(fn.cpBodySetPosition, body, state[i, 0], state[i, 1])
+        turn = state[i, 5]
+        call2(fn.cpBodySetVelocity, body, state[i, 3] - turn * y, state[i, 4] + turn * x)
+        call1(fn.cpBodySetAngularVelocity, body, turn)
+
+
+@compiled
+def set_discs(fn, world, discs):  # type: ignore[no-untyped-def]
+    """Place the hidden discs, as in `plain.set_discs`.
+
+    They are removed and added again, since the order of contacts depends on their earlier places.
+    """
+    obstacles = world.still.obstacles
+    first = len(obstacles) - len(world.discs)
+    for j in range(len(world.discs)):
+        call_pointer(fn.cpSpaceRemoveShape, world.space, world.discs[j])
+    if len(world.discs):
+        for _ in range(-len(world.discs) % (world.padding + len(world.shapes))):
+            # the numbers of the moving shapes go on from a multiple: see World._add_shapes
+            call_pointer(fn.cpSpaceAddShape, world.space, world.discs[0])
+            call_pointer(fn.cpSpaceRemoveShape, world.space, world.discs[0])
+    for j in range(len(world.discs)):
+        x, y, radius = discs[j, 0], discs[j, 1], discs[j, 2]
+        if not radius > 0.0:
+            x, y, radius = -world.far, -world.far * (j + 1.0), 0.0
+        call2(fn.cpCircleShapeSetOffset, world.discs[j], x, y)
+        call1(fn.cpCircleShapeSetRadius, world.discs[j], radius)
+        call_pointer(fn.cpSpaceAddShape, world.space, world.discs[j])
+        obstacle = obstacles[first + j]
+        obstacle[0] = obstacle[2] = x
+        obstacle[1] = obstacle[3] = y
+        obstacle[4] = radius
+
+
+@compiled
+def place_wheels(fn, world, bodies, state, axes, step):  # type: ignore[no-untyped-def]
+    """Put the rods' ends on the wheels' axes as predicted for the end of the substep."""
+    for j in range(len(world.wheel_body)):
+        row, body = bodies[world.wheel_body[j]], state[world.wheel_body[j]]
+        x_1, y_1, x_2, y_2 = wheel_ends(row, glide(row, body, step), axes[j, 0], axes[j, 1])
+        call2(fn.cpPinJointSetAnchorB, world.wheels[0, j], x_1, y_1)
+        call2(fn.cpPinJointSetAnchorB, world.wheels[1, j], x_2, y_2)
+
+
+@compiled
+def place_patches(fn, world, laws, bodies, state, step, acted):  # type: ignore[no-untyped-def]
+    """Put each point's rod along its velocity; split its friction with the pivot joint."""
+    for j in range(len(world.patch_body)):
+        k = world.patch_body[j]
+        row, body = bodies[k], state[k]
+        after = glide(row, body, step)
+        most, speed = patch_signal(row, body, world.still.normal_gravity)
+        most = bound(most, laws, k, 1, state, 0.0, 0.0, speed, acted)
+        slowing, most = most / row[COLUMN.mass], most / len(world.still.ring)
+        for i in range(len(world.still.ring)):
+            x, y, share = patch_point(row, after, body[5], world.still.ring[i], step, slowing)
+            call2(fn.cpPinJointSetAnchorB, world.patches[1, j, i], x, y)
+            call1(fn.cpConstraintSetMaxForce, world.patches[0, j, i], (1.0 - share) * most)
+            call1(fn.cpConstraintSetMaxForce, world.patches[1, j, i], share * most)
+
+
+@compiled
+def set_brakes(world, laws, bodies, joints, state, acted):  # type: ignore[no-untyped-def]
+    """Set the greatest torque of friction in hinges where laws change it."""
+    for j in range(len(world.strengths)):
+        setting = world.strengths[j]
+        i = setting.row
+        if setting.column == COLUMN.pivot_torque:
+            torque, rest, speed = hinge_signal(
+                world.pivots, world.still.gravity, bodies[i], joints, state[i], acted[i], i
+            )
+            base = bodies[i, COLUMN.pivot_torque]
+            most = bound(base, laws, i, 0, state, torque, rest, speed, acted)
+            call1(setting.function, setting.constraint, most)
+
+
+@compiled
+def drive(fn, world, state, action):  # type: ignore[no-untyped-def]
+    """Set the velocities of kinematic bodies for the interval that begins."""
+    for i in range(len(world.bodies)):
+        if world.kinematic[i]:
+            for w in range(3):
+                state[i, 3 + w] = action[i, w]
+            call2(fn.cpBodySetVelocity, world.bodies[i], action[i, 0], action[i, 1])
+            call1(fn.cpBodySetAngularVelocity, world.bodies[i], action[i, 2])
 
 
 @numba.njit(inline="always")
@@ -91,6 +296,53 @@ def intervals(bodies, p, t, horizon):  # type: ignore[no-untyped-def]
     return bodies[p]
 
 
+@numba.njit(inline="always")
+def _push(fn, world, bodies, state, acted):  # type: ignore[no-untyped-def]
+    """Set the forces and torques of a substep, which act at the bodies' origins."""
+    for i in range(len(world.bodies)):
+        if world.kinematic[i]:
+            continue
+        weight_x = bodies[i, COLUMN.mass] * bodies[i, COLUMN.extra_gravity_x]
+        weight_y = bodies[i, COLUMN.mass] * bodies[i, COLUMN.extra_gravity_y]
+        f_x, f_y = acted[i, WRENCHES], acted[i, WRENCHES + 1]
+        call2(fn.cpBodySetForce, world.bodies[i], f_x + weight_x, f_y + weight_y)
+        x, y = arm(bodies[i], state[i, 2])
+        torque = acted[i, WRENCHES + 2] - (x * f_y - y * f_x)
+        call1(fn.cpBodySetTorque, world.bodies[i], torque)
+
+
+@numba.njit(inline="always")
+def _read(fn, world, bodies, state):  # type: ignore[no-untyped-def]
+    """Set the states of the bodies' origins from the engine; return whether one has diverged."""
+    lost = False
+    for i in range(len(world.bodies)):
+        body = world.bodies[i]
+        state[i, 0], state[i, 1] = get2(fn.cpBodyGetPosition, body)
+        state[i, 2] = get1(fn.cpBodyGetAngle, body)
+        turn = get1(fn.cpBodyGetAngularVelocity, body)
+        x, y = arm(bodies[i], state[i, 2])
+        v_x, v_y = get2(fn.cpBodyGetVelocity, body)
+        state[i, 3], state[i, 4], state[i, 5] = v_x + turn * y, v_y - turn * x, turn
+        speed = abs(state[i, 3]) + abs(state[i, 4]) + world.still.length * abs(turn)
+        lost |= not speed < world.still.fastest  # also true of NaN
+    return lost
+
+
+@compiled
+def _scratch_of(world, batch):  # type: ignore[no-untyped-def]
+    """Return the arrays of a transition.
+
+    They are states (body, 6), cos and sin of the wheels' angles on the bodies (wheel, 2), what acts
+    (body + 4, 12), what laws remember (2, slot), where that was last (2,), and their own numbers
+    (2, slot): see `act` and `begin_laws`.
+    """
+    k = len(world.bodies)
+    return (
+        np.empty((k, 6)), np.empty((len(world.wheel_body), 2)), np.zeros((k + MORE, ACTED)),
+        np.zeros((2, batch.slots)), np.full(2, -1), np.zeros((2, batch.held)),
+    )  # fmt: skip
+
+
 @numba.njit(inline="always")  # a call costs as much as a substep: the world is many arrays
 def _transition(  # type: ignore[no-untyped-def]
     fn, world, batch, laws, p, t, substeps, scratch, first, begin, whole, out
@@ -113,13 +365,10 @@ def _transition(  # type: ignore[no-untyped-def]
     touched, near = _FREE, False
     driven = world.kinematic.any()
     acting = len(laws.commands) + len(laws.forces) > 0
-    sliding = len(world.patch_body) > 0
-    braked = len(laws.frictions) > 0
     still = world.still
     watch = len(still.obstacles) > 0 or k > 1
     place_bodies(fn, world, bodies, state)
-    set_memory(batch, laws, p, t, begin, first, acted, memory, held, at)
-    begin_held(state, laws, acted, held)
+    begin_laws(batch, laws, p, t, begin, state, acted, memory, held, at)
     while end < len(inputs) and (whole or near or end == begin):
         h = end
         if h > begin and len(properties) > 1:
@@ -142,33 +391,15 @@ def _transition(  # type: ignore[no-untyped-def]
                 )
                 for slot in range(held.shape[1]):
                     held[0, slot] += step * held[1, slot]
-            if braked:
+            if len(laws.frictions) > 0:
                 set_brakes(world, laws, bodies, joints, state, acted)
-            for i in range(k):
-                if driven and world.kinematic[i]:
-                    continue
-                weight_x = bodies[i, COLUMN.mass] * bodies[i, COLUMN.extra_gravity_x]
-                weight_y = bodies[i, COLUMN.mass] * bodies[i, COLUMN.extra_gravity_y]
-                f_x, f_y = acted[i, WRENCHES], acted[i, WRENCHES + 1]
-                call2(fn.cpBodySetForce, world.bodies[i], f_x + weight_x, f_y + weight_y)
-                x, y = arm(bodies[i], state[i, 2])
-                torque = acted[i, WRENCHES + 2] - (x * f_y - y * f_x)
-                call1(fn.cpBodySetTorque, world.bodies[i], torque)
+            _push(fn, world, bodies, state, acted)
             place_wheels(fn, world, bodies, state, axes, step)
-            if sliding:
+            if len(world.patch_body) > 0:
                 place_patches(fn, world, laws, bodies, state, step, acted)
             call1(fn.cpSpaceStep, world.space, step)
-            for i in range(k):
-                body = world.bodies[i]
-                state[i, 0], state[i, 1] = get2(fn.cpBodyGetPosition, body)
-                state[i, 2] = get1(fn.cpBodyGetAngle, body)
-                turn = get1(fn.cpBodyGetAngularVelocity, body)
-                x, y = arm(bodies[i], state[i, 2])
-                v_x, v_y = get2(fn.cpBodyGetVelocity, body)
-                state[i, 3], state[i, 4], state[i, 5] = v_x + turn * y, v_y - turn * x, turn
-                speed = abs(state[i, 3]) + abs(state[i, 4]) + still.length * abs(turn)
-                if not speed < still.fastest:  # also true of NaN
-                    return _LOST, end
+            if _read(fn, world, bodies, state):
+                return _LOST, end
             if watch and (touched == _FREE or not whole):
                 near = near_contact(state, still.radii, still.obstacles, still.can_touch)
                 touched = _TOUCHED if near else touched
@@ -200,22 +431,15 @@ def rollout(fn, world, batch, items, begins, whole, out):  # type: ignore[no-unt
     states = np.empty((horizon, batch.inputs.shape[2], 6))
     total = np.empty_like(states)
     timed = bodies.shape[1] > 1
-    k = len(world.bodies)
-    axes = np.empty((len(world.wheel_body), 2))
-    acted, memory = np.zeros((k + MORE, ACTED)), np.zeros((2, batch.slots))
-    scratch = Scratch(
-        np.empty((k, 6)), axes, acted, memory, np.full(2, -1), np.zeros((2, batch.held))
-    )
+    scratch = _scratch_of(world, batch)
     proposal, finer = -1, 1
-    start, outcome = batch.start, _TOUCHED  # an earlier call may have left contacts
+    outcome = _TOUCHED  # an earlier call may have left contacts
     for place in range(len(items)):
         item = items[place]
         p, t = item // n, item % n
         begin, laws = begins[place], laws_of(batch, p)
         first = intervals(bodies, p, t, horizon)[begin if timed else 0]
-        states_before = start[p if len(start) > 1 else 0, t]
-        if begin > 0:
-            states_before = out[item, begin - 1]
+        before_begin = states_before(batch, out, item, begin)
         if p != proposal:
             proposal = p
             set_properties(fn, world, first, joints[p])
@@ -231,7 +455,7 @@ def rollout(fn, world, batch, items, begins, whole, out):  # type: ignore[no-unt
                     set_properties(fn, world, first, joints[p])
                 _forget(fn, world, first, batch, before)
                 outcome, end = _transition(
-                    fn, world, batch, laws, p, t, substeps, scratch, states_before, begin, whole,
+                    fn, world, batch, laws, p, t, substeps, scratch, before_begin, begin, whole,
                     states,
                 )  # fmt: skip
                 if substeps > batch.counts[level] and outcome == _FREE:
@@ -251,7 +475,7 @@ def rollout(fn, world, batch, items, begins, whole, out):  # type: ignore[no-unt
                 break
             total += batch.weights[level] * states
         if whole and outcome == _FREE and len(batch.counts) > 1:
-            for i in range(k):
+            for i in range(len(world.bodies)):
                 if world.kinematic[i]:  # the weights' sum is 1 but for rounding
                     copy(out[item, :, i], total[:, i])
             for h in range(horizon):

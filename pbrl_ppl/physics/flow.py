@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pbrl_ppl.physics.compilation import compiled
+from pbrl_ppl.physics.calls import compiled, copy
 from pbrl_ppl.physics.laws import (
     COMMAND,
     FIRST,
@@ -23,9 +23,9 @@ from pbrl_ppl.physics.laws import (
     WRENCHES,
     Laws,
     act,
-    begin_held,
+    begin_laws,
     laws_of,
-    set_memory,
+    states_before,
 )
 from pbrl_ppl.physics.motion import (
     BIAS,
@@ -47,7 +47,6 @@ from pbrl_ppl.physics.motion import (
     Q,
     U,
     row_speed,
-    set_bounds,
     set_coordinates,
     set_first_slide,
     set_forces,
@@ -58,8 +57,7 @@ from pbrl_ppl.physics.motion import (
     strain,
 )
 from pbrl_ppl.physics.solids import near_contact
-from pbrl_ppl.physics.tree import ALONG, TURNING
-from pbrl_ppl.physics.tree import FIRST as COORDINATE
+from pbrl_ppl.physics.tree import ALONG, LINK, TURNING
 from pbrl_ppl.state import Floats
 
 #: Times of the stages; weights of the slopes before each, and in the last row those of the error.
@@ -111,8 +109,7 @@ def _load(work, flow, u, inputs, share, low, high):  # type: ignore[no-untyped-d
         )
     for s in range(flow.held):
         motion[u, held + s] = work.held[1, s]
-    set_forces(work, u)
-    set_bounds(work, laws, u)
+    set_forces(work, laws, u)
 
 
 @compiled
@@ -142,7 +139,7 @@ def _size(work, laws, r):  # type: ignore[no-untyped-def]
     """Return the natural size of a row's way: of a wheel's in m, or of its joint's coordinate."""
     if work.kinds[r, 0] >= ALONG:
         return laws.length
-    return work.motion[SIZE, work.tree[work.kinds[r, 1], COORDINATE]]
+    return work.motion[SIZE, work.tree[work.kinds[r, 1], LINK.first]]
 
 
 @compiled
@@ -161,36 +158,11 @@ def _decide(work, laws, inputs, share, low, high):  # type: ignore[no-untyped-de
     Rows with a speed slip. Of the others all stick first; that which is pulled hardest gives way,
     until no force exceeds its bound.
     """
-    motion, kinds, rows, rings = work.motion, work.kinds, work.rows, work.rings
-    count, n, moves = work.n_rows, work.n, False
+    motion, kinds, rows = work.motion, work.kinds, work.rows
+    count = work.n_rows
     set_places(work, Q, U)
     _load(work, laws, U, inputs, share, low, high)  # for the rows
-    for r in range(work.n_kinds):
-        # what stuck before moves by the error of steps alone
-        still = 100.0 * laws.tolerance if kinds[r, 2] == STICK else _STILL
-        greatest = rows[r, BOUND] if r < count else rings[r - count, GRIP, 0]
-        kinds[r, 2], kinds[r, 3] = STICK if greatest > 0.0 else SMOOTH, 1
-        if greatest == 0.0:
-            continue
-        if r < count:
-            speed = row_speed(work, r, U)
-            size = _size(work, laws, r)
-            if abs(speed) * laws.time_step > still * size:
-                kinds[r, 2] = 1 if speed > 0.0 else -1
-            moved = speed != 0.0
-        else:
-            i = kinds[r, 1]
-            square = set_twist(work, r - count, i, U, TWIST)
-            if square > _slowest(work, laws, r):
-                kinds[r, 2] = SLIDE
-            moved = square > 0.0
-        if kinds[r, 2] == STICK:
-            kinds[r, 3] = 0  # not settled
-            moves |= moved
-    for r in range(count, work.n_kinds):
-        if kinds[r, 2] == STICK:
-            _set_wheel(work, r, SMOOTH)  # the ring holds for it
-    stop = moves
+    stop = _begin_modes(work, laws)
     for _ in range(5 * work.n_kinds + 2):
         _slope(work, laws, U, SLOPES + 1, inputs, share, low, high)
         worst, back, most = -1, -1, 1.0 - _STILL
@@ -208,36 +180,82 @@ def _decide(work, laws, inputs, share, low, high):  # type: ignore[no-untyped-de
         if back >= 0:  # it holds, since another slips
             kinds[back, 2], kinds[back, 3] = STICK, 1
             continue
-        slid = False
-        for r in range(count, work.n_kinds):
-            if kinds[r, 2] == STICK and strain(work, r - count, kinds[r, 1]) > 0.0:
-                kinds[r, 2], slid = SLIDE, True
-                _set_wheel(work, r, STICK)
-        if slid:
-            set_first_slide(work, U, END_U)
-            for r in range(count):
-                if kinds[r, 2] == STICK and kinds[r, 3] == 2:
-                    rate, most = row_speed(work, r, END_U), 0.0
-                    for j in range(n):
-                        most += abs(rows[r, G + j] * motion[END_U, j])
-                    kinds[r, 3] = 0
-                    if abs(rate) > 0.05 * most:
-                        kinds[r, 2], kinds[r, 3] = 1 if rate > 0.0 else -1, 1
-            for r in range(count, work.n_kinds):
-                kinds[r, 3] = 1 if kinds[r, 2] == SLIDE else 0
-            for j in range(n):
-                motion[U, j] += 1e-6 * laws.time_step * motion[END_U, j]
-            set_places(work, Q, U)
+        if _slide(work, laws):
             continue
         if not stop:
             break
         solve(work, U, END_U, True)
-        for j in range(n):
+        for j in range(work.n):
             motion[U, j] = motion[END_U, j]
         set_places(work, Q, U)
         stop = False
     for r in range(count, work.n_kinds):
         set_twist(work, r - count, kinds[r, 1], U, TWIST)
+
+
+@compiled
+def _begin_modes(work, laws):  # type: ignore[no-untyped-def]
+    """Set modes by the speeds: rows and rings with a speed slip, and the others stick.
+
+    Returns whether any that sticks has a speed yet, which is to be stopped.
+    """
+    kinds, rows, count, moves = work.kinds, work.rows, work.n_rows, False
+    for r in range(work.n_kinds):
+        # what stuck before moves by the error of steps alone
+        still = 100.0 * laws.tolerance if kinds[r, 2] == STICK else _STILL
+        greatest = rows[r, BOUND] if r < count else work.rings[r - count, GRIP, 0]
+        kinds[r, 2], kinds[r, 3] = STICK if greatest > 0.0 else SMOOTH, 1
+        if greatest == 0.0:
+            continue
+        if r < count:
+            speed = row_speed(work, r, U)
+            size = _size(work, laws, r)
+            if abs(speed) * laws.time_step > still * size:
+                kinds[r, 2] = 1 if speed > 0.0 else -1
+            moved = speed != 0.0
+        else:
+            square = set_twist(work, r - count, kinds[r, 1], U, TWIST)
+            if square > _slowest(work, laws, r):
+                kinds[r, 2] = SLIDE
+            moved = square > 0.0
+        if kinds[r, 2] == STICK:
+            kinds[r, 3] = 0  # not settled
+            moves |= moved
+    for r in range(count, work.n_kinds):
+        if kinds[r, 2] == STICK:
+            _set_wheel(work, r, SMOOTH)  # the ring holds for it
+    return moves
+
+
+@compiled
+def _slide(work, laws):  # type: ignore[no-untyped-def]
+    """Let rings slide whose reaction exceeds what they can hold; return whether any does.
+
+    They get a first speed, with which the direction of their friction is known.
+    """
+    motion, kinds, rows, count = work.motion, work.kinds, work.rows, work.n_rows
+    slid = False
+    for r in range(count, work.n_kinds):
+        if kinds[r, 2] == STICK and strain(work, r - count, kinds[r, 1]) > 0.0:
+            kinds[r, 2], slid = SLIDE, True
+            _set_wheel(work, r, STICK)
+    if not slid:
+        return False
+    set_first_slide(work, U, END_U)
+    for r in range(count):
+        if kinds[r, 2] == STICK and kinds[r, 3] == 2:
+            rate, most = row_speed(work, r, END_U), 0.0
+            for j in range(work.n):
+                most += abs(rows[r, G + j] * motion[END_U, j])
+            kinds[r, 3] = 0
+            if abs(rate) > 0.05 * most:
+                kinds[r, 2], kinds[r, 3] = 1 if rate > 0.0 else -1, 1
+    for r in range(count, work.n_kinds):
+        kinds[r, 3] = 1 if kinds[r, 2] == SLIDE else 0
+    for j in range(work.n):
+        motion[U, j] += 1e-6 * laws.time_step * motion[END_U, j]
+    set_places(work, Q, U)
+    return True
 
 
 @compiled
@@ -252,6 +270,16 @@ def _margin(work, laws, u):  # type: ignore[no-untyped-def]
         elif mode != SMOOTH:
             size = _size(work, laws, r)
             least = min(least, mode * row_speed(work, r, u) * laws.time_step / size)
+    return least
+
+
+@compiled
+def _first_margin(work, laws):  # type: ignore[no-untyped-def]
+    """Return by how much nothing switches where a step begins."""
+    least = _margin(work, laws, U)
+    for r in range(work.n_rows, work.n_kinds):
+        if work.kinds[r, 2] == STICK:
+            least = min(least, -strain(work, r - work.n_rows, work.kinds[r, 1]))
     return least
 
 
@@ -320,7 +348,6 @@ def _advance(work, laws, still, inputs, low, high, budget, wanted):  # type: ign
     Begins with steps of a ``wanted`` width. Returns the steps left, and the width wanted next. Left
     is 0 where the motion has no prediction, and -1 where a body comes near an obstacle.
     """
-    motion, n = work.motion, work.n
     share, width, last = low, wanted, False
     fresh, locating = True, False  # whether modes are to be decided; whether a switch is located
     left = 0.0  # by how much nothing switches where the step begins
@@ -328,10 +355,7 @@ def _advance(work, laws, still, inputs, low, high, budget, wanted):  # type: ign
     while share < high:
         if fresh:
             _decide(work, laws, inputs, share, low, high)
-            fresh, left = False, _margin(work, laws, U)
-            for r in range(work.n_rows, work.n_kinds):
-                if work.kinds[r, 2] == STICK:
-                    left = min(left, -strain(work, r - work.n_rows, work.kinds[r, 1]))
+            fresh, left = False, _first_margin(work, laws)
         if locating:
             width = begin + (until - begin) * before / (before - after)
         else:
@@ -374,28 +398,40 @@ def _advance(work, laws, still, inputs, low, high, budget, wanted):  # type: ign
             fresh, left = end < -_LOCATED, end
             wider = width * min(5.0, 0.9 * max(error, 1e-9) ** -0.2)
             wanted = min(1.0, max(wanted, wider) if last or wanted > width else wider)
-        for j in range(n + 1, n + 1 + laws.held):
-            motion[Q, j], motion[U, j] = motion[END_Q, j], motion[END_U, j]
-        for j in range(n):
-            motion[Q, j], motion[U, j] = motion[END_Q, j], motion[END_U, j]
-            motion[SLOPES + 1, j] = motion[SLOPES + 13, j]
-        for r in range(work.n_rows, work.n_kinds):
-            ring, square = r - work.n_rows, 0.0
-            for d in range(3):
-                work.rings[ring, TWIST, d] = work.rings[ring, TWIST_END, d]
-                square += work.rings[ring, TWIST, d] ** 2
-            if work.kinds[r, 2] == SLIDE and square <= _slowest(work, laws, r):
-                fresh = True
-        seconds = laws.time_step * width
+        fresh |= _accept(work, laws)
         share = high if last else share + width
-        for k in range(work.n_bodies):
-            for d in range(3 if work.bodies[k] < 0 else 0):  # it follows a path
-                work.states[k, d] += seconds * work.states[k, 3 + d]
+        _follow_paths(work, laws.time_step * width)
         if still.watched and near_contact(
             work.states, still.radii, still.obstacles, still.can_touch
         ):
             return -1, wanted
     return budget, wanted
+
+
+@compiled
+def _accept(work, laws):  # type: ignore[no-untyped-def]
+    """Begin the next step where one ends; return whether a ring that slides is to stop."""
+    motion, n, stops = work.motion, work.n, False
+    for j in range(n + 1, n + 1 + laws.held):
+        motion[Q, j], motion[U, j] = motion[END_Q, j], motion[END_U, j]
+    for j in range(n):
+        motion[Q, j], motion[U, j] = motion[END_Q, j], motion[END_U, j]
+        motion[SLOPES + 1, j] = motion[SLOPES + 13, j]
+    for r in range(work.n_rows, work.n_kinds):
+        ring, square = r - work.n_rows, 0.0
+        for d in range(3):
+            work.rings[ring, TWIST, d] = work.rings[ring, TWIST_END, d]
+            square += work.rings[ring, TWIST, d] ** 2
+        stops |= work.kinds[r, 2] == SLIDE and square <= _slowest(work, laws, r)
+    return stops
+
+
+@compiled
+def _follow_paths(work, seconds):  # type: ignore[no-untyped-def]
+    """Move the bodies that follow a path."""
+    for k in range(work.n_bodies):
+        for d in range(3 if work.bodies[k] < 0 else 0):
+            work.states[k, d] += seconds * work.states[k, 3 + d]
 
 
 @compiled
@@ -412,11 +448,29 @@ class Flow(NamedTuple):
     """Laws of a proposal, what they remember, and what steps are measured by."""
 
     laws: Laws
-    memory: Floats  # (2, slot), see `laws.set_memory`
+    memory: Floats  # (2, slot), see `laws.begin_laws`
     held: int  # numbers of force laws
     time_step: float  # s
     tolerance: float  # error of a step, as a share of natural sizes
     length: float  # natural size of a way (m)
+
+
+@compiled
+def _place_discs(still, discs):  # type: ignore[no-untyped-def]
+    """Put the hidden discs (disc, 3) of a proposal among the obstacles."""
+    for j in range(len(discs)):
+        one, there = still.obstacles[len(still.obstacles) - len(discs) + j], discs[j, 2] > 0.0
+        one[0] = one[2] = discs[j, 0] if there else 1e9 * still.length
+        one[1], one[3], one[4] = discs[j, 1], discs[j, 1], discs[j, 2]
+
+
+@compiled
+def _set_states(work, states):  # type: ignore[no-untyped-def]
+    """Begin at states (body, 6); nothing is known of the friction."""
+    for r in range(work.n_kinds):
+        work.kinds[r, 2] = SMOOTH
+    set_coordinates(work, states)
+    copy(states, work.states)
 
 
 @compiled
@@ -430,7 +484,7 @@ def rollout(works, still, batch, items, begins, out):  # type: ignore[no-untyped
     rows, joints, discs = batch.given[:3]
     work = works[0]
     n, horizon, proposal, bodies = len(batch.inputs), batch.inputs.shape[1], -1, work.n_bodies
-    timed, fixed = rows.shape[1] > 1, len(still.obstacles) - discs.shape[1]
+    timed = rows.shape[1] > 1
     memory, at = np.zeros((2, batch.slots)), np.full(2, -1)
     for place in range(len(items)):
         item = items[place]
@@ -441,10 +495,7 @@ def rollout(works, still, batch, items, begins, out):  # type: ignore[no-untyped
         )  # fmt: skip
         if p != proposal:
             proposal = p
-            for j in range(discs.shape[1]):
-                one, there = still.obstacles[fixed + j], discs[p, j, 2] > 0.0
-                one[0] = one[2] = discs[p, j, 0] if there else 1e9 * still.length
-                one[1], one[3], one[4] = discs[p, j, 1], discs[p, j, 1], discs[p, j, 2]
+            _place_discs(still, discs[p])
         first, wanted = begins[place], 1.0
         begins[place] = horizon
         for h in range(first, horizon):
@@ -454,17 +505,8 @@ def rollout(works, still, batch, items, begins, out):  # type: ignore[no-untyped
                     rows[p, t * horizon + h if timed else 0], joints[p],
                 )  # fmt: skip
             if h == first:
-                for r in range(work.n_kinds):
-                    work.kinds[r, 2] = SMOOTH
-                begin = batch.start[p if len(batch.start) > 1 else 0, t]
-                if h > 0:
-                    begin = out[item, h - 1]
-                set_coordinates(work, begin)
-                for k in range(bodies):
-                    for d in range(6):
-                        work.states[k, d] = begin[k, d]
-                set_memory(batch, laws, p, t, h, work.states, work.acted, memory, work.held, at)
-                begin_held(work.states, laws, work.acted, work.held)
+                _set_states(work, states_before(batch, out, item, h))
+                begin_laws(batch, laws, p, t, h, work.states, work.acted, memory, work.held, at)
                 for s in range(batch.held):
                     work.motion[Q, work.n + 1 + s] = work.held[0, s]
             inputs, budget, low, high = batch.inputs[t, h], MOST_STEPS, 0.0, 0.0

@@ -8,12 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 import pymunk
-from numpy.typing import NDArray
 
 from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.parameters import JOINT_ANCHORS, JOINT_INDICES
 from pbrl_ppl.scene import WORLD, Scene, smallest_radius
-from pbrl_ppl.state import Bools, Floats
+from pbrl_ppl.state import Bools, Floats, Ints
 
 #: Columns of a joint's numbers: its anchors and its length; of a slider, the ends of its line in
 #: the first body's frame (m).
@@ -161,7 +160,7 @@ class SceneJoints:
             for joint, length in zip(scene.joints, lengths, strict=True)
         )
 
-    def _lengths(self, anchors: Floats, holders: NDArray[np.int64]) -> Floats:
+    def _lengths(self, anchors: Floats, holders: Ints) -> Floats:
         """Return the distances of anchors (..., 4) in the reference poses, shape (...,)."""
         poses = self._poses[holders]
         c, s = np.cos(poses[..., 2]), np.sin(poses[..., 2])
@@ -170,7 +169,7 @@ class SceneJoints:
         at_y = poses[..., 1] + s * x + c * y
         return np.asarray(np.hypot(at_x[..., 0] - at_x[..., 1], at_y[..., 0] - at_y[..., 1]))
 
-    def __call__(self, phi: Floats) -> tuple[Floats, NDArray[np.int64]]:
+    def __call__(self, phi: Floats) -> tuple[Floats, Ints]:
         """Return anchors and lengths, and the bodies that joints of unknown bodies hold.
 
         Parameters

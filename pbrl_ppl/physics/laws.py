@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numba
 import numpy as np
-from numpy.typing import NDArray
 
-from pbrl_ppl.physics.calls import call_law
-from pbrl_ppl.physics.compilation import compiled
+from pbrl_ppl.effects import Attached, Command, Force, Friction, at_stage, holder
+from pbrl_ppl.physics.calls import call_law, compiled, law_address
+from pbrl_ppl.scene import Scene
+from pbrl_ppl.state import WRENCH, Floats, Ints
 
 #: When an interval is nearly over, as a share of it.
 LATE = 1.0 - 1e-7
@@ -26,15 +28,61 @@ MORE = 4
 LAW, ON, FIRST, REMEMBER, SLOT, SLOTS, ALONE, UNDER, JUMPS, BEGINS, OTHER = range(11)
 
 
+def law_tables(scene: Scene, effects: tuple[Attached, ...]) -> tuple[Ints, Ints, Ints, int, int]:
+    """Return the rows of command, force and friction laws, with columns as above.
+
+    And how many numbers command laws remember, and force laws have of their own.
+    """
+    tables, slots = [], []
+    for kind in (Command, Force, Friction):
+        rows: list[Ints] = []
+        first = slot = 0
+        for attached in at_stage(effects, kind):
+            if isinstance(attached.effect.stage, Command | Force | Friction):
+                rows.append(_row(scene, attached, attached.effect.stage, first, slot))
+                first += len(attached.effect.parameters) + len(attached.effect.constants)
+                slot += int(rows[-1][SLOTS])
+        tables.append(np.array(rows, dtype=np.int64).reshape(-1, OTHER + 1))
+        slots.append(slot)
+    commands, forces, frictions = tables
+    return commands, forces, frictions, slots[0], slots[1]
+
+
+def _row(
+    scene: Scene, attached: Attached, stage: Command | Force | Friction, first: int, slot: int
+) -> Ints:
+    """Return the row of a law whose parameters, and numbers, begin at these places."""
+    row = np.zeros(OTHER + 1, dtype=np.int64)
+    row[[ALONE, BEGINS, OTHER]] = -1
+    row[ON] = [body.name for body in scene.moving].index(attached.body)
+    row[LAW], row[FIRST], row[SLOT] = law_address(stage.law), first, slot
+    if isinstance(stage, Command):
+        if stage.remember is not None:
+            row[REMEMBER], row[SLOTS] = law_address(stage.remember), 3 * stage.memory
+        if stage.alone:
+            row[ALONE] = WRENCH.index(stage.alone)
+        if stage.begins:
+            row[BEGINS] = first + len(attached.effect.parameters) - 1
+        if stage.reacts:
+            row[OTHER] = holder(scene, attached)
+        row[JUMPS] = stage.jumps
+    elif isinstance(stage, Force) and stage.rate is not None:
+        row[REMEMBER], row[SLOTS] = law_address(stage.rate), stage.memory
+        row[JUMPS] = 0 if stage.begin is None else law_address(stage.begin)
+    elif isinstance(stage, Friction):
+        row[UNDER] = stage.under
+    return row
+
+
 class Laws(NamedTuple):
     """Laws of a proposal: rows of integers, with columns as above, and their parameters."""
 
-    commands: NDArray[np.int64]
-    command_parameters: NDArray[np.float64]
-    forces: NDArray[np.int64]
-    force_parameters: NDArray[np.float64]
-    frictions: NDArray[np.int64]
-    friction_parameters: NDArray[np.float64]
+    commands: Ints
+    command_parameters: Floats
+    forces: Ints
+    force_parameters: Floats
+    frictions: Ints
+    friction_parameters: Floats
     time_step: float  # s
 
 
@@ -60,17 +108,8 @@ def act(  # type: ignore[no-untyped-def]
     ``memory`` is that of command laws when the interval begins; ``after`` it, it is brought up to
     date. ``held`` (2, slot) has the numbers of force laws, and gets their rates of change.
     """
-    k, known, data = len(interval), interval.shape[1] > 3, acted.ctypes.data
-    stride = 8 * ACTED
-    for i in range(k):
-        for w in range(3):
-            acted[i, COMMAND + w] = interval[i, w]
-            acted[i, PREVIOUS + w] = interval[i, 3 + w] if known else 0.0
-            acted[i, WRENCHES + w] = 0.0  # by how much actuators are turned, for now
-        acted[i, TIME] = np.inf
-        if known:
-            acted[i, TIME] = interval[i, 7] + begin * laws.time_step
-        acted[i, INTERVAL] = laws.time_step
+    k, data, stride = len(interval), acted.ctypes.data, 8 * ACTED
+    _set_commands(interval, begin, laws.time_step, acted)
     for e in range(len(laws.commands)):
         law = laws.commands[e]
         i, alone, state_at = law[ON], law[ALONE], state.ctypes.data + 48 * law[ON]
@@ -105,7 +144,30 @@ def act(  # type: ignore[no-untyped-def]
     for e in range(len(laws.commands)):
         if laws.commands[e, OTHER] >= 0:
             acted[laws.commands[e, OTHER], WRENCHES + 2] -= acted[laws.commands[e, ON], COMMAND + 2]
-    for e in range(0 if after else len(laws.forces)):
+    if not after:
+        _add_forces(state, laws, acted, held)
+
+
+@numba.njit(inline="always")
+def _set_commands(interval, begin, time_step, acted):  # type: ignore[no-untyped-def]
+    """Set command, command before and time of each body as the inputs of an interval have them."""
+    known = interval.shape[1] > 3
+    for i in range(len(interval)):
+        for w in range(3):
+            acted[i, COMMAND + w] = interval[i, w]
+            acted[i, PREVIOUS + w] = interval[i, 3 + w] if known else 0.0
+            acted[i, WRENCHES + w] = 0.0  # by how much actuators are turned, for now
+        acted[i, TIME] = np.inf
+        if known:
+            acted[i, TIME] = interval[i, 7] + begin * time_step
+        acted[i, INTERVAL] = time_step
+
+
+@numba.njit(inline="always")
+def _add_forces(state, laws, acted, held):  # type: ignore[no-untyped-def]
+    """Add what force laws do to the wrenches; set the rates of change of their numbers."""
+    k, data, stride = len(acted) - MORE, acted.ctypes.data, 8 * ACTED
+    for e in range(len(laws.forces)):
         law = laws.forces[e]
         at, state_at = data + stride * law[ON], state.ctypes.data + 48 * law[ON]
         seen, parameters_at = at, laws.force_parameters.ctypes.data + 8 * law[FIRST]
@@ -121,8 +183,16 @@ def act(  # type: ignore[no-untyped-def]
 
 
 @compiled
-def begin_held(state, laws, acted, held):  # type: ignore[no-untyped-def]
-    """Set the numbers of force laws where a transition begins."""
+def begin_laws(batch, laws, p, t, begin, start, acted, memory, held, at):  # type: ignore[no-untyped-def]
+    """Set what laws remember, and the numbers of force laws, before the interval ``begin``.
+
+    It is that of the transition ``t`` and the proposal ``p``. ``memory[1]``, shape (slot,), depends
+    on commands alone: those of all intervals that follow each other in the recording up to this
+    one, at the state ``start`` (body, 6). ``memory[0]`` is that before the first interval of the
+    transition ``at[1]`` of the proposal ``at[0]``.
+    """
+    if memory.shape[1] > 0:
+        _set_memory(batch, laws, p, t, begin, start, acted, memory, held, at)
     k = len(acted) - MORE
     for s in range(held.shape[1]):
         held[0, s] = held[1, s] = 0.0
@@ -130,24 +200,15 @@ def begin_held(state, laws, acted, held):  # type: ignore[no-untyped-def]
         law = laws.forces[e]
         if law[SLOTS] > 0 and law[JUMPS] != 0:
             call_law(
-                law[JUMPS], state.ctypes.data + 48 * law[ON], acted.ctypes.data + 8 * ACTED * k,
+                law[JUMPS], start.ctypes.data + 48 * law[ON], acted.ctypes.data + 8 * ACTED * k,
                 laws.force_parameters.ctypes.data + 8 * law[FIRST],
                 held.ctypes.data + 8 * law[SLOT],
             )  # fmt: skip
 
 
 @compiled
-def set_memory(batch, laws, p, t, begin, start, acted, memory, held, at):  # type: ignore[no-untyped-def]
-    """Set ``memory[1]``, shape (slot,), to what the laws of a proposal ``p`` remember.
-
-    That is before the interval ``begin`` of the transition ``t``. Commands alone decide it: those
-    of all intervals that follow each other in the recording up to this one, at the state ``start``
-    (body, 6). ``memory[0]`` is that before the first interval of the transition ``at[1]`` of the
-    proposal ``at[0]``.
-    """
-    slots = memory.shape[1]
-    if slots == 0:
-        return
+def _set_memory(batch, laws, p, t, begin, start, acted, memory, held, at):  # type: ignore[no-untyped-def]
+    """Set what command laws remember; see `begin_laws`."""
     inputs, first = batch.inputs, t
     while batch.follows[first] and not (at[0] == p and at[1] == first):
         first -= 1
@@ -157,7 +218,7 @@ def set_memory(batch, laws, p, t, begin, start, acted, memory, held, at):  # typ
         for h in range(inputs.shape[1]):
             act(start, inputs[earlier, h], laws, LATE, 1.0, acted, memory[0], held, True)
     at[0], at[1] = p, t
-    for s in range(slots):
+    for s in range(memory.shape[1]):
         memory[1, s] = memory[0, s]
     for h in range(begin):
         act(start, inputs[t, h], laws, LATE, 1.0, acted, memory[1], held, True)
@@ -206,3 +267,12 @@ def bound(base, laws, i, under, state, torque, rest, speed, acted):  # type: ign
             )  # fmt: skip
             base = max(acted[k + 3, 0], 0.0)
     return base
+
+
+@compiled
+def states_before(batch, out, item, h):  # type: ignore[no-untyped-def]
+    """Return the states (body, 6) before an interval of an item of ``out``."""
+    p, t = item // len(batch.inputs), item % len(batch.inputs)
+    if h > 0:
+        return out[item, h - 1]
+    return batch.start[p if len(batch.start) > 1 else 0, t]

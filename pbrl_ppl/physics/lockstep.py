@@ -4,41 +4,270 @@ Bodies that touch nothing need no collision search: positions, forces and the so
 impulses are a few lines, which the compiler vectorises over transitions. They are those of
 Chipmunk's ``cpSpaceStep``, in its order, so that the results agree to rounding.
 
+States, wrenches and obstacles refer to a body's origin; a substep moves its centre of mass.
+``body`` is the row of a body in a block of transitions, and ``i`` the number of one of them.
+
 Bodies with joints, or with friction under them, are a :mod:`tree <pbrl_ppl.physics.tree>`.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+from collections import namedtuple
+from typing import Any, NamedTuple
 
+import numba
 import numpy as np
-from numpy.typing import NDArray
 
-from pbrl_ppl.physics.compilation import compiled
-from pbrl_ppl.physics.laws import ACTED, LATE, MORE, act, begin_held, laws_of, set_memory
-from pbrl_ppl.physics.lockstep_bodies import (
-    BLOCK,
-    BODY,
-    accelerate,
-    align,
-    begin_wheel,
-    get_state,
-    lever,
-    lose,
-    set_body,
-    set_state,
-    set_wrench,
-    solve_wheel,
-    turn,
-    watch,
-)
+from pbrl_ppl.physics.calls import compiled, copy
+from pbrl_ppl.physics.laws import ACTED, LATE, MORE, act, begin_laws, laws_of, states_before
+from pbrl_ppl.physics.properties import COLUMN
+from pbrl_ppl.physics.solids import reaches, segment
 from pbrl_ppl.physics.world import World
+from pbrl_ppl.state import Bools, Floats, Ints
+
+#: Number of transitions in a block, which are computed side by side.
+BLOCK = 32
+
+
+def row_of(fields: str) -> Any:
+    """Return where the values of each field begin in a row: those of a block follow each other.
+
+    All fields are in one array: the compiler then knows that they do not overlap.
+    """
+    names = fields.split()
+    return namedtuple("Row", names)(*range(0, BLOCK * len(names), BLOCK))
+
+
+#: Fields of a body: the state of its centre of mass, which is at ``com`` in its frame; the place of
+#: its origin; the wrench on it and the weight beside the scene's gravity; the accelerations that
+#: they give. Then those of its wheel: place and axis in its frame, greatest and stored impulses of
+#: both rods; the axis in the world, levers and effective masses in a substep.
+BODY = row_of(
+    """
+    x y angle vx vy omega cos sin com_x com_y inverse_mass inverse_moment
+    origin_x origin_y force_x force_y torque weight_x weight_y acceleration_x acceleration_y spin_up
+    wheel_x wheel_y wheel_cos wheel_sin most_along most_across impulse_along impulse_across
+    axis_x axis_y lever_along lever_across mass_along mass_across
+    """
+)
+#: Smaller rotations in a substep (rad) are computed by a series, exact to rounding.
+_SMALL_TURN = 0.5
+_C1, _C2, _C3, _C4, _C5, _C6, _C7 = ((-1) ** k / math.factorial(2 * k) for k in range(1, 8))
+_S1, _S2, _S3, _S4, _S5, _S6, _S7 = ((-1) ** k / math.factorial(2 * k + 1) for k in range(1, 8))
+
+
+@compiled
+def set_body(body, i, row, wheel, normal_gravity, step):  # type: ignore[no-untyped-def]
+    """Set a body's properties for an interval; keep stored impulses.
+
+    Returns whether the centre of mass is off the origin.
+    """
+    mass, com_x, com_y = row[COLUMN.mass], row[COLUMN.com_x], row[COLUMN.com_y]
+    body[BODY.inverse_mass + i] = 1.0 / mass
+    body[BODY.inverse_moment + i] = 1.0 / row[COLUMN.moment]
+    body[BODY.weight_x + i] = mass * row[COLUMN.extra_gravity_x]
+    body[BODY.weight_y + i] = mass * row[COLUMN.extra_gravity_y]
+    body[BODY.com_x + i], body[BODY.com_y + i] = com_x, com_y
+    if wheel:
+        load, angle = mass * normal_gravity, row[COLUMN.w_theta]
+        body[BODY.wheel_x + i] = row[COLUMN.w_x] - com_x
+        body[BODY.wheel_y + i] = row[COLUMN.w_y] - com_y
+        body[BODY.wheel_cos + i], body[BODY.wheel_sin + i] = math.cos(angle), math.sin(angle)
+        body[BODY.most_along + i] = row[COLUMN.mu_x] * load * step
+        body[BODY.most_across + i] = row[COLUMN.mu_y] * load * step
+    return com_x != 0.0 or com_y != 0.0
+
+
+@compiled
+def align(body, i):  # type: ignore[no-untyped-def]
+    """Set the heading from the angle, which removes accumulated rounding."""
+    angle = body[BODY.angle + i]
+    body[BODY.cos + i], body[BODY.sin + i] = math.cos(angle), math.sin(angle)
+
+
+@compiled
+def _arm(body, i):  # type: ignore[no-untyped-def]
+    """Return the arm from the origin to the centre of mass, in the world's frame."""
+    x, y = body[BODY.com_x + i], body[BODY.com_y + i]
+    if x == 0.0 and y == 0.0:
+        return 0.0, 0.0
+    c, s = body[BODY.cos + i], body[BODY.sin + i]
+    return c * x - s * y, s * x + c * y
+
+
+@compiled
+def set_state(body, i, states, k):  # type: ignore[no-untyped-def]
+    """Set the state of the centre of mass from that of the origin, row ``k`` of the states."""
+    omega = states[k, 5]
+    body[BODY.angle + i], body[BODY.omega + i] = states[k, 2], omega
+    align(body, i)
+    x, y = _arm(body, i)
+    body[BODY.x + i], body[BODY.y + i] = states[k, 0] + x, states[k, 1] + y
+    body[BODY.vx + i], body[BODY.vy + i] = states[k, 3] - omega * y, states[k, 4] + omega * x
+
+
+@compiled
+def get_state(body, i, states, k):  # type: ignore[no-untyped-def]
+    """Write the state of the origin into row ``k`` of the states."""
+    (x, y), omega = _arm(body, i), body[BODY.omega + i]
+    states[k, 0], states[k, 1] = body[BODY.x + i] - x, body[BODY.y + i] - y
+    states[k, 2] = body[BODY.angle + i]
+    states[k, 3], states[k, 4] = body[BODY.vx + i] + omega * y, body[BODY.vy + i] - omega * x
+    states[k, 5] = omega
+
+
+@compiled
+def set_wrench(body, i, force_x, force_y, torque):  # type: ignore[no-untyped-def]
+    """Set the accelerations by a wrench and the additional weight."""
+    body[BODY.force_x + i], body[BODY.force_y + i], body[BODY.torque + i] = force_x, force_y, torque
+    inverse_mass = body[BODY.inverse_mass + i]
+    body[BODY.acceleration_x + i] = (force_x + body[BODY.weight_x + i]) * inverse_mass
+    body[BODY.acceleration_y + i] = (force_y + body[BODY.weight_y + i]) * inverse_mass
+    body[BODY.spin_up + i] = torque * body[BODY.inverse_moment + i]
+
+
+@compiled
+def lever(body):  # type: ignore[no-untyped-def]
+    """Set the angular accelerations by forces on origins that are off the centres of mass."""
+    for i in range(BLOCK):
+        c, s = body[BODY.cos + i], body[BODY.sin + i]
+        x = c * body[BODY.com_x + i] - s * body[BODY.com_y + i]
+        y = s * body[BODY.com_x + i] + c * body[BODY.com_y + i]
+        moment = x * body[BODY.force_y + i] - y * body[BODY.force_x + i]
+        body[BODY.spin_up + i] = (body[BODY.torque + i] - moment) * body[BODY.inverse_moment + i]
+
+
+@compiled
+def turn(body, step):  # type: ignore[no-untyped-def]
+    """Move a body and rotate its heading."""
+    fast = False
+    for i in range(BLOCK):
+        body[BODY.x + i] += body[BODY.vx + i] * step
+        body[BODY.y + i] += body[BODY.vy + i] * step
+        a = body[BODY.omega + i] * step
+        body[BODY.angle + i] += a
+        fast |= not abs(a) < _SMALL_TURN
+        d = a * a
+        c = 1.0 + d * (_C1 + d * (_C2 + d * (_C3 + d * (_C4 + d * (_C5 + d * (_C6 + d * _C7))))))
+        s = _S1 + d * (_S2 + d * (_S3 + d * (_S4 + d * (_S5 + d * (_S6 + d * _S7)))))
+        s = a * (1.0 + d * s)
+        before = body[BODY.cos + i]
+        body[BODY.cos + i] = before * c - body[BODY.sin + i] * s
+        body[BODY.sin + i] = body[BODY.sin + i] * c + before * s
+    if fast:
+        for i in range(BLOCK):
+            if not abs(body[BODY.omega + i] * step) < _SMALL_TURN:
+                align(body, i)
+
+
+@compiled
+def accelerate(body, gravity, step):  # type: ignore[no-untyped-def]
+    """Add the velocity changes by gravity and the wrench."""
+    g_x, g_y = gravity
+    for i in range(BLOCK):
+        body[BODY.vx + i] += (g_x + body[BODY.acceleration_x + i]) * step
+        body[BODY.vy + i] += (g_y + body[BODY.acceleration_y + i]) * step
+        body[BODY.omega + i] += body[BODY.spin_up + i] * step
+
+
+@compiled
+def lose(body, still, touched):  # type: ignore[no-untyped-def]
+    """Mark the transitions that have diverged."""
+    for i in range(BLOCK):
+        speed = abs(body[BODY.vx + i]) + abs(body[BODY.vy + i])
+        speed += still.length * abs(body[BODY.omega + i])
+        touched[i] |= not speed < still.fastest  # also true of NaN
+
+
+@compiled
+def watch(bodies, still, discs, touched):  # type: ignore[no-untyped-def]
+    """Mark the transitions in which a body is near an obstacle or another that it may touch."""
+    for k in range(len(still.radii)):
+        body, radius = bodies[k], still.radii[k]
+        for i in range(BLOCK):
+            c, s = body[BODY.cos + i], body[BODY.sin + i]
+            com_x, com_y = body[BODY.com_x + i], body[BODY.com_y + i]
+            body[BODY.origin_x + i] = body[BODY.x + i] - (c * com_x - s * com_y)
+            body[BODY.origin_y + i] = body[BODY.y + i] - (s * com_x + c * com_y)
+        for j in range(len(still.obstacles) - discs.shape[1]):
+            a_x, a_y, d_x, d_y, scale, size = segment(still.obstacles[j])
+            for i in range(BLOCK):
+                x, y = body[BODY.origin_x + i] - a_x, body[BODY.origin_y + i] - a_y
+                touched[i] |= reaches(x, y, d_x, d_y, scale, radius + size)
+        for j in range(discs.shape[1]):
+            for i in range(BLOCK):
+                x = body[BODY.origin_x + i] - discs[i, j, 0]
+                y = body[BODY.origin_y + i] - discs[i, j, 1]
+                near = reaches(x, y, 0.0, 0.0, 0.0, radius + discs[i, j, 2])
+                touched[i] |= near & (discs[i, j, 2] > 0.0)
+        for j in range(k):
+            if still.can_touch[k, j]:
+                other = bodies[j]
+                for i in range(BLOCK):
+                    x = body[BODY.origin_x + i] - other[BODY.origin_x + i]
+                    y = body[BODY.origin_y + i] - other[BODY.origin_y + i]
+                    touched[i] |= reaches(x, y, 0.0, 0.0, 0.0, radius + still.radii[j])
+
+
+@compiled
+def limited(impulse, most):  # type: ignore[no-untyped-def]
+    """Return an impulse clipped to ``most`` in both directions."""
+    impulse = most if impulse > most else impulse
+    return -most if impulse < -most else impulse
+
+
+@compiled
+def begin_wheel(body):  # type: ignore[no-untyped-def]
+    """Place a wheel's two rods and apply their impulses of the substep before."""
+    for i in range(BLOCK):
+        c, s = body[BODY.cos + i], body[BODY.sin + i]
+        x, y = body[BODY.wheel_x + i], body[BODY.wheel_y + i]
+        r_x, r_y = c * x - s * y, s * x + c * y
+        x, y = body[BODY.wheel_cos + i], body[BODY.wheel_sin + i]
+        n_x, n_y = c * x - s * y, s * x + c * y
+        along, across = r_x * n_y - r_y * n_x, r_x * n_x + r_y * n_y
+        mass, moment = body[BODY.inverse_mass + i], body[BODY.inverse_moment + i]
+        body[BODY.axis_x + i], body[BODY.axis_y + i] = n_x, n_y
+        body[BODY.lever_along + i], body[BODY.lever_across + i] = along, across
+        body[BODY.mass_along + i] = 1.0 / (mass + moment * along * along)
+        body[BODY.mass_across + i] = 1.0 / (mass + moment * across * across)
+        j_x, j_y = body[BODY.impulse_along + i], body[BODY.impulse_across + i]
+        body[BODY.vx + i] -= (n_x * j_x - n_y * j_y) * mass
+        body[BODY.vy + i] -= (n_y * j_x + n_x * j_y) * mass
+        body[BODY.omega + i] -= moment * (along * j_x + across * j_y)
+
+
+@compiled
+def solve_wheel(body):  # type: ignore[no-untyped-def]
+    """Do one iteration of a wheel's rods, whose impulses friction limits."""
+    for i in range(BLOCK):
+        n_x, n_y = body[BODY.axis_x + i], body[BODY.axis_y + i]
+        along, across = body[BODY.lever_along + i], body[BODY.lever_across + i]
+        mass, moment = body[BODY.inverse_mass + i], body[BODY.inverse_moment + i]
+        v_x, v_y, w = body[BODY.vx + i], body[BODY.vy + i], body[BODY.omega + i]
+        old = body[BODY.impulse_along + i]
+        new = old + (n_x * v_x + n_y * v_y + along * w) * body[BODY.mass_along + i]
+        new = limited(new, body[BODY.most_along + i])
+        body[BODY.impulse_along + i] = new
+        j = new - old
+        v_x -= n_x * j * mass
+        v_y -= n_y * j * mass
+        w -= moment * along * j
+        old = body[BODY.impulse_across + i]
+        new = old + (n_x * v_y - n_y * v_x + across * w) * body[BODY.mass_across + i]
+        new = limited(new, body[BODY.most_across + i])
+        body[BODY.impulse_across + i] = new
+        j = new - old
+        body[BODY.vx + i] = v_x + n_y * j * mass
+        body[BODY.vy + i] = v_y - n_x * j * mass
+        body[BODY.omega + i] = w - moment * across * j
 
 
 class Wheels(NamedTuple):
     """Which bodies have a wheel, and the solver's iterations."""
 
-    under: NDArray[np.bool_]  # (body,)
+    under: Bools  # (body,)
     iterations: int
 
 
@@ -62,6 +291,139 @@ def substep(bodies, wheels, gravity, step):  # type: ignore[no-untyped-def]
                 solve_wheel(bodies[k])
 
 
+class Block(NamedTuple):
+    """Transitions side by side, and what the laws of one of them see."""
+
+    bodies: Floats  # (body, BLOCK values of each field)
+    discs: Floats  # (BLOCK, disc, 3)
+    touched: Bools  # (BLOCK,)
+    proposal: Ints  # (BLOCK,), as the next ones
+    transition: Ints
+    first: Ints  # interval to predict
+    until: Ints  # the interval from which the engine must predict
+    remembered: Floats  # (BLOCK, slot)
+    held: Floats  # (BLOCK, 2, slot)
+    memory: Floats  # (2, slot), see `begin_laws`
+    at: Ints  # (2,), the same
+    states: Floats  # (body, 6)
+    acted: Floats  # (body + 4, 12), see `act`
+
+
+@compiled
+def block_of(moving, batch):  # type: ignore[no-untyped-def]
+    """Return a block for so many moving bodies."""
+    proposal, transition, first, until = np.zeros((4, BLOCK), dtype=np.int64)
+    return Block(
+        np.zeros((moving, BLOCK * len(BODY))), np.zeros((BLOCK, batch.given[2].shape[1], 3)),
+        np.zeros(BLOCK, dtype=np.bool_), proposal, transition, first, until,
+        np.zeros((BLOCK, batch.slots)), np.zeros((BLOCK, 2, batch.held)),
+        np.zeros((2, batch.slots)), np.full(2, -1),
+        np.empty((moving, 6)), np.zeros((moving + MORE, ACTED)),
+    )  # fmt: skip
+
+
+@compiled
+def fill(block, batch, items, begins, begin):  # type: ignore[no-untyped-def]
+    """Take the items from ``begin`` on; return how many, and the most intervals of one."""
+    n, horizon, discs = len(batch.inputs), batch.inputs.shape[1], batch.given[2]
+    width, longest = min(BLOCK, len(items) - begin), 0
+    for i in range(BLOCK):
+        place = begin + min(i, width - 1)  # the rest of a block repeats the last
+        item, block.first[i], block.until[i] = items[place], begins[place], horizon
+        block.proposal[i], block.transition[i] = item // n, item % n
+        longest = max(longest, horizon - block.first[i])
+        copy(discs[block.proposal[i]], block.discs[i])
+    return width, longest
+
+
+@numba.njit(inline="always")
+def place(block, batch, i, ahead):  # type: ignore[no-untyped-def]
+    """Return proposal, transition and interval of the i-th of a block, so many after its first."""
+    h = min(block.first[i] + ahead, batch.inputs.shape[1] - 1)
+    return block.proposal[i], block.transition[i], h
+
+
+@numba.njit(inline="always")
+def get_states(block, i):  # type: ignore[no-untyped-def]
+    """Write the states of a transition's bodies into those of the block."""
+    for k in range(len(block.states)):
+        get_state(block.bodies[k], i, block.states, k)
+
+
+@compiled
+def begin_interval(block, wheels, still, batch, ahead, step, out):  # type: ignore[no-untyped-def]
+    """Set properties, states and wrenches; return whether centres of mass are off the origins."""
+    rows, shifted = batch.given[0], False
+    timed, states = rows.shape[1] > 1, block.states
+    for k in range(len(states)):
+        body, wheel = block.bodies[k], wheels.under[k]
+        for i in range(BLOCK):
+            p, t, h = place(block, batch, i, ahead)
+            if timed or ahead == 0:
+                row = rows[p, t * batch.inputs.shape[1] + h if timed else 0, k]
+                if ahead == 0:
+                    before = states_before(batch, out, p * len(batch.inputs) + t, h)
+                    for d in range(6):
+                        states[k, d] = before[k, d]
+                else:
+                    get_state(body, i, states, k)
+                shifted |= set_body(body, i, row, wheel, still.normal_gravity, step)
+                set_state(body, i, states, k)
+            else:
+                align(body, i)
+            wrench = batch.inputs[t, h, k]
+            set_wrench(body, i, wrench[0], wrench[1], wrench[2])
+    return shifted
+
+
+@compiled
+def begin_memories(block, batch, width):  # type: ignore[no-untyped-def]
+    """Set what laws remember where the transitions begin."""
+    for i in range(width):
+        p, t, h = place(block, batch, i, 0)
+        get_states(block, i)
+        begin_laws(
+            batch, laws_of(batch, p), p, t, h, block.states, block.acted, block.memory,
+            block.held[i], block.at,
+        )  # fmt: skip
+        block.remembered[i] = block.memory[1]
+
+
+@compiled
+def act_on(block, batch, width, ahead, begin, end, step, after):  # type: ignore[no-untyped-def]
+    """Set the wrenches of the laws in a substep, which begins and ends at shares of an interval.
+
+    ``after`` it, bring what they remember up to date instead.
+    """
+    for i in range(width):
+        p, t, h = place(block, batch, i, ahead)
+        get_states(block, i)
+        act(
+            block.states, batch.inputs[t, h], laws_of(batch, p), begin, end, block.acted,
+            block.remembered[i], block.held[i], after,
+        )  # fmt: skip
+        for slot in range(0 if after else batch.held):
+            block.held[i, 0, slot] += step * block.held[i, 1, slot]
+        for k in range(0 if after else len(block.states)):
+            wrench = block.acted[k]
+            set_wrench(block.bodies[k], i, wrench[6], wrench[7], wrench[8])
+
+
+@compiled
+def add_states(block, items, ahead, weight, first_level, out):  # type: ignore[no-untyped-def]
+    """Add the weighted states at the end of an interval to the predictions of the items."""
+    for i in range(len(items)):
+        h = block.first[i] + ahead
+        if block.touched[i]:
+            block.until[i] = min(block.until[i], h)
+        if h < block.until[i]:
+            get_states(block, i)
+            for k in range(len(block.states)):
+                for d in range(6):
+                    total = 0.0 if first_level else out[items[i], h, k, d]
+                    out[items[i], h, k, d] = total + weight * block.states[k, d]
+
+
 @compiled
 def rollout(wheels, still, batch, items, begins, out):  # type: ignore[no-untyped-def]
     """Predict ``items`` as `compiled.rollout` does, but for intervals that the engine must predict.
@@ -69,99 +431,35 @@ def rollout(wheels, still, batch, items, begins, out):  # type: ignore[no-untype
     ``begins``, shape (item,), are their first intervals; they become those in which a body comes
     near an obstacle or diverges, H where none does.
     """
-    rows, discs = batch.given[0], batch.given[2]
-    start, inputs = batch.start, batch.inputs
-    n, horizon, moving = len(inputs), inputs.shape[1], len(still.radii)
-    timed = rows.shape[1] > 1
-    acting = len(batch.commands) + len(batch.forces) > 0
-    bodies = np.zeros((moving, BLOCK * len(BODY)))
-    own_discs = np.zeros((BLOCK, discs.shape[1], 3))
-    touched = np.zeros(BLOCK, dtype=np.bool_)
-    proposal, transition, first, until = np.zeros((4, BLOCK), dtype=np.int64)
-    states, acted = np.empty((moving, 6)), np.zeros((moving + MORE, ACTED))
-    memory, at = np.zeros((2, batch.slots)), np.full(2, -1)
-    remembered, held = np.zeros((BLOCK, batch.slots)), np.zeros((BLOCK, 2, batch.held))
+    moving, acting = len(still.radii), len(batch.commands) + len(batch.forces) > 0
+    block = block_of(moving, batch)
+    bodies = block.bodies
     for begin in range(0, len(items), BLOCK):
-        width = min(BLOCK, len(items) - begin)
-        longest = 0
-        for i in range(BLOCK):
-            place = begin + min(i, width - 1)  # the rest of a block repeats the last
-            item, first[i], until[i] = items[place], begins[place], horizon
-            proposal[i], transition[i] = item // n, item % n
-            longest = max(longest, horizon - first[i])
-            for j in range(discs.shape[1]):
-                for d in range(3):
-                    own_discs[i, j, d] = discs[proposal[i], j, d]
+        width, longest = fill(block, batch, items, begins, begin)
         for level in range(len(batch.counts)):
             substeps, weight = batch.counts[level], batch.weights[level]
             step = batch.time_step / substeps
             bodies[:] = 0.0
-            touched[:] = False
+            block.touched[:] = False
             shifted = False
             for ahead in range(longest):
-                for k in range(moving):
-                    body, wheel = bodies[k], wheels.under[k]
-                    for i in range(BLOCK):
-                        p, t, h = proposal[i], transition[i], min(first[i] + ahead, horizon - 1)
-                        if timed or ahead == 0:
-                            row = rows[p, t * horizon + h if timed else 0, k]
-                            if ahead == 0:
-                                for d in range(6):
-                                    states[k, d] = start[p if len(start) > 1 else 0, t, k, d]
-                                    if h > 0:
-                                        states[k, d] = out[p * n + t, h - 1, k, d]
-                            else:
-                                get_state(body, i, states, k)
-                            shifted |= set_body(body, i, row, wheel, still.normal_gravity, step)
-                            set_state(body, i, states, k)
-                        else:
-                            align(body, i)
-                        force_x, force_y = inputs[t, h, k, 0], inputs[t, h, k, 1]
-                        set_wrench(body, i, force_x, force_y, inputs[t, h, k, 2])
-                for i in range(width if ahead == 0 and batch.slots + batch.held > 0 else 0):
-                    p, t = proposal[i], transition[i]
-                    for k in range(moving):
-                        get_state(bodies[k], i, states, k)
-                    laws = laws_of(batch, p)
-                    set_memory(batch, laws, p, t, first[i], states, acted, memory, held[i], at)
-                    begin_held(states, laws, acted, held[i])
-                    remembered[i] = memory[1]
+                shifted |= begin_interval(block, wheels, still, batch, ahead, step, out)
+                if ahead == 0 and batch.slots + batch.held > 0:
+                    begin_memories(block, batch, width)
                 for s in range(substeps):
                     if acting:
-                        for i in range(width):
-                            p, t, h = proposal[i], transition[i], min(first[i] + ahead, horizon - 1)
-                            for k in range(moving):
-                                get_state(bodies[k], i, states, k)
-                            act(
-                                states, inputs[t, h], laws_of(batch, p), s / substeps,
-                                (s + 1) / substeps, acted, remembered[i], held[i],
-                            )  # fmt: skip
-                            for slot in range(batch.held):
-                                held[i, 0, slot] += step * held[i, 1, slot]
-                            for k in range(moving):
-                                set_wrench(bodies[k], i, acted[k, 6], acted[k, 7], acted[k, 8])
+                        now, after = s / substeps, (s + 1) / substeps
+                        act_on(block, batch, width, ahead, now, after, step, False)
                     if shifted:
                         for k in range(moving):
                             lever(bodies[k])
                     substep(bodies, wheels, still.gravity, step)
                     for k in range(moving):
-                        lose(bodies[k], still, touched)
+                        lose(bodies[k], still, block.touched)
                     if still.watched:
-                        watch(bodies, still, own_discs, touched)
-                for i in range(width if batch.slots > 0 else 0):
-                    p, t, h = proposal[i], transition[i], min(first[i] + ahead, horizon - 1)
-                    for k in range(moving):
-                        get_state(bodies[k], i, states, k)
-                    laws = laws_of(batch, p)
-                    act(states, inputs[t, h], laws, LATE, 1.0, acted, remembered[i], held[i], True)
-                for i in range(width):
-                    item, h = items[begin + i], first[i] + ahead
-                    if touched[i]:
-                        until[i] = min(until[i], h)
-                    for k in range(moving if h < until[i] else 0):
-                        get_state(bodies[k], i, states, k)
-                        for d in range(6):
-                            total = out[item, h, k, d] if level else 0.0
-                            out[item, h, k, d] = total + weight * states[k, d]
+                        watch(bodies, still, block.discs, block.touched)
+                if batch.slots > 0:
+                    act_on(block, batch, width, ahead, LATE, 1.0, step, True)
+                add_states(block, items[begin : begin + width], ahead, weight, level == 0, out)
         for i in range(width):
-            begins[begin + i] = until[i]
+            begins[begin + i] = block.until[i]

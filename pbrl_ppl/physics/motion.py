@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.physics.compilation import compiled
+from pbrl_ppl.physics.calls import compiled
 from pbrl_ppl.physics.joints import LENGTH
 from pbrl_ppl.physics.laws import ACTED, COMMAND, MORE, bound
 from pbrl_ppl.physics.properties import COLUMN
@@ -21,20 +21,12 @@ from pbrl_ppl.physics.tree import (
     ACROSS,
     ALONG,
     BAR,
-    BODY,
-    FAR,
-    FIRST,
     FREE,
     HINGE,
-    JOINT,
-    KIND,
+    LINK,
     MOST,
-    NEAR,
-    OWNER,
-    PARENT,
     PIVOT,
     RAIL,
-    TURN,
     TURNING,
     UNDER,
     Tree,
@@ -103,12 +95,10 @@ def work_of(tree: Tree, length: float) -> NDArray[np.void]:
     work["tree"][0, :links], work["poses"][0, :links] = tree.links, tree.poses
     work["bodies"][0, : len(tree.bodies)] = tree.bodies
     work["kinds"][0, :rows, :2] = tree.rows
-    work["kinds"][0, rows : rows + rings, 0], work["kinds"][0, rows : rows + rings, 1] = (
-        -1,
-        tree.rings,
-    )
+    work["kinds"][0, rows : rows + rings, 0] = -1
+    work["kinds"][0, rows : rows + rings, 1] = tree.rings
     work["motion"][0, SIZE] = 1.0
-    for kind, first in tree.links[:, [KIND, FIRST]]:
+    for kind, first in tree.links[:, [LINK.kind, LINK.first]]:
         if kind in (FREE, RAIL):
             work["motion"][0, SIZE, first : first + 1 + (kind == FREE)] = length
     return work
@@ -118,8 +108,8 @@ def work_of(tree: Tree, length: float) -> NDArray[np.void]:
 def set_numbers(work, gravity, normal_gravity, ring, bodies, joints):  # type: ignore[no-untyped-def]
     """Set what depends on parameters alone: of ``bodies`` (body, column), ``joints`` (joint, 9)."""
     for i in range(work.n_links):
-        fields, link, joint = work.tree[i], work.links[i], work.tree[i, JOINT]
-        parent, near, far = fields[PARENT], fields[NEAR], fields[FAR]
+        fields, link, joint = work.tree[i], work.links[i], work.tree[i, LINK.joint]
+        parent, near, far = fields[LINK.parent], fields[LINK.near], fields[LINK.far]
         link[OWN_X], link[OWN_Y] = 0.0, 0.0
         if far >= 0:
             link[OWN_X], link[OWN_Y] = joints[joint, far], joints[joint, far + 1]
@@ -129,23 +119,23 @@ def set_numbers(work, gravity, normal_gravity, ring, bodies, joints):  # type: i
         if parent < 0:
             at_x, at_y, c, s, _, _ = work.poses[i]
             x, y = at_x + c * x - s * y, at_y + s * x + c * y
-        elif work.tree[parent, KIND] == BAR:
+        elif work.tree[parent, LINK.kind] == BAR:
             x = joints[joint, LENGTH]
         else:
             x, y = x - work.links[parent, OWN_X], y - work.links[parent, OWN_Y]
         link[AT_X], link[AT_Y] = x, y
-        if fields[BODY] < 0:
+        if fields[LINK.body] < 0:
             continue
-        row = bodies[fields[BODY]]
+        row = bodies[fields[LINK.body]]
         link[MASS], link[MOMENT] = row[COLUMN.mass], row[COLUMN.moment]
         link[COM_X], link[COM_Y] = row[COLUMN.com_x] - link[OWN_X], row[COLUMN.com_y] - link[OWN_Y]
         link[WEIGHT_X] = gravity[0] + row[COLUMN.extra_gravity_x]
         link[WEIGHT_Y] = gravity[1] + row[COLUMN.extra_gravity_y]
-        if fields[OWNER] >= 0:
-            link[DAMPING] = bodies[fields[OWNER], COLUMN.pivot_damping]
+        if fields[LINK.owner] >= 0:
+            link[DAMPING] = bodies[fields[LINK.owner], COLUMN.pivot_damping]
     for r in range(work.n_kinds):
         kind, i = work.kinds[r, 0], work.kinds[r, 1]
-        link, row = work.links[i], bodies[work.tree[i, BODY]]
+        link, row = work.links[i], bodies[work.tree[i, LINK.body]]
         load, radius = link[MASS] * normal_gravity, row[COLUMN.patch_radius]
         lever = 0.0
         for j in range(len(ring) if kind < 0 or kind == UNDER else 0):
@@ -160,19 +150,17 @@ def set_numbers(work, gravity, normal_gravity, ring, bodies, joints):  # type: i
             continue
         numbers = work.rows[r]
         if kind == PIVOT:
-            numbers[BOUND] = bodies[work.tree[i, OWNER], COLUMN.pivot_torque]
+            numbers[BOUND] = bodies[work.tree[i, LINK.owner], COLUMN.pivot_torque]
         elif kind == UNDER:
-            lever = 1.0 if work.tree[i, KIND] == RAIL else lever
+            lever = 1.0 if work.tree[i, LINK.kind] == RAIL else lever
             numbers[BOUND] = row[COLUMN.patch_mu] * load * lever
         elif kind == TURNING:
             numbers[BOUND] = row[COLUMN.turn_torque]
         else:
             angle = row[COLUMN.w_theta] + (0.5 * math.pi if kind == ACROSS else 0.0)
             numbers[BOUND] = load * (row[COLUMN.mu_x] if kind == ALONG else row[COLUMN.mu_y])
-            numbers[W_X], numbers[W_Y] = (
-                row[COLUMN.w_x] - link[OWN_X],
-                row[COLUMN.w_y] - link[OWN_Y],
-            )
+            numbers[W_X] = row[COLUMN.w_x] - link[OWN_X]
+            numbers[W_Y] = row[COLUMN.w_y] - link[OWN_Y]
             numbers[W_COS], numbers[W_SIN] = math.cos(angle), math.sin(angle)
         numbers[BASE] = numbers[BOUND]
 
@@ -182,26 +170,26 @@ def set_coordinates(work, states):  # type: ignore[no-untyped-def]
     """Set coordinates and speeds from the states (body, 6) of bodies."""
     tree, motion = work.tree, work.motion
     for i in range(work.n_links):
-        parent, body, j = tree[i, PARENT], tree[i, BODY], tree[i, FIRST]
-        if tree[i, KIND] == FREE:
+        parent, body, j = tree[i, LINK.parent], tree[i, LINK.body], tree[i, LINK.first]
+        if tree[i, LINK.kind] == FREE:
             for d in range(3):
                 motion[Q, j + d], motion[U, j + d] = states[body, d], states[body, 3 + d]
-        elif tree[i, KIND] == HINGE:
+        elif tree[i, LINK.kind] == HINGE:
             motion[Q, j], motion[U, j] = states[body, 2], states[body, 5]
         else:  # from the joint's place on its parent to the one on its body, or the rod's
             x, y, v_x, v_y = work.links[i, AT_X], work.links[i, AT_Y], 0.0, 0.0
             if parent >= 0:
                 x += work.links[parent, OWN_X]
                 y += work.links[parent, OWN_Y]
-                x, y, v_x, v_y = _seen(states[tree[parent, BODY]], x, y)
-            last = i + 1 if tree[i, KIND] == BAR else i
+                x, y, v_x, v_y = _seen(states[tree[parent, LINK.body]], x, y)
+            last = i + 1 if tree[i, LINK.kind] == BAR else i
             end = work.links[last]
-            far = _seen(states[tree[last, BODY]], end[OWN_X], end[OWN_Y])
+            far = _seen(states[tree[last, LINK.body]], end[OWN_X], end[OWN_Y])
             x, y, v_x, v_y = far[0] - x, far[1] - y, far[2] - v_x, far[3] - v_y
-            if tree[i, KIND] == BAR:
+            if tree[i, LINK.kind] == BAR:
                 motion[Q, j], motion[U, j] = math.atan2(y, x), (x * v_y - y * v_x) / (x * x + y * y)
                 continue
-            angle = motion[Q, tree[i, TURN]] + work.poses[i, AXIS]
+            angle = motion[Q, tree[i, LINK.turn]] + work.poses[i, AXIS]
             c, s = math.cos(angle), math.sin(angle)
             motion[Q, j], motion[U, j] = c * x + s * y, c * v_x + s * v_y
 
@@ -223,16 +211,16 @@ def set_places(work, q, u):  # type: ignore[no-untyped-def]
     tree, links, slope, motion, states = work.tree, work.links, work.slope, work.motion, work.states
     n = work.n
     for i in range(work.n_links):
-        parent, turn = tree[i, PARENT], tree[i, TURN]
+        parent, turn = tree[i, LINK.parent], tree[i, LINK.turn]
         for k in range(n):
             slope[i, k, 0] = slope[i, k, 1] = 0.0
         x, y, v_x, v_y, b_x, b_y = links[i, AT_X], links[i, AT_Y], 0.0, 0.0, 0.0, 0.0
-        if tree[i, KIND] == FREE:
-            j = tree[i, FIRST]
+        if tree[i, LINK.kind] == FREE:
+            j = tree[i, LINK.first]
             x, y, v_x, v_y = motion[q, j], motion[q, j + 1], motion[u, j], motion[u, j + 1]
             slope[i, j, 0] = slope[i, j + 1, 1] = 1.0
         elif parent >= 0:
-            j = tree[parent, TURN]
+            j = tree[parent, LINK.turn]
             c, s, omega = links[parent, COS], links[parent, SIN], motion[u, j]
             x, y = c * x - s * y, s * x + c * y
             v_x, v_y = links[parent, V_X] - omega * y, links[parent, V_Y] + omega * x
@@ -244,8 +232,8 @@ def set_places(work, q, u):  # type: ignore[no-untyped-def]
             slope[i, j, 1] += x
             x, y = links[parent, X] + x, links[parent, Y] + y
         angle, omega = motion[q, turn], motion[u, turn]
-        if tree[i, KIND] == RAIL:
-            j = tree[i, FIRST]
+        if tree[i, LINK.kind] == RAIL:
+            j = tree[i, LINK.first]
             along, rate = motion[q, j], motion[u, j]
             c, s = math.cos(angle + work.poses[i, AXIS]), math.sin(angle + work.poses[i, AXIS])
             x, y = x + c * along, y + s * along
@@ -259,7 +247,7 @@ def set_places(work, q, u):  # type: ignore[no-untyped-def]
         c, s = math.cos(angle), math.sin(angle)
         links[i, COS], links[i, SIN], links[i, X], links[i, Y] = c, s, x, y
         links[i, V_X], links[i, V_Y], links[i, B_X], links[i, B_Y] = v_x, v_y, b_x, b_y
-        k = tree[i, BODY]
+        k = tree[i, LINK.body]
         if k >= 0:
             o_x, o_y = links[i, OWN_X], links[i, OWN_Y]
             o_x, o_y = c * o_x - s * o_y, s * o_x + c * o_y
@@ -268,9 +256,9 @@ def set_places(work, q, u):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def set_forces(work, u):  # type: ignore[no-untyped-def]
+def set_forces(work, laws, u):  # type: ignore[no-untyped-def]
     """Set M and Q, and the rows of dry friction, where places and wrenches are set."""
-    tree, links, slope, motion, rows = work.tree, work.links, work.slope, work.motion, work.rows
+    tree, links, slope, motion = work.tree, work.links, work.slope, work.motion
     n = work.n
     for j in range(n):
         motion[LOAD, j] = 0.0
@@ -280,7 +268,7 @@ def set_forces(work, u):  # type: ignore[no-untyped-def]
         i = work.bodies[body]
         if i < 0:
             continue
-        turn, mass = tree[i, TURN], links[i, MASS]
+        turn, mass = tree[i, LINK.turn], links[i, MASS]
         c, s, omega = links[i, COS], links[i, SIN], motion[u, turn]
         x = c * links[i, COM_X] - s * links[i, COM_Y]
         y = s * links[i, COM_X] + c * links[i, COM_Y]
@@ -302,23 +290,32 @@ def set_forces(work, u):  # type: ignore[no-untyped-def]
         slope[i, turn, 1] -= x
         motion[M + turn, turn] += links[i, MOMENT]
         if links[i, DAMPING] > 0.0:
-            rate, j = motion[u, tree[i, FIRST]], tree[i, FIRST]
-            if tree[i, KIND] == HINGE and tree[i, PARENT] >= 0:
-                rate -= motion[u, tree[tree[i, PARENT], TURN]]
-                motion[LOAD, tree[tree[i, PARENT], TURN]] += links[i, DAMPING] * rate
+            rate, j = motion[u, tree[i, LINK.first]], tree[i, LINK.first]
+            if tree[i, LINK.kind] == HINGE and tree[i, LINK.parent] >= 0:
+                rate -= motion[u, tree[tree[i, LINK.parent], LINK.turn]]
+                motion[LOAD, tree[tree[i, LINK.parent], LINK.turn]] += links[i, DAMPING] * rate
             motion[LOAD, j] -= links[i, DAMPING] * rate
     for j in range(n):
         for k in range(j):
             motion[M + k, j] = motion[M + j, k]
+    _set_rows(work, u)
+    _set_bounds(work, laws, u)
+
+
+@compiled
+def _set_rows(work, u):  # type: ignore[no-untyped-def]
+    """Set the rows of dry friction, where places are set."""
+    tree, links, slope, motion, rows = work.tree, work.links, work.slope, work.motion, work.rows
+    n = work.n
     for r in range(work.n_rows):
         kind, i = work.kinds[r, 0], work.kinds[r, 1]
-        turn = tree[i, TURN]
+        turn = tree[i, LINK.turn]
         for j in range(n):
             rows[r, G + j] = 0.0
         if kind in (PIVOT, UNDER, TURNING):
-            rows[r, G + tree[i, FIRST if kind != TURNING else TURN]] = 1.0
-            if kind == PIVOT and tree[i, KIND] == HINGE and tree[i, PARENT] >= 0:
-                rows[r, G + tree[tree[i, PARENT], TURN]] = -1.0
+            rows[r, G + tree[i, LINK.first if kind != TURNING else LINK.turn]] = 1.0
+            if kind == PIVOT and tree[i, LINK.kind] == HINGE and tree[i, LINK.parent] >= 0:
+                rows[r, G + tree[tree[i, LINK.parent], LINK.turn]] = -1.0
             continue
         c, s, omega = links[i, COS], links[i, SIN], motion[u, turn]
         x = c * rows[r, W_X] - s * rows[r, W_Y]
@@ -334,18 +331,18 @@ def set_forces(work, u):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def set_bounds(work, laws, u):  # type: ignore[no-untyped-def]
+def _set_bounds(work, laws, u):  # type: ignore[no-untyped-def]
     """Set the greatest forces of dry friction that laws change, where forces and rows are set."""
     if len(laws.frictions) == 0:
         return
     tree, motion, acted, states = work.tree, work.motion, work.acted, work.states
     for r in range(work.n_kinds):
         kind, i = work.kinds[r, 0], work.kinds[r, 1]
-        turn, body = tree[i, TURN], tree[i, BODY]
+        turn, body = tree[i, LINK.turn], tree[i, LINK.body]
         if kind == PIVOT:
-            owner, torque = tree[i, OWNER], acted[body, COMMAND + 2]
-            first, speed = tree[i, FIRST], row_speed(work, r, u)
-            if tree[i, KIND] == RAIL:
+            owner, torque = tree[i, LINK.owner], acted[body, COMMAND + 2]
+            first, speed = tree[i, LINK.first], row_speed(work, r, u)
+            if tree[i, LINK.kind] == RAIL:
                 torque = work.slope[i, first, 0] * acted[body, COMMAND]
                 torque += work.slope[i, first, 1] * acted[body, COMMAND + 1]
             rest = motion[LOAD, first] + work.links[i, DAMPING] * speed - torque
@@ -395,7 +392,7 @@ def solve(work, u, a, impulse):  # type: ignore[no-untyped-def]
                 system[j, size] += motion[M + j, k] * motion[u, k]
     for r in range(work.n_kinds):
         i, mode = kinds[r, 1], kinds[r, 2]
-        turn = work.tree[i, TURN]
+        turn = work.tree[i, LINK.turn]
         if mode == STICK:
             for d in range(1 if r < count else 3):
                 for j in range(n, size):
@@ -482,7 +479,7 @@ def _resist(work, r, u, column):  # type: ignore[no-untyped-def]
             system[j, column] -= work.kinds[r, 2] * work.rows[r, BOUND] * work.rows[r, G + j]
         return
     i = work.kinds[r, 1]
-    turn = work.tree[i, TURN]
+    turn = work.tree[i, LINK.turn]
     f_x, f_y, torque = _sliding(work, r - work.n_rows, i, work.motion[u, turn])
     for j in range(work.n):
         system[j, column] += slope[i, j, 0] * f_x + slope[i, j, 1] * f_y
@@ -517,7 +514,7 @@ def set_first_slide(work, u, a, tries=30):  # type: ignore[no-untyped-def]
                         system[j, k] += weight * rows[r, G + j] * rows[r, G + k]
         for r in range(count, work.n_kinds):
             i, ring = work.kinds[r, 1], r - count
-            c, s, turn = work.links[i, COS], work.links[i, SIN], work.tree[i, TURN]
+            c, s, turn = work.links[i, COS], work.links[i, SIN], work.tree[i, LINK.turn]
             if work.kinds[r, 3] == 1 and work.kinds[r, 2] == SLIDE:
                 _resist(work, r, u, n)
                 continue
@@ -570,7 +567,7 @@ def set_twist(work, ring, i, u, field):  # type: ignore[no-untyped-def]
     """Set a ring's twist, its third part times the ring's radius; return its square."""
     rings = work.rings
     x, y = rings[ring, POINTS, 0], rings[ring, POINTS, 1]
-    turned = work.motion[u, work.tree[i, TURN]] * math.sqrt(x * x + y * y)
+    turned = work.motion[u, work.tree[i, LINK.turn]] * math.sqrt(x * x + y * y)
     v_x, v_y = work.links[i, V_X], work.links[i, V_Y]
     rings[ring, field, 0], rings[ring, field, 1], rings[ring, field, 2] = v_x, v_y, turned
     return v_x * v_x + v_y * v_y + turned * turned

@@ -1,26 +1,124 @@
-"""Engines of scenes in parts: bodies that never meet are simulated apart, each part once."""
+"""Independent parts of a scene, and engines that simulate each part once."""
 
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Collection, Hashable
 from dataclasses import dataclass, field
-from itertools import combinations, product
-from typing import TYPE_CHECKING, Any, TypeVar
+from itertools import chain, combinations, compress, product
+from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
 
 from pbrl_ppl.errors import SimulationError
-from pbrl_ppl.physics.coupling import SHARE, come_near
+from pbrl_ppl.history import History
+from pbrl_ppl.physics.settings import Parts, PhysicsSettings
 from pbrl_ppl.physics.simulator import Simulator
-from pbrl_ppl.scene import body_sizes
+from pbrl_ppl.physics.solids import to_segment
+from pbrl_ppl.scene import WORLD, Scene, body_sizes
 from pbrl_ppl.state import Bools, Floats, Ints
 
-if TYPE_CHECKING:
-    from pbrl_ppl.physics.physics import Physics
-
 R = TypeVar("R")
+#: Distance that bodies of different parts must keep: a share of their size plus the same share of
+#: their relative motion in an interval, since paths are not straight.
+_SHARE = 0.25
+
+
+def joined_parts(parts: Parts, together: Collection[str]) -> Parts:
+    """Return the parts, with those that contain any of the bodies ``together`` merged.
+
+    Examples
+    --------
+    >>> joined_parts((("a", "b"), ("c",), ("d",)), ["b", "d"])
+    (('a', 'b', 'd'), ('c',))
+    """
+    apart = [set(together).isdisjoint(part) for part in parts]
+    if all(apart):
+        return parts
+    first = apart.index(False)
+    joined = chain(*(part for part, alone in zip(parts, apart, strict=True) if not alone))
+    return (*parts[:first], tuple(joined), *compress(parts[first:], apart[first:]))
+
+
+def independent_parts(scene: Scene, history: History | None = None) -> Parts:
+    """Return the moving bodies in parts that never come near and share no joint or parameters.
+
+    A kinematic body counts as any other: all bodies that it meets are in its part.
+
+    Given the noise, the likelihood factorises over the parts, so that many bodies cost the sum of
+    their costs alone. Bodies that were apart in the data may meet in a prediction, for which there
+    is :class:`OneWorld`.
+
+    Parameters
+    ----------
+    scene : Scene
+        Shapes, joints and classes. A joint of unknown bodies may join any two.
+    history : History, optional
+        Measured places, without which bodies come near no others; a body whose place is missing at
+        some time may have been anywhere.
+
+    Returns
+    -------
+    tuple of tuple of str
+        Names, in the order of ``scene.moving``.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> from pbrl_ppl.scene import Body, Shape
+    >>> pucks = tuple(Body(name, Shape.circle(0.1)) for name in "abc")
+    >>> scene = Scene(time_step=0.1, bodies=pucks)
+    >>> rows = [
+    ...     {"trajectory": 0, "time": 0.1 * t, "body": name, "x": x, "vx": 0.0} for t in range(2)
+    ...     for name, x in zip("abc", (0.0, 0.21, 3.0))
+    ... ]
+    >>> rest = dict.fromkeys(["y", "theta", "vy", "omega", "force_x", "force_y", "torque"], 0.0)
+    >>> independent_parts(scene, History.from_dataframe(pd.DataFrame(rows).assign(**rest), scene))
+    (('a', 'b'), ('c',))
+    """
+    names = [body.name for body in scene.moving]
+    k = len(names)
+    together = np.zeros((k, k), dtype=bool)
+    for joint in scene.joints:
+        if joint.bodies is None:
+            return (tuple(names),)
+        if all(name in names for name in joint.bodies) and WORLD not in joint.bodies:
+            i, j = (names.index(name) for name in joint.bodies)
+            together[i, j] = True
+    for sharing in scene.owners.values():
+        for name in sharing[1:]:
+            together[names.index(name), names.index(sharing[0])] = True
+    if history is not None:
+        place = history.dataset["start"].to_numpy()[..., :2]
+        intervals = history.dataset["n_rows"].to_numpy() - 1
+        inside = np.arange(place.shape[1] - 1) < intervals[:, None]
+        begin, end = place[:, :-1][inside], place[:, 1:][inside]  # (interval, body, 2)
+        reach = [body.shape.bounding_radius for body in scene.moving]
+        for i in range(k):
+            for j in range(i):
+                least = (1.0 + _SHARE) * (reach[i] + reach[j])
+                near = come_near(begin[:, i] - begin[:, j], end[:, i] - end[:, j], least)
+                together[i, j] |= near.any()
+    count, part = connected_components(together, directed=False)
+    kinematic = np.array([body.kinematic for body in scene.moving])
+    for label in range(count):  # a kinematic body that meets none joins the first dynamic one
+        if kinematic[part == label].all():
+            part[part == label] = part[~kinematic][0]
+    return tuple(tuple(np.array(names)[part == label].tolist()) for label in np.unique(part))
+
+
+def come_near(begin: Floats, end: Floats, least: float) -> Bools:
+    """Return whether two bodies come nearer than ``least`` (m), or may where places are missing.
+
+    Parameters
+    ----------
+    begin, end : ndarray
+        Place of one relative to the other before and after an interval, shape (..., 2), m.
+    """
+    path = end - begin
+    nearest = to_segment(-begin, path)
+    return np.asarray(~(nearest >= least + _SHARE * np.linalg.norm(path, axis=-1)))
 
 
 class Memory:
@@ -65,12 +163,12 @@ class Part:
     """One part: its engine, and where its parameters and bodies are in the whole."""
 
     simulator: Simulator
-    places: NDArray[np.intp]
-    bodies: NDArray[np.intp]
+    places: Ints
+    bodies: Ints
     memory: Memory = field(default_factory=Memory)
 
     @property
-    def physics(self) -> Physics:
+    def physics(self) -> PhysicsSettings:
         """Its scene, effects and parameters."""
         return self.simulator.physics
 
@@ -84,7 +182,7 @@ class PartedSimulator:
 
     Parameters
     ----------
-    physics : Physics
+    physics : PhysicsSettings
         Scene, effects, settings and parts.
 
     Raises
@@ -93,7 +191,8 @@ class PartedSimulator:
         If the parts do not hold every moving body once.
     """
 
-    def __init__(self, physics: Physics) -> None:
+    def __init__(self, physics: PhysicsSettings) -> None:
+        self.physics = physics
         names = tuple(body.name for body in physics.scene.moving)
         parts = (names,) if physics.parts is None else physics.parts
         listed = [name for part in parts for name in part]
@@ -106,13 +205,9 @@ class PartedSimulator:
         self.parts = []
         for part in parts:
             part_physics = physics if len(parts) == 1 else physics.part(part)
-            places = np.array(
-                [labels.index(label) for label in part_physics.layout.labels], dtype=int
-            )
-            bodies = np.array(
-                [names.index(body.name) for body in part_physics.scene.moving], dtype=int
-            )
-            self.parts.append(Part(Simulator(part_physics), places, bodies))
+            places = [labels.index(label) for label in part_physics.layout.labels]
+            bodies = [names.index(body.name) for body in part_physics.scene.moving]
+            self.parts.append(Part(Simulator(part_physics), np.array(places), np.array(bodies)))
 
     @property
     def steps(self) -> int:
@@ -129,11 +224,9 @@ class PartedSimulator:
         for part in self.parts:
             parameters = proposals[:, part.places]
             begin, acted = _of(part, start, actions)
-            keys = (
-                parameters
-                if start.ndim == 3
-                else np.hstack([parameters, begin.reshape(len(parameters), -1)])
-            )
+            keys = parameters
+            if start.ndim == 4:
+                keys = np.hstack([parameters, begin.reshape(len(parameters), -1)])
             _, first, which = np.unique(keys, axis=0, return_index=True, return_inverse=True)
             begin = begin if start.ndim == 3 else begin[first]
             states = part.simulator(parameters[first], begin, acted)
@@ -174,20 +267,21 @@ class OneWorld:
 
     Parameters
     ----------
-    physics : Physics
-        Scene, effects, settings and parts.
+    parted : PartedSimulator
+        Engine of the likelihood.
     rounding : float
         Largest difference of one world's prediction from a part's that counts as none, in radii of
         the smallest body, rad and sampling intervals.
     """
 
-    def __init__(self, physics: Physics, rounding: float = 1e-6) -> None:
-        self.parted = physics.simulator
+    def __init__(self, parted: PartedSimulator, rounding: float = 1e-6) -> None:
+        physics, self.parted = parted.physics, parted
         # contacts are not extrapolated, nor is anything else in a transition that has one
-        self._apart = physics.changed(extrapolate=False).simulator
+        alone = physics.changed(extrapolate=False)
+        self._apart = parted if alone is physics else PartedSimulator(alone)
         self._rounding = rounding * body_sizes(physics.scene).min(axis=0)
         self._reach = [body.shape.bounding_radius for body in physics.scene.moving]
-        self._whole = Simulator(physics.changed(extrapolate=False, parts=None))
+        self._whole = Simulator(alone.changed(parts=None))
 
     def __call__(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
         """Predict as :class:`Simulator` does: (transition, H, body, 6), or with proposals first."""
@@ -222,7 +316,7 @@ class OneWorld:
         near = np.zeros(states.shape[:-3], dtype=bool)
         for i, j in product(bodies_a, bodies_b):
             way = places[..., i, :] - places[..., j, :]
-            least = (1.0 + SHARE) * (self._reach[i] + self._reach[j])
+            least = (1.0 + _SHARE) * (self._reach[i] + self._reach[j])
             near |= come_near(way[..., :-1, :], way[..., 1:, :], least).any(axis=-1)
         return near
 

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 import pymunk
 
 from pbrl_ppl.effects import Attached, Command, Force, Friction, at_stage, holder
 from pbrl_ppl.effects.effect import INTERVAL, MEMORY, MOST_MEMORY, TIME
-from pbrl_ppl.physics.laws import LATE
-from pbrl_ppl.physics.properties import COLUMN, EngineInput
-from pbrl_ppl.physics.setters import (
+from pbrl_ppl.physics.compiled import (
     glide,
     hinge_signal,
     iterations,
@@ -21,11 +19,14 @@ from pbrl_ppl.physics.setters import (
     patch_signal,
     wheel_ends,
 )
+from pbrl_ppl.physics.laws import LATE
+from pbrl_ppl.physics.properties import COLUMN, EngineInput
 from pbrl_ppl.physics.solids import near_contact
 from pbrl_ppl.physics.world import RING, World
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import WRENCH, Floats
 
+Stage = TypeVar("Stage", Command, Force, Friction)
 _EXTRA = [COLUMN.extra_gravity_x, COLUMN.extra_gravity_y]
 
 
@@ -143,12 +144,13 @@ class Acting:
     ) -> None:
         names = [body.name for body in scene.moving]
 
-        def laws(kind: type, parameters: Floats) -> list[tuple[int, Any, Floats]]:
+        def laws(kind: type[Stage], parameters: Floats) -> list[tuple[int, Stage, Floats]]:
             first, rows = 0, []
             for attached in at_stage(effects, kind):
                 effect = attached.effect
                 last = first + len(effect.parameters) + len(effect.constants)
-                rows.append((names.index(attached.body), effect.stage, parameters[first:last]))
+                if isinstance(effect.stage, kind):
+                    rows.append((names.index(attached.body), effect.stage, parameters[first:last]))
                 first = last
             return rows
 
@@ -168,9 +170,9 @@ class Acting:
                 last += parameters[-1] * (earlier[0, i, :3] - last)
             self._memory.append(np.tile(_alone(last, stage), stage.memory))
         self._held = [np.zeros(stage.memory) for _, stage, _ in self._forces]
-        for (i, stage, parameters), held in zip(self._forces, self._held, strict=True):
-            if stage.begin is not None:
-                stage.begin(start[i], np.zeros(MEMORY), parameters, held)
+        for (i, force, parameters), held in zip(self._forces, self._held, strict=True):
+            if force.begin is not None:
+                force.begin(start[i], np.zeros(MEMORY), parameters, held)
         for before, now in pairwise([np.arange(3, 6), *older][::-1]):
             self.remember(start, np.hstack([earlier[0][:, now], earlier[0][:, before], 0 * past]))
         for interval in earlier[:-1]:
@@ -209,12 +211,12 @@ class Acting:
             if (other := self._others.get(i, -1)) >= 0 and stage.reacts:
                 total[other, 2] -= self.command[i, 2]
         signals[:, :3] = self.command
-        for (i, stage, parameters), held in zip(self._forces, self._held, strict=True):
+        for (i, force, parameters), held in zip(self._forces, self._held, strict=True):
             signals[i, MEMORY : MEMORY + len(held)] = held
             change = np.zeros_like(held)
-            if stage.rate is not None and not after:
-                stage.rate(states[i], signals[i], parameters, change)
-            stage.law(states[i], signals[i], parameters, total[i])
+            if force.rate is not None and not after:
+                force.rate(states[i], signals[i], parameters, change)
+            force.law(states[i], signals[i], parameters, total[i])
             held += (end - begin) * self._time_step * change
         return total
 
@@ -233,7 +235,7 @@ class Acting:
         return float(most[0])
 
 
-def _alone(wrench: Floats, stage: Any) -> Floats:
+def _alone(wrench: Floats, stage: Command) -> Floats:
     """Return what a command law sees of a wrench."""
     if not stage.alone:
         return wrench.copy()

@@ -6,7 +6,6 @@ from collections import namedtuple
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.effects import (
     Attached,
@@ -24,7 +23,7 @@ from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.parameters import BODY_PARAMETERS, Layout
 from pbrl_ppl.physics.joints import JOINT_COLUMNS, LENGTH, SceneJoints, never_turning
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import Floats
+from pbrl_ppl.state import Floats, Ints
 
 #: Columns of a body's properties. ``moment`` is about the centre of mass (kg m^2), which is at
 #: ``com_x`` and ``com_y`` of the body's frame (m); ``pivot_torque`` (N m) and ``pivot_damping``
@@ -88,7 +87,7 @@ class EngineInput(NamedTuple):
     commands: Floats
     forces: Floats
     frictions: Floats
-    indices: NDArray[np.int64]
+    indices: Ints
 
 
 def _changed_columns(attached: Attached) -> frozenset[str]:

@@ -5,31 +5,34 @@ from __future__ import annotations
 import math
 import threading
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property, partial
 from itertools import compress
-from typing import TYPE_CHECKING, Any
+from queue import SimpleQueue
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pbrl_ppl.effects import Clock, Command, Force, Friction, at_stage, holder, needs_inputs
+from pbrl_ppl.effects import Clock, needs_inputs
 from pbrl_ppl.errors import SimulationError
 from pbrl_ppl.history import fill_joints, joint_coordinates
 from pbrl_ppl.parameters import Layout, differentiate
-from pbrl_ppl.physics import calls, plain
-from pbrl_ppl.physics.engines import Batch, Engine, share_out
+from pbrl_ppl.physics import calls, compiled, flow, lockstep, plain
+from pbrl_ppl.physics.calls import pointers, still
 from pbrl_ppl.physics.joints import LENGTH, on_rod
+from pbrl_ppl.physics.laws import law_tables
+from pbrl_ppl.physics.motion import work_of
 from pbrl_ppl.physics.properties import EngineInput, EngineProperties
+from pbrl_ppl.physics.settings import PhysicsSettings
+from pbrl_ppl.physics.tree import MOST, tree_of
 from pbrl_ppl.physics.world import FINER, World
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import INPUT, STATE, THETA, VELOCITY, WRENCH, Floats, Ints
+from pbrl_ppl.state import INPUT, STATE, THETA, VELOCITY, WRENCH, Bools, Floats, Ints
 
-if TYPE_CHECKING:
-    from pbrl_ppl.physics.physics import Physics
-
-#: Engines by name; see :class:`Physics`.
-ENGINES = ("auto", "chipmunk", "contact-free", "python")
+#: Bodies are near each other within this multiple of their radii: a step of half a radius that
+#: passes through the edge of a bounding circle ends in it.
+_NEAR = 1.04
 #: For each joint of unknown bodies, which of ``scene.joinable`` it holds.
 Joined = tuple[tuple[int, int], ...]
 #: And which rods there are: what worlds differ in.
@@ -38,21 +41,133 @@ Choice = tuple[Joined, tuple[bool, ...]]
 _ONE_WORLD: Choice = ((), ())
 
 
-def check_engine(name: str) -> None:
-    """Refuse an engine that does not exist or is not available on this machine.
+class Batch(NamedTuple):
+    """What the rollouts take: see `compiled.rollout`."""
 
-    Raises
-    ------
-    SimulationError
-        If so.
+    given: tuple[Floats, ...]
+    commands: Ints
+    forces: Ints
+    frictions: Ints
+    slots: int
+    held: int
+    follows: Bools
+    start: Floats
+    inputs: Floats
+    time_step: float
+    counts: Ints
+    weights: Floats
+    tolerance: float
+
+
+class Engine:
+    """A world of one thread, and where its C objects are.
+
+    Parameters
+    ----------
+    build : callable
+        Builds a world.
+    name : str
+        Which engine; see :class:`Physics`.
     """
-    available = ENGINES if calls.AVAILABLE else ("auto", "python")
-    if name not in available:
-        raise SimulationError(
-            f"engine is {name!r}, expected one of {', '.join(available)}"
-            + " (others need compiled calls of Chipmunk, which this platform lacks)"
-            * (name in ENGINES)
-        )
+
+    def __init__(self, build: Callable[[], World], name: str = "auto") -> None:
+        self._build, self._name = build, name
+        self._renew()
+
+    def _renew(self) -> None:
+        self.world = self._build()
+        self.pointers = pointers(self.world)
+        self._wheels = self._tree = None
+        if self._name == "chipmunk":
+            return
+        self._wheels = lockstep.free_wheels(self.world)
+        self._still = still(self.world, _NEAR if self._wheels is None else 1.0)
+        if self._wheels is None:
+            self._tree = tree_of(self.world)
+        if self._tree is not None:
+            self._work = work_of(self._tree, self.world.size)
+
+    def rollout(self, batch: Batch, first: int, last: int, out: Floats) -> None:
+        """Predict the items ``first`` to ``last`` into ``out``, NaN where the engine diverges.
+
+        Parameters
+        ----------
+        batch : Batch
+            Of all bodies.
+        first, last : int
+            Of proposals x transitions.
+        out : ndarray
+            Shape (proposal * transition, H, body, 6).
+        """
+        items, horizon = np.arange(first, last), batch.inputs.shape[1]
+        begins = np.zeros(len(items), dtype=np.int64)
+        tree = self._tree
+        if tree is not None and batch.held > max(0, MOST - 1 - tree.size):
+            tree = None  # laws' own numbers have no place beside the coordinates
+        whole = self._wheels is None and tree is None
+        while len(items):
+            if self._wheels is not None:
+                lockstep.rollout(self._wheels, self._still, batch, items, begins, out)
+            elif tree is not None:
+                flow.rollout(self._work, self._still, batch, items, begins, out)
+            left = begins < horizon
+            items, begins = items[left], begins[left]
+            if len(items) and self._name == "contact-free":
+                raise SimulationError(
+                    f"engine 'contact-free': {len(items)} of {last - first} transitions have"
+                    " contacts, or joints that the fast path lacks; use 'auto' or 'chipmunk'"
+                )
+            if len(items):
+                self.world.check_steps()
+            done = 0
+            while done < len(items):
+                done += compiled.rollout(
+                    calls.FUNCTIONS, self.pointers, batch, items[done:], begins[done:], whole, out
+                )
+                if done < len(items):  # diverged: that world is spoilt, and the item is lost
+                    out[items[done]], begins[done] = np.nan, horizon
+                    self._renew()
+                    done += 1
+            left = begins < horizon
+            items, begins = items[left], begins[left]
+
+
+def share_out(
+    run: Callable[[Engine, int, int], None], engines: list[Engine], n: int, chunk: int = 512
+) -> None:
+    """Run ``n`` items, a thread an engine.
+
+    Parameters
+    ----------
+    run : callable
+        Runs the items from a first to before a last on an engine.
+    engines : list of Engine
+        One or more.
+    n : int
+        Number of items.
+    chunk : int
+        Items of a thread's chunk, at least: each costs as much Python as some hundred items.
+    """
+    workers = len(engines)
+    if workers == 1:
+        run(engines[0], 0, n)
+        return
+    # chunks, so that a thread which the machine slows down takes fewer of them
+    chunks = min(4 * workers, max(workers, n // chunk))
+    edges = np.linspace(0, n, chunks + 1).astype(int)
+    idle: SimpleQueue[Engine] = SimpleQueue()
+    for engine in engines:
+        idle.put(engine)
+
+    def serve(first: int, last: int) -> None:
+        engine = idle.get()
+        try:
+            run(engine, first, last)
+        finally:
+            idle.put(engine)
+
+    with ThreadPoolExecutor(workers) as pool:
+        list(pool.map(serve, edges[:-1], edges[1:]))
 
 
 class Simulator:
@@ -64,21 +179,21 @@ class Simulator:
 
     Parameters
     ----------
-    physics : Physics
+    physics : PhysicsSettings
         Scene, effects and settings; its parts are not used.
     """
 
-    def __init__(self, physics: Physics) -> None:
+    def __init__(self, physics: PhysicsSettings) -> None:
         self.physics = physics
         self._properties = EngineProperties(physics.scene, physics.effects, physics.layout)
         self._worlds: OrderedDict[Choice, list[Engine]] = OrderedDict()
         self._lock = threading.Lock()  # the worlds serve one call at a time
 
-    def __getstate__(self) -> Physics:
+    def __getstate__(self) -> PhysicsSettings:
         """Return the state to pickle, without C objects: another process builds its own."""
         return self.physics
 
-    def __setstate__(self, physics: Physics) -> None:
+    def __setstate__(self, physics: PhysicsSettings) -> None:
         """Restore a pickled simulator."""
         Simulator.__init__(self, physics)
 
@@ -135,7 +250,9 @@ class Simulator:
                 begin = starts[rows] if len(starts) > 1 else starts
                 count = int(rows.sum())
                 part = np.full((count * n, horizon, k, 6), np.nan)
-                run(choice, EngineInput(*(array[rows] for array in numbers)), begin, inputs, part)
+                run(
+                    choice, EngineInput._make(array[rows] for array in numbers), begin, inputs, part
+                )
                 out[rows] = part.reshape(count, n, horizon, k, 6)
         for i, sensor, values in self._properties.sensors(proposals):
             if sensor.timed and clock is not None:
@@ -143,7 +260,7 @@ class Simulator:
             out[..., i, :] = sensor.measure(out[..., i, :], values)
         return out if phi.ndim == 2 else out[0]
 
-    def _choices(self, numbers: EngineInput) -> Iterator[tuple[Choice, Any]]:
+    def _choices(self, numbers: EngineInput) -> Iterator[tuple[Choice, Bools]]:
         """The worlds that proposals need, and which of them each is for.
 
         What bodies an inferred joint holds makes another world, and so does each rod that there is.
@@ -233,7 +350,7 @@ class Simulator:
         )  # fmt: skip
 
     @cached_property
-    def levels(self) -> tuple[NDArray[np.int64], Floats]:
+    def levels(self) -> tuple[Ints, Floats]:
         """Numbers of substeps to run, the finest first, and the weights of their results.
 
         The engine's error is a series in the substep (Richardson, 1911): two runs cancel its first
@@ -249,39 +366,7 @@ class Simulator:
 
     @cached_property
     def _laws(self) -> tuple[Ints, Ints, Ints, int, int]:
-        """Rows of the laws of commands, forces and friction as in `laws`.
-
-        With how many numbers command laws remember, and force laws have of their own.
-        """
-        names, numbers = [body.name for body in self.physics.scene.moving], []
-        tables = []
-        for kind in (Command, Force, Friction):
-            first, slots, rows = 0, 0, []
-            for attached in at_stage(self.physics.effects, kind):
-                stage: Any = attached.effect.stage
-                remember, count, alone = getattr(stage, "remember", None), 0, -1
-                if remember is not None:
-                    count, remember = 3 * stage.memory, calls.law_address(remember)
-                jumps = int(getattr(stage, "jumps", False))
-                if getattr(stage, "rate", None) is not None:
-                    count, remember = stage.memory, calls.law_address(stage.rate)
-                    jumps = 0 if stage.begin is None else calls.law_address(stage.begin)
-                begins, reacts = (getattr(stage, x, False) for x in ("begins", "reacts"))
-                if getattr(stage, "alone", ""):
-                    alone = WRENCH.index(stage.alone)
-                rows.append((
-                    calls.law_address(stage.law), names.index(attached.body), first, remember or 0,
-                    slots, count, alone, int(getattr(stage, "under", False)),
-                    jumps,
-                    first + len(attached.effect.parameters) - 1 if begins else -1,
-                    holder(self.physics.scene, attached) if reacts else -1,
-                ))  # fmt: skip
-                first += len(attached.effect.parameters) + len(attached.effect.constants)
-                slots += count
-            numbers.append(slots)
-            tables.append(np.array(rows, dtype=np.int64).reshape(-1, 11))
-        commands, forces, frictions = tables
-        return commands, forces, frictions, numbers[0], numbers[1]
+        return law_tables(self.physics.scene, self.physics.effects)
 
     def _new_world(self, choice: Choice) -> World:
         joined, there = choice
@@ -363,7 +448,7 @@ def _each(states: Floats, proposals: int) -> Floats:
     return np.array(np.broadcast_to(states, (proposals, *states.shape[1:])), order="C")
 
 
-def _continues_previous(inputs: Floats) -> NDArray[np.bool_]:
+def _continues_previous(inputs: Floats) -> Bools:
     """Return which transitions begin where the one before ends in the recording, (transition,)."""
     follows = np.zeros(len(inputs), dtype=bool)
     if inputs.shape[-1] > len(WRENCH):

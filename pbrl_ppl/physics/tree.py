@@ -9,7 +9,9 @@ ends; a free body has three. Nothing has to hold the joints together, and nothin
 from __future__ import annotations
 
 import math
+from collections import namedtuple
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -27,9 +29,9 @@ PIVOT, UNDER, TURNING, ALONG, ACROSS = range(5)
 #: is 0 and whose forces count for nothing), its row among all joints (-1: none), the columns of the
 #: anchor on its parent (-1: a rod's end) and of its own (-1: its origin), and the body whose
 #: friction acts in its hinge or slider (-1: none).
-KIND, PARENT, BODY, FIRST, TURN, JOINT, NEAR, FAR, OWNER = range(9)
-
-
+LINK: Any = namedtuple("LINK", "kind parent body first turn joint near far owner")(*range(9))
+#: Pose of a link that hangs on nothing fixed and in no slider.
+_NOWHERE = (0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 #: Links, coordinates, and rows and rings that a tree may have; a larger one is left to the engine.
 MOST = 24
 
@@ -71,86 +73,98 @@ def tree_of(world: World) -> Tree | None:
     """
     if not all(link.kind.contact_free for link in world.links):
         return None
-    links: list[list[int]] = []
-    poses: list[tuple[float, ...]] = []
-    headings: list[tuple[float, float]] = []
-    place: dict[int, int] = {}
-    references = [world.scene.reference_angle(body.name) for body in world.scene.moving]
-    turns = [-angle for angle in references]  # since the poses, less the coordinate of an angle
     left = [(_ends(world, link), link) for link in world.links]
-    size, nowhere = 0, (0.0, 0.0, 1.0, 0.0)
     if any(end >= 0 and world.kinematic[end] for ends, _ in left for end in ends):
         return None
-
-    def add(kind: int, parent: int, body: int, pose: tuple[float, ...], *joint: int) -> int:
-        nonlocal size
-        turn = size + 2 * (kind == FREE)
-        if kind == RAIL:
-            turn = links[parent][TURN] if parent >= 0 else -1
-        links.append([kind, parent, body, size, turn, *joint])
-        poses.append(pose)
-        headings.append((0.0, 0.0))
-        size += 3 if kind == FREE else 1
-        return len(links) - 1
-
-    moves = (~world.kinematic).tolist()
-    while len(place) < sum(moves):
-        ready = [one for one in left if any(end < 0 or end in place for end in one[0])]
+    links, moving = _Links(world), np.flatnonzero(~world.kinematic).tolist()
+    while len(links.place) < len(moving):
+        ready = [one for one in left if any(end < 0 or end in links.place for end in one[0])]
         if not ready:
-            body = next(i for i in range(len(world.bodies)) if i not in place and moves[i])
-            place[body] = add(FREE, -1, body, nowhere, -1, -1, -1, -1)
+            body = next(body for body in moving if body not in links.place)
+            links.add(FREE, -1, body, -1, -1, -1, -1)
             continue
         chosen = min(ready, key=lambda one: min(one[0]) >= 0)  # the world's first
         left.remove(chosen)
         (a, b), link = chosen
-        turned = not (a < 0 or a in place)
+        turned = not (a < 0 or a in links.place)
         holder, body = (b, a) if turned else (a, b)
-        if body < 0 or body in place:
+        if body < 0 or body in links.place:
             return None  # a loop, or a body that the world holds twice
-        parent, pose = place.get(holder, -1), nowhere
+        links.hang(link, holder, body, turned)
+    return None if left else links.tree(world)
+
+
+class _Links:
+    """Links of a world's bodies, as they are added."""
+
+    def __init__(self, world: World) -> None:
+        self.place: dict[int, int] = {}  # link of each body
+        self._links: list[list[int]] = []
+        self._poses: list[tuple[float, ...]] = []
+        self._size = 0
+        self._references = [world.scene.reference_angle(body.name) for body in world.scene.moving]
+        #: Angles since the reference poses, less the coordinate of the angle.
+        self._turns = [-angle for angle in self._references]
+
+    def add(
+        self, kind: int, parent: int, body: int, *joint: int, pose: tuple[float, ...] = _NOWHERE
+    ) -> int:
+        """Add a link, the joint's columns as above, and return its number."""
+        turn = self._size + 2 * (kind == FREE)
+        if kind == RAIL:
+            turn = self._links[parent][LINK.turn] if parent >= 0 else -1
+        if body >= 0:
+            self.place[body] = len(self._links)
+        self._links.append([kind, parent, body, self._size, turn, *joint])
+        self._poses.append(pose)
+        self._size += 3 if kind == FREE else 1
+        return len(self._links) - 1
+
+    def hang(self, link: Link, holder: int, body: int, turned: bool) -> None:
+        """Add a body that hangs on a holder, which is the joint's second body if ``turned``."""
+        parent, pose = self.place.get(holder, -1), _NOWHERE
         if holder < 0:
             fixed = link.constraint.b if turned else link.constraint.a
-            pose = (*fixed.position, math.cos(fixed.angle), math.sin(fixed.angle))
+            pose = (*fixed.position, math.cos(fixed.angle), math.sin(fixed.angle), 0.0, 0.0)
         near, far = (B_X, A_X) if turned else (A_X, B_X)
         if link.kind is ROD:
-            parent = add(BAR, parent, -1, pose, link.joint, near, -1, -1)
-            pose, near = nowhere, -1
+            parent = self.add(BAR, parent, -1, link.joint, near, -1, -1, pose=pose)
+            pose, near = _NOWHERE, -1
+        if link.kind is SLIDER:
+            turn = self._turns[body] = self._turns[holder] if holder >= 0 else 0.0
+            pose = (*pose[:4], self._references[body] + turn, link.axis + turn)
         kind = RAIL if link.kind is SLIDER else HINGE
-        place[body] = add(kind, parent, body, pose, link.joint, near, far, link.pivot)
-        if kind == RAIL:
-            turns[body] = turns[holder] if holder >= 0 else 0.0
-            headings[-1] = references[body] + turns[body], link.axis + turns[body]
-    if left:
-        return None
-    rows, rings = _friction(world, links, place)
-    if any(links[i][TURN] < 0 for i in rings):
-        return None
-    upright = any(link[TURN] < 0 for link in links)
-    if max(len(links), size + upright, len(rows) + len(rings)) > MOST:
-        return None
-    for each in links:
-        each[TURN] = size if each[TURN] < 0 else each[TURN]
-    return Tree(
-        links=np.array(links, dtype=np.int64),
-        poses=np.hstack([poses, headings]),
-        rows=np.array(rows, dtype=np.int64).reshape(-1, 2),
-        rings=np.array(rings, dtype=np.int64),
-        bodies=np.array([place.get(i, -1) for i in range(len(world.bodies))], dtype=np.int64),
-        size=size,
-    )
+        self.add(kind, parent, body, link.joint, near, far, link.pivot, pose=pose)
 
+    def tree(self, world: World) -> Tree | None:
+        """Return the tree of these links; None if it is too large, or lets a ring not turn."""
+        rows, rings = self._friction(world)
+        if any(self._links[i][LINK.turn] < 0 for i in rings):
+            return None
+        upright = any(link[LINK.turn] < 0 for link in self._links)
+        if max(len(self._links), self._size + upright, len(rows) + len(rings)) > MOST:
+            return None
+        links = np.array(self._links, dtype=np.int64)
+        links[links[:, LINK.turn] < 0, LINK.turn] = self._size
+        return Tree(
+            links=links,
+            poses=np.array(self._poses),
+            rows=np.array(rows, dtype=np.int64).reshape(-1, 2),
+            rings=np.array(rings, dtype=np.int64),
+            bodies=np.array([self.place.get(i, -1) for i in range(len(world.bodies))]),
+            size=self._size,
+        )
 
-def _friction(
-    world: World, links: list[list[int]], place: dict[int, int]
-) -> tuple[list[tuple[int, int]], list[int]]:
-    """Return kind and link of each row of dry friction, and the links of the rings."""
-    rows = [(PIVOT, i) for i, link in enumerate(links) if link[OWNER] >= 0]
-    rows += [(TURNING, place[turner.body]) for turner in world.turners]
-    for wheel in world.wheels:
-        rows += [(ALONG, place[wheel.body]), (ACROSS, place[wheel.body])]
-    under = [place[patch.body] for patch in world.patches]
-    alone = [i for i in under if links[i][KIND] != FREE and links[i][PARENT] < 0]
-    return rows + [(UNDER, i) for i in alone], [i for i in under if i not in alone]
+    def _friction(self, world: World) -> tuple[list[tuple[int, int]], list[int]]:
+        """Return kind and link of each row of dry friction, and the links of the rings."""
+        links, place = self._links, self.place
+        rows = [(PIVOT, i) for i, link in enumerate(links) if link[LINK.owner] >= 0]
+        rows += [(TURNING, place[turner.body]) for turner in world.turners]
+        for wheel in world.wheels:
+            rows += [(ALONG, place[wheel.body]), (ACROSS, place[wheel.body])]
+        under = [place[patch.body] for patch in world.patches]
+        alone = [i for i in under if links[i][LINK.kind] != FREE and links[i][LINK.parent] < 0]
+        return rows + [(UNDER, i) for i in alone], [i for i in under if i not in alone]
 
 
 def _ends(world: World, link: Link) -> tuple[int, int]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterable
 from concurrent.futures import Future, wait
-from typing import Any
 
 import numpy as np
 
@@ -135,9 +134,8 @@ def _check_null(
     states = np.nan_to_num(history.dataset["start"].to_numpy())
     segments = history.pieces(states, 1)
     chosen = np.unique(np.linspace(0, segments.n - 1, 6).astype(int))
-    settings: dict[str, Any] = {"substeps": 2, "extrapolate": False, "engine": "python"}
-    without = Physics(scene, **settings)
-    there = Physics(scene, (effect.on(body.name),), **settings)
+    without = Physics(scene, substeps=2, extrapolate=False, engine="python")
+    there = without.changed(effects=(effect.on(body.name),))
     values = {
         label: prior.centre
         for label, prior in zip(without.layout.labels, without.layout.priors, strict=True)
@@ -181,8 +179,7 @@ def _named(effect: Effect, parameters: Iterable[float]) -> dict[str, Floats]:
 
 def _applied(effect: Effect, state: Floats, parameters: Floats, body: Body, units: Units) -> Floats:
     """Return the results of an effect's functions at a state and parameters, as one array."""
-    stage: Any = effect.stage
-    named = _named(effect, parameters)
+    stage, named = effect.stage, _named(effect, parameters)
     if isinstance(stage, Force | Command | Friction):
         wrench = np.array([1.0, -0.5, 0.2]) * (units.force, units.force, units.torque)
         command = np.zeros(MEMORY + MOST_MEMORY)

@@ -205,11 +205,7 @@ class World:
         self.fastest = 1e5 * self.size / scene.time_step
         #: Distance of the places where bodies are parked (m).
         self.far = 1e9 * _extent(scene)
-        # overlaps scale with the scene; the engine's defaults are meant for pixels
-        self.space.collision_slop = 1e-4 / _CART * self.size
-        left = self.space.collision_bias**_CART_TIME
-        # the power underflows where the engine time is below a hundredth of the cart's
-        self.space.collision_bias = max(left ** (1.0 / engine_time(scene)), 1e-300)
+        self._scale_overlaps()
         self.bodies: list[pymunk.Body] = []
         self.shapes: list[tuple[int, pymunk.Shape]] = []
         self.wheels: list[OnBody] = []
@@ -231,35 +227,22 @@ class World:
             self._add_static(self.discs[j])
         #: Which bodies follow a path, at the velocities in their actions.
         self.kinematic = np.array([body.kinematic for body in scene.moving])
-        for i, body in enumerate(scene.moving):
-            kind = pymunk.Body.KINEMATIC if body.kinematic else pymunk.Body.DYNAMIC
-            rigid = pymunk.Body(1.0, 1.0, kind)
-            rigid.position = self.far * (i + 1.0), self.far
-            self.bodies.append(rigid)
-            self._by_name[body.name] = rigid
-            self.space.add(rigid)
-            self.shapes += [(i, shape) for shape in engine_shapes(body, rigid)]
-            if body.wheel or i in wheels:
-                self.wheels.append(self._constrain("wheel", i, rigid, self.space.static_body))
+        self._add_moving(wheels)
         self._add_shapes()
         #: Which bodies can touch each other, and what does not move (the diagonal).
         self.can_touch = ~np.logical_and.outer(self.kinematic, self.kinematic)
         self._add_joints(kinds, joined)
+        ground = self.space.static_body
         for i, position in rods:
-            self._add_link(position, self.bodies[i], self.space.static_body, ROD)
-        self.patches = [
-            self._constrain("patch", i, self.bodies[i], self.space.static_body, RING)
-            for i in patches
-        ]
-        self.turners = [
-            self._constrain("turning", i, self.bodies[i], self.space.static_body) for i in turners
-        ]
+            self._add_link(position, self.bodies[i], ground, ROD)
+        self.patches = [self._constrain("patch", i, self.bodies[i], ground, RING) for i in patches]
+        self.turners = [self._constrain("turning", i, self.bodies[i], ground) for i in turners]
         #: Which dynamic bodies are joined to other moving ones.
         self.chained = np.logical_not(self.can_touch.all(axis=1)) & ~self.kinematic
         alone = len(scene.bodies) == 1 and not scene.walls and not (discs or patches)
         #: Solver iterations. The wheel or hinge of a single body without obstacles soon converges
         #: to rounding; several bodies need the engine's default, and a chain of joints more (see
-        #: `setters.iterations`).
+        #: `compiled.iterations`).
         self.iterations = 30 if self.chained.any() else 5 if alone else 10
         #: For the near-contact test: radii of bounding circles, and segments with a radius.
         self.radii = np.array([body.shape.bounding_radius for body in scene.moving])
@@ -290,6 +273,26 @@ class World:
                     " closed chains, has no such joint; expected a slider to the world, or to one"
                     " that slides on it. Use engine 'auto', and keep other bodies and walls away"
                 )
+
+    def _scale_overlaps(self) -> None:
+        """Let overlaps scale with the scene; the engine's defaults are meant for pixels."""
+        self.space.collision_slop = 1e-4 / _CART * self.size
+        left = self.space.collision_bias**_CART_TIME
+        # the power underflows where the engine time is below a hundredth of the cart's
+        self.space.collision_bias = max(left ** (1.0 / engine_time(self.scene)), 1e-300)
+
+    def _add_moving(self, wheels: tuple[int, ...]) -> None:
+        """Add the moving bodies, far from each other, with their wheels but without shapes."""
+        for i, body in enumerate(self.scene.moving):
+            kind = pymunk.Body.KINEMATIC if body.kinematic else pymunk.Body.DYNAMIC
+            rigid = pymunk.Body(1.0, 1.0, kind)
+            rigid.position = self.far * (i + 1.0), self.far
+            self.bodies.append(rigid)
+            self._by_name[body.name] = rigid
+            self.space.add(rigid)
+            self.shapes += [(i, shape) for shape in engine_shapes(body, rigid)]
+            if body.wheel or i in wheels:
+                self.wheels.append(self._constrain("wheel", i, rigid, self.space.static_body))
 
     def _add_shapes(self) -> None:
         """Add the moving shapes so that contacts have one order, whatever was simulated before.

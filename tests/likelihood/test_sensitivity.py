@@ -17,7 +17,7 @@ from pbrl_ppl.likelihood import (
 )
 from pbrl_ppl.model import SimulatorOp, build_model
 from pbrl_ppl.parameters import change_from
-from pbrl_ppl.physics import OneWorld, PartedSimulator, Physics, Simulator, build_layout
+from pbrl_ppl.physics import PartedSimulator, Physics, Simulator, build_layout
 from pbrl_ppl.posterior import parameter_draws, problem_of
 from pbrl_ppl.sampling import fit
 from pbrl_ppl.scene import Body, Joint, Scene, Shape
@@ -205,7 +205,7 @@ def test_each_proposal_from_its_own_start(joints) -> None:
     for engine in (
         Simulator(Physics(scene)),
         PartedSimulator(Physics(scene, parts=parts)),
-        OneWorld(Physics(scene, parts=parts)),
+        Physics(scene, parts=parts).one_world,
     ):
         each = [engine(*own, actions) for own in zip(phi, start, strict=True)]
         np.testing.assert_array_equal(engine(phi, start, actions), each)

@@ -10,8 +10,8 @@ import pytest
 from pymunk import _chipmunk_cffi
 
 from pbrl_ppl.physics import calls, compiled, lockstep
-from pbrl_ppl.physics.compilation import SOURCES, disk_cache, sources_digest
-from pbrl_ppl.physics.compilation import compiled as decorator
+from pbrl_ppl.physics.calls import SOURCES, disk_cache, sources_digest
+from pbrl_ppl.physics.calls import compiled as decorator
 
 #: Functions by the kinds of their arguments after the object, and of what they return.
 SIGNATURES = {
