@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
 from pbrl_ppl.effects import Attached, Command, Force, Friction, at_stage, holder
@@ -109,7 +108,14 @@ def act(  # type: ignore[no-untyped-def]
     date. ``held`` (2, slot) has the numbers of force laws, and gets their rates of change.
     """
     k, data, stride = len(interval), acted.ctypes.data, 8 * ACTED
-    _set_commands(interval, begin, laws.time_step, acted)
+    known = interval.shape[1] > 3
+    for i in range(k):
+        for w in range(3):
+            acted[i, COMMAND + w] = interval[i, w]
+            acted[i, PREVIOUS + w] = interval[i, 3 + w] if known else 0.0
+            acted[i, WRENCHES + w] = 0.0  # by how much actuators are turned, for now
+        acted[i, TIME] = interval[i, 7] + begin * laws.time_step if known else np.inf
+        acted[i, INTERVAL] = laws.time_step
     for e in range(len(laws.commands)):
         law = laws.commands[e]
         i, alone, state_at = law[ON], law[ALONE], state.ctypes.data + 48 * law[ON]
@@ -144,30 +150,7 @@ def act(  # type: ignore[no-untyped-def]
     for e in range(len(laws.commands)):
         if laws.commands[e, OTHER] >= 0:
             acted[laws.commands[e, OTHER], WRENCHES + 2] -= acted[laws.commands[e, ON], COMMAND + 2]
-    if not after:
-        _add_forces(state, laws, acted, held)
-
-
-@numba.njit(inline="always")
-def _set_commands(interval, begin, time_step, acted):  # type: ignore[no-untyped-def]
-    """Set command, command before and time of each body as the inputs of an interval have them."""
-    known = interval.shape[1] > 3
-    for i in range(len(interval)):
-        for w in range(3):
-            acted[i, COMMAND + w] = interval[i, w]
-            acted[i, PREVIOUS + w] = interval[i, 3 + w] if known else 0.0
-            acted[i, WRENCHES + w] = 0.0  # by how much actuators are turned, for now
-        acted[i, TIME] = np.inf
-        if known:
-            acted[i, TIME] = interval[i, 7] + begin * time_step
-        acted[i, INTERVAL] = time_step
-
-
-@numba.njit(inline="always")
-def _add_forces(state, laws, acted, held):  # type: ignore[no-untyped-def]
-    """Add what force laws do to the wrenches; set the rates of change of their numbers."""
-    k, data, stride = len(acted) - MORE, acted.ctypes.data, 8 * ACTED
-    for e in range(len(laws.forces)):
+    for e in range(0 if after else len(laws.forces)):
         law = laws.forces[e]
         at, state_at = data + stride * law[ON], state.ctypes.data + 48 * law[ON]
         seen, parameters_at = at, laws.force_parameters.ctypes.data + 8 * law[FIRST]

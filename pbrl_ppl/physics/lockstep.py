@@ -16,7 +16,6 @@ import math
 from collections import namedtuple
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 
 from pbrl_ppl.physics.calls import compiled, copy
@@ -336,18 +335,11 @@ def fill(block, batch, items, begins, begin):  # type: ignore[no-untyped-def]
     return width, longest
 
 
-@numba.njit(inline="always")
-def place(block, batch, i, ahead):  # type: ignore[no-untyped-def]
-    """Return proposal, transition and interval of the i-th of a block, so many after its first."""
-    h = min(block.first[i] + ahead, batch.inputs.shape[1] - 1)
-    return block.proposal[i], block.transition[i], h
-
-
-@numba.njit(inline="always")
-def get_states(block, i):  # type: ignore[no-untyped-def]
-    """Write the states of a transition's bodies into those of the block."""
-    for k in range(len(block.states)):
-        get_state(block.bodies[k], i, block.states, k)
+@compiled
+def get_states(bodies, i, states):  # type: ignore[no-untyped-def]
+    """Write the states of a transition's bodies into ``states`` (body, 6)."""
+    for k in range(len(states)):
+        get_state(bodies[k], i, states, k)
 
 
 @compiled
@@ -358,7 +350,8 @@ def begin_interval(block, wheels, still, batch, ahead, step, out):  # type: igno
     for k in range(len(states)):
         body, wheel = block.bodies[k], wheels.under[k]
         for i in range(BLOCK):
-            p, t, h = place(block, batch, i, ahead)
+            p, t = block.proposal[i], block.transition[i]
+            h = min(block.first[i] + ahead, batch.inputs.shape[1] - 1)
             if timed or ahead == 0:
                 row = rows[p, t * batch.inputs.shape[1] + h if timed else 0, k]
                 if ahead == 0:
@@ -380,8 +373,8 @@ def begin_interval(block, wheels, still, batch, ahead, step, out):  # type: igno
 def begin_memories(block, batch, width):  # type: ignore[no-untyped-def]
     """Set what laws remember where the transitions begin."""
     for i in range(width):
-        p, t, h = place(block, batch, i, 0)
-        get_states(block, i)
+        p, t, h = block.proposal[i], block.transition[i], block.first[i]
+        get_states(block.bodies, i, block.states)
         begin_laws(
             batch, laws_of(batch, p), p, t, h, block.states, block.acted, block.memory,
             block.held[i], block.at,
@@ -396,8 +389,9 @@ def act_on(block, batch, width, ahead, begin, end, step, after):  # type: ignore
     ``after`` it, bring what they remember up to date instead.
     """
     for i in range(width):
-        p, t, h = place(block, batch, i, ahead)
-        get_states(block, i)
+        p, t = block.proposal[i], block.transition[i]
+        h = min(block.first[i] + ahead, batch.inputs.shape[1] - 1)
+        get_states(block.bodies, i, block.states)
         act(
             block.states, batch.inputs[t, h], laws_of(batch, p), begin, end, block.acted,
             block.remembered[i], block.held[i], after,
@@ -417,7 +411,7 @@ def add_states(block, items, ahead, weight, first_level, out):  # type: ignore[n
         if block.touched[i]:
             block.until[i] = min(block.until[i], h)
         if h < block.until[i]:
-            get_states(block, i)
+            get_states(block.bodies, i, block.states)
             for k in range(len(block.states)):
                 for d in range(6):
                     total = 0.0 if first_level else out[items[i], h, k, d]
