@@ -18,12 +18,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pbrl_ppl.physics.calls import compiled, copy
-from pbrl_ppl.physics.laws import ACTED, LATE, MORE, act, begin_laws, laws_of, states_before
+from pbrl_ppl.physics.calls import compiled
+from pbrl_ppl.physics.laws import ACTED, LATE, MORE, act, begin_laws, laws_of
 from pbrl_ppl.physics.properties import COLUMN
 from pbrl_ppl.physics.solids import reaches, segment
 from pbrl_ppl.physics.world import World
-from pbrl_ppl.state import Bools, Floats, Ints
+from pbrl_ppl.state import Bools
 
 #: Number of transitions in a block, which are computed side by side.
 BLOCK = 32
@@ -290,134 +290,6 @@ def substep(bodies, wheels, gravity, step):  # type: ignore[no-untyped-def]
                 solve_wheel(bodies[k])
 
 
-class Block(NamedTuple):
-    """Transitions side by side, and what the laws of one of them see."""
-
-    bodies: Floats  # (body, BLOCK values of each field)
-    discs: Floats  # (BLOCK, disc, 3)
-    touched: Bools  # (BLOCK,)
-    proposal: Ints  # (BLOCK,), as the next ones
-    transition: Ints
-    first: Ints  # interval to predict
-    until: Ints  # the interval from which the engine must predict
-    remembered: Floats  # (BLOCK, slot)
-    held: Floats  # (BLOCK, 2, slot)
-    memory: Floats  # (2, slot), see `begin_laws`
-    at: Ints  # (2,), the same
-    states: Floats  # (body, 6)
-    acted: Floats  # (body + 4, 12), see `act`
-
-
-@compiled
-def block_of(moving, batch):  # type: ignore[no-untyped-def]
-    """Return a block for so many moving bodies."""
-    proposal, transition, first, until = np.zeros((4, BLOCK), dtype=np.int64)
-    return Block(
-        np.zeros((moving, BLOCK * len(BODY))), np.zeros((BLOCK, batch.given[2].shape[1], 3)),
-        np.zeros(BLOCK, dtype=np.bool_), proposal, transition, first, until,
-        np.zeros((BLOCK, batch.slots)), np.zeros((BLOCK, 2, batch.held)),
-        np.zeros((2, batch.slots)), np.full(2, -1),
-        np.empty((moving, 6)), np.zeros((moving + MORE, ACTED)),
-    )  # fmt: skip
-
-
-@compiled
-def fill(block, batch, items, begins, begin):  # type: ignore[no-untyped-def]
-    """Take the items from ``begin`` on; return how many, and the most intervals of one."""
-    n, horizon, discs = len(batch.inputs), batch.inputs.shape[1], batch.given[2]
-    width, longest = min(BLOCK, len(items) - begin), 0
-    for i in range(BLOCK):
-        place = begin + min(i, width - 1)  # the rest of a block repeats the last
-        item, block.first[i], block.until[i] = items[place], begins[place], horizon
-        block.proposal[i], block.transition[i] = item // n, item % n
-        longest = max(longest, horizon - block.first[i])
-        copy(discs[block.proposal[i]], block.discs[i])
-    return width, longest
-
-
-@compiled
-def get_states(bodies, i, states):  # type: ignore[no-untyped-def]
-    """Write the states of a transition's bodies into ``states`` (body, 6)."""
-    for k in range(len(states)):
-        get_state(bodies[k], i, states, k)
-
-
-@compiled
-def begin_interval(block, wheels, still, batch, ahead, step, out):  # type: ignore[no-untyped-def]
-    """Set properties, states and wrenches; return whether centres of mass are off the origins."""
-    rows, shifted = batch.given[0], False
-    timed, states = rows.shape[1] > 1, block.states
-    for k in range(len(states)):
-        body, wheel = block.bodies[k], wheels.under[k]
-        for i in range(BLOCK):
-            p, t = block.proposal[i], block.transition[i]
-            h = min(block.first[i] + ahead, batch.inputs.shape[1] - 1)
-            if timed or ahead == 0:
-                row = rows[p, t * batch.inputs.shape[1] + h if timed else 0, k]
-                if ahead == 0:
-                    before = states_before(batch, out, p * len(batch.inputs) + t, h)
-                    for d in range(6):
-                        states[k, d] = before[k, d]
-                else:
-                    get_state(body, i, states, k)
-                shifted |= set_body(body, i, row, wheel, still.normal_gravity, step)
-                set_state(body, i, states, k)
-            else:
-                align(body, i)
-            wrench = batch.inputs[t, h, k]
-            set_wrench(body, i, wrench[0], wrench[1], wrench[2])
-    return shifted
-
-
-@compiled
-def begin_memories(block, batch, width):  # type: ignore[no-untyped-def]
-    """Set what laws remember where the transitions begin."""
-    for i in range(width):
-        p, t, h = block.proposal[i], block.transition[i], block.first[i]
-        get_states(block.bodies, i, block.states)
-        begin_laws(
-            batch, laws_of(batch, p), p, t, h, block.states, block.acted, block.memory,
-            block.held[i], block.at,
-        )  # fmt: skip
-        block.remembered[i] = block.memory[1]
-
-
-@compiled
-def act_on(block, batch, width, ahead, begin, end, step, after):  # type: ignore[no-untyped-def]
-    """Set the wrenches of the laws in a substep, which begins and ends at shares of an interval.
-
-    ``after`` it, bring what they remember up to date instead.
-    """
-    for i in range(width):
-        p, t = block.proposal[i], block.transition[i]
-        h = min(block.first[i] + ahead, batch.inputs.shape[1] - 1)
-        get_states(block.bodies, i, block.states)
-        act(
-            block.states, batch.inputs[t, h], laws_of(batch, p), begin, end, block.acted,
-            block.remembered[i], block.held[i], after,
-        )  # fmt: skip
-        for slot in range(0 if after else batch.held):
-            block.held[i, 0, slot] += step * block.held[i, 1, slot]
-        for k in range(0 if after else len(block.states)):
-            wrench = block.acted[k]
-            set_wrench(block.bodies[k], i, wrench[6], wrench[7], wrench[8])
-
-
-@compiled
-def add_states(block, items, ahead, weight, first_level, out):  # type: ignore[no-untyped-def]
-    """Add the weighted states at the end of an interval to the predictions of the items."""
-    for i in range(len(items)):
-        h = block.first[i] + ahead
-        if block.touched[i]:
-            block.until[i] = min(block.until[i], h)
-        if h < block.until[i]:
-            get_states(block.bodies, i, block.states)
-            for k in range(len(block.states)):
-                for d in range(6):
-                    total = 0.0 if first_level else out[items[i], h, k, d]
-                    out[items[i], h, k, d] = total + weight * block.states[k, d]
-
-
 @compiled
 def rollout(wheels, still, batch, items, begins, out):  # type: ignore[no-untyped-def]
     """Predict ``items`` as `compiled.rollout` does, but for intervals that the engine must predict.
@@ -425,35 +297,98 @@ def rollout(wheels, still, batch, items, begins, out):  # type: ignore[no-untype
     ``begins``, shape (item,), are their first intervals; they become those in which a body comes
     near an obstacle or diverges, H where none does.
     """
-    moving, acting = len(still.radii), len(batch.commands) + len(batch.forces) > 0
-    block = block_of(moving, batch)
-    bodies = block.bodies
+    rows, discs = batch.given[0], batch.given[2]
+    start, inputs = batch.start, batch.inputs
+    n, horizon, moving = len(inputs), inputs.shape[1], len(still.radii)
+    timed = rows.shape[1] > 1
+    acting = len(batch.commands) + len(batch.forces) > 0
+    bodies = np.zeros((moving, BLOCK * len(BODY)))
+    own_discs = np.zeros((BLOCK, discs.shape[1], 3))
+    touched = np.zeros(BLOCK, dtype=np.bool_)
+    proposal, transition, first, until = np.zeros((4, BLOCK), dtype=np.int64)
+    states, acted = np.empty((moving, 6)), np.zeros((moving + MORE, ACTED))
+    memory, at = np.zeros((2, batch.slots)), np.full(2, -1)
+    remembered, held = np.zeros((BLOCK, batch.slots)), np.zeros((BLOCK, 2, batch.held))
     for begin in range(0, len(items), BLOCK):
-        width, longest = fill(block, batch, items, begins, begin)
+        width = min(BLOCK, len(items) - begin)
+        longest = 0
+        for i in range(BLOCK):
+            place = begin + min(i, width - 1)  # the rest of a block repeats the last
+            item, first[i], until[i] = items[place], begins[place], horizon
+            proposal[i], transition[i] = item // n, item % n
+            longest = max(longest, horizon - first[i])
+            for j in range(discs.shape[1]):
+                for d in range(3):
+                    own_discs[i, j, d] = discs[proposal[i], j, d]
         for level in range(len(batch.counts)):
             substeps, weight = batch.counts[level], batch.weights[level]
             step = batch.time_step / substeps
             bodies[:] = 0.0
-            block.touched[:] = False
+            touched[:] = False
             shifted = False
             for ahead in range(longest):
-                shifted |= begin_interval(block, wheels, still, batch, ahead, step, out)
-                if ahead == 0 and batch.slots + batch.held > 0:
-                    begin_memories(block, batch, width)
+                for k in range(moving):
+                    body, wheel = bodies[k], wheels.under[k]
+                    for i in range(BLOCK):
+                        p, t, h = proposal[i], transition[i], min(first[i] + ahead, horizon - 1)
+                        if timed or ahead == 0:
+                            row = rows[p, t * horizon + h if timed else 0, k]
+                            if ahead == 0:
+                                for d in range(6):
+                                    states[k, d] = start[p if len(start) > 1 else 0, t, k, d]
+                                    if h > 0:
+                                        states[k, d] = out[p * n + t, h - 1, k, d]
+                            else:
+                                get_state(body, i, states, k)
+                            shifted |= set_body(body, i, row, wheel, still.normal_gravity, step)
+                            set_state(body, i, states, k)
+                        else:
+                            align(body, i)
+                        force_x, force_y = inputs[t, h, k, 0], inputs[t, h, k, 1]
+                        set_wrench(body, i, force_x, force_y, inputs[t, h, k, 2])
+                for i in range(width if ahead == 0 and batch.slots + batch.held > 0 else 0):
+                    p, t = proposal[i], transition[i]
+                    for k in range(moving):
+                        get_state(bodies[k], i, states, k)
+                    laws = laws_of(batch, p)
+                    begin_laws(batch, laws, p, t, first[i], states, acted, memory, held[i], at)
+                    remembered[i] = memory[1]
                 for s in range(substeps):
                     if acting:
-                        now, after = s / substeps, (s + 1) / substeps
-                        act_on(block, batch, width, ahead, now, after, step, False)
+                        for i in range(width):
+                            p, t, h = proposal[i], transition[i], min(first[i] + ahead, horizon - 1)
+                            for k in range(moving):
+                                get_state(bodies[k], i, states, k)
+                            act(
+                                states, inputs[t, h], laws_of(batch, p), s / substeps,
+                                (s + 1) / substeps, acted, remembered[i], held[i],
+                            )  # fmt: skip
+                            for slot in range(batch.held):
+                                held[i, 0, slot] += step * held[i, 1, slot]
+                            for k in range(moving):
+                                set_wrench(bodies[k], i, acted[k, 6], acted[k, 7], acted[k, 8])
                     if shifted:
                         for k in range(moving):
                             lever(bodies[k])
                     substep(bodies, wheels, still.gravity, step)
                     for k in range(moving):
-                        lose(bodies[k], still, block.touched)
+                        lose(bodies[k], still, touched)
                     if still.watched:
-                        watch(bodies, still, block.discs, block.touched)
-                if batch.slots > 0:
-                    act_on(block, batch, width, ahead, LATE, 1.0, step, True)
-                add_states(block, items[begin : begin + width], ahead, weight, level == 0, out)
+                        watch(bodies, still, own_discs, touched)
+                for i in range(width if batch.slots > 0 else 0):
+                    p, t, h = proposal[i], transition[i], min(first[i] + ahead, horizon - 1)
+                    for k in range(moving):
+                        get_state(bodies[k], i, states, k)
+                    laws = laws_of(batch, p)
+                    act(states, inputs[t, h], laws, LATE, 1.0, acted, remembered[i], held[i], True)
+                for i in range(width):
+                    item, h = items[begin + i], first[i] + ahead
+                    if touched[i]:
+                        until[i] = min(until[i], h)
+                    for k in range(moving if h < until[i] else 0):
+                        get_state(bodies[k], i, states, k)
+                        for d in range(6):
+                            total = out[item, h, k, d] if level else 0.0
+                            out[item, h, k, d] = total + weight * states[k, d]
         for i in range(width):
-            begins[begin + i] = block.until[i]
+            begins[begin + i] = until[i]
