@@ -394,8 +394,9 @@ def _tail_score(mode: Mode, attached: Attached, test: ScoreTest) -> Signature:
     polynomial over 4, of variance 3/2.
     """
     problem = mode.problem
-    filtered = is_filtered(problem)
-    seen = problem.likelihood.noise.seen if filtered else problem.observations.measured
+    seen = problem.observations.measured
+    if is_filtered(problem):
+        seen = problem.likelihood.noise.seen
     whitened = test.residual[: seen.size].reshape(seen.shape)
     # coordinates that never move have no noise, and would make all others look heavy-tailed
     moving = seen & (np.abs(whitened).max(axis=0) > VISIBLE)

@@ -25,6 +25,7 @@ from pbrl_ppl.likelihood import LikelihoodT, Problem, in_pieces, is_filtered, is
 from pbrl_ppl.modes import (
     MOST_GROWTH,
     Mode,
+    SimulatedMode,
     corrected,
     filtered_mode,
     find_mode,
