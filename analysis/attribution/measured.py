@@ -20,9 +20,8 @@ from running import sources
 import pbrl_ppl as pp
 from attribution.fitted_initial_states import forecast_errors
 from pbrl_ppl.criticism import Loop, close_loop
-from pbrl_ppl.criticism.forecast import forecast
-from pbrl_ppl.criticism.held_out import HeldOut
-from pbrl_ppl.criticism.recordings import checked_histories
+from pbrl_ppl.criticism.held_out import HeldOut, forecast
+from pbrl_ppl.criticism.refinement import checked_histories
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import trajectory_mode
 from pbrl_ppl.physics import Physics

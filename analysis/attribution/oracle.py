@@ -12,8 +12,7 @@ from attribution.bodies import mh
 from attribution.cases import OUTSIDE, Case
 from attribution.outside import OUTSIDE_EFFECTS, parameters_of
 from attribution.sizes import STRONGEST
-from pbrl_ppl.criticism.forecast import forecast
-from pbrl_ppl.criticism.held_out import HeldOut, longest_rollout, rollout_horizon
+from pbrl_ppl.criticism.held_out import HeldOut, forecast, longest_rollout, rollout_horizon
 from pbrl_ppl.criticism.refinement import with_enough_substeps
 from pbrl_ppl.effects import Attached
 from pbrl_ppl.likelihood import Problem, bodies_acceleration

@@ -9,4 +9,4 @@ from .agent import TrueModelAgent as TrueModelAgent
 from .agent import act as act
 from .pbrl import LibraryAgent as LibraryAgent
 from .pbrl import PBRLAgent as PBRLAgent
-from .revision import Revision as Revision
+from .pbrl import Revision as Revision

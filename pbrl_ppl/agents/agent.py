@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Unpack, final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pbrl_ppl.agents.revision import Revision
+from pbrl_ppl.agents.pbrl import Revision
 from pbrl_ppl.effects import Attached, Effect
 from pbrl_ppl.errors import GoalError
 from pbrl_ppl.history import History, from_segments

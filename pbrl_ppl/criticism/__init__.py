@@ -10,7 +10,7 @@ from .criteria import DEFAULT as DEFAULT
 from .criteria import Criteria as Criteria
 from .dependence import QUANTITIES as QUANTITIES
 from .dependence import recorded_quantities as recorded_quantities
-from .forecast import whole_rollouts as whole_rollouts
+from .held_out import whole_rollouts as whole_rollouts
 from .loop import ADEQUATE as ADEQUATE
 from .loop import EFFECTS_ADDED as EFFECTS_ADDED
 from .loop import FILES as FILES

@@ -21,8 +21,7 @@ from pbrl_ppl.criticism.misfit import (
     with_negligible_acceleration,
 )
 from pbrl_ppl.criticism.prior_check import informative_horizon, prior_predictive_check
-from pbrl_ppl.criticism.recordings import checked_histories, outliers
-from pbrl_ppl.criticism.refinement import declared_mode, shift
+from pbrl_ppl.criticism.refinement import checked_histories, declared_mode, outliers, shift
 from pbrl_ppl.criticism.results import (
     NOTHING_RECORDED,
     Acceleration,

@@ -1,22 +1,248 @@
-"""Held-out errors: log predictive density, forecasts, and the noise floor."""
+"""Forecasts, and held-out errors: log predictive density, simulations, and the noise floor."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import logsumexp
 
-from pbrl_ppl.criticism.forecast import forecast, whole_rollouts
 from pbrl_ppl.criticism.results import Errors, Rollout
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History, longest_gap
-from pbrl_ppl.likelihood import FilteredProblem, along_trajectories, in_pieces, observed_coordinates
+from pbrl_ppl.likelihood import (
+    FilteredProblem,
+    TrajectoryNoise,
+    along_trajectories,
+    in_pieces,
+    observed_coordinates,
+)
 from pbrl_ppl.modes import MOST_GROWTH, FilteredMode, fit_pieces, growth
 from pbrl_ppl.posterior import Fit
 from pbrl_ppl.scene import Scene, motion_time, state_sizes
-from pbrl_ppl.state import STATE, STATE_UNITS, THETA, Floats
+from pbrl_ppl.state import STATE, STATE_UNITS, THETA, Floats, Ints
+
+#: Rows after which a filter's covariance is in steady state.
+_STEADY_STATE_ROWS = 5
+
+
+@dataclass(frozen=True, eq=False)
+class Forecast:
+    """Errors at the end of forecasts, and their size under noise alone.
+
+    Parameters
+    ----------
+    error : ndarray
+        Measured minus predicted, shape (start, cell), SI units; NaN where not measured, infinite
+        where the prediction diverges.
+    variance : ndarray
+        Expected square of the error under measurement noise, shape (start, cell).
+    motion : ndarray
+        Measured change over the forecast, shape (start, cell), SI units; NaN where not measured.
+    dimension : ndarray of int
+        State dimension of each cell, shape (cell,).
+    """
+
+    error: Floats
+    variance: Floats
+    motion: Floats
+    dimension: Ints
+
+    def rmse(self) -> dict[str, float]:
+        """Return the root mean square error of each measured state dimension, in its unit."""
+        return self._by_dimension(self.error**2)
+
+    def floor(self) -> dict[str, float]:
+        """Return the same for the noise alone."""
+        return self._by_dimension(np.where(np.isnan(self.error), np.nan, self.variance))
+
+    def _by_dimension(self, square: Floats) -> dict[str, float]:
+        """Return root mean squares by state dimension."""
+        result = {}
+        for d in np.unique(self.dimension):
+            columns = square[:, self.dimension == d]
+            if not np.isnan(columns).all():
+                result[STATE[d]] = float(np.sqrt(np.nanmean(columns)))
+        return result
+
+
+def filtered_states(problem: FilteredProblem, phi: Floats, sigma: Floats) -> Floats:
+    """Return the filtered states, shape (trajectory, time, body, 6), SI units."""
+    noise = problem.likelihood.noise
+    coordinates, segments = noise.coordinates, problem.segments
+    residual = coordinates.of_residual(problem.residual(phi))
+    deviation = noise.filtered(residual[None], sigma)[1][0]
+    states = problem.data.smoothed_states.copy()
+    flat = states.reshape(*states.shape[:2], -1)
+    flat[segments.trajectory[:, None], segments.step[:, None] + 1, coordinates.places] += deviation
+    # the first row has no earlier one: it is as measured, or as smoothed over the next rows
+    few = replace(noise, seen=noise.seen & (segments.step < _STEADY_STATE_ROWS)[:, None])
+    hidden = (noise.initial_variance > 0).any(axis=1, keepdims=True)
+    first = np.where(hidden, few.smoothed(residual, sigma)[0], noise.begin)[noise.first]
+    flat[segments.trajectory[noise.first, None], 0, coordinates.places] += first
+    return coordinates.completed(problem.scene, states)
+
+
+def rollout(problem: FilteredProblem, phi: Floats, start: Floats, inputs: Floats) -> Floats:
+    """Return predicted states after each interval, NaN from where a prediction diverges.
+
+    Parameters
+    ----------
+    problem : FilteredProblem
+        A problem of whole trajectories.
+    phi : ndarray
+        Shape (p,).
+    start : ndarray
+        Filtered states, shape (n, body, 6), SI units: not finite where the filter diverges.
+    inputs : ndarray
+        Inputs of the intervals, shape (n, H, body, 3 or 9).
+
+    Returns
+    -------
+    ndarray
+        Shape (n, H, body, 6), SI units.
+    """
+    states = np.full((*inputs.shape[:2], *start.shape[1:]), np.nan)
+    finite = np.isfinite(start).all(axis=(1, 2))
+    states[finite] = problem.physics.one_world(phi, start[finite], inputs[finite])
+    states[~np.isfinite(states)] = np.nan
+    return states
+
+
+def whole_rollouts(problem: FilteredProblem, phi: Floats, sigma: Floats) -> dict[int, Floats]:
+    """Predict whole trajectories, each from its filtered first state.
+
+    That state is as measured, or fitted to the first rows where its velocities were not measured.
+
+    Returns
+    -------
+    dict of int to ndarray
+        By trajectory: predicted states from the first one on, shape (time, body, 6), SI units; NaN
+        from where the prediction diverges.
+    """
+    noise, segments = problem.likelihood.noise, problem.segments
+    begins = np.flatnonzero(noise.first)
+    lengths = np.diff(np.append(begins, segments.n))
+    trajectory = segments.trajectory[begins]
+    start = filtered_states(problem, phi, sigma)[trajectory, 0]
+    # shorter trajectories repeat their last command, and what follows is left out
+    steps = np.minimum(np.arange(lengths.max()), lengths[:, None] - 1)
+    inputs = problem.inputs[begins[:, None] + steps, 0]
+    states = rollout(problem, phi, start, inputs)
+    for i in np.flatnonzero(~np.isfinite(states).all(axis=(1, 2, 3))):
+        states[i] = _finite_part(problem, phi, start[i : i + 1], inputs[i : i + 1])
+    states = np.concatenate([start[:, None], states], axis=1)
+    whole = zip(trajectory.tolist(), states, lengths.tolist(), strict=True)
+    return {which: paths[: length + 1] for which, paths, length in whole}
+
+
+def _finite_part(problem: FilteredProblem, phi: Floats, start: Floats, inputs: Floats) -> Floats:
+    """Return a prediction that diverges up to there, shape (H, body, 6), then NaN.
+
+    The engine returns none of it: the longest prediction that it returns is found by bisection.
+    """
+    low, high = 0, inputs.shape[1]
+    result = np.full((high, *start.shape[1:]), np.nan)
+    while high - low > 1:
+        middle = (low + high) // 2
+        states = rollout(problem, phi, start, inputs[:, :middle])[0]
+        if np.isfinite(states).all():
+            low, result[:middle] = middle, states
+        else:
+            high = middle
+    return result
+
+
+def forecast(
+    problem: FilteredProblem,
+    phi: Floats,
+    sigma: Floats,
+    intervals: int,
+    *,
+    allowed: Floats | None = None,
+) -> Forecast:
+    """Predict several intervals from filtered states all along the trajectories.
+
+    Parameters
+    ----------
+    problem : FilteredProblem
+        A problem of whole trajectories.
+    phi, sigma : ndarray
+        Parameters and noise parameters, shapes (p,) and (parameter,).
+    intervals : int
+        Length of a forecast.
+    allowed : ndarray, optional
+        Constant accelerations that count as noise in the expected square, shape (velocity,),
+        m/s^2 and rad/s^2.
+    """
+    noise = problem.likelihood.noise
+    coordinates, segments = noise.coordinates, problem.segments
+    begins = np.flatnonzero(noise.first)
+    lengths = np.diff(np.append(begins, segments.n))
+    starts = []
+    for begin, length in zip(begins, lengths, strict=True):
+        if length >= intervals:
+            first = min(_STEADY_STATE_ROWS, length - intervals)
+            rows = begin + np.arange(first, length - intervals + 1)
+            measured = noise.seen[rows + intervals - 1].any(axis=1)
+            starts.append(rows[measured][:: max(1, intervals // 2)])
+    at = np.concatenate(starts) if starts else np.zeros(0, dtype=np.intp)
+    if not len(at):
+        none = np.zeros((0, len(coordinates.places)))
+        return Forecast(none, none, none, coordinates.places % len(STATE))
+    trajectory, step = segments.trajectory[at], segments.step[at]
+    every = at[:, None] + np.arange(intervals)
+    states = filtered_states(problem, phi, sigma)[trajectory, step]
+    inputs = problem.inputs[every, 0]
+    ends = coordinates.of(rollout(problem, phi, states, inputs)[:, -1])
+    observed = problem.data.history.dataset["observed"].to_numpy()
+    measured_ends = coordinates.of(observed[trajectory, step + intervals])
+    error = coordinates.wrapped(measured_ends - ends)
+    error[np.isfinite(measured_ends) & np.isnan(ends)] = np.inf
+    motion = measured_ends - coordinates.of(states)
+    covariance = _spread(noise, sigma, at, step)
+    free, touching = coordinates.steps(sigma)
+    contact = touching - free  # uncertainty of how bodies part
+    pushes = np.zeros((len(coordinates.places), 0))
+    if allowed is not None:
+        rate = coordinates.pushed[coordinates.always] - len(coordinates.sensors)
+        pushes = (coordinates.push[coordinates.always] * allowed[rate][:, None]).T
+    pushed = np.zeros((len(at), *pushes.shape))
+    for i in range(intervals):
+        slope = noise.slope[every[:, i]]
+        covariance = slope @ covariance @ slope.transpose(0, 2, 1)
+        covariance = covariance + noise.touching[every[:, i], None, None] * contact
+        pushed = slope @ pushed + pushes
+    variance = np.diagonal(covariance, axis1=1, axis2=2) + coordinates.errors(sigma) ** 2
+    variance = variance + (pushed**2).sum(axis=2)
+    return Forecast(error, variance, motion, coordinates.places % len(STATE))
+
+
+def _spread(noise: TrajectoryNoise, sigma: Floats, at: Ints, step: Ints) -> Floats:
+    """Return the covariance of filtered states before transitions, shape (start, cell, cell)."""
+    after = noise.covariance(sigma)[at - 1]
+    for i in np.flatnonzero(step == 0):
+        after[i] = _first_spread(noise, sigma, int(at[i]))
+    return after
+
+
+def _first_spread(noise: TrajectoryNoise, sigma: Floats, first: int) -> Floats:
+    """Return the covariance of a trajectory's first filtered state, shape (cell, cell)."""
+    error = noise.coordinates.errors(sigma)
+    initial_variance = noise.initial_variance[first]
+    if not initial_variance.any():
+        return np.diag(error**2)
+    # the information of the first rows, with no process noise between them
+    scale = np.where(initial_variance > 0, np.sqrt(initial_variance), error)
+    information, way = np.eye(len(scale)), np.diag(scale)
+    for k in range(first, min(first + _STEADY_STATE_ROWS, len(noise.first))):
+        if k > first and noise.first[k]:
+            break
+        way = noise.slope[k] @ way
+        seen = way[noise.seen[k]] / error[noise.seen[k], None]
+        information += seen.T @ seen
+    return np.asarray(scale[:, None] * np.linalg.inv(information) * scale)
 
 
 def rollout_horizon(history: History, scene: Scene, motion_times: float = 4.0) -> int:

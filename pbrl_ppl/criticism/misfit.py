@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from pbrl_ppl.criticism.correlation import correlation_tests
 from pbrl_ppl.criticism.criteria import Criteria
 from pbrl_ppl.criticism.dependence import find_dependence
-from pbrl_ppl.criticism.forecast import forecast
+from pbrl_ppl.criticism.held_out import forecast
 from pbrl_ppl.criticism.results import (
     NOTHING_RECORDED,
     Correlations,

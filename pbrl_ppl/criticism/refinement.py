@@ -1,21 +1,165 @@
-"""Mode of a declared model: its recording checked, with enough engine steps."""
+"""Mode of a declared model: its recordings checked and cleaned, with enough engine steps."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 import numpy as np
+from scipy.stats import norm
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
-from pbrl_ppl.criticism.recordings import checked_histories
 from pbrl_ppl.criticism.results import Stage
-from pbrl_ppl.criticism.unexplained import unexplained_acceleration
+from pbrl_ppl.criticism.unexplained import unexplained_acceleration, without_acceleration
 from pbrl_ppl.effects import Attached, Effect, attach
-from pbrl_ppl.history import History, with_units
-from pbrl_ppl.likelihood import Problem, single_transitions
+from pbrl_ppl.errors import HistoryError
+from pbrl_ppl.history import (
+    History,
+    UnusedVelocity,
+    bad_frames,
+    measured_alone,
+    unused_velocities,
+    with_units,
+    without_bad_frames,
+)
+from pbrl_ppl.likelihood import Problem, check_moves, observed_coordinates, single_transitions
 from pbrl_ppl.modes import FilteredMode, find_mode, nearby_mode, trajectory_mode
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Scene, check_substeps
+from pbrl_ppl.state import STATE, Floats, Ints
+
+
+def checked_histories(
+    scene: Scene, train: History, test: History
+) -> tuple[History, History, tuple[UnusedVelocity, ...], tuple[str, ...]]:
+    """Return both histories without unused velocities and single bad frames, and name those.
+
+    Parameters
+    ----------
+    scene : Scene
+        The declared scene.
+    train, test : History
+        The training and the test history.
+
+    Returns
+    -------
+    train, test : History
+        Without them.
+    unused : tuple of UnusedVelocity
+        Velocity columns of the training history that are not used, in either.
+    bad : tuple of str
+        A sentence for each single bad frame that is left out.
+
+    Raises
+    ------
+    HistoryError
+        If they have other bodies, another time step or other measured dimensions, or nothing
+        moves in the training history.
+    """
+    names = [body.name for body in scene.moving]
+    for which, history in (("training", train), ("test", test)):
+        if list(history.bodies) != names:
+            raise HistoryError(
+                f"{which} history: it is of {', '.join(history.bodies)}, the scene has"
+                f" {', '.join(names)}; load it with this scene"
+            )
+        step = float(history.dataset.attrs["time_step"])
+        if not np.isclose(step, scene.time_step, atol=0.0):
+            raise HistoryError(
+                f"{which} history: it has a row each {step:g} s, the scene each"
+                f" {scene.time_step:g} s; load it with this scene"
+            )
+    same = test is train
+    # a bad frame makes positions look noisy, and a measured velocity as if they predicted it
+    clear = np.flatnonzero(~bad_frames(train).any(axis=(1, 2, 3)))
+    most = 2 * len(clear) >= train.n_trajectories
+    unused = unused_velocities(train.select(clear) if most else train)
+    train, test = measured_alone(train, unused), measured_alone(test, unused)
+    train, bad = without_bad_frames(train)
+    test, more = without_bad_frames(test)
+    check_moves(observed_coordinates(scene, train), scene)
+    known, tested = (
+        np.isfinite(history.dataset["observed"].to_numpy()).any(axis=(0, 1))
+        for history in (train, test)
+    )
+    if (tested & ~known).any():
+        missing = ", ".join(
+            f"{STATE[d]} of {scene.moving[body].name}" for body, d in np.argwhere(tested & ~known)
+        )
+        raise HistoryError(
+            f"test history measures {missing}, which the training history does"
+            " not; leave those columns empty, or measure them in both"
+        )
+    held_out = [] if same else [f"held out: {frame}" for frame in more]
+    return train, test, unused, (*map(str, bad), *held_out)
+
+
+def outliers(
+    mode: FilteredMode,
+    criteria: Criteria = DEFAULT,
+    *,
+    errors_off: float = 4.0,
+    neighbours: float = 2.0,
+    most: float = 0.05,
+    least_measurements: int = 12,
+) -> Floats:
+    """Return errors of single measurements that a fitted model and all others contradict.
+
+    They are judged by the residual given all other measurements (auxiliary residuals), without any
+    unexplained acceleration, which would follow them, and in units of the median residual: where
+    physics is missing most residuals are large, and none is far off.
+
+    Parameters
+    ----------
+    mode : FilteredMode
+        Fitted to whole trajectories.
+    criteria : Criteria
+        How far off a measurement is to be left out.
+    errors_off : float
+        It is this many measurement errors from the smoothed state, which it attracts.
+    neighbours : float
+        It is this many times as far off as its neighbours, which an event that lasts moves, too.
+    most : float
+        If a larger share of a coordinate's measurements is far off, none is left out.
+    least_measurements : int
+        Measurements of a coordinate that are needed to call one far off.
+
+    Returns
+    -------
+    ndarray
+        Measured minus smoothed, shape (trajectory, time, body, 6), SI units; NaN elsewhere.
+    """
+    problem = mode.problem
+    noise, segments = problem.likelihood.noise, problem.segments
+    residual = noise.coordinates.of_residual(problem.residual(mode.phi))
+    sigma = without_acceleration(mode).sigma
+    both, error = noise.auxiliary(residual, sigma), noise.coordinates.errors(sigma)
+    size = np.abs(np.concatenate(both))  # of rows that transitions end at, then of first rows
+    size[size == 0.0] = np.nan
+    off = np.concatenate([noise.measured, noise.begin])
+    trajectory = np.tile(segments.trajectory, 2)
+    row = np.concatenate([segments.step + 1, segments.step])
+    observed = problem.data.history.dataset["observed"]
+    errors = np.full(observed.shape, np.nan)
+    flat = errors.reshape(*errors.shape[:2], -1)
+    for cell, place in enumerate(noise.coordinates.places):
+        sizes = size[:, cell]
+        count = np.isfinite(sizes).sum()
+        if noise.coordinates.sensor[cell] < 0 or count < least_measurements:
+            continue
+        far = sizes > criteria.outlier_deviations * np.nanmedian(sizes) / norm.isf(0.25)
+        far &= np.abs(off[:, cell]) > errors_off * error[cell]
+        far &= sizes > neighbours * np.nan_to_num(_beside(sizes, trajectory, row))
+        if 0 < far.sum() <= max(most * count, 1):
+            flat[trajectory[far], row[far], place] = off[far, cell]
+    return errors
+
+
+def _beside(size: Floats, trajectory: Ints, row: Ints) -> Floats:
+    """Return the larger residual of the rows before and after, shape of ``size``; NaN if none."""
+    table = np.full((trajectory.max() + 1, row.max() + 3), np.nan)
+    some = np.isfinite(size)
+    table[trajectory[some], row[some] + 1] = size[some]
+    return np.fmax(table[trajectory, row], table[trajectory, row + 2])
 
 
 def checked_mode(

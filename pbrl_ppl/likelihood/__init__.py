@@ -28,6 +28,8 @@ from .log_posterior import log_posterior as log_posterior
 from .log_posterior import log_prior as log_prior
 from .log_posterior import noise_law as noise_law
 from .log_posterior import noise_prior_slope as noise_prior_slope
+from .log_posterior import simulated_trajectories as simulated_trajectories
+from .log_posterior import with_measurements as with_measurements
 from .output_error import OutputErrorLikelihood as OutputErrorLikelihood
 from .output_error import SimulatedProblem as SimulatedProblem
 from .output_error import in_pieces as in_pieces
@@ -47,8 +49,6 @@ from .problem import tail_places as tail_places
 from .problem import variable_coords as variable_coords
 from .problem import variable_dims as variable_dims
 from .problem import with_defect as with_defect
-from .simulation import simulated_trajectories as simulated_trajectories
-from .simulation import with_measurements as with_measurements
 from .smoothing import along_trajectories as along_trajectories
 from .smoothing import bodies_acceleration as bodies_acceleration
 from .smoothing import linearised as linearised

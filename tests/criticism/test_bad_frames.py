@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from pbrl_ppl.criticism.attribution import criticise
-from pbrl_ppl.criticism.recordings import checked_histories
+from pbrl_ppl.criticism.refinement import checked_histories
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.history import History, without_bad_frames
 from pbrl_ppl.posterior import recorded, recording

@@ -7,7 +7,7 @@ import pytest
 
 from pbrl_ppl.criticism import close_loop
 from pbrl_ppl.criticism.criteria import DEFAULT
-from pbrl_ppl.criticism.forecast import forecast
+from pbrl_ppl.criticism.held_out import forecast
 from pbrl_ppl.criticism.misfit import held_out_forecasts
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.effects import candidates, catalogue

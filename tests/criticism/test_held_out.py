@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from pbrl_ppl.criticism import close_loop
-from pbrl_ppl.criticism.forecast import forecast
-from pbrl_ppl.criticism.held_out import HeldOut
+from pbrl_ppl.criticism.held_out import HeldOut, forecast
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History

@@ -17,7 +17,7 @@ import pbrl_ppl as pp
 from pbrl_ppl.criticism import close_loop
 from pbrl_ppl.criticism import closing as loop_module
 from pbrl_ppl.criticism.criteria import DEFAULT
-from pbrl_ppl.criticism.recordings import checked_histories
+from pbrl_ppl.criticism.refinement import checked_histories
 from pbrl_ppl.errors import (
     ConvergenceWarning,
     EffectError,
