@@ -10,7 +10,7 @@ from pbrl_ppl.effects import catalogue
 from pbrl_ppl.history import History, without_bad_frames
 from pbrl_ppl.posterior import recorded, recording
 from pbrl_ppl.reporting import in_brief, render
-from tests.helpers.free_puck import DISC, fitted
+from tests.helpers.free_puck import DISC, Disc, fitted, searched
 from tests.helpers.histories import simulated_history
 from tests.helpers.made_up import made_up
 from tests.helpers.places import MODELS, load
@@ -66,6 +66,23 @@ def test_one_bad_frame_changes_no_mode() -> None:
     whole, left_out = fitted(DISC, puck(1, -1)), fitted(DISC, without_bad_frames(puck(1, 8))[0])
     spread = np.sqrt(np.diagonal(whole.covariance))
     assert (np.abs(left_out.phi - whole.phi) < spread).all()
+
+
+def test_laws_are_refitted_by_simulations_without_the_frames() -> None:
+    """A frame less changes a law within its standard error, and not the likelihood."""
+    rng = np.random.default_rng(4)
+    train = History.from_dataframe(Disc(trajectories=6, intervals=12, drag=0.8).frame(rng), DISC)
+    found = searched(fitted(DISC, train), [one for one in catalogue if one.name == "linear_drag"])
+    assert len(found.laws) == 1
+    observed = train.dataset["observed"].copy()
+    observed[1, 5, 0, 0] = np.nan
+    again = found.on(History(train.dataset.assign(observed=observed)))
+    for mode in (again.declared, again.after):
+        assert mode.problem.likelihood.name == "simulation"
+    seen = [each.problem.observations.measured.sum() for each in (found.after, again.after)]
+    assert seen[0] == seen[1] + 1
+    off = again.after.phi - found.after.phi
+    assert (np.abs(off) < np.sqrt(np.diagonal(found.after.covariance))).all()
 
 
 def test_criticise_says_which() -> None:
