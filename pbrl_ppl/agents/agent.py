@@ -10,7 +10,6 @@ from typing import Any, ClassVar, Unpack, final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pbrl_ppl.agents.pbrl import Revision
 from pbrl_ppl.effects import Attached, Effect
 from pbrl_ppl.errors import GoalError
 from pbrl_ppl.history import History, from_segments
@@ -30,6 +29,41 @@ from pbrl_ppl.planning import (
 from pbrl_ppl.posterior import Idata, scene_of
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import WRENCH, Floats
+
+
+@dataclass(frozen=True)
+class Revision:
+    """Effect that an agent added to its model during an episode.
+
+    Parameters
+    ----------
+    attached : Attached
+        The effect, and the body that it acts on.
+    transitions : int
+        Number of transitions observed when it was first added.
+    nats : float
+        Log-evidence that is lost without it, less its price.
+    share : float
+        Share of the prediction error (root mean square) that it takes away.
+    not_separable_from : tuple of str
+        Effects that the data cannot separate from it.
+    """
+
+    attached: Attached
+    transitions: int
+    nats: float
+    share: float
+    not_separable_from: tuple[str, ...] = ()
+
+    @property
+    def effect(self) -> str:
+        """Return the name of the effect."""
+        return self.attached.effect.name
+
+    @property
+    def body(self) -> str:
+        """Return the name of the body."""
+        return self.attached.body
 
 
 @dataclass(frozen=True)

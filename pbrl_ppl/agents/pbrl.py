@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from itertools import combinations, compress
 from typing import Any, ClassVar, Unpack, final
@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Unpack, final
 import numpy as np
 import pandas as pd
 
-from pbrl_ppl.agents.agent import Agent, AgentOptions, Task
+from pbrl_ppl.agents.agent import Agent, AgentOptions, Revision, Task
 from pbrl_ppl.criticism import DEFAULT, Evidence, Search
 from pbrl_ppl.effects import Attached, Effect, Noise, Structure, attach, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
@@ -27,41 +27,6 @@ from pbrl_ppl.posterior import group
 from pbrl_ppl.sampling import sample, try_own_effects
 from pbrl_ppl.scene import Scene, body_sizes
 from pbrl_ppl.state import THETA, Bools, Floats, wrapped
-
-
-@dataclass(frozen=True)
-class Revision:
-    """Effect that an agent added to its model during an episode.
-
-    Parameters
-    ----------
-    attached : Attached
-        The effect, and the body that it acts on.
-    transitions : int
-        Number of transitions observed when it was first added.
-    nats : float
-        Log-evidence that is lost without it, less its price.
-    share : float
-        Share of the prediction error (root mean square) that it takes away.
-    not_separable_from : tuple of str
-        Effects that the data cannot separate from it.
-    """
-
-    attached: Attached
-    transitions: int
-    nats: float
-    share: float
-    not_separable_from: tuple[str, ...] = ()
-
-    @property
-    def effect(self) -> str:
-        """Return the name of the effect."""
-        return self.attached.effect.name
-
-    @property
-    def body(self) -> str:
-        """Return the name of the body."""
-        return self.attached.body
 
 
 def revise(

@@ -7,7 +7,7 @@ import pytest
 import pbrl_ppl as pp
 from pbrl_ppl.criticism.criteria import DEFAULT
 from pbrl_ppl.criticism.misfit import simulation_test
-from pbrl_ppl.reporting.scene_plots import held_out_motions
+from pbrl_ppl.reporting.motion import held_out_motions
 from pbrl_ppl.scene import Recording
 
 pytestmark = [pytest.mark.one_stack, pytest.mark.filterwarnings("ignore")]
