@@ -55,7 +55,7 @@ from pbrl_ppl.errors import (
     warn,
 )
 from pbrl_ppl.history import History, UnusedVelocity, with_units, without_measurements
-from pbrl_ppl.likelihood import Problem, single_transitions
+from pbrl_ppl.likelihood import Problem, is_simulated, single_transitions
 from pbrl_ppl.modes import (
     FilteredMode,
     Mode,
@@ -261,7 +261,7 @@ class _Model:
     @classmethod
     def of(cls, mode: Mode, innovations: FilteredMode, test: History, criteria: Criteria) -> _Model:
         """Test a mode's innovations, and linearise it along the test history."""
-        if not mode.problem.likelihood.simulated:  # single transitions
+        if not is_simulated(mode.problem):  # single transitions
             mode = innovations
         excess = unexplained_acceleration(innovations, criteria)
         return cls(mode, innovations, excess, HeldOut.of(innovations, test))

@@ -13,6 +13,7 @@ from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.criticism.search import with_effects
 from pbrl_ppl.effects import Attached, Effect, Noise
 from pbrl_ppl.errors import EffectError, PosteriorError
+from pbrl_ppl.likelihood import is_independent
 from pbrl_ppl.modes import FilteredMode, trajectory_mode
 from pbrl_ppl.posterior import Fit, Idata, PosteriorRecord, stored_fields
 from pbrl_ppl.scene import Scene
@@ -115,7 +116,7 @@ def posterior_mode(fit: Fit) -> FilteredMode:
         If the posterior is of single transitions.
     """
     problem = fit.problem.with_physics(threads=2)
-    if problem.likelihood.independent:
+    if is_independent(problem):
         raise PosteriorError(
             "posterior: it is of single transitions, which do not separate measurement noise from"
             " process noise; take after.nc of close_loop, or fit whole trajectories"

@@ -21,7 +21,14 @@ from pbrl_ppl.criticism.score import named_beside, rank_candidates
 from pbrl_ppl.criticism.subsets import Regression, Subset, best_subsets, worth
 from pbrl_ppl.effects import Attached, Noise, Structure
 from pbrl_ppl.history import History
-from pbrl_ppl.likelihood import LikelihoodT, Problem, in_pieces, is_filtered, is_simulated
+from pbrl_ppl.likelihood import (
+    LikelihoodT,
+    Problem,
+    in_pieces,
+    is_filtered,
+    is_independent,
+    is_simulated,
+)
 from pbrl_ppl.modes import (
     MOST_GROWTH,
     Mode,
@@ -323,7 +330,7 @@ class Search:
         HistoryError
             If no trajectory has three rows, or initial states can follow all that was measured.
         """
-        if mode.problem.likelihood.independent:
+        if is_independent(mode.problem):
             model, here, before, regression = self._at_length(_Model(mode))
             found = self._judged(mode, mode, model, regression, (here,), _alone(before))
             return replace(found, declared=mode)

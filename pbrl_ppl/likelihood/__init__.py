@@ -45,6 +45,7 @@ from .problem import Problem as Problem
 from .problem import corrected as corrected
 from .problem import degrees_of_freedom as degrees_of_freedom
 from .problem import is_filtered as is_filtered
+from .problem import is_independent as is_independent
 from .problem import tail_places as tail_places
 from .problem import variable_coords as variable_coords
 from .problem import variable_dims as variable_dims

@@ -43,16 +43,9 @@ class Likelihood(ABC):
     ----------
     name : str
         As users choose it; see :func:`pbrl_ppl.physics_model`.
-    independent, filtered, simulated : bool
-        Which of the three it is: transitions are independent given measured initial states (Eq.
-        11); trajectories are whitened by a filter; trajectories are simulated from latent initial
-        states.
     """
 
     name: ClassVar[str]
-    independent: ClassVar[bool] = False
-    filtered: ClassVar[bool] = False
-    simulated: ClassVar[bool] = False
 
     nu: float | None = None
     prior: NoisePrior | None = None
@@ -214,7 +207,6 @@ class TransitionLikelihood(Likelihood):
     """
 
     name: ClassVar[str] = "transitions"
-    independent: ClassVar[bool] = True
 
     scalar: bool = False
 
@@ -278,7 +270,6 @@ class TrajectoryLikelihood(Likelihood):
     """
 
     name: ClassVar[str] = "trajectories"
-    filtered: ClassVar[bool] = True
 
     noise: TrajectoryNoise
 

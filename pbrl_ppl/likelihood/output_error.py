@@ -165,7 +165,6 @@ class OutputErrorLikelihood(Likelihood):
     """
 
     name: ClassVar[str] = "simulation"
-    simulated: ClassVar[bool] = True
 
     initial_states: InitialStates
     tau: tuple[float, ...]

@@ -318,6 +318,11 @@ class Problem(Generic[LikelihoodT]):
 FilteredProblem = Problem[TrajectoryLikelihood]
 
 
+def is_independent(problem: Problem) -> TypeGuard[Problem[TransitionLikelihood]]:
+    """Return whether transitions are independent given measured initial states (Eq. 11)."""
+    return isinstance(problem.likelihood, TransitionLikelihood)
+
+
 def is_filtered(problem: Problem) -> TypeGuard[FilteredProblem]:
     """Return whether the problem's trajectories are filtered, with process noise."""
     return isinstance(problem.likelihood, TrajectoryLikelihood)
@@ -357,7 +362,7 @@ def variable_dims(problem: Problem) -> dict[str, tuple[str, ...]]:
         if problem.likelihood.scalar:
             dims[name] = ()
         else:
-            dims[name] = (_NOISE_DIMS[name] if problem.likelihood.filtered else "state",)
+            dims[name] = (_NOISE_DIMS[name] if is_filtered(problem) else "state",)
     return dims
 
 
@@ -371,7 +376,7 @@ def variable_coords(problem: Problem) -> dict[str, list[str] | list[int]]:
         "transition": list(range(problem.segments.n)),
         "step": list(range(1, problem.data.horizon + 1)),
     }
-    if problem.likelihood.filtered:
+    if is_filtered(problem):
         coords |= {
             _NOISE_DIMS[name]: list(names) for name, names in problem.noise_variables.items()
         }

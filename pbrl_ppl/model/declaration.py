@@ -18,6 +18,7 @@ from pbrl_ppl.likelihood import (
     NEXT_STATE_DIMS,
     START_DIMS,
     Problem,
+    is_filtered,
     variable_coords,
     variable_dims,
 )
@@ -148,7 +149,7 @@ def _noise(problem: Problem) -> TensorVariable:
     if problem.likelihood.scalar:
         scalar = pm.LogNormal("sigma", mu=np.log(median).mean(), sigma=spread)
         return pt.ones(len(median)) * scalar
-    if not problem.likelihood.filtered:
+    if not is_filtered(problem):
         return pm.LogNormal("sigma", mu=np.log(median), sigma=spread, dims="state")
     parts, mu = [pt.zeros(0)], np.log(median)
     for name, names in problem.noise_variables.items():

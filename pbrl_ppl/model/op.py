@@ -15,7 +15,7 @@ from pytensor.graph.op import Op
 from pytensor.link.numba.dispatch.basic import generate_fallback_impl, numba_funcify
 
 from pbrl_ppl.errors import ParameterError, SimulationError
-from pbrl_ppl.likelihood import Problem, Sensitivity
+from pbrl_ppl.likelihood import Problem, Sensitivity, is_filtered
 from pbrl_ppl.physics import Memory, Physics
 from pbrl_ppl.state import INPUT, WRENCH, Floats
 
@@ -231,8 +231,8 @@ class LogLikelihoodOp(_BlackBoxOp):
 
     def _residual(self, value: Floats, predicted: Floats) -> Floats:
         """Return residuals about the linearisation, and set the likelihood to the measurements."""
-        observations, likelihood = self.problem.observations, self.problem.likelihood
-        linearised = np.nan_to_num(observations.values) if likelihood.filtered else value
+        observations = self.problem.observations
+        linearised = np.nan_to_num(observations.values) if is_filtered(self.problem) else value
         deviation = observations.wrapped(value - linearised)
         self._likelihood = self._likelihood.measuring(deviation)  # kept, with its gains
         residual = observations.wrapped(linearised - predicted)

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import differential_evolution
 
 from pbrl_ppl.errors import FitError
-from pbrl_ppl.likelihood import LikelihoodT, Problem, estimate_sigma
+from pbrl_ppl.likelihood import LikelihoodT, Problem, estimate_sigma, is_filtered
 from pbrl_ppl.modes.laplace import ROUNDS, STALLED, LocalMode, Mode, canonical_wheels, climb, finish
 from pbrl_ppl.modes.noise import FAR_OFF, finite, gaussian_profile
 from pbrl_ppl.parameters import box, by_prior, inside, prior_draws
@@ -165,7 +165,7 @@ def _part(problem: Problem, transitions: int) -> Problem:
     history = problem.data.history
     share = transitions / max(problem.segments.n, 1)
     count = max(2, math.ceil(share * history.n_trajectories))
-    if problem.likelihood.filtered or count >= history.n_trajectories:
+    if is_filtered(problem) or count >= history.n_trajectories:
         return problem.coarse
     chosen = np.linspace(0, history.n_trajectories - 1, count).astype(int)
     part = problem.coarse.with_data(history=history.select(chosen))

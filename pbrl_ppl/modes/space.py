@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from scipy.special import expit
 
-from pbrl_ppl.likelihood import Problem, exponential, log_noise_prior
+from pbrl_ppl.likelihood import Problem, exponential, is_independent, log_noise_prior
 from pbrl_ppl.modes.laplace import Mode
 from pbrl_ppl.parameters import Prior, inside, nearest, symmetrised, wheels
 from pbrl_ppl.state import Bools, Floats, Ints, wrapped
@@ -132,7 +132,7 @@ class Space:
     def parts(self) -> tuple[Independent, ...]:
         """Independent parts; one where the likelihood mixes the bodies' residuals."""
         parts = self.problem.physics.simulator.parts
-        if not self.problem.likelihood.independent:
+        if not is_independent(self.problem):
             bodies = np.arange(len(self.problem.scene.moving))
             return (Independent(np.flatnonzero(~self.uninformed), bodies),)
         return tuple(
@@ -406,7 +406,7 @@ def _noise_gaussian(mode: Mode) -> tuple[Floats, Floats]:
     Shapes (free,) and (free, free).
     """
     problem = mode.problem
-    if not problem.likelihood.independent:
+    if not is_independent(problem):
         return mode.noise_gaussian()
     # the variance of log sigma is half the inverse of the number of measurements
     counts = problem.likelihood.pooled(problem.likelihood.counts(problem.observations))

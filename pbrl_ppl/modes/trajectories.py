@@ -13,6 +13,7 @@ from pbrl_ppl.likelihood import (
     along_trajectories,
     corrected,
     is_filtered,
+    is_simulated,
     log_posterior,
     single_transitions,
     smoothed,
@@ -251,8 +252,7 @@ def find_simulation_mode(problem: Problem, seed: int) -> SimulatedMode:
     Mode
         Result of :func:`simulation_mode`.
     """
-    likelihood = problem.likelihood
-    prior = likelihood.prior if likelihood.simulated else None
+    prior = problem.likelihood.prior if is_simulated(problem) else None
     return simulation_mode(find_trajectory_mode(problem, seed), prior)
 
 

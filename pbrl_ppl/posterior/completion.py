@@ -458,7 +458,7 @@ def _folded(problem: Problem, trace: Idata, seed: int | None) -> xr.Dataset:
 def _with_units(problem: Problem, posterior: xr.Dataset) -> xr.Dataset:
     units = {block.name: block.unit for block in problem.layout.blocks}
     units["sigma"] = "the unit of each state dimension"
-    if problem.likelihood.filtered:
+    if is_filtered(problem):
         units |= dict.fromkeys((ACCELERATION, CONTACT), "m/s^2, of omega rad/s^2")
     for name in units.keys() & set(posterior.data_vars):
         posterior[str(name)].attrs["units"] = units[str(name)]

@@ -23,6 +23,7 @@ from pbrl_ppl.likelihood import (
     along_trajectories,
     in_pieces,
     is_filtered,
+    is_independent,
     is_simulated,
     linearised,
     linearised_pieces,
@@ -228,7 +229,7 @@ def linearised_as(problem: Problem, idata: Idata) -> Problem:
             f"posterior: its likelihood is of {stored}, the model's of {kind}; make the model with"
             f" the likelihood {stored!r}"
         )
-    if problem.likelihood.simulated:
+    if is_simulated(problem):
         problem = in_pieces(problem, record.horizon, problem.data.smoothed_states)
     measured = group(idata, "observed_data")["next_state"].transpose(*NEXT_STATE_DIMS).to_numpy()
     if not np.array_equal(measured, problem.measured, equal_nan=True):
@@ -247,7 +248,7 @@ def linearised_as(problem: Problem, idata: Idata) -> Problem:
 
 def recording(problem: Problem) -> xr.Dataset:
     """Return the recording and linearisation of trajectories; empty for single transitions."""
-    if problem.likelihood.independent:
+    if is_independent(problem):
         return xr.Dataset()
     dataset = problem.data.history.dataset
     kept = dataset.rename(

@@ -33,6 +33,7 @@ from pbrl_ppl.likelihood import (
     TransitionLikelihood,
     declared_problem,
     is_filtered,
+    is_independent,
     simulated_trajectories,
     with_measurements,
 )
@@ -352,7 +353,7 @@ def draw_truths(
     from pbrl_ppl.model import build_model, prior_predictive_draws  # PyMC takes seconds to load
 
     model = build_model(design)
-    whole = not design.likelihood.independent
+    whole = not is_independent(design)
     names = [*(block.name for block in design.layout.blocks), *design.noise_variables]
     names += [] if whole else ["next_state"]
     total = n
@@ -423,7 +424,7 @@ def simulated(design: Problem, values: Floats) -> Problem:
         Next states, shape (transition, H, body, state), SI units; of whole trajectories all
         measured states, shape (trajectory, time, body, 6).
     """
-    if not design.likelihood.independent:
+    if not is_independent(design):
         measured = np.isfinite(design.data.history.dataset["observed"].to_numpy())
         return with_measurements(design, np.where(measured, values, np.nan))
     segments, observations = design.segments, design.observations

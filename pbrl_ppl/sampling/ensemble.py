@@ -14,6 +14,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.special import logsumexp
 
+from pbrl_ppl.likelihood import is_independent
 from pbrl_ppl.modes import Mode, Space
 from pbrl_ppl.state import Bools, Floats, Ints
 
@@ -284,7 +285,7 @@ class Ensemble:
             Whether step sizes follow acceptance rates.
         """
         rates = []
-        noise = self.noise * (5 if self.space.problem.likelihood.independent else 1)
+        noise = self.noise * (5 if is_independent(self.space.problem) else 1)
         for chosen in groups(self.space, len(self.q)):
             q, of_sweeps = self.q[chosen], []
             values = target.evaluate(q)

@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from pbrl_ppl.errors import FitError, MeetingWarning, warn
-from pbrl_ppl.likelihood import Problem, is_filtered
+from pbrl_ppl.likelihood import Problem, is_filtered, is_independent, is_simulated
 from pbrl_ppl.modes import (
     Mode,
     covariance_of,
@@ -260,7 +260,7 @@ def _drawn(
     job = _at_mode(job, start)
     trace = _run(job)
     gaussian = (METHODS["laplace"].run, METHODS["map"].run)
-    if problem.likelihood.simulated and method.run not in gaussian:
+    if is_simulated(problem) and method.run not in gaussian:
         trace = _with_robust_width(job, trace)
     return job, trace, ParameterPoint(job.at_mode.phi, job.at_mode.sigma)
 
@@ -270,7 +270,7 @@ def _at_mode(job: SamplerRun, start: Mode | None) -> SamplerRun:
     while True:
         problem = job.problem
         mode = start or _SEARCHES[problem.likelihood.name](problem, seed=job.seed)
-        if not mode.problem.likelihood.independent:
+        if not is_independent(mode.problem):
             if is_filtered_mode(mode) and mode.problem.likelihood.sensitivity is None:
                 mode = with_state_sensitivity(mode)
             problem = mode.problem  # linearised at the mode

@@ -20,6 +20,7 @@ from pbrl_ppl.likelihood import (
     Problem,
     along_trajectories,
     declared_problem,
+    is_filtered,
     single_transitions,
 )
 from pbrl_ppl.modes import systematic
@@ -338,7 +339,7 @@ def _weighted(
         weights, k = files.smoothed(log_weights)
     data = _with_data(idata, problem)
     changed = replace(record, together=tuple(problem.physics.together))
-    if problem.likelihood.filtered:
+    if is_filtered(problem):
         coordinates = files.recorded_coordinates(problem.scene, data["constant_data"])
         changed = replace(changed, cells=coordinates)
     more_noise = [label for label in changed.noise_labels if label not in problem.noise_labels]
