@@ -207,7 +207,8 @@ class PartedSimulator:
             part_physics = physics if len(parts) == 1 else physics.part(part)
             places = [labels.index(label) for label in part_physics.layout.labels]
             bodies = [names.index(body.name) for body in part_physics.scene.moving]
-            self.parts.append(Part(Simulator(part_physics), np.array(places), np.array(bodies)))
+            indices = np.array(places, dtype=int), np.array(bodies, dtype=int)
+            self.parts.append(Part(Simulator(part_physics), *indices))
 
     @property
     def steps(self) -> int:
