@@ -473,8 +473,7 @@ def test_the_command_fits_what_python_fits(options: list[str]) -> None:
         main([*fit, *options])
         scene = Scene.load("scene.toml")
         history = History.load("train.csv", scene)
-        # the seed is that of the search for the mode
-        settings = {} if options else {"likelihood": "trajectories", "seed": 1}
+        settings = {} if options else {"likelihood": "trajectories"}
         model = physics_model(scene, history, **settings)
         here = sampling.fit(model, seed=1, method="laplace", progress=False)
     there = load_posterior("puck.nc")
