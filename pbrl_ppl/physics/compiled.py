@@ -15,9 +15,10 @@ from pbrl_ppl.physics.laws import (
     MORE,
     WRENCHES,
     act,
-    begin_laws,
+    begin_held,
     bound,
     laws_of,
+    set_memory,
     states_before,
 )
 from pbrl_ppl.physics.properties import COLUMN
@@ -334,7 +335,7 @@ def _scratch_of(world, batch):  # type: ignore[no-untyped-def]
 
     They are states (body, 6), cos and sin of the wheels' angles on the bodies (wheel, 2), what acts
     (body + 4, 12), what laws remember (2, slot), where that was last (2,), and their own numbers
-    (2, slot): see `act` and `begin_laws`.
+    (2, slot): see `act` and `set_memory`.
     """
     k = len(world.bodies)
     return (
@@ -368,7 +369,8 @@ def _transition(  # type: ignore[no-untyped-def]
     still = world.still
     watch = len(still.obstacles) > 0 or k > 1
     place_bodies(fn, world, bodies, state)
-    begin_laws(batch, laws, p, t, begin, state, acted, memory, held, at)
+    set_memory(batch, laws, p, t, begin, state, acted, memory, held, at)
+    begin_held(state, laws, acted, held)
     while end < len(inputs) and (whole or near or end == begin):
         h = end
         if h > begin and len(properties) > 1:

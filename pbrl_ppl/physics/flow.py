@@ -23,8 +23,9 @@ from pbrl_ppl.physics.laws import (
     WRENCHES,
     Laws,
     act,
-    begin_laws,
+    begin_held,
     laws_of,
+    set_memory,
     states_before,
 )
 from pbrl_ppl.physics.motion import (
@@ -47,11 +48,13 @@ from pbrl_ppl.physics.motion import (
     Q,
     U,
     row_speed,
+    set_bounds,
     set_coordinates,
     set_first_slide,
     set_forces,
     set_numbers,
     set_places,
+    set_rows,
     set_twist,
     solve,
     strain,
@@ -109,7 +112,9 @@ def _load(work, flow, u, inputs, share, low, high):  # type: ignore[no-untyped-d
         )
     for s in range(flow.held):
         motion[u, held + s] = work.held[1, s]
-    set_forces(work, laws, u)
+    set_forces(work, u)
+    set_rows(work, u)
+    set_bounds(work, laws, u)
 
 
 @compiled
@@ -448,7 +453,7 @@ class Flow(NamedTuple):
     """Laws of a proposal, what they remember, and what steps are measured by."""
 
     laws: Laws
-    memory: Floats  # (2, slot), see `laws.begin_laws`
+    memory: Floats  # (2, slot), see `laws.set_memory`
     held: int  # numbers of force laws
     time_step: float  # s
     tolerance: float  # error of a step, as a share of natural sizes
@@ -506,7 +511,8 @@ def rollout(works, still, batch, items, begins, out):  # type: ignore[no-untyped
                 )  # fmt: skip
             if h == first:
                 _set_states(work, states_before(batch, out, item, h))
-                begin_laws(batch, laws, p, t, h, work.states, work.acted, memory, work.held, at)
+                set_memory(batch, laws, p, t, h, work.states, work.acted, memory, work.held, at)
+                begin_held(work.states, laws, work.acted, work.held)
                 for s in range(batch.held):
                     work.motion[Q, work.n + 1 + s] = work.held[0, s]
             inputs, budget, low, high = batch.inputs[t, h], MOST_STEPS, 0.0, 0.0

@@ -166,16 +166,8 @@ def act(  # type: ignore[no-untyped-def]
 
 
 @compiled
-def begin_laws(batch, laws, p, t, begin, start, acted, memory, held, at):  # type: ignore[no-untyped-def]
-    """Set what laws remember, and the numbers of force laws, before the interval ``begin``.
-
-    It is that of the transition ``t`` and the proposal ``p``. ``memory[1]``, shape (slot,), depends
-    on commands alone: those of all intervals that follow each other in the recording up to this
-    one, at the state ``start`` (body, 6). ``memory[0]`` is that before the first interval of the
-    transition ``at[1]`` of the proposal ``at[0]``.
-    """
-    if memory.shape[1] > 0:
-        _set_memory(batch, laws, p, t, begin, start, acted, memory, held, at)
+def begin_held(state, laws, acted, held):  # type: ignore[no-untyped-def]
+    """Set the numbers of force laws where a transition begins."""
     k = len(acted) - MORE
     for s in range(held.shape[1]):
         held[0, s] = held[1, s] = 0.0
@@ -183,15 +175,22 @@ def begin_laws(batch, laws, p, t, begin, start, acted, memory, held, at):  # typ
         law = laws.forces[e]
         if law[SLOTS] > 0 and law[JUMPS] != 0:
             call_law(
-                law[JUMPS], start.ctypes.data + 48 * law[ON], acted.ctypes.data + 8 * ACTED * k,
+                law[JUMPS], state.ctypes.data + 48 * law[ON], acted.ctypes.data + 8 * ACTED * k,
                 laws.force_parameters.ctypes.data + 8 * law[FIRST],
                 held.ctypes.data + 8 * law[SLOT],
             )  # fmt: skip
 
 
 @compiled
-def _set_memory(batch, laws, p, t, begin, start, acted, memory, held, at):  # type: ignore[no-untyped-def]
-    """Set what command laws remember; see `begin_laws`."""
+def set_memory(batch, laws, p, t, begin, start, acted, memory, held, at):  # type: ignore[no-untyped-def]
+    """Set what command laws remember before the interval ``begin`` of the transition ``t``.
+
+    ``memory[1]``, shape (slot,), depends on commands alone: those of all intervals that follow each
+    other in the recording up to this one, at the state ``start`` (body, 6). ``memory[0]`` is that
+    before the first interval of the transition ``at[1]`` of the proposal ``at[0]``.
+    """
+    if memory.shape[1] == 0:
+        return
     inputs, first = batch.inputs, t
     while batch.follows[first] and not (at[0] == p and at[1] == first):
         first -= 1

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pbrl_ppl.physics.calls import compiled
-from pbrl_ppl.physics.laws import ACTED, LATE, MORE, act, begin_laws, laws_of
+from pbrl_ppl.physics.laws import ACTED, LATE, MORE, act, begin_held, laws_of, set_memory
 from pbrl_ppl.physics.properties import COLUMN
 from pbrl_ppl.physics.solids import reaches, segment
 from pbrl_ppl.physics.world import World
@@ -351,7 +351,8 @@ def rollout(wheels, still, batch, items, begins, out):  # type: ignore[no-untype
                     for k in range(moving):
                         get_state(bodies[k], i, states, k)
                     laws = laws_of(batch, p)
-                    begin_laws(batch, laws, p, t, first[i], states, acted, memory, held[i], at)
+                    set_memory(batch, laws, p, t, first[i], states, acted, memory, held[i], at)
+                    begin_held(states, laws, acted, held[i])
                     remembered[i] = memory[1]
                 for s in range(substeps):
                     if acting:

@@ -256,7 +256,7 @@ def set_places(work, q, u):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def set_forces(work, laws, u):  # type: ignore[no-untyped-def]
+def set_forces(work, u):  # type: ignore[no-untyped-def]
     """Set M and Q, and the rows of dry friction, where places and wrenches are set."""
     tree, links, slope, motion = work.tree, work.links, work.slope, work.motion
     n = work.n
@@ -298,12 +298,10 @@ def set_forces(work, laws, u):  # type: ignore[no-untyped-def]
     for j in range(n):
         for k in range(j):
             motion[M + k, j] = motion[M + j, k]
-    _set_rows(work, u)
-    _set_bounds(work, laws, u)
 
 
 @compiled
-def _set_rows(work, u):  # type: ignore[no-untyped-def]
+def set_rows(work, u):  # type: ignore[no-untyped-def]
     """Set the rows of dry friction, where places are set."""
     tree, links, slope, motion, rows = work.tree, work.links, work.slope, work.motion, work.rows
     n = work.n
@@ -331,7 +329,7 @@ def _set_rows(work, u):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _set_bounds(work, laws, u):  # type: ignore[no-untyped-def]
+def set_bounds(work, laws, u):  # type: ignore[no-untyped-def]
     """Set the greatest forces of dry friction that laws change, where forces and rows are set."""
     if len(laws.frictions) == 0:
         return
