@@ -3,6 +3,7 @@
 import importlib.util
 import math
 import os
+import signal
 from pathlib import Path
 from types import ModuleType
 
@@ -11,6 +12,10 @@ from hypothesis import settings
 
 from tests.helpers.places import RECORDED, ROOT
 
+# Programs that the tests start must receive interrupts, even where this process was started with
+# interrupts ignored, as by nohup or in the background of a script: children inherit that.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 # Traces of each tensor's origin cost 2 % of the tests' time, and no test runs long enough for
 # optimised C code to pay off. PyTensor reads this when it is imported.
 os.environ.setdefault("PYTENSOR_FLAGS", "traceback__limit=0,gcc__cxxflags=-O0")
