@@ -1,15 +1,13 @@
-"""Work in parallel: threads, BLAS in one of them, processes, and an executor's tasks."""
+"""Work in parallel: threads, BLAS in one of them, processes that end, and an executor's tasks."""
 
 from __future__ import annotations
 
-import multiprocessing as mp
+import multiprocessing
 import os
-import warnings
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+import signal
+from collections.abc import Callable, Generator, Iterable, Mapping
 from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
 from functools import cache, wraps
-from multiprocessing.connection import Connection
 from threading import Thread
 from typing import ParamSpec, TypeVar
 
@@ -57,72 +55,14 @@ def _pools() -> ThreadpoolController:
     return ThreadpoolController()
 
 
-@contextmanager
-def background(function: Callable[[], R]) -> Iterator[Callable[[], R]]:
-    """Evaluate a function in a forked process, which ends with the context or its parent.
-
-    Without processors to spare or without forks, the caller's process evaluates it when asked.
-
-    Parameters
-    ----------
-    function : callable
-        Takes nothing; its result can be pickled.
-
-    Yields
-    ------
-    callable
-        Waits for the result and returns it; raises what the function raised.
-
-    Examples
-    --------
-    >>> with background(lambda: 6 * 7) as answer:
-    ...     answer()
-    42
-    """
-    if mp.cpu_count() < 2 or "fork" not in mp.get_all_start_methods():
-        yield function
-        return
-    context = mp.get_context("fork")
-    receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=_send, args=(function, sender))
-    with warnings.catch_warnings():
-        # of processes with threads: those of BLAS and of the engine wait between calls
-        warnings.filterwarnings("ignore", message=".*fork.*", category=DeprecationWarning)
-        process.start()
-    sender.close()
-
-    def result() -> R:
-        try:
-            succeeded, value = receiver.recv()
-        except (EOFError, OSError):  # the process was killed, as by a lack of memory
-            return function()
-        if not succeeded:
-            raise value
-        answer: R = value
-        return answer
-
-    try:
-        yield result
-    finally:
-        process.terminate()
-        process.join()
-        receiver.close()
-
-
-def _send(function: Callable[[], object], sender: Connection) -> None:
-    """Send whether the function succeeded, and its result or what it raised."""
+def obey_parent() -> None:
+    """Leave interrupts to the parent, and end once it has ended: the initializer of a pool."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     Thread(target=_end_with_parent, daemon=True).start()
-    try:
-        answer = True, function()
-    except BaseException as error:
-        answer = False, error
-    sender.send(answer)
-    sender.close()
 
 
 def _end_with_parent() -> None:
-    """End this process once its parent has ended, be it killed."""
-    parent = mp.parent_process()
+    parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
         os._exit(1)

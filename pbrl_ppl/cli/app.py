@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import multiprocessing
 import os
 import re
 import sys
@@ -163,6 +164,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         input, with one message on stderr; 3 where chains have not converged; 130 if interrupted.
     """
     os.environ.setdefault("MPLBACKEND", "Agg")  # commands show no windows
+    if argv is None and "forkserver" in multiprocessing.get_all_start_methods():
+        # a fork of this process, by PyMC's chains, could copy a lock that a thread holds
+        multiprocessing.set_start_method("forkserver", force=True)
+        multiprocessing.set_forkserver_preload(["pymc"])
     argv = sys.argv[1:] if argv is None else list(argv)
     try:
         with terminal.warnings_in_a_line():

@@ -23,6 +23,7 @@ from pbrl_ppl.cli.new import models_folder
 from pbrl_ppl.cli.terminal import Progress, Result
 from pbrl_ppl.errors import OutputError
 from pbrl_ppl.files import check_folder
+from pbrl_ppl.threads import obey_parent
 
 if TYPE_CHECKING:
     from pbrl_ppl.criticism import Loop
@@ -74,6 +75,7 @@ def close_loop(
     reading: options.SceneReading,
     sampler: Sampler,
     progress: Progress,
+    interrupts: terminal.Interrupts,
     test: Path | None = None,
     learn_remainder: bool = False,
 ) -> Result:
@@ -104,7 +106,7 @@ def close_loop(
         criticism.check_scikit_learn()
     settings = sampler.settings() | {"catalogue": catalogue}
     run = partial(criticism.close_loop, declared, *histories, **settings)
-    loop, stopped = _finished(run, progress)
+    loop, stopped = _finished(run, progress, interrupts)
     progress("writing the report")
     files = str(scene), str(train), str(test or "")
     source = report.Source(*files, options.command_line(context))
@@ -118,7 +120,9 @@ def close_loop(
     return Result(contents, report.in_brief(loop, output, words), code)
 
 
-def _finished(run: Callable[..., Loop], progress: Progress) -> tuple[Loop, bool]:
+def _finished(
+    run: Callable[..., Loop], progress: Progress, interrupts: terminal.Interrupts
+) -> tuple[Loop, bool]:
     """Return the loop, with Gaussians at the modes if it is interrupted while it samples.
 
     The second value is whether it was. An earlier interrupt ends the command, and says what was
@@ -132,6 +136,8 @@ def _finished(run: Callable[..., Loop], progress: Progress) -> tuple[Loop, bool]
         progress(stage)
         if stage.startswith(_FOUND):
             names.append(stage)
+        if stage == criticism.Stage.SAMPLE:
+            interrupts.keep()
 
     try:
         return run(progress=noted), False
@@ -169,6 +175,7 @@ def _remainder(
 def demo(
     context: typer.Context,
     progress: Progress,
+    interrupts: terminal.Interrupts,
     as_json: bool,
     quiet: bool,
     output: options.OutputFolder = Path("pbrl-ppl-demo"),
@@ -198,8 +205,9 @@ def demo(
         )
     train, test = (cart / "recorded" / f"{name}.csv" for name in ("train", "test"))
     result = close_loop(
-        context, cart / "scene.toml", train, to, options.SceneReading(), sampler, progress, test
-    )
+        context, cart / "scene.toml", train, to, options.SceneReading(), sampler, progress,
+        interrupts, test,
+    )  # fmt: skip
     if quiet or result.code:
         return result
     last = "With a recording of yours: pbrl-ppl new scene.toml --history train.csv"
@@ -315,7 +323,7 @@ def _in_a_process(function: partial[T]) -> T:
 
 
 def _in_a_new_one(call: bytes) -> Any:
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(1, get_context("spawn"), obey_parent) as pool:
         return pool.submit(_called, call).result()
 
 

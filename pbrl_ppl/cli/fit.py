@@ -6,6 +6,7 @@ import sys
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import nullcontext, redirect_stdout
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -18,6 +19,7 @@ from pbrl_ppl.cli import options, terminal
 from pbrl_ppl.cli.app import command
 from pbrl_ppl.cli.terminal import Progress, Result, check_file
 from pbrl_ppl.files import check_folder, write_atomically, write_text
+from pbrl_ppl.threads import obey_parent
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -94,7 +96,7 @@ def fit(
     model: Model,
     sampler: Sampler,
     quiet: bool,
-    interrupts: list[int],
+    interrupts: terminal.Interrupts,
     resume: Path | None = None,
 ) -> Result:
     """Fit the declared model to a history: a posterior file, and a table of it.
@@ -126,11 +128,13 @@ def fit(
             )  # fmt: skip
         except ValueError as error:  # an option that the model refuses
             raise errors.FitError(f"fit: {error}") from None
+    if sampler.method not in ("importance", "laplace", "map"):
+        interrupts.keep()  # the draws of chains so far
     # the sampler shows its own progress
     with terminal.noted_warnings("was interrupted") as caught, redirect_stdout(sys.stderr):
         idata = sampling.fit(made, resume=earlier, progress=not quiet, **vars(sampler))
         save_posterior(idata, to.output)
-    return _fitted(idata, to.output, {type(warning) for warning in caught}, bool(interrupts))
+    return _fitted(idata, to.output, {type(warning) for warning in caught}, interrupts.seen)
 
 
 def _fitted(idata: Idata, output: Path, warned: set[type], interrupted: bool) -> Result:
@@ -301,7 +305,8 @@ def calibrate(
     from pbrl_ppl.sampling import calibration
 
     # fresh processes: PyMC's threads do not survive a fork
-    with ProcessPoolExecutor(jobs, get_context("spawn")) if jobs > 1 else nullcontext() as pool:
+    processes = partial(ProcessPoolExecutor, jobs, get_context("spawn"), obey_parent)
+    with processes() if jobs > 1 else nullcontext() as pool:
         try:
             result = calibration.calibrate(
                 declared, design, effects=effects, likelihood=likelihood, colour=colour,

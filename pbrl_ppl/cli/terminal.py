@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import sys
 import tempfile
@@ -10,7 +11,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -28,6 +29,9 @@ from pbrl_ppl.files import json_values
 #: inseparable; bad input or usage; chains that have not converged, so no verdict; an interrupt, as
 #: shells report it.
 FAILED, BAD_INPUT, UNDECIDED, INTERRUPTED = 1, 2, 3, 130
+
+#: Seconds in which an interrupted command ends by itself.
+_PATIENCE = 1.5
 
 #: Takes the name of a stage that begins.
 Progress = Callable[[str], None]
@@ -64,25 +68,64 @@ class Status:
         return Text(f"{self.name}, {self.elapsed:.0f} s{done}")
 
 
-@contextmanager
-def interruptible(state: str = "nothing was written") -> Iterator[list[int]]:
-    """Turn an interrupt into a message that says which results are kept, and an exit code.
+class Interrupts:
+    """Whether a command was interrupted, and how long it then has to end."""
 
-    Yields the interrupts so far: a sampler may catch one and return as if it had finished.
-    """
-    seen: list[int] = []
+    def __init__(self) -> None:
+        self.seen = False  # a sampler may catch one and return as if it had finished
+        self._going_on = threading.Event()
 
-    def note(number: int, frame: FrameType | None) -> None:
-        seen.append(number)
+    def keep(self) -> None:
+        """Let the command end by itself from now on: it keeps what it has so far."""
+        self._going_on.set()
+
+    def note(self, number: int, frame: FrameType | None) -> None:
+        """Handle the signal."""
+        self.seen = True
         signal.default_int_handler(number, frame)
 
+    @contextmanager
+    def enforced(self, state: str) -> Iterator[None]:
+        """End the process if an interrupt has not ended the context after `_PATIENCE`.
+
+        Machine code and other threads run on until they are done: only the operating system's
+        signal gets through to a thread that waits for it.
+        """
+        reader, writer = os.pipe()
+        os.set_blocking(writer, False)
+        before = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+
+        def watch() -> None:
+            while (number := os.read(reader, 1)) and number[0] != signal.SIGINT:
+                pass
+            if number and not self._going_on.wait(_PATIENCE):
+                Console(stderr=True).show_cursor()
+                os._exit(interrupted(state))
+
+        watcher = threading.Thread(target=watch, daemon=True)
+        watcher.start()
+        try:
+            yield
+        finally:
+            self._going_on.set()
+            signal.set_wakeup_fd(before)
+            os.close(writer)
+            watcher.join()
+            os.close(reader)
+
+
+@contextmanager
+def interruptible(state: str = "nothing was written") -> Iterator[Interrupts]:
+    """Turn an interrupt into a message that says which results are kept, and an exit code."""
+    interrupts = Interrupts()
     # a shell's background job ignores interrupts: leave it so
     handled = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     handled = handled and threading.current_thread() is threading.main_thread()
     if handled:
-        signal.signal(signal.SIGINT, note)
+        signal.signal(signal.SIGINT, interrupts.note)
     try:
-        yield seen
+        with interrupts.enforced(state) if handled else nullcontext():
+            yield interrupts
     except KeyboardInterrupt:
         raise typer.Exit(interrupted(state)) from None
     finally:

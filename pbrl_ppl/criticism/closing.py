@@ -69,7 +69,7 @@ from pbrl_ppl.posterior import MAX_PARETO_K, Comparison, Fit, compare, identify,
 from pbrl_ppl.posterior import draws as posterior_draws
 from pbrl_ppl.sampling import sample
 from pbrl_ppl.scene import Scene, check_substeps
-from pbrl_ppl.threads import background, one_blas_thread
+from pbrl_ppl.threads import one_blas_thread
 
 #: Draws of each chain by method, then those where that is not enough.
 _DRAWS = {"importance": (180, 600), "laplace": (125,)}
@@ -295,18 +295,15 @@ def _cleaned(task: _Task, train: History, test: History) -> _Cleaned:
 def _fitted(task: _Task, cleaned: _Cleaned) -> _Fitted:
     """Fit the declared model, and test whether its prior could have made the data."""
     task.say(Stage.CHECK_PRIOR)
-    with background(partial(_compile, task.scene, cleaned.train, task.effects)) as compiled:
-        prior = _prior_test(task, cleaned.train, task.effects)
-        if not prior.passed:  # before the long fit: units may be wrong
-            hint = "the declared prior does not explain this recording"
-            hint = f"{hint}, unless a missing effect is why"
-            warn(f"{hint}: {prior.sentence}", PriorWarning)
-        task.say(Stage.FIT)
-        mode = declared_mode(
-            task.scene, cleaned.train, task.effects, task.seed, task.substeps, task.say,
-            task.criteria,
-        )  # fmt: skip
-        compiled()
+    prior = _prior_test(task, cleaned.train, task.effects)
+    if not prior.passed:  # before the long fit: units may be wrong
+        hint = "the declared prior does not explain this recording"
+        hint = f"{hint}, unless a missing effect is why"
+        warn(f"{hint}: {prior.sentence}", PriorWarning)
+    task.say(Stage.FIT)
+    mode = declared_mode(
+        task.scene, cleaned.train, task.effects, task.seed, task.substeps, task.say, task.criteria
+    )
     return _Fitted(prior, mode)
 
 
@@ -408,14 +405,6 @@ def _sampled(task: _Task, judged: _Judged, recorded: History) -> Loop:
     return _put_together(task, judged, fits[0], fits[-1], recorded)
 
 
-def _compile(scene: Scene, train: History, effects: tuple[Attached, ...]) -> None:
-    """Compile the engine's loop unless it is on disk; candidates need it, the fit rarely."""
-    physics = Physics(scene, effects, substeps=1, engine="chipmunk")
-    rng = np.random.default_rng(0)
-    phi = np.array([prior.sample(rng, 1)[0] for prior in physics.layout.priors])
-    Problem.of(physics, train).predict(phi)
-
-
 def _prior_test(
     task: _Task,
     train: History,
@@ -436,52 +425,44 @@ def _prior_test(
 
 
 def _fits(task: _Task, modes: list[Mode]) -> list[Fit]:
-    """Sample the models of modes, the first beside the others; issue their warnings, each once.
+    """Sample the models of modes; issue their warnings, each once.
 
     What the data do not inform is said, and in the report: no conclusion depends on it.
     """
-    with background(partial(_fit, task, modes[0])) as first:
-        others = [_fit(task, mode) for mode in modes[1:]]
-        results = [first(), *others]
-    issued = {str(message): message for _, caught, _ in results for message in caught}
+    results = [_fit(task, mode) for mode in modes]
+    issued = {str(message): message for _, caught in results for message in caught}
     uninformed = [
         text for text, warning in issued.items() if isinstance(warning, UninformedWarning)
     ]
-    said = [sentence for _, _, sentences in results for sentence in sentences]
-    for sentence in dict.fromkeys((*said, *uninformed)):
+    for sentence in uninformed:
         task.say(sentence)
     for text, message in issued.items():
         if text not in uninformed:
             warn(message)
-    return [fitted for fitted, *_ in results]
+    return [fitted for fitted, _ in results]
 
 
-def _fit(task: _Task, mode: Mode) -> tuple[Fit, list[Warning], list[str]]:
-    """Sample a mode's model, with more draws if they do not suffice.
-
-    Returns the fit, its warnings, and what to tell the user.
-    """
-    # one thread a chain: more would wait for each other
-    mode = replace(mode, problem=mode.problem.with_physics(threads=1))
+def _fit(task: _Task, mode: Mode) -> tuple[Fit, list[Warning]]:
+    """Sample a mode's model, with more draws if they do not suffice; return its warnings too."""
     if is_simulated_mode(mode):
         mode = tempered_mode(mode)
-    method, said = task.method, []
+    method = task.method
     for n in _DRAWS.get(method, _CHAIN_DRAWS) if task.draws is None else (task.draws,):
         tune = max(100, 5 * n // 8)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             fitted = sample(
-                mode.problem, method=method, seed=task.seed, draws=n, tune=tune, start=mode, cores=1
+                mode.problem, method=method, seed=task.seed, draws=n, tune=tune, start=mode
             )
         if fitted.record.interrupted:  # half a posterior gives no verdict
             raise KeyboardInterrupt
         if _converged(fitted, task.criteria):
             break
-        said.append(f"{n} draws of each chain are too few")
+        task.say(f"{n} draws of each chain are too few")
     # of the last fit; draws from a Gaussian are no chains that converge
     unheeded: tuple[type[Warning], ...] = (ConvergenceWarning,) if method == "laplace" else ()
     kept = [warning.message for warning in caught if not issubclass(warning.category, unheeded)]
-    return fitted, [message for message in kept if isinstance(message, Warning)], said
+    return fitted, [message for message in kept if isinstance(message, Warning)]
 
 
 def _converged(fit: Fit, criteria: Criteria) -> bool:

@@ -26,7 +26,6 @@ from pbrl_ppl.reporting import (
     words,
 )
 from pbrl_ppl.reporting.style import NARROW, WIDE, png
-from pbrl_ppl.threads import background
 
 _MODULES = (
     words, tables, evidence, motion, posterior_summary, effect_plots, error_plots, posterior_plots,
@@ -124,16 +123,8 @@ def render_page(title: str, header: str, sections: Sequence[Section], **context:
     page = environment.get_template("page.html.jinja").render(
         title=title, header=rendered(header), sections=shown
     )
-    pictures = _drawn(draws)
+    pictures = [picture(draw) for draw in draws]
     return re.sub(r"\0(\d+) (\w+)\0", lambda place: pictures[int(place[1])][place[2]], page)
-
-
-def _drawn(draws: Sequence[Callable[..., Figure]]) -> list[Mapping[str, str]]:
-    """Return pictures in both widths, drawn by two processes."""
-    with background(lambda: [picture(draw) for draw in draws[1::2]]) as others:
-        pictures = {2 * i: picture(draw) for i, draw in enumerate(draws[::2])}
-        pictures |= {2 * i + 1: drawn for i, drawn in enumerate(others())}
-    return [pictures[i] for i in range(len(draws))]
 
 
 def picture(draw: Callable[..., Figure]) -> Mapping[str, str]:

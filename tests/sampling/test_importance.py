@@ -1,11 +1,6 @@
 """Importance sampling: draws, weights, diagnostics, whatever particles go through."""
 
 import json
-import os
-import signal
-import subprocess
-import sys
-import time
 import warnings
 from dataclasses import replace
 from functools import partial
@@ -40,7 +35,6 @@ from pbrl_ppl.sampling import fit, physics_model, update
 from pbrl_ppl.sampling.ensemble import Reference
 from pbrl_ppl.sampling.importance import anneal, draw_proposals, resample
 from pbrl_ppl.scene import Body, Scene, Shape, Wall
-from pbrl_ppl.threads import background
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
 
@@ -556,100 +550,3 @@ def test_updates_keep_count_of_what_draws_are_worth(model, mode) -> None:
         new = quiet(update, last, rest, seed=2, progress=False)
     assert json.loads(new.attrs["updates"])[-1]["did"] == "refitted"
     assert 400 < new.attrs[SIZE] <= 1000  # a fit's own draws
-
-
-# -- a function beside the caller ------------------------------------------------------------------
-
-
-@pytest.fixture
-def two_processors(monkeypatch):
-    monkeypatch.setattr("multiprocessing.cpu_count", lambda: 2)
-
-
-@pytest.mark.one_stack
-@pytest.mark.usefixtures("two_processors")
-def test_background_runs_in_another_process() -> None:
-    with background(lambda: (os.getpid(), 42)) as answer:
-        process, value = answer()
-    assert process != os.getpid()
-    assert value == 42
-
-
-@pytest.mark.usefixtures("two_processors")
-def test_background_returns_a_posterior(fitted) -> None:
-    with background(lambda: fitted) as answer:
-        found = answer()
-    assert found is not fitted  # it came from the other process
-    assert dict(found.attrs) == dict(fitted.attrs)
-    np.testing.assert_array_equal(draws(found)["mass"], draws(fitted)["mass"])
-
-
-@pytest.mark.one_stack
-@pytest.mark.usefixtures("two_processors")
-def test_background_raises_what_the_function_raised() -> None:
-    def fail() -> None:
-        raise ValueError("no such mode")
-
-    with background(fail) as answer, pytest.raises(ValueError, match="no such mode"):
-        answer()
-
-
-@pytest.mark.one_stack
-@pytest.mark.usefixtures("two_processors")
-def test_background_of_a_killed_process_is_evaluated_here() -> None:
-    here = os.getpid()
-
-    def killed() -> int:
-        if os.getpid() != here:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return os.getpid()
-
-    with background(killed) as answer:
-        assert answer() == here
-
-
-@pytest.mark.one_stack
-@pytest.mark.usefixtures("two_processors")
-def test_background_ends_with_its_context() -> None:
-    begin = time.monotonic()
-    with pytest.raises(KeyError), background(lambda: time.sleep(60.0)):
-        raise KeyError
-    assert time.monotonic() - begin < 30.0
-
-
-#: Prints the number of the process in the background, which computes or has a result to send.
-KILLED = """
-import multiprocessing, os, time
-from pbrl_ppl.threads import background
-multiprocessing.cpu_count = lambda: 2
-def work():
-    print(os.getpid(), flush=True)
-    return {work}
-with background(work):
-    time.sleep(120.0)
-"""
-
-
-@pytest.mark.one_stack
-@pytest.mark.parametrize("work", ["time.sleep(60.0)", "bytes(10**7)"])
-def test_background_ends_with_a_killed_parent(work) -> None:
-    parent = subprocess.Popen(
-        [sys.executable, "-c", KILLED.format(work=work)], stdout=subprocess.PIPE
-    )
-    child = int(parent.stdout.readline())
-    parent.kill()
-    try:
-        parent.communicate(timeout=20.0)  # the output ends once both have ended
-    except subprocess.TimeoutExpired:
-        os.kill(child, signal.SIGKILL)
-        raise
-
-
-@pytest.mark.one_stack
-@pytest.mark.parametrize(
-    ("name", "value"), [("get_all_start_methods", lambda: ["spawn"]), ("cpu_count", lambda: 1)]
-)
-def test_background_without_forks_or_processors_runs_here(monkeypatch, name, value) -> None:
-    monkeypatch.setattr(f"multiprocessing.{name}", value)
-    with background(os.getpid) as answer:
-        assert answer() == os.getpid()
