@@ -187,6 +187,9 @@ def _bursts(
 ) -> tuple[str, dict[str, str | float]] | None:
     """Return a message on stamps that come in bursts, with the entry that cures them."""
     whole = np.isfinite(time) & ~frame.duplicated().to_numpy()
+    body = column_of(dict(layout.columns).get("body", "body"))
+    if body in frame and whole.any():  # rows of several bodies share a stamp
+        whole &= (frame[body] == frame[body].iloc[int(whole.argmax())]).to_numpy(dtype=bool)
     rows, seen = np.flatnonzero(whole), time[whole]
     steps = np.diff(seen)
     if len(steps) < 20:

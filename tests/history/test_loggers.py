@@ -112,6 +112,15 @@ def test_stamps_in_bursts_offer_the_true_rate() -> None:
     assert gap.dataset["n_rows"].to_numpy().tolist() == [100, 280]
 
 
+def test_bodies_that_share_a_stamp_are_no_bursts() -> None:
+    """One row for each body: half of the rows have the stamp of the row before."""
+    scene = PUCK.replace(bodies=(*PUCK.bodies, Body("disc", Shape.circle(0.1))))
+    other = moving().assign(x=lambda table: table["x"] + 1.0, object="disc")
+    both = pd.concat([moving().assign(object="puck"), other]).sort_values("t", kind="stable")
+    history = load(both, scene, columns={"time": "t", "body": "object"})
+    assert history.n_transitions == N - 1
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_jittered_stamps_are_no_bursts(seed: int) -> None:
     """Twenty clocks that jitter by up to 40 % of a step: no false alarm."""
