@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import math
-import secrets
+import shutil
 import tempfile
-from collections.abc import Callable, Iterable, Mapping
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from itertools import takewhile
 from pathlib import Path
@@ -14,27 +15,45 @@ from typing import Any
 
 from pbrl_ppl.errors import OutputError
 
+#: How names of temporary folders begin; a process that is killed leaves them behind.
+_MAKING = ".pbrl-ppl-"
+#: Age (s) of a temporary folder whose process no longer writes to it.
+_ABANDONED = 3600.0
+
+
+@contextlib.contextmanager
+def temporary_folder(folder: Path) -> Iterator[Path]:
+    """Yield a temporary folder in a folder, and remove those that killed processes left there."""
+    for left in folder.glob(f"{_MAKING}*"):
+        with contextlib.suppress(OSError):
+            if time.time() - left.stat().st_mtime > _ABANDONED:
+                shutil.rmtree(left)
+    with tempfile.TemporaryDirectory(prefix=_MAKING, dir=folder) as made:
+        yield Path(made)
+
+
+def is_empty(folder: Path) -> bool:
+    """Return whether a folder holds nothing but temporary folders of this package."""
+    return all(path.name.startswith(_MAKING) for path in folder.iterdir())
+
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
-    """Call ``write`` with a temporary path beside ``path``, then rename it to ``path``.
+    """Call ``write`` with a path of this name in a temporary folder, then rename it to ``path``.
 
     Raises
     ------
     OutputError
         If the file cannot be written; nothing is left behind then.
     """
-    temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}{path.suffix}")
     try:
-        write(temporary)
-        temporary.replace(path)
+        with temporary_folder(path.parent) as aside:
+            write(aside / path.name)
+            (aside / path.name).replace(path)
     except OSError as error:
         raise OutputError(
             f"{path}: cannot be written: {error.strerror or error}; choose an existing, writable"
             " folder"
         ) from error
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -62,7 +81,7 @@ def check_folder(folder: Path, overwrite: bool, files: Iterable[str] = ()) -> Pa
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder):
                 pass
-        filled = folder.is_dir() and any(folder.iterdir())
+        filled = folder.is_dir() and not is_empty(folder)
     except OSError as error:
         raise OutputError(
             f"{where} it cannot be made or written ({error.strerror}); choose another path"

@@ -8,7 +8,7 @@ import resource
 import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -42,6 +42,8 @@ class Ran:
         The longest time (s) without a line on stderr or stdout.
     peak : float
         Peak memory (MB).
+    process : int
+        Its process, which was the first of its session.
     """
 
     argv: tuple[str, ...]
@@ -51,6 +53,7 @@ class Ran:
     seconds: float
     silent: float
     peak: float
+    process: int = 0
 
     def fault(self, codes: Sequence[int] = (0,)) -> str:
         """Return what is wrong with it, or nothing; ``codes`` are exit codes that are right."""
@@ -83,7 +86,11 @@ def warm() -> None:
 
 
 def run(
-    argv: Sequence[str], folder: Path, limit: float = 900.0, memory: float | None = None
+    argv: Sequence[str],
+    folder: Path,
+    limit: float = 900.0,
+    memory: float | None = None,
+    kill: Callable[[float], bool] | None = None,
 ) -> Ran:
     """Run a command of ``pbrl-ppl`` in a forked child of this process.
 
@@ -97,6 +104,9 @@ def run(
         Seconds after which it is killed, with its children.
     memory : float, optional
         Most address space (MB) that it may take beyond what this process has.
+    kill : callable, optional
+        Takes the seconds since the begin; once it is true the process is killed, without its
+        children.
     """
     out, err = folder / ".stdout", folder / ".stderr"
     begin = time.monotonic()
@@ -115,10 +125,12 @@ def run(
             break
         if now - begin > limit:
             os.killpg(child, signal.SIGKILL)
-        time.sleep(0.02)
+        if kill is not None and kill(now - begin):
+            os.kill(child, signal.SIGKILL)
+        time.sleep(0.02 if kill is None else 0.001)
     code = os.waitstatus_to_exitcode(status)
     texts = (path.read_text(errors="replace") if path.exists() else "" for path in (out, err))
-    return Ran(tuple(argv), code, *texts, now - begin, silent, usage.ru_maxrss / 1024)
+    return Ran(tuple(argv), code, *texts, now - begin, silent, usage.ru_maxrss / 1024, child)
 
 
 def _become(argv: Sequence[str], folder: Path, out: Path, err: Path, memory: float | None) -> None:

@@ -161,7 +161,6 @@ def _remainder(
     from pbrl_ppl.reporting import render
 
     path = folder / "remainder.nc"
-    path.unlink(missing_ok=True)  # of an earlier run
     try:
         loop = replace(loop, remainder=loop.learn_remainder(seed=seed, progress=progress))
     except FitError as error:

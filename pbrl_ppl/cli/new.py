@@ -20,7 +20,7 @@ from pbrl_ppl.cli import options
 from pbrl_ppl.cli.app import command
 from pbrl_ppl.cli.terminal import Result, check_file
 from pbrl_ppl.errors import HistoryError, LayoutError, OutputError, RecordingWarning, SceneError
-from pbrl_ppl.files import write_text
+from pbrl_ppl.files import write_atomically, write_text
 from pbrl_ppl.scene import WORLD, Actuator, Body, Joint, Recording, Scene, Shape, nearest, toml_of
 from pbrl_ppl.state import Floats
 
@@ -396,7 +396,7 @@ def _copied(model: str, scene: Path, overwrite: bool) -> list[Path]:
     for path in copies:
         check_file(path, (".toml", ".csv"), overwrite)
     for path, source in copies.items():
-        shutil.copyfile(source, path)
+        write_atomically(path, partial(shutil.copyfile, source))
     return list(copies)
 
 

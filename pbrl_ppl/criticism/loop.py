@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +29,7 @@ from pbrl_ppl.criticism.results import (
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import FitError, OutputError
-from pbrl_ppl.files import check_folder, json_fields, json_values
+from pbrl_ppl.files import check_folder, json_fields, json_values, temporary_folder
 from pbrl_ppl.history import History, UnusedVelocity
 from pbrl_ppl.modes import FilteredMode
 from pbrl_ppl.posterior import Comparison, Fit, Idata, Identifiability, save_posterior
@@ -43,6 +42,8 @@ NOT_CONVERGED = "not-converged"
 #: Files of a saved loop and its report; beside them, the posterior with a learned remainder.
 FILES = ("report.html", "report.json", "before.nc", "after.nc")
 REMAINDER = "remainder.nc"
+#: The file that is written last: where it is, the others belong to it.
+DONE = "report.json"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -287,6 +288,9 @@ class Loop:
     def save(self, folder: str | Path, overwrite: bool = False, *, page: str = "") -> Path:
         """Write report.json, before.nc, after.nc (and remainder.nc), all or nothing.
 
+        Of an earlier result in the folder ``report.json`` is removed first, and the new one is
+        written last: where it is, the files belong together, even if the process was killed.
+
         Parameters
         ----------
         folder : str or pathlib.Path
@@ -317,8 +321,8 @@ class Loop:
         nearest = check_folder(folder, overwrite, (*FILES, REMAINDER))
         try:
             # on the same file system as the folder, so that only a rename is left at the end
-            with tempfile.TemporaryDirectory(prefix=".pbrl-ppl-", dir=nearest) as temporary:
-                made = Path(temporary) / "result"
+            with temporary_folder(nearest) as temporary:
+                made = temporary / "result"
                 made.mkdir()
                 if page:
                     (made / "report.html").write_text(page, encoding="utf-8")
@@ -327,11 +331,13 @@ class Loop:
                 if self.remainder is not None:
                     save_posterior(self.remainder, made / REMAINDER)
                 text = json.dumps(self.to_dict(), indent=1, allow_nan=False)
-                (made / "report.json").write_text(text + "\n", encoding="utf-8")
+                (made / DONE).write_text(text + "\n", encoding="utf-8")
                 if nearest == folder:
                     # it may be a mount or a working directory: fill it, do not replace it
-                    for file in made.iterdir():
-                        file.replace(folder / file.name)
+                    for earlier in (DONE, REMAINDER):
+                        (folder / earlier).unlink(missing_ok=True)
+                    for name in sorted((file.name for file in made.iterdir()), key=DONE.__eq__):
+                        (made / name).replace(folder / name)
                 else:
                     folder.parent.mkdir(parents=True, exist_ok=True)
                     made.rename(folder)

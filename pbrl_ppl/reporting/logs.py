@@ -19,6 +19,7 @@ from typing import Any, Protocol
 
 from pbrl_ppl import __version__
 from pbrl_ppl.criticism import Loop, close_loop
+from pbrl_ppl.criticism.loop import DONE as DONE
 from pbrl_ppl.criticism.loop import FILES
 from pbrl_ppl.errors import ManifestError, PbrlError
 from pbrl_ppl.files import write_text
@@ -129,8 +130,8 @@ def _log(head: list[str], cells: list[str], where: str, folder: Path) -> Log:
     return Log(row["name"], folder / row["scene"], folder / row["train"], test, row["kind"])
 
 
-#: The file that marks a finished log, written last; the file that a failed log leaves.
-DONE, FAILED = "report.json", "error.json"
+#: The file that a failed log leaves, in place of the one that marks a finished log.
+FAILED = "error.json"
 #: Warnings and figures belong to a process, not a thread: a process works on one log at a time.
 _ONE = threading.Lock()
 _MAKING = ".making-"

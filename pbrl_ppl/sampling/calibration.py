@@ -25,7 +25,7 @@ from scipy.signal import lfilter
 
 from pbrl_ppl.effects import Attached, Effect
 from pbrl_ppl.errors import FitError, OutputError, PbrlWarning, warn
-from pbrl_ppl.files import write_text
+from pbrl_ppl.files import is_empty, write_text
 from pbrl_ppl.history import History, from_segments, with_units
 from pbrl_ppl.likelihood import (
     OutputErrorLikelihood,
@@ -273,7 +273,7 @@ def _opened(folder: Path, about: Mapping[str, object], n: int) -> list[Path]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if not path.exists():
-            if any(folder.iterdir()):
+            if not is_empty(folder):
                 raise OutputError(f"{folder}: holds other files; choose a new or an empty folder")
             write_text(path, json.dumps(about, indent=1) + "\n")
         stored = json.loads(path.read_text(encoding="utf-8"))

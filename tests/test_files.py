@@ -1,0 +1,86 @@
+"""Files: what a process that is killed leaves, and what stands in the way of the next one."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from pbrl_ppl.criticism import Loop
+from pbrl_ppl.criticism import loop as loops
+from pbrl_ppl.errors import OutputError
+from pbrl_ppl.files import check_folder, write_atomically, write_text
+
+pytestmark = pytest.mark.one_stack
+
+
+def killed_in(action) -> None:
+    """Call a function in a fork of this process, which ends by SIGKILL."""
+    child = os.fork()
+    if not child:
+        action()
+        os._exit(1)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+
+
+def kill(*_: object) -> None:
+    """Kill this process."""
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_killed_write_leaves_the_earlier_file(tmp_path) -> None:
+    """A folder in which only its temporary file is counts as empty, and an hour later it goes."""
+    results = tmp_path / "results"
+    results.mkdir()
+    killed_in(lambda: write_atomically(results / "a.txt", kill))
+    (left,) = results.iterdir()
+    check_folder(results, overwrite=False)
+    write_text(results / "a.txt", "whole")
+    killed_in(lambda: write_atomically(results / "a.txt", kill))
+    assert (results / "a.txt").read_text() == "whole"
+    assert len(list(results.iterdir())) == 3, "another process may still write"
+    with pytest.raises(OutputError, match="not empty"):
+        check_folder(results, overwrite=False)
+    long_ago = time.time() - 4000
+    os.utime(left, (long_ago, long_ago))
+    write_text(results / "a.txt", "new")
+    assert left not in list(results.iterdir())
+
+
+@pytest.mark.parametrize("renamed", range(6))
+def test_a_report_json_has_its_own_posteriors(tmp_path, monkeypatch, renamed) -> None:
+    """A kill between two renames leaves no report.json: it never names another run's files."""
+    names = {"report.html", "report.json", "before.nc", "after.nc"}
+
+    def save(content: str, overwrite: bool = False) -> None:
+        loop = object.__new__(Loop)
+        for name in ("declared", "revised"):
+            object.__setattr__(loop, name, type("Fit", (), {"posterior": content}))
+        object.__setattr__(loop, "remainder", None)
+        monkeypatch.setattr(Loop, "to_dict", lambda self: content)
+        monkeypatch.setattr(loops, "save_posterior", lambda text, path: path.write_text(text))
+        loop.save(tmp_path / "out", overwrite, page=content)
+
+    save("old")
+    (tmp_path / "out" / "remainder.nc").write_text("old")
+    replace, count = Path.replace, []
+
+    def counted(path: Path, target: Path) -> None:
+        if len(count) == renamed:
+            kill()
+        count.append(target)
+        replace(path, target)
+
+    def save_and_die() -> None:
+        monkeypatch.setattr(Path, "replace", counted)
+        save("new", overwrite=True)
+        kill()
+
+    killed_in(save_and_die)
+    there = {path.name: path.read_text() for path in (tmp_path / "out").glob("[!.]*")}
+    assert there.keys() >= names - {"report.json"}
+    if "report.json" in there:
+        assert renamed >= 4
+        assert set(there) == names
+        assert {text.strip().strip('"') for text in there.values()} == {"new"}
