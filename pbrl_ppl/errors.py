@@ -1,11 +1,27 @@
 """Exceptions and warnings: each message says what is wrong, where, and the cure."""
 
 import inspect
+import re
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
 
 _PACKAGE = str(Path(__file__).parent)
+#: Characters that a terminal obeys or that turn the direction of a text, and halves of characters.
+_OBEYED = re.compile(
+    "[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"
+)
+
+
+def printable(text: object, kept: str = "") -> str:
+    r"""Return a text with control characters and marks of direction as escapes, but those ``kept``.
+
+    Examples
+    --------
+    >>> print(printable("cart\x1b[2J"))
+    cart\x1b[2J
+    """
+    return _OBEYED.sub(lambda one: one[0] if one[0] in kept else ascii(one[0])[1:-1], str(text))
 
 
 def warn(message: str | Warning, category: type[Warning] | None = None) -> None:

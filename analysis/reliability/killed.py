@@ -250,11 +250,14 @@ def main() -> None:
         earlier = written(place, inputs) if again else {}
         if again:  # so that the new result differs from the earlier one
             for changed in (place / "train.csv", place / "test.csv"):
-                changed.write_text(changed.read_text().replace("00", "01"))
+                pd.read_csv(changed).assign(x=lambda table: table["x"] + 1e-4).to_csv(
+                    changed, index=False
+                )
         seconds = json.loads(timed.read_text())["seconds"]
         ran = run(command(name, again), place, kill=moment(seconds, draw, place))
         row = {"try": number, "command": name, "again": again, "code": ran.code,
-               "seconds": round(ran.seconds, 2), **judge(place, inputs, earlier, ran)}  # fmt: skip
+               "seconds": round(ran.seconds, 2), "error": ran.err[-300:] * (ran.code == 2),
+               **judge(place, inputs, earlier, ran)}  # fmt: skip
         if draw.random() < 0.1 or (
             row["left"] and not again
         ):  # nothing stands in the next run's way

@@ -18,7 +18,7 @@ import typer
 from pbrl_ppl import __version__
 from pbrl_ppl.cli import options, terminal
 from pbrl_ppl.cli.terminal import Result, in_a_line
-from pbrl_ppl.errors import PbrlError
+from pbrl_ppl.errors import OutputError, PbrlError, printable
 
 F = TypeVar("F", bound=Callable[..., Result])
 
@@ -170,6 +170,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         multiprocessing.set_forkserver_preload(["pymc"])
     argv = sys.argv[1:] if argv is None else list(argv)
     try:
+        _check_arguments(argv)
         with terminal.warnings_in_a_line():
             app(args=argv, prog_name="pbrl-ppl")
     except SystemExit as stop:
@@ -180,6 +181,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"error: {in_a_line(error)}", file=sys.stderr)  # noqa: T201
         return terminal.BAD_INPUT
     return 0
+
+
+def _check_arguments(argv: Sequence[str]) -> None:
+    """Refuse arguments that cannot be shown, as in a report's command: names of files mostly."""
+    for argument in argv:
+        if printable(argument) != argument:
+            raise OutputError(
+                f"argument '{argument}': it has control characters; rename the file, or leave them"
+                " out"
+            )
 
 
 def _show_version(value: bool) -> None:

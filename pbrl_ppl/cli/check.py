@@ -14,12 +14,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import typer
-from rich.console import Console
 from rich.table import Column, Table
 
 from pbrl_ppl.cli import options
 from pbrl_ppl.cli.app import command
-from pbrl_ppl.cli.terminal import FAILED, Progress, Result, sizes, table
+from pbrl_ppl.cli.terminal import FAILED, PlainConsole, Progress, Result, sizes, table
 from pbrl_ppl.state import STATE
 
 if TYPE_CHECKING:
@@ -60,7 +59,7 @@ def check(
     contents, missing = _contents(declared, loaded), _missing(loaded)
     unused = histories.unused_velocities(loaded)
     # shown at once: the prior's draws take long
-    console = Console(highlight=False, quiet=as_json)
+    console = PlainConsole(quiet=as_json)
     listed = Table(show_header=False, box=None)
     for row in contents.items():
         listed.add_row(*row)
@@ -222,7 +221,7 @@ def _shown_laws(attribution: Attribution) -> Iterator[str | Table]:
             ([", ".join(best.laws), best.nats, best.error] for best in length.path),
         )
         yield f"accepted: {', '.join(length.accepted) or 'none'}"
-        yield f"dropped: {', '.join(length.dropped) or 'none'}\n"
+        yield from (f"dropped: {', '.join(length.dropped) or 'none'}", "")
     columns = {"law": "<", "body": "<", "kind": "<", "nats": ".1f", "share of error": ""}
     yield table(
         "laws that the simulation error of trajectories shows",

@@ -324,7 +324,11 @@ def calibrate(
     table, page = result.table().to_dict("index"), output / "ranks.png"
     contents = {"passed": result.passed, "parameters": table, "picture": page}
     verdict = f"{'passed' if result.passed else 'failed'}: {page}"
-    return Result(contents, [_calibrated(result), verdict], 0 if result.passed else terminal.FAILED)
+    return Result(
+        contents,
+        [*_calibrated(result).splitlines(), verdict],
+        0 if result.passed else terminal.FAILED,
+    )
 
 
 def _calibrated(calibration: Calibration) -> str:

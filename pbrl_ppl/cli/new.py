@@ -18,8 +18,15 @@ import typer
 
 from pbrl_ppl.cli import options
 from pbrl_ppl.cli.app import command
-from pbrl_ppl.cli.terminal import Result, check_file
-from pbrl_ppl.errors import HistoryError, LayoutError, OutputError, RecordingWarning, SceneError
+from pbrl_ppl.cli.terminal import Result, check_file, in_a_line
+from pbrl_ppl.errors import (
+    HistoryError,
+    LayoutError,
+    OutputError,
+    RecordingWarning,
+    SceneError,
+    printable,
+)
 from pbrl_ppl.files import write_atomically, write_text
 from pbrl_ppl.scene import WORLD, Actuator, Body, Joint, Recording, Scene, Shape, nearest, toml_of
 from pbrl_ppl.state import Floats
@@ -425,11 +432,11 @@ def _asked(
         names = [typer.prompt("What is the body that moves called?", default="cart")]
     for name in names:
         while name not in shapes:
-            answer = typer.prompt(f"Outline of {name} ({SHAPES})")
+            answer = typer.prompt(f"Outline of {printable(name)} ({SHAPES})")
             try:
                 shapes |= outlines([f"{name}={answer}"])
             except SceneError as error:
-                typer.echo(str(error), err=True)
+                typer.echo(in_a_line(error), err=True)
     if time_step is None:
         time_step = typer.prompt("Time between two rows of the recording (s)", type=float)
     return {name: shapes[name] for name in names}, bool(side), time_step
@@ -455,7 +462,7 @@ def scene_text(shapes: Mapping[str, Shape], side: bool, time_step: float, found:
     return environment.get_template("scene.toml.jinja").render(
         shapes={name: vars(shape) for name, shape in shapes.items()},
         side=side, time_step=time_step, joints=found.hinges.joints(shapes),
-        actuators=actuators, recording=found.layout, said=found.said,
+        actuators=actuators, recording=found.layout, said=map(in_a_line, found.said),
         entry=lambda key, value: toml_of([("", {key: value})]).strip(),
     )  # fmt: skip
 

@@ -15,14 +15,14 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import TextIO
+from typing import Any, TextIO
 
 import typer
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from pbrl_ppl.errors import OutputError
+from pbrl_ppl.errors import OutputError, printable
 from pbrl_ppl.files import json_values
 
 #: Exit codes: a failed calibration, a failed log, a goal that was not reached, or effects that stay
@@ -37,15 +37,26 @@ _PATIENCE = 1.5
 Progress = Callable[[str], None]
 
 
+class PlainConsole(Console):
+    """Console without markup, to which names from files can be printed: they are escaped."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(highlight=False, markup=False, emoji=False, **options)
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Return a text with what a terminal would obey as escapes."""
+        return super().render_str(printable(text, kept="\n"), **options)
+
+
 @contextmanager
 def stages(quiet: bool) -> Iterator[Progress]:
     """Show stages on stderr with the time elapsed; a terminal also shows the running stage."""
-    console = Console(stderr=True, quiet=quiet, highlight=False, markup=False)
+    console = PlainConsole(stderr=True, quiet=quiet)
     running = Status()
     with console.status(running):
 
         def progress(stage: str) -> None:
-            console.print(f"[{running.elapsed:5.1f} s] {stage}", soft_wrap=True)
+            console.print(f"[{running.elapsed:5.1f} s] {in_a_line(stage)}", soft_wrap=True)
             running.name, running.share = stage, getattr(stage, "share", None)
 
         yield progress
@@ -65,7 +76,7 @@ class Status:
 
     def __rich__(self) -> Text:
         done = "" if self.share is None else f", about {self.share:.0%} done"
-        return Text(f"{self.name}, {self.elapsed:.0f} s{done}")
+        return Text(f"{in_a_line(self.name)}, {self.elapsed:.0f} s{done}")
 
 
 class Interrupts:
@@ -135,13 +146,13 @@ def interruptible(state: str = "nothing was written") -> Iterator[Interrupts]:
 
 def interrupted(state: str = "nothing was written") -> int:
     """Print which results are kept after an interrupt, and return the exit code."""
-    print(f"interrupted; {state}", file=sys.stderr)  # noqa: T201
+    print(f"interrupted; {in_a_line(state)}", file=sys.stderr)  # noqa: T201
     return INTERRUPTED
 
 
 def in_a_line(message: object) -> str:
-    """Return a message in one line, whatever it quotes from a file."""
-    return " ".join(str(message).split())
+    """Return a message in one line, whatever it quotes from a file, without control characters."""
+    return printable(" ".join(str(message).split()))
 
 
 @contextmanager
@@ -207,26 +218,27 @@ class Result:
         if as_json:
             typer.echo(json.dumps(json_values(self.contents), indent=1, allow_nan=False))
         # a file or a pipe has no width
-        console = Console(highlight=False, markup=False, width=None if sys.stdout.isatty() else 160)
+        console = PlainConsole(width=None if sys.stdout.isatty() else 160)
         for each in () if as_json else self.shown:
             if isinstance(each, Table):
                 console.print(each)
             else:
-                typer.echo(each)
+                typer.echo(printable(each))
         if self.warning:
-            typer.echo(self.warning, err=True)
+            typer.echo(printable(self.warning), err=True)
         if self.code:
             raise typer.Exit(self.code)
 
 
 def table(title: str | None, columns: Mapping[str, str], rows: Iterable[Sequence[object]]) -> Table:
     """Return a table whose columns have a format each; those that begin with < are text."""
-    made = Table(title=title, title_justify="left", box=None, pad_edge=False)
+    made = Table(title=title and printable(title), title_justify="left", box=None, pad_edge=False)
     for name, form in columns.items():
         left = form.startswith("<")
         made.add_column(name, justify="left" if left else "right", no_wrap=not left)
     for row in rows:
-        made.add_row(*(f"{each:{form}}" for each, form in zip(row, columns.values(), strict=True)))
+        cells = (f"{each:{form}}" for each, form in zip(row, columns.values(), strict=True))
+        made.add_row(*map(printable, cells))
     return made
 
 

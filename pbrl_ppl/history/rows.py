@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from pbrl_ppl.errors import HistoryError
+from pbrl_ppl.errors import HistoryError, printable
 from pbrl_ppl.history.files import COLUMNS
 from pbrl_ppl.history.kinematics import kinematic_bodies
 from pbrl_ppl.scene import Scene, nearest
@@ -226,6 +226,12 @@ def _trajectories(column: pd.Series, at: list[str]) -> tuple[Labels, Ints]:
         raise HistoryError(
             f"{at[text.index('')]}: trajectory is empty; expected a number or a name; fill it in"
         )
+    for label in dict.fromkeys(text):
+        if printable(label) != label:
+            raise HistoryError(
+                f"{at[text.index(label)]}: trajectory is {label!r}, expected a name without control"
+                " characters; rename it"
+            )
     whole = [re.fullmatch(r"(-?(?:0|[1-9]\d{0,17}))(?:\.0*)?", label) for label in text]
     labels: Labels = [*text]
     if all(whole):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Literal
 
@@ -11,6 +12,7 @@ from cycler import cycler
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from PIL import Image
 from scipy.stats import gaussian_kde
 
@@ -199,7 +201,13 @@ def shares_below(axes: Axes, samples: Mapping[str, Floats], size: float) -> tupl
 def png(figure: Figure, colours: int = 96) -> bytes:
     """Render a figure as a PNG picture, which a palette makes a third as large."""
     drawn, small = io.BytesIO(), io.BytesIO()
-    figure.savefig(drawn, format="png", dpi=130 if figure.get_figwidth() > NARROW else 170)
+    for text in figure.findobj(Text):
+        if "$" in text.get_text():  # of a name: no text here is a formula
+            text.set_parse_math(False)
+    with warnings.catch_warnings():
+        # a name in letters that the font lacks is in the page's text all the same
+        warnings.filterwarnings("ignore", message="Glyph .* missing from", category=UserWarning)
+        figure.savefig(drawn, format="png", dpi=130 if figure.get_figwidth() > NARROW else 170)
     picture = Image.open(drawn).convert("RGB")
     picture = picture.quantize(colours, dither=Image.Dither.NONE)
     picture.save(small, format="png", optimize=True)
