@@ -19,7 +19,7 @@ from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Scene, state_sizes, units_of
 from tests.helpers.similar import (
     factor,
-    framed,
+    in_frame,
     similar,
     similar_history,
     similar_phi,
@@ -154,25 +154,6 @@ def test_candidates_are_ranked_as_on_the_similar_rig(scales) -> None:
         assert same.estimate[name] == pytest.approx(expected, rel=0.02)
 
 
-def _in_frame(history: pp.History, scene: Scene, turn: float, shift, later: float, turns: int):
-    """Return the scene and the history in a turned and moved frame, with later time stamps."""
-    c, s = np.cos(turn), np.sin(turn)
-    frame = history.to_dataframe()
-    for x, y in (("x", "y"), ("vx", "vy"), ("force_x", "force_y")):
-        frame[x], frame[y] = c * frame[x] - s * frame[y], s * frame[x] + c * frame[y]
-    frame["x"] += shift[0]
-    frame["y"] += shift[1]
-    frame["theta"] += turn + 2 * np.pi * turns
-    frame["time"] += later
-
-    def place(point):
-        x, y = point
-        return c * x - s * y + shift[0], s * x + c * y + shift[1]
-
-    moved = framed(scene, place, turn)
-    return moved, pp.History.from_dataframe(frame, moved)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("turn", "shift", "later", "turns"),
@@ -182,7 +163,7 @@ def test_candidates_do_not_depend_on_the_frame(turn, shift, later, turns) -> Non
     """A turned, a moved frame; time stamps of 1e9 s and angles of forty turns."""
     scene, history = cart()
     here = ranked().candidates[0]
-    there = criticise(*_in_frame(history, scene, turn, shift, later, turns)).candidates[0]
+    there = criticise(*in_frame(history, scene, turn, shift, later, turns)).candidates[0]
     assert here.effect == there.effect
     assert there.statistic == pytest.approx(here.statistic, rel=0.06)
     for name in here.estimate:

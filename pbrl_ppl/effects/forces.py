@@ -202,7 +202,7 @@ def _scan_periods(
 
     The derivative is taken by the forces or torques, which come first.
     """
-    longest = float(np.nanmax(history.dataset["clock"].to_numpy(), initial=0.0))
+    longest = float(np.nanmax(history.elapsed, initial=0.0))
     periods = [longest / n for n in (1, 2, 4, 8, 16) if longest / n > 4.0 * scene.time_step]
     grid = [(np.nan, np.nan, period, *turn) for period in periods for turn in directions]
     return np.array(grid).reshape(-1, 3 + len(directions[0]))
@@ -290,7 +290,7 @@ def _scan_begins(scene: Scene, history: History, body: Body, *, most: int = 20) 
     """
     data = history.dataset
     numbers = data["number"].to_numpy()
-    last = float(np.nanmax(data["clock"].to_numpy()))
+    last = float(np.nanmax(history.elapsed))
     grid = np.linspace(0, 1, most)
     between = numbers[1:] - 0.5
     begins = np.unique(np.quantile(between, grid, method="nearest")) if len(between) else between

@@ -83,6 +83,7 @@ class History:
           velocities and the scene's pose;
         - ``assumed`` (body, state): columns of it that may not start single transitions (Eq. 11);
         - ``clock`` (trajectory, time): time (s);
+        - ``began`` (trajectory,): time at which the trajectory began (s);
         - ``number`` (trajectory,): which trajectory of the recording it is, from 0;
         - ``before`` (trajectory, body, wrench): what acted before; zero;
         - ``n_rows`` (trajectory,): number of steps;
@@ -246,6 +247,7 @@ class History:
                 "start": ((*dims, "state"), start, states),
                 "assumed": (("body", "state"), assumed),
                 "clock": (("trajectory", "time"), clock, {"units": "s"}),
+                "began": ("trajectory", clock[:, 0], {"units": "s"}),
                 "n_rows": ("trajectory", n_rows),
                 "number": ("trajectory", np.arange(float(n))),
                 "before": (("trajectory", "body", "wrench"), before, wrenches),
@@ -368,12 +370,18 @@ class History:
         action[:, :-1, follows] = path_velocities(poses, float(data.attrs["time_step"]))
         before = data["before"].to_numpy()[:, None]
         previous = np.concatenate([before, action[:, :-1]], axis=1)
-        clock = data["clock"].to_numpy()
+        clock = self.elapsed
         end = np.pad(clock[:, 1:], ((0, 0), (0, 1)), constant_values=np.nan)
         number = np.broadcast_to(data["number"].to_numpy()[:, None], clock.shape)
         when = np.stack([number, clock, end], axis=-1)[:, :, None]
         when = np.broadcast_to(when, (*action.shape[:-1], 3))
         return np.concatenate([action, previous, when], axis=-1)
+
+    @property
+    def elapsed(self) -> Floats:
+        """Time since each trajectory began, shape (trajectory, time), s; laws know no other."""
+        data = self.dataset
+        return np.asarray(data["clock"].to_numpy() - data["began"].to_numpy()[:, None])
 
     def split(self, test_fraction: float = 0.25, seed: int = 0) -> tuple[History, History]:
         """Return a training and a test history, each of whole trajectories.
@@ -596,6 +604,7 @@ def from_segments(scene: Scene, start: Floats, actions: Floats, observed: Floats
             before=data["before"].copy(data=actions[:, 0, :, 3:6]),
             number=data["number"].copy(data=number[:, 0]),
             clock=data["clock"].copy(data=np.concatenate([begin, end[:, -1:]], axis=1)),
+            began=data["began"].copy(data=np.zeros(len(begin))),
         )
     )
 

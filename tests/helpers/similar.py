@@ -141,3 +141,36 @@ def framed(scene: Scene, place: Callable, turn: float = 0.0, mirrored: bool = Fa
             for joint in scene.joints
         ),
     )
+
+
+def in_frame(
+    history: History,
+    scene: Scene,
+    turn: float = 0.0,
+    shift: tuple[float, float] = (0.0, 0.0),
+    later: float = 0.0,
+    turns: int = 0,
+    mirrored: bool = False,
+) -> tuple[Scene, History]:
+    """Return the scene and the history in another frame, with later time stamps.
+
+    The frame is mirrored along x, then turned, then moved; angles have ``turns`` whole turns more.
+    """
+    c, s, flip = np.cos(turn), np.sin(turn), -1.0 if mirrored else 1.0
+    frame = history.to_dataframe()
+    for x, y in (("x", "y"), ("vx", "vy"), ("force_x", "force_y")):
+        there = flip * frame[y]
+        frame[x], frame[y] = c * frame[x] - s * there, s * frame[x] + c * there
+    for name in ("theta", "omega", "torque"):
+        frame[name] *= flip
+    frame["x"] += shift[0]
+    frame["y"] += shift[1]
+    frame["theta"] += turn + 2 * np.pi * turns
+    frame["time"] += later
+
+    def place(point):
+        x, y = point[0], flip * point[1]
+        return c * x - s * y + shift[0], s * x + c * y + shift[1]
+
+    moved = framed(scene, place, turn, mirrored)
+    return moved, History.from_dataframe(frame, moved)
