@@ -56,6 +56,9 @@ LIKELY = 0.7
 _CLEAR = 30.0
 #: Log odds of laws that are rare, at most.
 _RARE = -5.0
+#: The last digits of the data may change the evidence of a refit beside another by this (nats):
+#: each ends where a step gains less than half of it.
+_REPEATABLE = 1.0
 #: Share of the joint sizes from which refits begin a second time.
 _SHORTER = 0.3
 
@@ -463,9 +466,16 @@ class Search:
             grown = self._exchanged(grown, law, mode, _family(regression, subset, law))
         laws = [law for law in grown.earlier if law not in model.earlier]
         self.say(f"simulations name {' and '.join(map(_name, laws))}")
-        subset = next((one for one in regression.subsets if set(one.laws) == set(laws)), subset)
-        rivals = {law: _rivals(regression, subset, law, limits.least_nats) for law in subset.laws}
-        pruned = self._pruned(replace(grown, rivals={**model.rivals, **rivals}).fitted())
+        close = [one for one in enough if one[0].nats > top - 2.0 * limits.least_nats]
+        here = next((one for one in regression.subsets if set(one.laws) == set(laws)), subset)
+        rivals = dict(grown.rivals)
+        for law, chosen in zip(laws, subset.laws, strict=True):
+            beside = _refitted_instead(subset, chosen, [one[1:] for one in close])
+            scored = law if law in here.laws else chosen
+            beside |= _rivals(regression, here, scored, limits.least_nats)
+            named = {one: size for one, size in beside.items() if one not in laws}
+            rivals[law] = {**rivals.get(law, {}), **named}
+        pruned = self._pruned(replace(grown, rivals=rivals).fitted())
         return pruned if set(pruned.earlier) - set(model.earlier) else model
 
     def _exchanged(
@@ -484,10 +494,19 @@ class Search:
         swaps = _swaps(begin, law, family)
         net = _net(before, model.mode, law, swaps)
         better = max(net, key=lambda one: net[one], default=law)
-        if better == law or net[better] < least:
+        named = better if net.get(better, -np.inf) >= least else law
+        # which of those that are nearly as good is named may be a matter of the last digits
+        near = net.get(named, 0.0) - 2.0 * self.criteria.search.least_nats
+        modes = {law: model.mode, **swaps}
+        close = sorted(({law: 0.0} | net).items(), key=lambda one: -one[1])
+        rivals = {
+            one: sizes_of(modes[one], one) for one, nats in close if nats > near and one != named
+        }
+        model = replace(model, rivals={**model.rivals, named: rivals})
+        if named == law:
             return model
-        self.say(f"{_name(better)} explains simulations better than {_name(law)}")
-        return model.exchanged(law, better, swaps[better])
+        self.say(f"{_name(named)} explains simulations better than {_name(law)}")
+        return model.exchanged(law, named, swaps[named])
 
     def _as_common(self, mode: Mode, law: Attached, others: set[str]) -> dict[Attached, Floats]:
         """Return common effects and a rare law's family, ``others``' aside, and their sizes."""
@@ -615,13 +634,17 @@ class Search:
             same = [one for one in rivals if one in absorbed]
             rivals = {one: size for one, size in rivals.items() if one not in absorbed}
             swaps = _swaps(mode, law, rivals, most)
-            close = [one for one, other in swaps.items() if _gained(mode, other) > -least]
             net = _net(without, mode, law, swaps)
+            close = [
+                one for one, other in swaps.items()
+                if _gained(mode, other) > -least or net[one] > -least - _REPEATABLE
+            ]  # fmt: skip
             better = max(net, key=lambda one: net[one], default=law)
             if better != law and net[better] > least:
                 self.say(f"{_name(better)} explains whole trajectories better than {_name(law)}")
                 model = model.exchanged(law, better, swaps[better]).fitted(whole=True)
-                close = [law] if _gained(mode, swaps[better]) < least else []
+                gained = min(_gained(mode, swaps[better]), net[better] - _REPEATABLE)
+                close = [law] if gained < least else []
                 law = better
             groups[law] = (*same, *close)
         return model, groups
@@ -857,6 +880,19 @@ def _family(
         (other,) = set(one.laws) - set(subset.laws)
         if _is_alike(other, law) and one.share > near * subset.share:
             sizes.setdefault(other, one.sizes[other])
+    return sizes
+
+
+def _refitted_instead(
+    subset: Subset, law: Attached, refits: Sequence[tuple[Subset, Mode]]
+) -> dict[Attached, Floats]:
+    """Return effects that refitted subsets have in the place of one law, and their sizes."""
+    rest, sizes = set(subset.laws) - {law}, dict[Attached, Floats]()
+    for other, fitted in refits:
+        more = set(other.laws) - rest
+        if len(more) == 1 and law not in other.laws and rest < set(other.laws):
+            (one,) = more
+            sizes[one] = sizes_of(fitted, one)
     return sizes
 
 

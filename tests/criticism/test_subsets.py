@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import pbrl_ppl as pp
-from pbrl_ppl.criticism.search import Evidence
+from pbrl_ppl.criticism import search
+from pbrl_ppl.criticism.search import Evidence, Search, refit
 from pbrl_ppl.criticism.subsets import best_subsets
 from pbrl_ppl.effects import candidates
 from pbrl_ppl.errors import EffectError
@@ -99,6 +100,25 @@ def test_filtered_at_a_modes_parameters_is_that_mode() -> None:
     again = filtered_mode(mode, mode)
     assert again.log_posterior == pytest.approx(mode.log_posterior, abs=0.5)
     np.testing.assert_array_equal(again.phi, mode.phi)
+
+
+@pytest.mark.parametrize("net", [3.1, 2.9, -2.9, -3.1])
+def test_the_other_of_two_laws_that_are_nearly_as_good_is_reported(
+    dragged_and_pulled, monkeypatch, net
+) -> None:
+    """Which of them is named is decided by 3 nats, and near that by the data's last digits."""
+    first, second = (one for one in candidates(DISC, (), OFFERED) if "drag" in one.effect.name)
+    bare = dragged_and_pulled
+    model = search._Model(refit(bare, (first,), {}), {first: 0.0})
+    monkeypatch.setattr(search, "_net", lambda *_: {second: net})
+    monkeypatch.setattr(search, "_gained", lambda *_: 9.0 * np.sign(net))
+    named, other = (second, first) if net > 3.0 else (first, second)
+    found = Search(lambda _: ())._exchanged(model, first, bare, {second: np.array([0.3])})
+    assert ([*found.earlier], [*found.rivals[named]]) == ([named], [other])
+    # on the longest pieces, where the first is named and the second among its rivals
+    kept = replace(model, rivals={first: {second: np.array([0.3])}}).fitted(whole=True)
+    again, confounded = Search(lambda _: ())._confounded(kept, set())
+    assert ([*again.earlier], confounded) == ([named], {named: (other,)})
 
 
 @pytest.mark.slow
