@@ -1,7 +1,9 @@
 """The public names: all resolve, each at its first use."""
 
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -21,6 +23,23 @@ def test_star_import() -> None:
     names: dict[str, object] = {}
     exec("from pbrl_ppl import *", names)
     assert {*pbrl_ppl.__all__} <= {*names}
+
+
+def test_modules_and_commands_import_without_a_warning(tmp_path: Path) -> None:
+    """With an empty home folder, for ArviZ 0.23 warns where it has not done so today."""
+    code = """if True:
+        import importlib, pkgutil
+        import pbrl_ppl
+        for each in pkgutil.walk_packages(pbrl_ppl.__path__, "pbrl_ppl."):
+            if not each.name.startswith("pbrl_ppl.models."):
+                importlib.import_module(each.name)
+        print(pbrl_ppl.cli.main(["check", "--help"]))
+    """
+    home = os.environ | {"HOME": str(tmp_path)}
+    argv = [sys.executable, "-W", "error", "-c", code]
+    said = subprocess.run(argv, capture_output=True, text=True, env=home)
+    assert not said.returncode and not said.stderr, said.stderr
+    assert said.stdout.endswith("0\n")
 
 
 def test_import_is_quick() -> None:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from functools import partial
 
 import numpy as np
-import pymc as pm
 import pytensor.tensor as pt
 from pytensor.tensor.variable import TensorVariable
 from scipy.special import i0e
@@ -25,6 +25,10 @@ from pbrl_ppl.likelihood import (
 from pbrl_ppl.model.op import LogLikelihoodOp, SimulatorOp
 from pbrl_ppl.parameters import Block, Layout, ParameterLibrary, Prior
 from pbrl_ppl.state import Floats
+
+with warnings.catch_warnings():  # PyMC 5 imports ArviZ 0.23, which announces 1.0 once a day
+    warnings.filterwarnings("ignore", r"\s*ArviZ is undergoing", FutureWarning)
+    import pymc as pm
 
 
 def build_model(problem: Problem) -> pm.Model:

@@ -44,6 +44,7 @@ from .store import DATATREE as DATATREE
 from .store import HDI_PROB as HDI_PROB
 from .store import SIZE as SIZE
 from .store import Idata as Idata
+from .store import arviz as arviz
 from .store import convergence as convergence
 from .store import draws as draws
 from .store import from_groups as from_groups

@@ -7,7 +7,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import arviz as az
 import numpy as np
 import pandas as pd
 import xarray as xr
@@ -20,6 +19,7 @@ from pbrl_ppl.posterior import (
     HDI_PROB,
     SIZE,
     Idata,
+    arviz,
     from_groups,
     group,
     groups,
@@ -160,7 +160,7 @@ def summary(posterior: Idata) -> pd.DataFrame:
     # the same interval has other names before and after ArviZ 1.0
     options = {"ci_prob": HDI_PROB, "ci_kind": "hdi"} if DATATREE else {"hdi_prob": HDI_PROB}
     with np.errstate(all="ignore"):  # a parameter that never moved has no R-hat
-        table = az.summary(scalars(posterior), round_to="none", **options)
+        table = arviz().summary(scalars(posterior), round_to="none", **options)
     names = {table.columns[2]: "lower", table.columns[3]: "upper"}
     columns = ["mean", "sd", "lower", "upper", "ess_bulk", "ess_tail", "r_hat"]
     result: pd.DataFrame = table.rename(columns=names)[columns]
@@ -264,7 +264,7 @@ def pareto_k(posterior: Idata) -> tuple[Floats, float, str]:
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")  # ArviZ warns of a high k, which the result shows
         try:
-            loo = az.loo(separate(posterior), pointwise=True)
+            loo = arviz().loo(separate(posterior), pointwise=True)
         except (TypeError, ValueError, KeyError, IndexError) as error:  # no finite likelihood
             raise PosteriorError(f"leave-one-out cross-validation: {error}") from error
     return np.asarray(loo.pareto_k, dtype=float).ravel(), float(loo.good_k), left_out(posterior)
