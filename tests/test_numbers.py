@@ -50,6 +50,11 @@ def test_other_units_are_read_to_the_last_digits(tmp_path) -> None:
     np.testing.assert_allclose(read.elapsed, history().elapsed, atol=3e-7)
 
 
+def test_a_history_from_before_laws_knew_where_it_began_is_read() -> None:
+    older = History(history().dataset.drop_vars("began"))
+    np.testing.assert_array_equal(older.elapsed, older.dataset["clock"])
+
+
 @pytest.mark.parametrize("other", ["units", "digits"])
 def test_posterior_is_the_same_to_a_millionth(other, tmp_path) -> None:
     """Means and standard deviations of single transitions; measured: 1e-11."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import resource
@@ -44,6 +45,8 @@ class Ran:
         Peak memory (MB).
     process : int
         Its process, which was the first of its session.
+    after : float
+        Time (s) from the signal that killed it to its end; NaN without one.
     """
 
     argv: tuple[str, ...]
@@ -54,6 +57,7 @@ class Ran:
     silent: float
     peak: float
     process: int = 0
+    after: float = math.nan
 
     def fault(self, codes: Sequence[int] = (0,)) -> str:
         """Return what is wrong with it, or nothing; ``codes`` are exit codes that are right."""
@@ -91,6 +95,7 @@ def run(
     limit: float = 900.0,
     memory: float | None = None,
     kill: Callable[[float], bool] | None = None,
+    by: int = signal.SIGKILL,
 ) -> Ran:
     """Run a command of ``pbrl-ppl`` in a forked child of this process.
 
@@ -107,13 +112,15 @@ def run(
     kill : callable, optional
         Takes the seconds since the begin; once it is true the process is killed, without its
         children.
+    by : int
+        Signal that kills it; SIGINT goes to its children too, as from a terminal.
     """
     out, err = folder / ".stdout", folder / ".stderr"
     begin = time.monotonic()
     child = os.fork()
     if not child:
         _become(argv, folder, out, err, memory)
-    silent, size, last = 0.0, 0, begin
+    silent, size, last, sent = 0.0, 0, begin, math.nan
     while True:
         ended, status, usage = os.wait4(child, os.WNOHANG)
         now = time.monotonic()
@@ -125,12 +132,14 @@ def run(
             break
         if now - begin > limit:
             os.killpg(child, signal.SIGKILL)
-        if kill is not None and kill(now - begin):
-            os.kill(child, signal.SIGKILL)
+        if kill is not None and math.isnan(sent) and kill(now - begin):
+            (os.killpg if by == signal.SIGINT else os.kill)(child, by)
+            sent = now
         time.sleep(0.02 if kill is None else 0.001)
     code = os.waitstatus_to_exitcode(status)
     texts = (path.read_text(errors="replace") if path.exists() else "" for path in (out, err))
-    return Ran(tuple(argv), code, *texts, now - begin, silent, usage.ru_maxrss / 1024, child)
+    peak = usage.ru_maxrss / 1024
+    return Ran(tuple(argv), code, *texts, now - begin, silent, peak, child, now - sent)
 
 
 def _become(argv: Sequence[str], folder: Path, out: Path, err: Path, memory: float | None) -> None:

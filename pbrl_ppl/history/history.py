@@ -100,6 +100,8 @@ class History:
     """
 
     def __init__(self, dataset: xr.Dataset) -> None:
+        if "began" not in dataset:  # of a file from before laws knew it
+            dataset = dataset.assign(began=xr.zeros_like(dataset["number"]))
         self.dataset = dataset
 
     @classmethod

@@ -425,6 +425,28 @@ def test_an_interrupt_of_the_shell_ends_a_fit(seconds: float) -> None:
     assert ("kept in puck.nc" in said) == Path("puck.nc").exists()
 
 
+#: Runs machine code for minutes, in which Python handles no signal.
+BUSY = """
+import hashlib
+from pbrl_ppl.cli import terminal
+with terminal.interruptible("two logs are kept"):
+    print("begun", flush=True)
+    hashlib.pbkdf2_hmac("sha256", b"", b"", 10**9)
+"""
+
+
+def test_an_interrupt_ends_machine_code() -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", BUSY], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+    ) as process:  # fmt: skip
+        assert process.stdout is not None and process.stderr is not None
+        assert process.stdout.readline() == "begun\n"
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 130
+        assert process.stderr.read() == "interrupted; two logs are kept\n"
+
+
 @pytest.mark.usefixtures("puck")
 def test_an_interrupt_that_a_sampler_swallowed_is_none_the_less_one(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -438,9 +460,9 @@ def test_an_interrupt_that_a_sampler_swallowed_is_none_the_less_one(
         return whole(*args, **options)
 
     monkeypatch.setattr(sampling, "fit", swallowed)
-    fit = ["fit", "scene.toml", "train.csv", "-o", "puck.nc", "-q", "--method", "map"]
-    assert main(fit) == 130
-    assert "1 draws of each of 1 chains are kept in puck.nc" in capsys.readouterr().err
+    fit = ["fit", "scene.toml", "train.csv", "-o", "puck.nc", "-q", "--method", "metropolis"]
+    assert main([*fit, "--draws", "40", "--tune", "40", "--chains", "2"]) == 130
+    assert "40 draws of each of 2 chains are kept in puck.nc" in capsys.readouterr().err
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
