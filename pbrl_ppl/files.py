@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import math
 import shutil
 import tempfile
 import time
+import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from itertools import takewhile
@@ -14,6 +16,59 @@ from pathlib import Path
 from typing import Any
 
 from pbrl_ppl.errors import OutputError
+
+
+def check_regular(path: Path) -> None:
+    """Raise an OSError where there is a folder, or a pipe or device, which may have no end."""
+    if path.exists() and not path.is_file():
+        raise OSError(errno.EINVAL, "it is a folder, a pipe or a device; expected a file")
+
+
+def read_text(path: Path, encoding: str = "utf-8") -> str:
+    """Return the text of a regular file; raises an OSError or a UnicodeDecodeError."""
+    check_regular(path)
+    return path.read_text(encoding=encoding)
+
+
+def reason(error: Exception) -> str:
+    """Return why a file could not be read, without the number of the system's error."""
+    return getattr(error, "strerror", None) or str(error)
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """Return a TOML document; raises a ValueError that says why it is none."""
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError:
+        raise
+    except RecursionError:
+        raise ValueError("its values are nested too deeply") from None
+    except ValueError:  # of Python's integers
+        raise ValueError("a number has thousands of digits") from None
+
+
+#: Bytes of arrays that a file may hold whatever its size, and for each of its bytes.
+_MOST, _PACKED = 2**30, 200
+
+
+def check_hdf5(path: Path) -> None:
+    """Raise an error where a file is not HDF5, or declares arrays far larger than itself.
+
+    xarray would take the memory of such arrays, and leaves what is no HDF5 to be closed later.
+    """
+    import h5py
+
+    sizes: list[int] = []
+
+    def note(_: str, item: h5py.Dataset | h5py.Group) -> None:
+        if isinstance(item, h5py.Dataset):
+            sizes.append(math.prod(item.shape or (0,)) * item.dtype.itemsize)
+
+    with h5py.File(path, "r") as file:
+        file.visititems(note)
+    if sum(sizes) > max(_MOST, _PACKED * path.stat().st_size):
+        raise ValueError(f"it declares arrays of {sum(sizes) / 2**30:.3g} GB")
+
 
 #: How names of temporary folders begin; a process that is killed leaves them behind.
 _MAKING = ".pbrl-ppl-"

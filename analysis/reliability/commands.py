@@ -96,6 +96,7 @@ def run(
     memory: float | None = None,
     kill: Callable[[float], bool] | None = None,
     by: int = signal.SIGKILL,
+    program: Callable[[list[str]], int] | None = None,
 ) -> Ran:
     """Run a command of ``pbrl-ppl`` in a forked child of this process.
 
@@ -114,12 +115,14 @@ def run(
         children.
     by : int
         Signal that kills it; SIGINT goes to its children too, as from a terminal.
+    program : callable, optional
+        In place of ``pbrl-ppl``: takes the arguments, and returns the exit code.
     """
     out, err = folder / ".stdout", folder / ".stderr"
     begin = time.monotonic()
     child = os.fork()
     if not child:
-        _become(argv, folder, out, err, memory)
+        _become(argv, folder, out, err, memory, program)
     silent, size, last, sent = 0.0, 0, begin, math.nan
     while True:
         ended, status, usage = os.wait4(child, os.WNOHANG)
@@ -142,7 +145,14 @@ def run(
     return Ran(tuple(argv), code, *texts, now - begin, silent, peak, child, now - sent)
 
 
-def _become(argv: Sequence[str], folder: Path, out: Path, err: Path, memory: float | None) -> None:
+def _become(
+    argv: Sequence[str],
+    folder: Path,
+    out: Path,
+    err: Path,
+    memory: float | None,
+    program: Callable[[list[str]], int] | None,
+) -> None:
     """Run the command in this process, a new session's first, and end."""
     code = 70
     try:
@@ -163,7 +173,7 @@ def _become(argv: Sequence[str], folder: Path, out: Path, err: Path, memory: flo
             resource.setrlimit(resource.RLIMIT_AS, (most, most))
         from pbrl_ppl.cli import main
 
-        code = main(list(argv))
+        code = (program or main)(list(argv))
     except BaseException:
         import traceback
 

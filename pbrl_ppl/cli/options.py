@@ -39,7 +39,7 @@ import typer
 
 from pbrl_ppl.cli.terminal import check_file
 from pbrl_ppl.errors import EffectError, GoalError
-from pbrl_ppl.files import check_folder
+from pbrl_ppl.files import check_folder, check_regular
 
 if TYPE_CHECKING:
     from pbrl_ppl.effects import Attached, Effect
@@ -354,6 +354,7 @@ def _defined(path: Path) -> list[Effect]:
     from pbrl_ppl.effects import Effect, check_names
 
     try:
+        check_regular(path)
         source = path.read_bytes()
     except OSError as error:
         raise EffectError(

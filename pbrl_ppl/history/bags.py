@@ -205,8 +205,10 @@ def _opened(path: Path) -> Iterator[AnyReader]:
     except HistoryError:
         raise
     except Exception as error:  # damaged files raise errors of many kinds
+        # those of rosbags say what is wrong
+        why = f" ({error})" if type(error).__name__.endswith("ReaderError") else ""
         raise HistoryError(
-            f"bag {path}: cannot be read ({type(error).__name__}: {error}); record it to its end,"
+            f"bag {path}: cannot be read{why}; record it to its end,"
             " or repair it with `rosbag reindex`, `ros2 bag reindex` or `mcap recover`"
         ) from None
 

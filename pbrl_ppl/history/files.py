@@ -21,7 +21,7 @@ import pandas as pd
 import xarray as xr
 
 from pbrl_ppl.errors import HistoryError, OutputError
-from pbrl_ppl.files import write_atomically
+from pbrl_ppl.files import check_hdf5, check_regular, reason, write_atomically
 from pbrl_ppl.scene import SEPARATORS, Recording
 from pbrl_ppl.state import STATE, WRENCH, Floats
 
@@ -92,11 +92,13 @@ def read_table(path: Path, layout: Recording) -> pd.DataFrame:
             f"{', '.join(readers)}; save it as one of these"
         )
     try:
+        if reader is not readers[FOLDER]:
+            check_regular(path)
         return reader(path, layout)
     except FileNotFoundError:
         raise HistoryError(f"history {path}: there is no such file; check the path") from None
     except OSError as error:
-        raise HistoryError(f"history {path}: cannot be read: {error}") from None
+        raise HistoryError(f"history {path}: cannot be read: {reason(error)}") from None
 
 
 def read_commands(path: Path, layout: Recording | None) -> pd.DataFrame | None:
@@ -279,6 +281,7 @@ def read_netcdf(path: Path, layout: Recording) -> pd.DataFrame:
     """Return the rows of a NetCDF file that `History.save` wrote."""
     path.open("rb").close()
     try:
+        check_hdf5(path)
         with xr.open_dataset(path, engine="h5netcdf", decode_times=False) as stored:
             dataset = stored.load()
     except Exception as error:  # HDF5 raises many kinds on a damaged file

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from pbrl_ppl.errors import GoalError
+from pbrl_ppl.files import parse_toml, read_text, reason
 from pbrl_ppl.scene import Scene, nearest
 from pbrl_ppl.state import POSE, Floats
 
@@ -246,11 +246,11 @@ def read_tables(
         If it is missing, is not TOML, has another key, or a table names no body.
     """
     try:
-        document = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        document = parse_toml(read_text(Path(path)))
     except FileNotFoundError:
         raise GoalError(f"{what} {path}: there is no such file; check the path") from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise GoalError(f"{what} {path}: cannot be read as TOML: {error}") from None
+    except (OSError, ValueError) as error:
+        raise GoalError(f"{what} {path}: cannot be read as TOML: {reason(error)}") from None
     key = kind.__name__.lower()
     _check_keys(document, [*options, key], f"{what} {path}")
     tables = document.pop(key, [])

@@ -11,7 +11,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 import numpy as np
 
 from pbrl_ppl.effects import Attached, Effect, attach, catalogue, learned_remainder
-from pbrl_ppl.errors import PosteriorError
+from pbrl_ppl.errors import PbrlError, PosteriorError
 from pbrl_ppl.likelihood import (
     Coordinates,
     Problem,
@@ -433,12 +433,18 @@ def layout_of(idata: Idata, effects: Iterable[Effect] = catalogue) -> Layout:
 
 def stored_fields(idata: Idata, names: Iterable[str] | None = None) -> dict[str, Any]:
     """Return fields of the record that a posterior's attributes hold, all or some, by name."""
-    kinds = _kinds(PosteriorRecord)
-    return {
-        name: _read(kinds[name], idata.attrs[name])
-        for name in (kinds if names is None else names)
-        if name in idata.attrs
-    }
+    kinds, read = _kinds(PosteriorRecord), {}
+    for name in kinds if names is None else names:
+        if name in idata.attrs:
+            try:
+                read[name] = _read(kinds[name], idata.attrs[name])
+            except PbrlError:
+                raise
+            except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+                raise PosteriorError(
+                    f"posterior: its attribute {name} cannot be read; fit it again"
+                ) from None
+    return read
 
 
 @cache

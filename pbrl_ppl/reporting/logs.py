@@ -22,7 +22,7 @@ from pbrl_ppl.criticism import Loop, close_loop
 from pbrl_ppl.criticism.loop import DONE as DONE
 from pbrl_ppl.criticism.loop import FILES
 from pbrl_ppl.errors import ManifestError, PbrlError
-from pbrl_ppl.files import write_text
+from pbrl_ppl.files import read_text, reason, write_text
 from pbrl_ppl.history import read_recording, read_scene
 from pbrl_ppl.reporting.reports import render
 from pbrl_ppl.scene import nearest
@@ -77,12 +77,12 @@ def read_manifest(path: str | Path) -> tuple[Log, ...]:
     path = Path(path)
     where = f"manifest {path}"
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_text(path, "utf-8-sig")
         table = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines())]
     except FileNotFoundError:
         raise ManifestError(f"{where}: there is no such file; check the path") from None
     except (OSError, UnicodeDecodeError) as error:
-        raise ManifestError(f"{where}: cannot be read: {error}") from None
+        raise ManifestError(f"{where}: cannot be read: {reason(error)}") from None
     except csv.Error as error:
         raise ManifestError(f"{where}: no CSV table: {error}") from None
     columns = ", ".join(_NEEDED)

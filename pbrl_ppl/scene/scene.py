@@ -10,7 +10,6 @@ import dataclasses
 import json
 import math
 import re
-import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
@@ -19,6 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from pbrl_ppl.errors import SceneError
+from pbrl_ppl.files import parse_toml, read_text, reason
 from pbrl_ppl.scene import checks
 from pbrl_ppl.scene.bodies import Body, Shape, Wall, check_classes
 from pbrl_ppl.scene.checks import Named, Point
@@ -180,11 +180,12 @@ class Scene:
         """
         path = Path(path)
         try:
-            text = path.read_text(encoding="utf-8")
+            text = read_text(path)
         except FileNotFoundError:
             raise SceneError(f"scene {path}: there is no such file; check the path") from None
         except (OSError, UnicodeDecodeError) as error:
-            raise SceneError(f"scene {path}: cannot be read as UTF-8 text: {error}") from None
+            why = reason(error)
+            raise SceneError(f"scene {path}: cannot be read as UTF-8 text: {why}") from None
         with checks.located(f"scene {path}"):
             return cls.from_toml(text)
 
@@ -198,8 +199,8 @@ class Scene:
             As `load`; an unknown key is named with its table and the nearest known key.
         """
         try:
-            document = tomllib.loads(text)
-        except tomllib.TOMLDecodeError as error:
+            document = parse_toml(text)
+        except ValueError as error:
             raise SceneError(f"not TOML: {error}") from None
         arrays = [key for key, _ in _PARTS.values()]
         _checked(document, "the file", ["world"], ["noise", "recording", *arrays])
