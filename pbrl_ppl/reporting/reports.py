@@ -164,6 +164,13 @@ def render_posterior(
     known, why_unknown = _or_why(lambda: identify(posterior, effects=effects))
     covered, why_uncovered = _or_why(lambda: coverage(posterior))
     k, why_no_k = _or_why(lambda: pareto_k(posterior))
+    compared = compare(posterior, posterior) if k else None
+    if k and compared is None:
+        why_no_k = (
+            f"Not available: leaving out one {k[2]} at a time gives no finite number; in some draws"
+            " the likelihood is zero"
+        )
+        k = None
     return render_page(
         f"posterior of {', '.join(body.name for body in record.scene.moving)}",
         "posterior",
@@ -182,7 +189,7 @@ def render_posterior(
         covered=covered,
         why_uncovered=why_uncovered,
         pareto=k,
-        compared=k and compare(posterior, posterior),
+        compared=compared,
         why_no_k=why_no_k,
         sizes={**group(posterior, "observed_data").sizes, **sizes},
     )

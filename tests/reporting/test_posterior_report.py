@@ -79,6 +79,18 @@ def test_what_cannot_be_had_is_said() -> None:
     assert "Warning of the fit. mass is pressed" in Page(render_posterior(warned)).text
 
 
+@pytest.mark.usefixtures("undrawn")
+def test_a_draw_of_zero_likelihood_has_no_cross_validation() -> None:
+    whole = load_posterior(file("5"))
+    parts = groups(whole)
+    values = parts["log_likelihood"]["next_state"].copy(deep=True)
+    values[0, 0, 3] = -np.inf
+    parts["log_likelihood"] = parts["log_likelihood"].assign(next_state=values)
+    text = Page(render_posterior(from_groups(parts, whole.attrs))).text
+    assert "leaving out one transition at a time gives no finite number" in text
+    assert "In the central 94 %" in text
+
+
 def test_ranks_that_differ_are_said_and_others_are_not() -> None:
     fine, stuck = (
         [axes.get_title() for axes in plot_rank(made_up_posterior(stuck)).axes]
