@@ -3,8 +3,8 @@
 Each case is drawn by its seed (`tests.helpers.drawn`) and goes through ``check``, then
 ``close-loop``, ``fit``, ``report``, ``simulate`` and ``plan``, each in a forked child. ``check``
 may refuse it with one message; after it everything must end in a verdict. Results are lines of JSON
-in ``out/reliability/valid.jsonl``; seeds that are there are not run again, and the same command goes
-on after an interrupt. Run from the root of the repository::
+in ``out/reliability/valid.jsonl``; seeds that are there are not run again, and the same command
+goes on after an interrupt. Run from the root of the repository::
 
     python -m reliability.valid --from 0 --to 100
     python -m reliability.valid --show 17 case/     # writes the case, prints its commands
@@ -44,10 +44,12 @@ def commands(case: Case, recording: str) -> list[tuple[list[str], tuple[int, ...
     ]
 
 
-def tried(seed: int, most: int) -> dict[str, object]:
-    """Return what came of a case: its words, seconds, refusal or faults, and warnings."""
-    result: dict[str, object] = {"seed": seed, "most": most}
-    case = drawn_case(seed, most)
+def tried(case: Case, most: int, until: int) -> dict[str, object]:
+    """Return what came of a case: its words, seconds, refusal or faults, and warnings.
+
+    ``until``: how many commands are run after ``check``.
+    """
+    result: dict[str, object] = {"seed": case.seed, "most": most}
     result["about"] = case.about + case.suffix
     with tempfile.TemporaryDirectory(prefix="valid") as name:
         folder = Path(name)
@@ -61,7 +63,7 @@ def tried(seed: int, most: int) -> dict[str, object]:
         if checked.code == 2:
             return result | {"refused": _said(checked, "error: ")[0]}
         faults, seconds, peak = {}, {}, 0.0
-        for argv, codes in commands(case, recording):
+        for argv, codes in commands(case, recording)[:until]:
             if not all((folder / part).exists() for part in argv if part == "loop/after.nc"):
                 continue  # the loop's fault is told
             ran = run(argv, folder, LIMIT)
@@ -112,6 +114,8 @@ def main() -> None:
     parser.add_argument("--from", dest="first", type=int, default=0, help="first seed")
     parser.add_argument("--to", type=int, default=500, help="seed after the last")
     parser.add_argument("--rows", type=int, default=2500, help="most rows of a case, rarely twice")
+    parser.add_argument("--bodies", type=int, default=9, help="leave out cases of more")
+    parser.add_argument("--until", type=int, default=9, help="commands after check")
     parser.add_argument("--minutes", type=float, default=1e9, help="begin no case after these")
     parser.add_argument("--again", action="store_true", help="run seeds with faults again")
     parser.add_argument("--show", nargs=2, metavar=("SEED", "FOLDER"), help="write a case")
@@ -129,7 +133,10 @@ def main() -> None:
             continue
         if time.monotonic() - begin > 60.0 * options.minutes:
             break
-        entry = tried(seed, options.rows)
+        case = drawn_case(seed, options.rows)
+        if len(case.scene.moving) > options.bodies:
+            continue
+        entry = tried(case, options.rows, options.until)
         with options.output.open("a") as lines:
             lines.write(json.dumps(entry) + "\n")
         state = entry.get("faults") or entry.get("refused") or entry.get("seconds")
