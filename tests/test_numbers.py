@@ -25,8 +25,9 @@ from tests.helpers.variants import (
 
 #: Effects that act by the time.
 TIMED = [one for one in catalogue if getattr(one.stage, "timed", False)]
-#: Standard deviations by which a posterior may differ: where digits alone change, a millionth.
-BOUNDS = {"units": 1e-6, "digits-1": 1e-6, "digits-2": 1e-6}
+#: Standard deviations by which posteriors may differ: a millionth but where digits are lost, or the
+#: noise of x and y is another.
+BOUNDS = {"far": 1e-3, "turned": 0.3}
 DISC = Disc(trajectories=4, intervals=15, drag=1.0)
 
 
@@ -114,5 +115,5 @@ def test_loop_gives_the_same_answer(name, tmp_path) -> None:
     first, second = answer(here), answer(there)
     assert changed_names(first, second) == []
     assert [*named(first)] == [*named(second)] == [("linear_drag", "puck")]
-    assert deviation(first, second, variant) < BOUNDS.get(name, 1e-2)
+    assert deviation(first, second, variant) < BOUNDS.get(name, 1e-6)
     assert there.after.normalised_rmse == pytest.approx(here.after.normalised_rmse, rel=1e-2)

@@ -96,7 +96,8 @@ def scaled(length: float, mass: float, time: float) -> Variant:
     )
 
 
-#: Changes that apply to every recording. A rigid placement alone turns gravity and walls with it.
+#: Changes that apply to every recording; gravity and walls turn with the frame. Noise has a size
+#: along x and one along y: another frame than a quarter turned one has another noise model.
 VARIANTS: Mapping[str, Variant] = {
     "units": Variant(in_other_units),
     "digits-1": _nudge(1),
@@ -104,6 +105,7 @@ VARIANTS: Mapping[str, Variant] = {
     "epoch": _frame(later=1.7e9),
     "turns": _frame(turns=160),
     "far": _frame(shift=(1e6, -1e6)),
+    "quarter": _frame(turn=np.pi / 2),
     "turned": _frame(turn=0.7),
     "mirrored": _frame(mirrored=True),
     "gram": scaled(0.1, 1e-3, 0.1),
