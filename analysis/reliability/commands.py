@@ -47,6 +47,8 @@ class Ran:
         Its process, which was the first of its session.
     after : float
         Time (s) from the signal that killed it to its end; NaN without one.
+    cpu : float
+        Processor seconds, its children's among them.
     """
 
     argv: tuple[str, ...]
@@ -58,6 +60,7 @@ class Ran:
     peak: float
     process: int = 0
     after: float = math.nan
+    cpu: float = 0.0
 
     def fault(self, codes: Sequence[int] = (0,)) -> str:
         """Return what is wrong with it, or nothing; ``codes`` are exit codes that are right."""
@@ -141,8 +144,8 @@ def run(
         time.sleep(0.02 if kill is None else 0.001)
     code = os.waitstatus_to_exitcode(status)
     texts = (path.read_text(errors="replace") if path.exists() else "" for path in (out, err))
-    peak = usage.ru_maxrss / 1024
-    return Ran(tuple(argv), code, *texts, now - begin, silent, peak, child, now - sent)
+    peak, cpu = usage.ru_maxrss / 1024, usage.ru_utime + usage.ru_stime
+    return Ran(tuple(argv), code, *texts, now - begin, silent, peak, child, now - sent, cpu)
 
 
 def _become(
