@@ -124,3 +124,11 @@ def borrow_compiled(physics: Path) -> None:
     for made in (ROOT / "pbrl_ppl" / "physics" / "__pycache__").glob("*.nb?"):
         (physics / "__pycache__").mkdir(exist_ok=True)
         shutil.copy(made, physics / "__pycache__")
+
+
+def test_the_docs_list_the_dependencies_with_their_bounds() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    page = ROOT / "analysis" / "docs" / "pages" / "explanation" / "dependencies.md"
+    said = re.findall(r"^\| ([\w-]+) \| ([\d.]+) \|", page.read_text(), re.M)
+    bounds = [re.match(r"([\w-]+)>=([\d.]+)", one) for one in project["dependencies"]]
+    assert said == [one.groups() for one in bounds if one]
