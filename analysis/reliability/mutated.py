@@ -146,8 +146,9 @@ def foreign(content: bytes, draw: random.Random, base: Path) -> bytes:
         archive.writestr("a.csv", "1,2")
     others = [base / name for name, *_ in KINDS.values()]
     return draw.choice(
-        (b"", b"\0" * 5000, b"\xff\xfe" + b"a" * 99, b"<html></html>", picture.getvalue(), b"\n" * 99,
-         packed.getvalue(), draw.choice(others).read_bytes(), draw.randbytes(3000), b"PAR1PAR1")
+        (b"", b"\0" * 5000, b"\xff\xfe" + b"a" * 99, b"<html></html>", picture.getvalue(),
+         b"\n" * 99, packed.getvalue(), draw.choice(others).read_bytes(), draw.randbytes(3000),
+         b"PAR1PAR1")
     )  # fmt: skip
 
 
@@ -190,8 +191,9 @@ def hostile_csv(text: str, draw: random.Random) -> str:
     """Return a table with many columns, long fields, odd characters or enormous numbers."""
     head, *rows = text.splitlines()
     cell = draw.choice(
-        ("1e400", "nan", "inf", "9" * 5000, "x" * 200000, "\0", "\x1b[2J", "\u202e", '"', "'", "=1+1",
-         "1,2", "1;2", "", " ", "−1", "٣", "1e", "0x10", "True", "1979-05-27", "🙂", "\r", "\f")
+        ("1e400", "nan", "inf", "9" * 5000, "x" * 200000, "\0", "\x1b[2J", "\u202e", '"', "'",
+         "=1+1", "1,2", "1;2", "", " ", "−1", "٣", "1e", "0x10", "True", "1979-05-27", "🙂", "\r",
+         "\f")
     )  # fmt: skip
     at = draw.randrange(len(rows))
     cells = rows[at].split(",")
@@ -256,11 +258,24 @@ def hostile_hdf5(path: Path, draw: random.Random) -> None:
 def hostile_json(draw: random.Random) -> str:
     """Return JSON that is deep, or large, or no log."""
     return draw.choice(
-        ("[" * 10**6, '{"a":' * 10**5, '{"a": [[1e999, 1, 2, 3]]}', '{"\\ud800": [[0,0,0,0],[1,1,1,1]]}',
-         '{"a\\u001b[2J": [[0,0,0,0],[1,1,1,1]]}', "null", "[1]", '{"a": [[1,2],[3]]}', "9" * 9999,
-         '{"a": [["x",1,2,3]]}', '{"units": 5, "a": [[0,0,0,0],[0.1,0,0,0]]}', "NaN",
-         '{"a": [' + "[0,0,0,0]," * 10**5 + "[1,1,1,1]]}", '{"a": [[[[1]]]]}', '"' + "x" * 10**7 + '"')
-    )  # fmt: skip
+        (
+            "[" * 10**6,
+            '{"a":' * 10**5,
+            '{"a": [[1e999, 1, 2, 3]]}',
+            '{"\\ud800": [[0,0,0,0],[1,1,1,1]]}',
+            '{"a\\u001b[2J": [[0,0,0,0],[1,1,1,1]]}',
+            "null",
+            "[1]",
+            '{"a": [[1,2],[3]]}',
+            "9" * 9999,
+            '{"a": [["x",1,2,3]]}',
+            '{"units": 5, "a": [[0,0,0,0],[0.1,0,0,0]]}',
+            "NaN",
+            '{"a": [' + "[0,0,0,0]," * 10**5 + "[1,1,1,1]]}",
+            '{"a": [[[[1]]]]}',
+            '"' + "x" * 10**7 + '"',
+        )
+    )
 
 
 def hostile_parquet(path: Path, draw: random.Random) -> None:
@@ -388,8 +403,10 @@ def main() -> None:
         fault = fault_of(ran)
         if not fault and kind == "posterior" and way == "damaged" and ran.code != 2:
             fault = other_contents(place / name, whole)
-        row = {"try": number, "kind": kind, "way": way, "command": argv[0], "code": ran.code,
-               "seconds": round(ran.seconds, 2), "fault": fault, "said": ran.err[-400:]}  # fmt: skip
+        row = {
+            "try": number, "kind": kind, "way": way, "command": argv[0], "code": ran.code,
+            "seconds": round(ran.seconds, 2), "fault": fault, "said": ran.err[-400:],
+        }  # fmt: skip
         rows[number] = row
         if not arguments.only:
             with log.open("a") as file:
