@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import hashlib
 import math
+import os
 import shutil
 import tempfile
 import time
@@ -13,9 +15,14 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from itertools import takewhile
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from pbrl_ppl.errors import OutputError
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 
 def check_regular(path: Path) -> None:
@@ -109,6 +116,48 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
             f"{path}: cannot be written: {error.strerror or error}; choose an existing, writable"
             " folder"
         ) from error
+
+
+@contextlib.contextmanager
+def only_writer(path: Path) -> Iterator[None]:
+    """Keep other processes of this user and machine from this context with the same path.
+
+    A lock of the operating system, which ends with the process; without such locks, nothing.
+
+    Raises
+    ------
+    OutputError
+        If another process is in it.
+    """
+    lock = _locked(path)
+    try:
+        yield
+    finally:
+        if lock is not None:
+            Path(lock.name).unlink(missing_ok=True)
+            lock.close()
+
+
+def _locked(path: Path) -> BinaryIO | None:
+    """Return a locked file that stands for a path, or None where that is impossible."""
+    if fcntl is None:
+        return None
+    digest = hashlib.sha256(os.fsencode(path.absolute().resolve())).hexdigest()[:32]
+    try:
+        file = (Path(tempfile.gettempdir()) / f"pbrl-ppl-{os.getuid()}-{digest}.lock").open("ab")
+    except OSError:  # no folder for temporary files
+        return None
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        file.close()
+        raise OutputError(
+            f"{path}: another command is writing to it; wait for its end, or choose another output"
+        ) from None
+    if os.fstat(file.fileno()).st_nlink:
+        return file
+    file.close()  # of a command that has just ended
+    return _locked(path)
 
 
 def write_text(path: Path, text: str) -> None:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from copy import copy
 from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
 from typing import Annotated, TypeVar, get_args, get_origin, get_type_hints
 
 import typer
@@ -19,6 +20,7 @@ from pbrl_ppl import __version__
 from pbrl_ppl.cli import options, terminal
 from pbrl_ppl.cli.terminal import Result, in_a_line
 from pbrl_ppl.errors import OutputError, PbrlError, printable
+from pbrl_ppl.files import only_writer
 
 F = TypeVar("F", bound=Callable[..., Result])
 
@@ -80,7 +82,12 @@ class Printing:
         """Run a command with what it takes, and print its result."""
         taken = inspect.signature(function).parameters
         staged = terminal.stages(self.quiet) if "progress" in taken else nullcontext()
-        with terminal.interruptible(kept.format(**given)) as interrupts, staged as progress:
+        output = given.get("output", getattr(given.get("to"), "output", None))
+        with (
+            terminal.interruptible(kept.format(**given)) as interrupts,
+            only_writer(output) if isinstance(output, Path) else nullcontext(),
+            staged as progress,
+        ):
             session = {"progress": progress, "interrupts": interrupts}
             known = {**given, **vars(self), **session}
             result = function(**{name: known[name] for name in taken})

@@ -633,3 +633,22 @@ def test_a_spreadsheet_s_commas_and_semicolons(capsys: pytest.CaptureFixture[str
     assert len(hashes) == 1
     Path("short.csv").write_text(before.replace(",", ";").replace(".", ",")[:-20] + "\n")
     assert "cells, expected 13" in message(capsys, "check", "scene.toml", "short.csv")
+
+
+@pytest.mark.usefixtures("puck")
+def test_of_two_commands_with_one_output_one_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    """The other may read and write anything else, and after its end this one."""
+    held = "from pathlib import Path; from pbrl_ppl.files import only_writer\n"
+    held += "with only_writer(Path('puck.nc')): print('begun', flush=True); input()"
+    fit = ["fit", "scene.toml", "train.csv", "-q", "--method", "map", "-o"]
+    with subprocess.Popen(
+        [sys.executable, "-c", held], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+    ) as other:  # fmt: skip
+        assert other.stdout is not None
+        assert other.stdout.readline() == "begun\n"
+        assert main([*fit, "./puck.nc"]) == 2
+        assert "puck.nc: another command is writing to it" in capsys.readouterr().err
+        assert main([*fit, "other.nc"]) == 0
+        other.communicate("\n")
+    assert main([*fit, "puck.nc"]) == 0
