@@ -11,7 +11,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -49,17 +49,42 @@ class PlainConsole(Console):
 
 
 @contextmanager
-def stages(quiet: bool) -> Iterator[Progress]:
-    """Show stages on stderr with the time elapsed; a terminal also shows the running stage."""
+def stages(quiet: bool, every: float = 60.0) -> Iterator[Progress]:
+    """Show stages on stderr with the time elapsed; a terminal also shows the running stage.
+
+    Elsewhere a line is written ``every`` so many seconds: a log is never silent for long.
+    """
     console = PlainConsole(stderr=True, quiet=quiet)
     running = Status()
-    with console.status(running):
+    watched = nullcontext() if quiet or console.is_terminal else _alive(running, every)
+    with console.status(running), watched:
 
         def progress(stage: str) -> None:
             console.print(f"[{running.elapsed:5.1f} s] {in_a_line(stage)}", soft_wrap=True)
             running.name, running.share = stage, getattr(stage, "share", None)
 
         yield progress
+
+
+@contextmanager
+def _alive(running: Status, every: float) -> Iterator[None]:
+    """Write to stderr from time to time that a stage goes on."""
+    ended = threading.Event()
+
+    def write() -> None:
+        while not ended.wait(every):
+            # not by the console: it may be at work
+            line = f"[{running.elapsed:5.1f} s] {in_a_line(running.name)}: still running\n"
+            with suppress(OSError):
+                os.write(2, line.encode())
+
+    writer = threading.Thread(target=write, daemon=True)
+    writer.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        writer.join()
 
 
 class Status:

@@ -22,6 +22,7 @@ import typer
 from pbrl_ppl import criticism, sampling
 from pbrl_ppl.cli import main
 from pbrl_ppl.cli.app import app
+from pbrl_ppl.cli.terminal import stages
 from pbrl_ppl.errors import ConvergenceWarning, FitError
 from pbrl_ppl.history import History
 from pbrl_ppl.model import problem_in
@@ -652,3 +653,15 @@ def test_of_two_commands_with_one_output_one_says_so(capsys: pytest.CaptureFixtu
         assert main([*fit, "other.nc"]) == 0
         other.communicate("\n")
     assert main([*fit, "puck.nc"]) == 0
+
+
+def test_a_long_stage_is_not_silent(capfd) -> None:
+    """A log shows every minute that it goes on; nothing is written after it, or where quiet."""
+    for quiet in (False, True):
+        with stages(quiet, every=0.05) as progress:
+            progress("climbing")
+            time.sleep(0.3)
+        said = capfd.readouterr().err
+        assert (said.count("s] climbing: still running\n") >= 2) is not quiet
+        time.sleep(0.1)
+        assert capfd.readouterr().err == ""
