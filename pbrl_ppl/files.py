@@ -54,6 +54,38 @@ def parse_toml(text: str) -> dict[str, Any]:
         raise ValueError("a number has thousands of digits") from None
 
 
+#: What a sealed file ends with, before a hash of all bytes before it: HDF5 ignores it.
+_SEAL = b"\npbrl_ppl sha256 "
+
+
+def seal(path: Path) -> None:
+    """Append the hash of a file's contents to it."""
+    digest = _digest(path, path.stat().st_size)
+    with path.open("ab") as file:
+        file.write(_SEAL + digest)
+
+
+def is_as_sealed(path: Path) -> bool | None:
+    """Return whether a file is as it was sealed; None if it has no seal."""
+    with path.open("rb") as file:
+        size = file.seek(0, os.SEEK_END) - len(_SEAL) - 64
+        file.seek(max(size, 0))
+        end = file.read()
+    if not end.startswith(_SEAL):
+        return None
+    return end == _SEAL + _digest(path, size)
+
+
+def _digest(path: Path, size: int) -> bytes:
+    """Return the SHA-256 of a file's first bytes, in hexadecimal digits."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while size > 0 and (part := file.read(min(size, 2**20))):
+            digest.update(part)
+            size -= len(part)
+    return digest.hexdigest().encode()
+
+
 #: Bytes of arrays that a file may hold whatever its size, and for each of its bytes.
 _MOST, _PACKED = 2**30, 200
 

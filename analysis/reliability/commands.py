@@ -18,7 +18,7 @@ SILENCE = 300.0
 #: What a message to a user does not contain: names of Python's and NumPy's own errors.
 _INTERNAL = re.compile(
     r"\b(KeyError|IndexError|TypeError|AttributeError|ZeroDivisionError|RuntimeWarning"
-    r"|LinAlgError|broadcast|NoneType|Errno|object at 0x|nan\b.*\bnan\b|invalid value"
+    r"|LinAlgError|broadcast|NoneType|Errno|object at 0x|nan\b.*\bnan\b|invalid value encountered"
     r"|divide by zero|overflow encountered|underflow encountered|Mean of empty slice"
     r"|Degrees of freedom|singular matrix)",
     re.IGNORECASE,

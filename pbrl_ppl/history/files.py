@@ -21,7 +21,7 @@ import pandas as pd
 import xarray as xr
 
 from pbrl_ppl.errors import HistoryError, OutputError
-from pbrl_ppl.files import check_hdf5, check_regular, reason, write_atomically
+from pbrl_ppl.files import check_hdf5, check_regular, is_as_sealed, reason, seal, write_atomically
 from pbrl_ppl.scene import SEPARATORS, Recording
 from pbrl_ppl.state import STATE, WRENCH, Floats
 
@@ -273,7 +273,7 @@ def read_parquet(path: Path, layout: Recording) -> pd.DataFrame:
         try:
             return pd.read_parquet(file)
         except Exception as error:  # pyarrow's own errors share no base with Python's
-            raise HistoryError(f"history {path}: not a Parquet table: {error}") from None
+            raise HistoryError(f"history {path}: not a Parquet table: {reason(error)}") from None
 
 
 @reads(".nc")
@@ -281,11 +281,13 @@ def read_netcdf(path: Path, layout: Recording) -> pd.DataFrame:
     """Return the rows of a NetCDF file that `History.save` wrote."""
     path.open("rb").close()
     try:
+        if is_as_sealed(path) is False:
+            raise ValueError("it is damaged; copy it again")
         check_hdf5(path)
         with xr.open_dataset(path, engine="h5netcdf", decode_times=False) as stored:
             dataset = stored.load()
     except Exception as error:  # HDF5 raises many kinds on a damaged file
-        raise HistoryError(f"history {path}: not a NetCDF file: {error}") from None
+        raise HistoryError(f"history {path}: not a NetCDF file: {reason(error)}") from None
     for name, last in (
         ("observed", ("body", "state")),
         ("action", ("body", "wrench")),
@@ -361,10 +363,16 @@ def write_dataset(dataset: xr.Dataset, path: Path) -> None:
         )
     if suffix == ".nc":
         measured = dataset[["observed", "action", "clock", "n_rows"]]
-        write_atomically(path, lambda to: measured.to_netcdf(to, engine="h5netcdf"))
+        write_atomically(path, lambda to: _write_netcdf(measured, to))
         return
     table = to_table(dataset)
     if suffix == ".csv":
         write_atomically(path, lambda to: table.to_csv(to, index=False, lineterminator="\n"))
     else:
         write_atomically(path, lambda to: table.to_parquet(to, index=False))
+
+
+def _write_netcdf(dataset: xr.Dataset, path: Path) -> None:
+    """Write a NetCDF file with a seal."""
+    dataset.to_netcdf(path, engine="h5netcdf")
+    seal(path)

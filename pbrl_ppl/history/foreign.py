@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from pbrl_ppl.errors import HistoryError
+from pbrl_ppl.errors import HistoryError, printable
+from pbrl_ppl.files import reason
 from pbrl_ppl.history.files import reads
 from pbrl_ppl.scene import Recording
 from pbrl_ppl.state import Floats
@@ -40,6 +41,8 @@ def read_sysid(path: Path, layout: Recording) -> pd.DataFrame:
         tests = {k: np.array(v, float) for k, v in log.items() if isinstance(v, list) and v}
         (width,) = {rows.shape[1] for rows in tests.values()}
         names = _SYSID[width]
+        if any(printable(k) != k for k in tests):
+            raise ValueError
     except (ValueError, KeyError, AttributeError, IndexError, TypeError, RecursionError):
         raise HistoryError(
             f"history {path}: not a log of WPILib's SysId; expected an object with rows of 4 or 9"
@@ -74,7 +77,8 @@ def read_mat(path: Path, layout: Recording) -> pd.DataFrame:
             content = loadmat(file, squeeze_me=True, simplify_cells=True)
         except Exception as error:  # damaged files raise errors of many kinds
             cure = 'save it from MATLAB with "-v7", or as CSV'
-            raise HistoryError(f"history {path}: not a MATLAB file ({error}); {cure}") from None
+            why = reason(error)
+            raise HistoryError(f"history {path}: not a MATLAB file ({why}); {cure}") from None
     columns: dict[str, Floats] = {}
     for name, value in content.items():
         if not name.startswith("__"):

@@ -9,7 +9,6 @@ and needs no netCDF4. ``arviz.from_netcdf`` of either and ``xarray.open_datatree
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import warnings
 from collections.abc import Mapping
 from importlib.metadata import version
@@ -17,12 +16,11 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Protocol, cast
 
-import h5py
 import numpy as np
 import xarray as xr
 
 from pbrl_ppl.errors import OutputError, PosteriorError
-from pbrl_ppl.files import check_hdf5, write_atomically
+from pbrl_ppl.files import check_hdf5, is_as_sealed, seal, write_atomically
 from pbrl_ppl.state import Floats, Ints
 
 #: ArviZ 1.x stores groups in an xarray.DataTree, 0.x in an InferenceData.
@@ -36,8 +34,8 @@ SIZE = "importance_ess"
 #: Version of the attributes of a posterior file, see `PosteriorRecord`.
 SCHEMA = 2
 
-#: Attribute of a file alone: the hash of all that it holds.
-_HASH = "contents_sha256"
+#: Attribute of a file alone: it has a seal.
+_SEALED = "sealed"
 
 _NEEDED = ("posterior", "sample_stats", "log_likelihood", "observed_data", "constant_data")
 
@@ -132,35 +130,11 @@ def save_posterior(idata: Idata, path: str | Path) -> None:
 
 def _write(idata: Idata, path: Path) -> None:
     """Write NetCDF 4 with one group a dataset: the same file from both stacks."""
-    attrs = {name: value for name, value in idata.attrs.items() if name != _HASH}
-    xr.Dataset(attrs=attrs).to_netcdf(path, mode="w", engine="h5netcdf")
+    xr.Dataset(attrs={**idata.attrs, _SEALED: 1}).to_netcdf(path, mode="w", engine="h5netcdf")
     for name, data in groups(idata).items():
         encoding = {key: {"zlib": True} for key, v in data.variables.items() if v.dtype.kind == "f"}
         data.to_netcdf(path, mode="a", group=name, engine="h5netcdf", encoding=encoding)
-    contents = _hash_of(path)
-    with h5py.File(path, "a") as file:
-        file.attrs[_HASH] = contents
-
-
-def _hash_of(path: Path) -> str:
-    """Return the hash of a file's arrays and attributes, but those that HDF5 keeps for itself."""
-    digest, names = hashlib.sha256(), ["/"]
-
-    def add(*values: object) -> None:
-        digest.update(repr(values).encode(errors="surrogateescape"))
-
-    with h5py.File(path, "r") as file:
-        file.visit(names.append)
-        for name in sorted(names):
-            item = file[name]
-            for key in sorted({*item.attrs} - {_HASH, "DIMENSION_LIST", "REFERENCE_LIST"}):
-                add(name, key, np.asarray(item.attrs[key]).tolist())
-            if isinstance(item, h5py.Dataset):
-                values = np.asarray(item[()])
-                add(name, values.shape, values.dtype.str)
-                text = values.dtype.kind == "O"
-                digest.update(repr(values.tolist()).encode() if text else values.tobytes())
-    return digest.hexdigest()
+    seal(path)
 
 
 def load_posterior(path: str | Path) -> Idata:
@@ -185,23 +159,27 @@ def load_posterior(path: str | Path) -> Idata:
     if not path.is_file():
         raise PosteriorError(f"{path}: there is no such file")
     try:
+        # first: HDF5 may read some damaged files for ever
+        if (as_sealed := is_as_sealed(path)) is False:
+            raise PosteriorError(f"{path}: it is damaged; copy it again, or fit again")
         check_hdf5(path)
         with contextlib.closing(xr.open_datatree(path, engine="h5netcdf")) as tree:
             loaded = {name: node.to_dataset().load() for name, node in tree.children.items()}
             attrs = {str(name): value for name, value in tree.attrs.items()}
-        written = attrs.pop(_HASH, None)
-        whole = written is None or written == _hash_of(path)
+    except PosteriorError:
+        raise
     except Exception as error:  # HDF5 raises many kinds on a damaged file
         raise PosteriorError(
             f"{path}: this is not a NetCDF file, or it is damaged; pass one that fit saved"
         ) from error
+    changed = attrs.pop(_SEALED, 0) and not as_sealed
     check_schema(attrs, str(path))
     if missing := [name for name in _NEEDED if name not in loaded]:
         raise PosteriorError(f"{path}: it lacks {', '.join(missing)}; save the whole fit again")
-    if not whole:
+    if changed:
         raise PosteriorError(
-            f"{path}: its contents are not those that were saved: it is damaged, or another program"
-            " changed it; copy it again, or save what arviz.from_netcdf reads by save_posterior"
+            f"{path}: it is damaged, or another program changed it; copy it again, or save what"
+            " arviz.from_netcdf reads by save_posterior"
         )
     return from_groups(loaded, attrs)
 
