@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor
 from contextlib import closing
@@ -38,6 +39,8 @@ from pbrl_ppl.threads import as_ended
 
 #: Marks the summary of many logs, and with it their folder.
 _KIND = "pbrl_ppl logs 1"
+#: Pause between two writings of the page, as a multiple of what one takes.
+_PAUSE = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,15 +188,25 @@ def close_loop_many(
     if finished:
         tell(f"{finished} of {len(logs)} logs are in {folder}")
     tasks = {log: partial(settle, log, folder, settings, inputs[log.name], run) for log in left}
-    loops = _written(ManyLoops(folder, tuple(rows.values()), {}, {}), source)
-    with closing(as_ended(tasks, executor)) as results:
-        for count, (log, result) in enumerate(results, finished + 1):
-            try:
-                rows[log.name] = result()
-            except Exception as error:  # its worker died, or it could not be sent there
-                rows[log.name] = failed(log, folder, error)
-            tell(f"{count}/{len(logs)} {_row_in_words(rows[log.name])}")
-            loops = _written(replace(loops, rows=tuple(rows.values())), source)
+    written = loops = _written(ManyLoops(folder, tuple(rows.values()), {}, {}), source)
+    due = time.monotonic()
+    try:
+        with closing(as_ended(tasks, executor)) as results:
+            for count, (log, result) in enumerate(results, finished + 1):
+                try:
+                    rows[log.name] = result()
+                except Exception as error:  # its worker died, or it could not be sent there
+                    rows[log.name] = failed(log, folder, error)
+                loops = replace(loops, rows=tuple(rows.values()))
+                tell(f"{count}/{len(logs)} {_row_in_words(rows[log.name])}")
+                begin = time.monotonic()
+                if begin >= due:  # of a thousand logs the page takes longer than a log
+                    written = _written(loops, source)
+                    due = time.monotonic() + _PAUSE * (time.monotonic() - begin)
+    except KeyboardInterrupt:
+        if loops is not written:
+            _written(loops, source)
+        raise
     pooled, not_pooled = _pooled(logs, rows, folder)
     return _written(replace(loops, pooled=pooled, not_pooled=not_pooled), source)
 

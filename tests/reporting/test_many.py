@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import time
 from collections import Counter
 from concurrent.futures import Executor, Future
 from concurrent.futures.process import BrokenProcessPool
@@ -14,7 +15,7 @@ import pytest
 
 from pbrl_ppl.criticism.loop import FILES
 from pbrl_ppl.errors import ManifestError, OutputError
-from pbrl_ppl.reporting import close_loop_many, read_manifest
+from pbrl_ppl.reporting import ManyLoops, Source, close_loop_many, many, read_manifest
 from tests.helpers.fleet import BEGUN, KEPT, cluster, lines, made_logs, pretend
 
 
@@ -112,6 +113,26 @@ def test_changed_inputs_are_run_again(tmp_path) -> None:
     run(with_test, out, seed=2)
     assert lines(tmp_path, BEGUN)[8:] == ["a"]
     assert sorted(p.name for p in (out / "a").iterdir()) == sorted(FILES)
+
+
+def test_the_page_of_many_quick_logs_is_not_written_after_each(tmp_path, monkeypatch) -> None:
+    """It has a row a log: a page after each of n logs takes time in proportion to n^2."""
+    names, write, counts = [f"log{i:02d}" for i in range(20)], many._written, []
+
+    def slow(loops: ManyLoops, source: Source) -> ManyLoops:
+        counts.append(sum(row["status"] == "done" for row in loops.rows))
+        time.sleep(0.1)
+        return write(loops, source)
+
+    monkeypatch.setattr(many, "_written", slow)
+    logs = made_logs(tmp_path, **dict.fromkeys(names, "") | {"log15": "interrupt"})
+    with pytest.raises(KeyboardInterrupt):
+        run(logs, tmp_path / "out")
+    assert counts[0] == 0 and counts[-1] == 15 and len(counts) < 10
+    counts.clear()
+    (tmp_path / "log15.csv").write_text("")
+    run(logs, tmp_path / "out")
+    assert counts[0] == 15 and counts[-1] == 20
 
 
 def test_an_interrupt_keeps_what_is_finished(tmp_path) -> None:
