@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pytest
 
 from pbrl_ppl.criticism.loop import FILES
@@ -142,8 +143,14 @@ def test_an_interrupt_keeps_what_is_finished(tmp_path) -> None:
     rows = json.loads((out / "summary.json").read_text())["logs"]
     assert [row["status"] for row in rows] == ["done", "waiting", "waiting"]
     (tmp_path / "b.csv").write_text("")
-    assert not run(logs, out).failed
+    resumed = run(logs, out)
+    assert not resumed.failed
     assert lines(tmp_path, KEPT) == ["a", "b", "c"]
+    whole = run(logs, tmp_path / "whole")  # as if it had not been interrupted
+    timed = ["seconds", "finished"]
+    for got, expected in ((resumed.table(), whole.table()), (resumed.effects(), whole.effects())):
+        got, expected = (one.drop(columns=timed, errors="ignore") for one in (got, expected))
+        pd.testing.assert_frame_equal(got, expected)
 
 
 def test_folders_of_others_are_left_alone(tmp_path) -> None:
