@@ -283,11 +283,20 @@ def loo_pit(idata: Idata) -> xr.DataArray:
     likelihood = group(idata, "log_likelihood")["next_state"].stack(samples)
     likelihood = likelihood.transpose("transition", "sample")
     measured = group(idata, "observed_data")["next_state"].transpose(*NEXT_STATE_DIMS)
-    # smoothed over all draws, for a better estimate of the tail
-    weights = np.stack([smoothed(-column)[0][rows] for column in likelihood.to_numpy()], axis=1)
-    weights /= weights.sum(axis=0)
+    weights = np.stack([_weights(-column, rows) for column in likelihood.to_numpy()], axis=1)
     below = np.einsum("rt,rthbs->thbs", weights, _deviations(predicted, measured) <= 0.0)
     return measured.copy(data=np.where(np.isfinite(measured), below, np.nan))
+
+
+def _weights(log_weights: Floats, rows: Ints) -> Floats:
+    """Return the importance weights of some of the draws, which sum to one.
+
+    They are smoothed over all draws, for a better estimate of the tail, unless all weight is on
+    other draws.
+    """
+    weights = smoothed(log_weights)[0][rows]
+    total = weights.sum()
+    return weights / total if total > 0.0 else smoothed(log_weights[rows])[0]
 
 
 def _deviations(predicted: xr.DataArray, measured: xr.DataArray) -> Floats:

@@ -241,6 +241,17 @@ def test_loo_pit_is_arviz_s(idata, of_vx) -> None:
     np.testing.assert_allclose(ours.sel(state="vx").values.ravel(), theirs, atol=1e-6)
 
 
+def test_loo_pit_where_a_draw_without_predictions_has_all_weight(idata) -> None:
+    """A draw under which a transition is impossible, nearly: the others' weights underflow."""
+    data = groups(idata)
+    data["posterior_predictive"] = data["posterior_predictive"].isel(draw=slice(1, None))
+    values = data["log_likelihood"]["next_state"].copy(deep=True)
+    values[{"chain": 0, "draw": 0, "transition": 3}] = -1e14
+    data["log_likelihood"] = values.to_dataset(name="next_state")
+    seen = loo_pit(from_groups(data, idata.attrs)).sel(state="vx").to_numpy()
+    assert ((seen >= 0.0) & (seen <= 1.0)).all()
+
+
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
 @pytest.mark.filterwarnings("ignore::RuntimeWarning", "ignore::UserWarning")  # ArviZ's own
 def test_arviz_s_loo_pit_of_every_number(idata) -> None:
