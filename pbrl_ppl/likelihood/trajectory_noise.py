@@ -303,7 +303,9 @@ class TrajectoryNoise:
         push = coordinates.push
         np.add.at(slope, coordinates.pushed, np.einsum("ja,jab,jb->j", push, steps, push))
         norm = -0.5 * np.log(2 * np.pi) * self.seen.sum()
-        value = norm - 0.5 * float((white**2).sum()) - float(self.log_scale(sigma).sum())
+        with np.errstate(over="ignore"):  # minus infinity where innovations leave the numbers
+            square = float((white**2).sum())
+        value = norm - 0.5 * square - float(self.log_scale(sigma).sum())
         return value, sigma**2 * slope
 
     def auxiliary(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:

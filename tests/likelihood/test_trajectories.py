@@ -152,6 +152,12 @@ def test_score_of_the_noise_is_that_of_differences(problem, missing) -> None:
     np.testing.assert_allclose(slope, by_differences, rtol=1e-6, atol=1e-6 * np.abs(slope).max())
 
 
+def test_the_score_of_innovations_beyond_the_numbers_is_minus_infinity(problem) -> None:
+    """A climb comes by where the filter diverges: no warning."""
+    residual = 1e160 * problem.residual(PHI * 1.2)
+    assert problem.likelihood.noise.score(residual, NOISE)[0] == -np.inf
+
+
 def test_smoothed_states_are_the_most_probable(problem) -> None:
     """No state is moved once the smoother has converged, and the fit of all is a minimum there."""
     converged = smoothed(problem, PHI, NOISE)
