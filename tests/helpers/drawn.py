@@ -331,6 +331,10 @@ def _foreign(
             frame = frame.drop(columns=[
                 f"{body}.{name}" for name in WRENCH if f"{body}.{name}" in frame
             ])  # fmt: skip
+    elif actuated:  # columns of their own, on the rows of their body
+        for body, given in actuated.items():
+            for name, column in zip(WRENCH, given, strict=False):
+                frame[column] = frame[name].where(frame["body"] == body)
     if not several:
         frame = frame.drop(columns="body")
     if scene.moving and frame["trajectory"].nunique() == 1 and rng.random() < 0.5:
