@@ -111,7 +111,7 @@ def test_what_is_no_file_is_refused_at_once(tmp_path, kind) -> None:
     read_log = partial(History.load, scene=Scene.from_toml(SCENE))
     for suffix, read in {
         ".toml": Scene.load, ".csv": read_manifest, ".nc": load_posterior, ".goal": Goal.load,
-        ".parquet": read_log, ".txt": read_log,
+        ".parquet": read_log, ".txt": read_log, ".mcap": read_log,
     }.items():  # fmt: skip
         path = tmp_path / f"a{suffix}"
         make[kind](path)

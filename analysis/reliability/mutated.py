@@ -65,7 +65,7 @@ MJCF = """<mujoco><worldbody><body name="puck" pos="0 0 0"><joint type="slide" a
 URDF = """<robot name="arm"><link name="base"/><link name="arm"><inertial><origin xyz="0 0 0"/>
 <mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial><collision>
 <geometry><box size="0.1 0.1 0.5"/></geometry></collision></link><joint name="hinge"
-type="continuous"><parent link="base"/><child link="arm"/><axis xyz="0 1 0"/></joint></robot>"""
+type="continuous"><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/></joint></robot>"""
 LAUGHS = '<!DOCTYPE m [<!ENTITY a0 "ha">' + "".join(
     f'<!ENTITY a{i + 1} "{f"&a{i};" * 10}">' for i in range(12)
 )

@@ -191,7 +191,7 @@ def _opened(path: Path) -> Iterator[AnyReader]:
         raise HistoryError(
             f"bag {path}: reading it needs rosbags: pip install 'pbrl_ppl[ros]'"
         ) from None
-    if not path.exists():
+    if not (path.is_file() or path.is_dir()):
         raise HistoryError(f"bag {path}: there is no such file or folder; check the path")
     if path.is_file() and path.suffix not in SUFFIXES:
         raise HistoryError(

@@ -92,7 +92,7 @@ def read_table(path: Path, layout: Recording) -> pd.DataFrame:
             f"{', '.join(readers)}; save it as one of these"
         )
     try:
-        if reader is not readers[FOLDER]:
+        if not path.is_dir():
             check_regular(path)
         return reader(path, layout)
     except FileNotFoundError:
