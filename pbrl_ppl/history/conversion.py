@@ -337,7 +337,8 @@ def _held(frame: pd.DataFrame, scene: Scene, say: Say) -> pd.DataFrame:
             continue
         groups = frame[name].groupby([frame["trajectory"], frame["body"]])
         held = groups.transform(lambda column: column.ffill().bfill()).fillna(0.0)
+        given = groups.transform("count") > 0  # else the file has no such column of this body
         frame[name] = frame[name].where(~empty, held)
-        if between := int((empty & ~last).sum()):
+        if between := int((empty & ~last & given).sum()):
             say(f"{name} is empty in {between} rows: the command before holds")
     return frame

@@ -115,10 +115,12 @@ def _degrees(angles: list[Floats], *, hinged: bool) -> str:
     wraps = (steps > 340.0) & (steps < 360.5)
     if wraps.any() and np.median(steps) < 36.0:
         return 'jumps by 360 between rows: looks like deg: units = { theta = "deg" }'
-    middle = float(np.median(np.concatenate(angles)))
-    size = float(np.quantile(np.abs(np.concatenate(angles) - middle), 0.9))
+    every = np.concatenate(angles)
+    middle = float(np.median(every))
+    size = float(np.quantile(np.abs(every - middle), 0.9))
+    turned = np.ptp(every) > 2.0 * np.pi  # not an angle in rad that wraps at 0 or half a turn
     crossings = sum(int((np.diff(np.sign(run - middle)) != 0).sum()) for run in angles)
-    if hinged and size > np.pi and crossings >= 4:
+    if hinged and turned and size > np.pi and crossings >= 4:
         return (
             f'swings to both sides by {size:.2g} rad: looks like deg: units = {{ theta = "deg" }}'
         )

@@ -2,6 +2,7 @@
 
 import json
 import re
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -351,6 +352,28 @@ def test_angles_of_another_convention_are_asked_about(tmp_path: Path) -> None:
     assert "one of them is clockwise" in said
     headings = pd.DataFrame({"t": time, "knee": (60 * time) % 360})
     assert "jumps by 360" in warned(headings, PUCK.replace(time_step=0.05), tmp_path, columns=names)
+
+
+def test_an_angle_that_wraps_at_hanging_does_not_look_like_degrees(tmp_path: Path) -> None:
+    time = 0.05 * np.arange(200)
+    swing = 0.1 + 0.8 * np.exp(-0.1 * time) * np.sin(5 * time)
+    pd.DataFrame({"t": time, "knee": swing % (2 * np.pi)}).to_csv(tmp_path / "log.csv", index=False)
+    layout = Recording(columns={"time": "t", "theta": "knee"})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        history = read_recording(tmp_path / "log.csv", POLE.replace(recording=layout))
+    assert np.ptp(of(history, "theta")) > 6.0
+
+
+def test_a_body_without_a_column_of_forces_is_not_pushed() -> None:
+    """Nothing is said of empty cells: the file has no such column."""
+    scene = PUCK.replace(bodies=(*PUCK.bodies, Body("disc", Shape.circle(0.1))))
+    names = {"puck.x": "a", "disc.x": "b", "disc.force_x": "f"}
+    frame = pd.DataFrame({"time": 0.1 * np.arange(N), "a": 0.1, "b": 0.5, "f": 2.0})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        action = load(frame, scene, columns=names).dataset["action"].to_numpy()[0, :-1]
+    assert (action[:, 1, 0] == 2.0).all() and not action[:, 0].any()
 
 
 def test_places_of_a_bob_give_its_angle() -> None:
