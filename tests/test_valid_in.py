@@ -1,0 +1,43 @@
+"""Valid in, verdict out: drawn scenes and recordings through the commands.
+
+Some of the cases of ``analysis/reliability/valid.py``, which draws hundreds.
+"""
+
+import tempfile
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from reliability.commands import run
+from reliability.valid import commands
+
+from tests.helpers.drawn import Case, cases, drawn_case
+
+pytestmark = [pytest.mark.one_stack, pytest.mark.slow]
+
+#: Quick cases with one body, of at most `ROWS` rows.
+SEEDS = (5, 9)
+ROWS = 80
+
+
+@settings(
+    max_examples=25, deadline=None, derandomize=True, database=None,
+    suppress_health_check=[HealthCheck.too_slow],
+)  # fmt: skip
+@given(cases(120))
+def test_check_reads_what_is_valid(case: Case) -> None:
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        ran = run(["check", "scene.toml", case.write(folder), "--no-prior"], folder, limit=60.0)
+    assert not ran.fault(), (case.seed, case.about, ran.fault())
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_what_check_passes_ends_in_a_verdict(seed: int, tmp_path: Path) -> None:
+    case = drawn_case(seed, ROWS)
+    recording = case.write(tmp_path)
+    checked = run(["check", "scene.toml", recording], tmp_path)
+    assert not checked.fault(), checked.fault()
+    for argv, codes in commands(case, recording):
+        ran = run(argv, tmp_path)
+        assert not ran.fault(codes), (case.about, argv, ran.fault(codes), ran.err[-2000:])
