@@ -38,6 +38,6 @@ def test_what_check_passes_ends_in_a_verdict(seed: int, tmp_path: Path) -> None:
     recording = case.write(tmp_path)
     checked = run(["check", "scene.toml", recording], tmp_path)
     assert not checked.fault(), checked.fault()
-    for argv, codes in commands(case, recording):
+    for argv, codes in commands(case, recording, checked.out):
         ran = run(argv, tmp_path)
         assert not ran.fault(codes), (case.about, argv, ran.fault(codes), ran.err[-2000:])

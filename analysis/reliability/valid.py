@@ -30,13 +30,22 @@ from tests.helpers.drawn import Case, drawn_case  # noqa: E402
 
 #: Seconds that a command may take.
 LIMIT = 900.0
+#: What ``check`` says of a recording that the loop cannot split.
+ONE = "one trajectory: close-loop"
 
 
-def commands(case: Case, recording: str) -> list[tuple[list[str], tuple[int, ...]]]:
-    """Return each command after ``check``, with the exit codes that are right."""
+def commands(
+    case: Case, recording: str, checked: str = ""
+) -> list[tuple[list[str], tuple[int, ...]]]:
+    """Return each command after ``check``, with the exit codes that are right.
+
+    Where ``check`` said that there is one trajectory, the loop gets the recording again as the
+    test.
+    """
     fitted = ["scene.toml", recording]
+    test = ["--test", recording] if ONE in checked else []
     return [
-        (["close-loop", *fitted, "--method", "laplace", "-o", "loop"], (0, 3)),
+        (["close-loop", *fitted, *test, "--method", "laplace", "-o", "loop"], (0, 3)),
         (["fit", *fitted, "--method", "map", "-o", "map.nc"], (0, 3)),
         (["report", "loop/after.nc", "-o", "r.html"], (0,)),
         (["simulate", "loop/after.nc", recording, "-o", "predicted.csv"], (0,)),
@@ -63,7 +72,7 @@ def tried(case: Case, most: int, until: int) -> dict[str, object]:
         if checked.code == 2:
             return result | {"refused": _said(checked, "error: ")[0]}
         faults, seconds, peak = {}, {}, 0.0
-        for argv, codes in commands(case, recording)[:until]:
+        for argv, codes in commands(case, recording, checked.out)[:until]:
             if not all((folder / part).exists() for part in argv if part == "loop/after.nc"):
                 continue  # the loop's fault is told
             ran = run(argv, folder, LIMIT)

@@ -68,6 +68,12 @@ def check(
     masses = histories.mass_contradictions(declared, loaded)
     for sentence in (*(velocity.sentence for velocity in unused), *masses):
         console.print(sentence, soft_wrap=True)
+    if loaded.n_trajectories < 2:
+        console.print(
+            "one trajectory: close-loop holds out whole ones, and needs another, --test with a file"
+            " of its own, or cut = { every = ... } in [recording] (s)",
+            soft_wrap=True,
+        )
     sized = histories.with_units(declared, loaded)
     priors = _default_priors(sized, catalogue)
     console.print(_priors_table(priors))

@@ -399,7 +399,8 @@ class History:
         if n < 2:
             raise HistoryError(
                 f"a history of {n} trajectory cannot be split by whole trajectories; expected at "
-                "least 2; record another, or give the test data in a file of their own"
+                "least 2; record another, cut it (cut = { every = ... } in [recording]), or give"
+                " the test data in a file of their own"
             )
         n_test = min(max(round(test_fraction * n), 1), n - 1)
         shuffled = np.random.default_rng(seed).permutation(n)

@@ -306,6 +306,18 @@ def test_check(capsys: pytest.CaptureFixture[str]) -> None:
     assert re.search(r"half-normal, [0-9.]+ kg/s", line)
 
 
+@pytest.mark.usefixtures("files")
+def test_check_says_what_close_loop_needs(capsys: pytest.CaptureFixture[str]) -> None:
+    lines = Path("train.csv").read_text().splitlines()
+    one = [line for line in lines if not line.startswith("1,")]
+    Path("one.csv").write_text("\n".join(one))
+    for name, said in (("train.csv", False), ("one.csv", True)):
+        assert main(["check", "scene.toml", name, "--no-prior"]) == 0
+        assert (
+            "one trajectory: close-loop holds out whole ones" in capsys.readouterr().out
+        ) is said
+
+
 def test_version_and_help(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--version"]) == 0
     assert capsys.readouterr().out.startswith("pbrl-ppl ")
