@@ -86,6 +86,7 @@ def warm() -> None:
     """Import what commands import, so that a forked child begins at once."""
     import pymc  # noqa: F401
 
+    import pbrl_ppl.cli
     import pbrl_ppl.criticism
     import pbrl_ppl.planning
     import pbrl_ppl.reporting

@@ -9,6 +9,7 @@ a posterior file that is read with other contents than it was written with.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import io
 import json
 import os
@@ -24,6 +25,7 @@ import numpy as np
 import pandas as pd
 from PIL import Image
 
+from pbrl_ppl import cli
 from pbrl_ppl.errors import PbrlError
 from pbrl_ppl.files import json_values
 from pbrl_ppl.posterior import load_posterior
@@ -52,7 +54,7 @@ KINDS: Mapping[str, tuple[str, int, tuple[str, ...]]] = {
     )),
     "manifest": ("logs.csv", 4, ("manifest {}",)),
     "json": ("log.json", 5, (CHECK,)),
-    "mat": ("log.mat", 3, (CHECK,)),
+    "mat": ("log.mat", 3, (f"{CHECK} --columns time=time",)),
     "bag1": ("log.bag", 4, ("check bag.toml {} --no-prior",)),
     "db3": ("log.db3", 4, ("check bag.toml {} --no-prior",)),
     "mcap": ("log.mcap", 4, ("check bag.toml {} --no-prior",)),
@@ -104,7 +106,8 @@ def inputs(base: Path) -> None:
     rows = [[0.1 * i, 0.0, 0.01 * i, 0.1] for i in range(20)]
     (base / "log.json").write_text(json.dumps({"units": "Meters", "slow-forward": rows}))
     one = table[table["trajectory"] == 0]
-    savemat(base / "log.mat", {name: one[name].to_numpy() for name in one if name != "body"})
+    numbers = {name: one[name].to_numpy() for name in one if name not in ("body", "trajectory")}
+    savemat(base / "log.mat", numbers)
     layout = "topics = { puck = ['/odom', '/wrench'] }\ncolumns = { x = 'pose.pose.position.x',"
     layout += " y = 'pose.pose.position.y', theta = 'yaw', force_x = 'wrench.force.x',"
     layout += " force_y = 'wrench.force.y', torque = 'wrench.torque.z' }\n"
@@ -385,6 +388,11 @@ def main() -> None:
         shutil.rmtree(base, ignore_errors=True)
         inputs(base)
     whole = contents(base / "posterior.nc")
+    with contextlib.chdir(base), contextlib.redirect_stdout(io.StringIO()):
+        for name in ("log.parquet", "log.mcap", "log.mat"):  # their packages are then imported
+            cli.main(
+                ["check", "bag.toml" if "mcap" in name else "scene.toml", name, "--no-prior", "-q"]
+            )
     log.touch()
     rows = {row["try"]: row for row in map(json.loads, log.read_text().splitlines())}
     for number in arguments.only or range(arguments.tries):
