@@ -389,10 +389,9 @@ def main() -> None:
         inputs(base)
     whole = contents(base / "posterior.nc")
     with contextlib.chdir(base), contextlib.redirect_stdout(io.StringIO()):
-        for name in ("log.parquet", "log.mcap", "log.mat"):  # their packages are then imported
-            cli.main(
-                ["check", "bag.toml" if "mcap" in name else "scene.toml", name, "--no-prior", "-q"]
-            )
+        for kind in ("parquet", "mcap", "mat"):  # their packages are then imported
+            name, _, (argv,) = KINDS[kind]
+            cli.main(argv.format(name).split())
     log.touch()
     rows = {row["try"]: row for row in map(json.loads, log.read_text().splitlines())}
     for number in arguments.only or range(arguments.tries):
