@@ -209,13 +209,15 @@ def forecast(
         rate = coordinates.pushed[coordinates.always] - len(coordinates.sensors)
         pushes = (coordinates.push[coordinates.always] * allowed[rate][:, None]).T
     pushed = np.zeros((len(at), *pushes.shape))
-    for i in range(intervals):
-        slope = noise.slope[every[:, i]]
-        covariance = slope @ covariance @ slope.transpose(0, 2, 1)
-        covariance = covariance + noise.touching[every[:, i], None, None] * contact
-        pushed = slope @ pushed + pushes
-    variance = np.diagonal(covariance, axis1=1, axis2=2) + coordinates.errors(sigma) ** 2
-    variance = variance + (pushed**2).sum(axis=2)
+    with np.errstate(over="ignore", invalid="ignore"):  # unstable motions spread without limit
+        for i in range(intervals):
+            slope = noise.slope[every[:, i]]
+            covariance = slope @ covariance @ slope.transpose(0, 2, 1)
+            covariance = covariance + noise.touching[every[:, i], None, None] * contact
+            pushed = slope @ pushed + pushes
+        variance = np.diagonal(covariance, axis1=1, axis2=2) + coordinates.errors(sigma) ** 2
+        variance = variance + (pushed**2).sum(axis=2)
+    variance = np.where(np.isnan(variance), np.inf, variance)
     return Forecast(error, variance, motion, coordinates.places % len(STATE))
 
 

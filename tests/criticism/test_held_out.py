@@ -106,6 +106,16 @@ def test_the_floor_is_of_the_noise_of_measuring_and_grows_with_the_length() -> N
     assert ten["x"] > 1.2 * one["x"]  # the error of the speed, over a second
 
 
+def test_a_forecast_of_an_unstable_motion_has_no_finite_floor() -> None:
+    """Its derivatives grow beyond the numbers within a forecast; no warning."""
+    mode = Disc(4, 15, DISC).mode(np.random.default_rng(9))
+    noise = mode.problem.likelihood.noise
+    unstable = mode.problem.along(replace(noise, slope=-1e60 * noise.slope))
+    allowed = np.full(3, 1e-3)
+    told = forecast(unstable, mode.phi, mode.sigma, 10, allowed=allowed)
+    assert np.isposinf(told.variance).any() and not np.isnan(told.variance).any()
+
+
 def test_a_mode_is_judged_by_other_data_at_the_same_noise(frames) -> None:
     mode = fitted(BOX, frames[0])
     problem = HeldOut.of(mode, history(frames[1])).problem
