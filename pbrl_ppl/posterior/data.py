@@ -322,6 +322,9 @@ def both_recordings(earlier: xr.Dataset, new: xr.Dataset) -> xr.Dataset:
         return xr.Dataset()
     by_transition = [name for name in ("slope", _ORIGIN, _SENSITIVITY) if name in new]
     whole = [str(name) for name in new.data_vars if f"{_PREFIX}trajectory" in new[name].dims]
+    if f"{_PREFIX}began" not in earlier:  # of a file from before laws knew it
+        began = xr.zeros_like(earlier[f"{_PREFIX}number"])
+        earlier = earlier.assign({f"{_PREFIX}began": began})
     result = new[[name for name in ("linearised_at",) if name in new]]
     result = result.drop_vars([str(name) for name in result.coords])
     for names, dim in ((by_transition, "transition"), (whole, f"{_PREFIX}trajectory")):
