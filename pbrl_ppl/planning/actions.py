@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.errors import GoalError
 from pbrl_ppl.planning.dynamics import TransitionModel, remembered
-from pbrl_ppl.planning.goals import check_pushed, read_tables
+from pbrl_ppl.planning.goals import check_pushed, is_finite, read_tables
 from pbrl_ppl.scene import Scene, nearest
 from pbrl_ppl.state import THETA, WRENCH, Floats, turned
 
@@ -51,7 +51,7 @@ class Action:
     def __post_init__(self) -> None:
         try:
             numbers = np.array([*np.ravel(self.force), self.torque], dtype=float)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             numbers = np.full(3, np.nan)
         if numbers.shape != (3,) or not np.isfinite(numbers).all():
             raise GoalError(
@@ -98,11 +98,15 @@ class ActionSet:
             raise GoalError("actions: the set is empty; give at least one wrench on a body")
         if self.durations is None:
             return
+        if not isinstance(self.durations, Iterable):
+            raise GoalError(
+                f"actions: durations is {self.durations!r}, expected a list of them (s)"
+            )
         object.__setattr__(self, "durations", tuple(self.durations))
         if not self.durations:
             raise GoalError("actions: there is no duration; give one (s)")
         for value in self.durations:
-            if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
+            if not is_finite(value) or not value > 0:
                 raise GoalError(f"actions: a duration is {value!r}, expected a positive number (s)")
 
     @classmethod

@@ -62,12 +62,12 @@ class Target:
             value = getattr(self, field.name)
             if value is None and field.default is None:
                 continue
-            if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+            if not is_number(value):
                 raise GoalError(
                     f"goal of {self.body}: {field.name} is {value!r}, expected a number"
                 )
             positive = field.name not in POSE
-            if not math.isfinite(value) or (positive and value <= 0):
+            if not is_finite(value) or (positive and value <= 0):
                 what = "a positive number" if positive else "a finite number"
                 raise GoalError(f"goal of {self.body}: {field.name} is {value}, expected {what}")
         if self.x is None and self.y is None and self.theta is None:
@@ -109,7 +109,10 @@ class Goal:
         for name in names:
             if names.count(name) > 1:
                 raise GoalError(f"goal: {name} has {names.count(name)} targets; keep one")
-        if not self.contact_penalty >= 0:
+        penalty = self.contact_penalty
+        if not (
+            is_number(penalty) and (is_finite(penalty) or penalty == math.inf) and penalty >= 0
+        ):
             raise GoalError(f"goal: contact_penalty is {self.contact_penalty}, expected 0 or more")
 
     @classmethod
@@ -254,11 +257,30 @@ def read_tables(
     key = kind.__name__.lower()
     _check_keys(document, [*options, key], f"{what} {path}")
     tables = document.pop(key, [])
+    if not (isinstance(tables, list) and all(isinstance(table, dict) for table in tables)):
+        raise GoalError(
+            f"{path}: {key} is {tables!r}, expected tables: [[{key}]], with two brackets"
+        )
     for table in tables:
         _check_keys(table, [field.name for field in fields(kind)], f"{path}: [[{key}]]")
         if "body" not in table:
             raise GoalError(f"{path}: one [[{key}]] has no body; name it")
+        if not isinstance(table["body"], str):
+            raise GoalError(f"{path}: [[{key}]]: body is {table['body']!r}, expected a name")
     return [kind(**table) for table in tables], document
+
+
+def is_number(value: object) -> bool:
+    """Return whether a value is a number."""
+    return isinstance(value, int | float | np.number) and not isinstance(value, bool)
+
+
+def is_finite(value: Any) -> bool:
+    """Return whether a value is a finite number, which integers of hundreds of digits are not."""
+    try:
+        return is_number(value) and math.isfinite(value)
+    except OverflowError:
+        return False
 
 
 def _check_keys(table: Mapping[str, object], known: list[str], where: str) -> None:

@@ -96,6 +96,11 @@ def test_specs_are_read_from_files(tmp_path: Path) -> None:
         ('[[target]]\nbody = "puck"\nangle = 1', "unknown key"),
         ("[[target]]\nx = 1", "has no body"),
         ("", "no target"),
+        ("target = 5", "expected tables"),
+        ("[[target]]\nbody = 5\nx = 1", "expected a name"),
+        ('[[target]]\nbody = "puck"\nx = ' + "9" * 400, "expected a finite number"),
+        ('contact_penalty = "x"\n[[target]]\nbody = "puck"\nx = 1', "contact_penalty is x"),
+        ("contact_penalty = " + "9" * 400 + '\n[[target]]\nbody = "puck"\nx = 1', "0 or more"),
     ],
 )
 def test_a_bad_goal_file_is_named(text: str, message: str, tmp_path: Path) -> None:
@@ -105,6 +110,23 @@ def test_a_bad_goal_file_is_named(text: str, message: str, tmp_path: Path) -> No
         Goal.load(path)
     with pytest.raises(GoalError, match="no such file"):
         Goal.load(tmp_path / "gaol.toml")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("durations = 5", "expected a list"),
+        ("durations = [inf]", "expected a positive number"),
+        ("durations = [" + "9" * 400 + "]", "expected a positive number"),
+        ("", "two finite numbers"),
+    ],
+)
+def test_bad_actions_are_named(text: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "actions.toml"
+    force = "[" + ("9" * 400 if not text else "1") + ", 0]"
+    path.write_text(f'{text}\n[[action]]\nbody = "puck"\nforce = {force}\n')
+    with pytest.raises(GoalError, match=message):
+        ActionSet.load(path)
 
 
 def test_wrenches_turn_with_the_body_in_its_frame_alone() -> None:
