@@ -100,7 +100,9 @@ def inputs(base: Path) -> None:
     for name in ("log.nc", "log.parquet"):
         History.load(base / "train.csv", scene).save(base / name)
     (base / "goal.toml").write_text("[[target]]\nbody = 'puck'\nx = 1.0\ny = 0.0\n")
-    (base / "actions.toml").write_text("durations = [0.1, 0.2]\n[[action]]\nbody = 'puck'\nforce = [5.0, 0.0]\n")
+    (base / "actions.toml").write_text(
+        "durations = [0.1, 0.2]\n[[action]]\nbody = 'puck'\nforce = [5.0, 0.0]\n"
+    )
     (base / "model.xml").write_text(MJCF)
     (base / "model.urdf").write_text(URDF)
     rows = [[0.1 * i, 0.0, 0.01 * i, 0.1] for i in range(20)]
