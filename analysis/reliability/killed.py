@@ -261,7 +261,7 @@ def main() -> None:
         if draw.random() < 0.1 or (
             row["left"] and not again
         ):  # nothing stands in the next run's way
-            then = run(command(name, again), place)
+            then = run(command(name, bool(written(place, inputs))), place)
             row["next"] = fault = then.fault((0, 1, 3))
             row["faults"] += [f"the next run: {fault}"] if fault else []
         rows[number] = row
