@@ -56,9 +56,9 @@ LIKELY = 0.7
 _CLEAR = 30.0
 #: Log odds of laws that are rare, at most.
 _RARE = -5.0
-#: The last digits of the data may change the evidence of a refit beside another by this (nats):
-#: each ends where a step gains less than half of it.
-_REPEATABLE = 1.0
+#: With the last digits of the data the evidence of a refit may change by this (nats): friction
+#: makes the top rough, and climbs end on different grains of it.
+_REPEATABLE = 2.0
 #: Share of the joint sizes from which refits begin a second time.
 _SHORTER = 0.3
 
