@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.refinement import checked_mode
 from pbrl_ppl.criticism.results import ONE_TRAJECTORY, Candidate, Law, SearchLength, Stage
-from pbrl_ppl.criticism.score import rank_candidates
+from pbrl_ppl.criticism.score import Signature, rank_candidates
 from pbrl_ppl.criticism.search import Search
 from pbrl_ppl.criticism.unexplained import unexplained_acceleration
 from pbrl_ppl.effects import Attached, Effect, candidates
@@ -214,7 +214,8 @@ def criticise(
     mode = checked_mode(scene, history, catalogue, seed, substeps, criteria, say)
     scene, effects = mode.problem.scene, mode.problem.physics.effects
     say(Stage.SCORE)
-    ranked = rank_candidates(mode, candidates(scene, effects, catalogue), criteria)
+    missing = candidates(scene, effects, catalogue)
+    ranked = rank_candidates(mode, missing, criteria, Signature.test_alone)
     excess = unexplained_acceleration(mode, criteria)
     return Ranking(
         tuple(signature.candidate for signature in ranked),

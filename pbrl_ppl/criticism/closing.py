@@ -316,7 +316,8 @@ def _searched(task: _Task, declared: _Fitted) -> _Searched:
     except HistoryError:  # initial states could follow all that was measured
         found = search(find_mode(single_transitions(mode.problem), initial=mode.phi))
     task.say(Stage.SCORE)
-    ranked = rank_candidates(declared.mode, task.missing(declared.mode), task.criteria)
+    missing, kept = task.missing(declared.mode), Signature.without_bases
+    ranked = rank_candidates(declared.mode, missing, task.criteria, kept)
     return _Searched(declared, found, ranked)
 
 
@@ -373,7 +374,8 @@ def _tested(task: _Task, cleaned: _Cleaned, searched: _Searched) -> _Judged:
         )
     ranked = searched.ranked
     if searched.laws:
-        ranked = rank_candidates(innovations, task.missing(innovations), criteria)
+        missing = task.missing(innovations)
+        ranked = rank_candidates(innovations, missing, criteria, Signature.without_bases)
     misfit = misfit.with_test(score_test(innovations, ranked, criteria))
     small = tuple(one.candidate for one in ranked[:1] if one.candidate.p_value < criteria.try_p)
     return _Judged(cleaned, searched, declared, revised, misfit, small, rollout, simulated)

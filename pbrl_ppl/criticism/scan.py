@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import norm
@@ -34,6 +34,11 @@ class GridPoint:
     columns: tuple[int, ...]
 
     @property
+    def place(self) -> GridPoint:
+        """Return the grid point without its signature."""
+        return replace(self, signature=self.signature[:0].copy())
+
+    @property
     def proposed(self) -> Floats:
         """Return the grid point as a scan proposes it, shape (q,), NaN for what is not scanned."""
         point = self.values.astype(float)
@@ -41,10 +46,15 @@ class GridPoint:
         return point
 
 
-def grid_points(
+def grid_points(mode: Mode, candidate: Attached) -> list[GridPoint]:
+    """Return the grid points of a candidate's scan; see :func:`each_grid_point`."""
+    return list(each_grid_point(mode, candidate))
+
+
+def each_grid_point(
     mode: Mode, candidate: Attached, proposed: Floats | None = None, *, at_once: int = 8
-) -> list[GridPoint]:
-    """Simulate a candidate at grid points.
+) -> Iterator[GridPoint]:
+    """Simulate a candidate at grid points, a few at a time, for each holds a value a measurement.
 
     Parameters
     ----------
@@ -58,14 +68,14 @@ def grid_points(
     at_once : int
         Grid points that are simulated in one call.
 
-    Returns
-    -------
-    list of GridPoint
+    Yields
+    ------
+    GridPoint
         The grid points that change a prediction.
     """
     effect, problem = candidate.effect, mode.problem
     if effect.scan is None:
-        return []
+        return
     body = problem.scene.body(candidate.body)
     enlarged = problem.with_physics(effects=(*problem.physics.effects, candidate)).medium
     of_scan = proposed is None
@@ -89,7 +99,6 @@ def grid_points(
     if of_scan:  # one side will do to choose from
         behind = np.where(ahead > 0.0, 0.0, behind)
     nothing = whitened(null[None])
-    kept = []
     for begin in range(0, len(proposed), at_once):
         part = slice(begin, begin + at_once)
         points, plan = _points(proposed[part], free[part], null, (ahead, behind))
@@ -102,8 +111,7 @@ def grid_points(
             else:
                 signature = (states[rows] - states[0]).T
             if np.any(signature):
-                kept.append(GridPoint(values, signature, columns))
-    return kept
+                yield GridPoint(values, signature, columns)
 
 
 def _points(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -14,7 +14,7 @@ from pbrl_ppl.criticism.results import Candidate
 from pbrl_ppl.criticism.scan import (
     GridPoint,
     detection_limits,
-    grid_points,
+    each_grid_point,
     is_upper_limit,
 )
 from pbrl_ppl.effects import Attached, Noise
@@ -57,6 +57,14 @@ class Signature:
     direction: Floats
     linear: tuple[Linearisation, ...]
 
+    def without_bases(self) -> Signature:
+        """Return the test with its direction, without arrays of several values a row."""
+        return replace(self, basis=self.basis[:0].copy(), linear=())
+
+    def test_alone(self) -> Signature:
+        """Return the test without arrays of n values."""
+        return replace(self.without_bases(), direction=self.direction[:0].copy())
+
 
 @dataclass(frozen=True, eq=False)
 class Linearisation:
@@ -88,18 +96,28 @@ class Linearisation:
         return values
 
 
+def _whole(signature: Signature) -> Signature:
+    return signature
+
+
 def rank_candidates(
-    mode: Mode, candidates: Sequence[Attached], criteria: Criteria = DEFAULT
+    mode: Mode,
+    candidates: Sequence[Attached],
+    criteria: Criteria = DEFAULT,
+    kept: Callable[[Signature], Signature] = _whole,
 ) -> list[Signature]:
     """Score every candidate effect at the mode of the model that lacks it, best first.
 
     See :func:`score_candidates`.
     """
-    return score_candidates(mode, candidates, criteria)[1]
+    return score_candidates(mode, candidates, criteria, kept)[1]
 
 
 def score_candidates(
-    mode: Mode, candidates: Sequence[Attached], criteria: Criteria = DEFAULT
+    mode: Mode,
+    candidates: Sequence[Attached],
+    criteria: Criteria = DEFAULT,
+    kept: Callable[[Signature], Signature] = _whole,
 ) -> tuple[Floats, list[Signature]]:
     """Return the whitened residual without what parameters absorb, and candidates, best first.
 
@@ -116,6 +134,8 @@ def score_candidates(
         Effects that it lacks.
     criteria : Criteria
         Which signatures are absorbed.
+    kept : callable
+        Returns what of each signature is kept, such as :meth:`Signature.without_bases`.
 
     Returns
     -------
@@ -129,7 +149,7 @@ def score_candidates(
 
     def score(attached: Attached) -> Signature:
         best = _tail_score if _of_noise(attached) else _best_grid_point
-        return best(mode, attached, test)
+        return kept(best(mode, attached, test))
 
     # the noise's shape comes last: any missing effect makes tails heavy; p-values of the same
     # physics differ by rounding
@@ -170,10 +190,10 @@ def _score_test(mode: Mode, candidates: int, criteria: Criteria) -> ScoreTest:
     return ScoreTest(q, residual - q @ (q.T @ residual), candidates, criteria)
 
 
-def _points(mode: Mode, attached: Attached) -> list[GridPoint]:
+def _points(mode: Mode, attached: Attached) -> Iterable[GridPoint]:
     """Return a candidate at every grid point of its scan, or else at its null value."""
     if attached.effect.scan is not None:
-        return grid_points(mode, attached)
+        return each_grid_point(mode, attached)
     null = np.array(attached.effect.null, dtype=float)
     return [GridPoint(null, _slopes(mode, attached), tuple(range(len(null))))]
 
@@ -219,6 +239,10 @@ class _Evidence:
     direction: Floats
     unit: Floats
     back: Floats
+
+    def test_alone(self) -> _Evidence:
+        """Return the evidence without arrays of n values."""
+        return replace(self, basis=self.basis[:0].copy(), direction=self.direction[:0].copy())
 
     def about(self, point: GridPoint) -> Linearisation:
         """Return the linearisation of the signature of a grid point."""
@@ -356,15 +380,18 @@ def _best_grid_point(mode: Mode, attached: Attached, test: ScoreTest, again: int
 
     The ``again`` leading ones of a scan are simulated again with more engine steps.
     """
-    tried = _points(mode, attached)
-    scores = [test.at(point, attached) for point in tried]
-    judged = list(zip(scores, tried, strict=True))
-    if attached.effect.scan is not None:  # with more engine steps a body may pass by
+    scanned = attached.effect.scan is not None
+    judged = []
+    for point in _points(mode, attached):
+        score = test.at(point, attached)
+        judged.append((score.test_alone(), point.place) if scanned else (score, point))
+    tried, units = [point for _, point in judged], [score.unit for score, _ in judged]
+    if scanned:  # with more engine steps a body may pass by
         leading = sorted(judged, key=lambda x: x[0].log_p)[:again]
         finer: list[GridPoint] = []
         if leading and leading[0][0].log_p < 0.0:
             proposed = np.array([point.proposed for _, point in leading])
-            finer = grid_points(mode, attached, proposed)
+            finer = list(each_grid_point(mode, attached, proposed))
         judged = sorted(
             ((test.at(point, attached), point) for point in finer), key=lambda x: x[0].log_p
         )
@@ -378,7 +405,7 @@ def _best_grid_point(mode: Mode, attached: Attached, test: ScoreTest, again: int
         one.about(point) for one, point in judged
         if one.statistic > 0 or attached.effect.scan is None
     )  # fmt: skip
-    return _signature(attached, best, values, test, tried, [one.unit for one in scores], linear)
+    return _signature(attached, best, values, test, tried, units, linear)
 
 
 def _of_noise(attached: Attached) -> bool:

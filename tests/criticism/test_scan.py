@@ -3,13 +3,18 @@
 That they are found is tested in test_criticism, with all other effects.
 """
 
+from collections.abc import Iterator
+from typing import Any
+from weakref import WeakSet
+
 import numpy as np
 import pytest
 from scipy.stats import binom, chi2, norm
 
+from pbrl_ppl.criticism import score
 from pbrl_ppl.criticism.criteria import DEFAULT
 from pbrl_ppl.criticism.scan import GridPoint, detection_limits, grid_points, is_upper_limit
-from pbrl_ppl.criticism.score import rank_candidates
+from pbrl_ppl.criticism.score import Signature, rank_candidates
 from pbrl_ppl.effects import candidates, catalogue
 from pbrl_ppl.state import STATE
 from tests.helpers.free_puck import BOX, DISC, Disc, box2d, fitted
@@ -115,3 +120,26 @@ def test_p_values_of_scans_are_no_smaller_than_chance_makes_them() -> None:
 
 def test_an_effect_without_a_scan_has_no_grid_points(mode) -> None:
     assert grid_points(mode, EFFECTS["linear_drag"].on("puck")) == []
+
+
+def test_a_ranking_does_not_hold_every_signature(mode, monkeypatch) -> None:
+    """Of many rows, all candidates at all their grid points do not go into memory."""
+    made, most, each = 0, 0, score.each_grid_point
+
+    def noted(*arguments: Any) -> Iterator[GridPoint]:
+        nonlocal made, most
+        alive: WeakSet[GridPoint] = WeakSet()
+        for point in each(*arguments):
+            alive.add(point)
+            made, most = made + 1, max(most, len(alive))
+            yield point
+            del point
+
+    monkeypatch.setattr(score, "each_grid_point", noted)
+    tried = [EFFECTS[name].on("puck") for name in ("linear_drag", "force_cutoff", "mass_change")]
+    ranked = rank_candidates(mode, tried, kept=Signature.test_alone)
+    assert made > 30 and most < 10
+    for one in ranked:
+        assert not one.basis.size and not one.direction.size and not one.linear
+    whole = rank_candidates(mode, tried)
+    assert [one.candidate for one in ranked] == [one.candidate for one in whole]
