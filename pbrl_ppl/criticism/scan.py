@@ -13,6 +13,9 @@ from pbrl_ppl.effects import Attached, Effect
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.state import Floats
 
+#: Measurements times grid points that are simulated in one call, at most.
+_VALUES = 4_000_000
+
 
 @dataclass(frozen=True, eq=False)
 class GridPoint:
@@ -66,7 +69,7 @@ def each_grid_point(
         The grid points, shape (point, q); by default all that its scan proposes, simulated with as
         few engine steps as tell them apart.
     at_once : int
-        Grid points that are simulated in one call.
+        Grid points that are simulated in one call, at most; fewer of long recordings.
 
     Yields
     ------
@@ -99,6 +102,7 @@ def each_grid_point(
     if of_scan:  # one side will do to choose from
         behind = np.where(ahead > 0.0, 0.0, behind)
     nothing = whitened(null[None])
+    at_once = max(1, min(at_once, _VALUES // max(mode.whitened_residual.size, 1)))
     for begin in range(0, len(proposed), at_once):
         part = slice(begin, begin + at_once)
         points, plan = _points(proposed[part], free[part], null, (ahead, behind))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, chi2, norm
 
-from pbrl_ppl.criticism import score
+from pbrl_ppl.criticism import scan, score
 from pbrl_ppl.criticism.criteria import DEFAULT
 from pbrl_ppl.criticism.scan import GridPoint, detection_limits, grid_points, is_upper_limit
 from pbrl_ppl.criticism.score import Signature, rank_candidates
@@ -143,3 +143,12 @@ def test_a_ranking_does_not_hold_every_signature(mode, monkeypatch) -> None:
         assert not one.basis.size and not one.direction.size and not one.linear
     whole = rank_candidates(mode, tried)
     assert [one.candidate for one in ranked] == [one.candidate for one in whole]
+
+
+def test_grid_points_of_long_recordings_are_simulated_one_by_one(mode, monkeypatch) -> None:
+    """To the last digit as eight at a time."""
+    tried = EFFECTS["mass_change"].on("puck")
+    at_once = grid_points(mode, tried)
+    monkeypatch.setattr(scan, "_VALUES", 1)
+    for one, other in zip(at_once, grid_points(mode, tried), strict=True):
+        np.testing.assert_array_equal(one.signature, other.signature)
