@@ -12,6 +12,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import pytest
+from reliability import supply
 
 import pbrl_ppl
 from tests.helpers.places import ROOT
@@ -132,3 +133,21 @@ def test_the_docs_list_the_dependencies_with_their_bounds() -> None:
     said = re.findall(r"^\| ([\w-]+) \| ([\d.]+) \|", page.read_text(), re.M)
     bounds = [re.match(r"([\w-]+)>=([\d.]+)", one) for one in project["dependencies"]]
     assert said == [one.groups() for one in bounds if one]
+
+
+def test_no_dependency_has_copyleft_but_those_that_the_docs_name() -> None:
+    """PyTensor 2 needs etuples, which needs cons."""
+    told = {one.metadata["Name"]: supply.licence(one) for one in supply.installed()}
+    assert {"numpy", "pymc", "cffi"} <= set(told)
+    assert {name for name, text in told.items() if supply.COPYLEFT.search(text)} <= {"cons"}
+    assert "not stated" not in told.values()
+
+
+def test_the_bill_of_materials_is_closed(tmp_path: Path) -> None:
+    supply.sbom(tmp_path / "sbom.json")
+    bom = json.loads((tmp_path / "sbom.json").read_text())
+    refs = [bom["metadata"]["component"]["bom-ref"], *(one["bom-ref"] for one in bom["components"])]
+    assert len(set(refs)) == len(refs) > 30
+    assert [one["ref"] for one in bom["dependencies"]] == refs
+    needed = {ref for one in bom["dependencies"] for ref in one["dependsOn"]}
+    assert needed == set(refs[1:])
