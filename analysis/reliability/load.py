@@ -23,6 +23,7 @@ import sys
 import tempfile
 import threading
 import time
+import traceback
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -34,7 +35,6 @@ import numpy as np
 
 import pbrl_ppl as pp
 from pbrl_ppl.criticism import criticise
-from pbrl_ppl.state import Floats
 from reliability.commands import run, warm
 
 ROOT = Path(__file__).parents[2]
@@ -77,23 +77,22 @@ def pucks(rows: int, bodies: int, laws: int, seed: int) -> tuple[pp.Scene, pp.Hi
             for name in names
         ),
     )
-    true, given = scene, {}
-    for name in names:
-        if not laws:
-            true = true.with_effects(name, "linear_drag")
-    for label in pp.Physics(true).layout.labels:
-        given[label] = 1.0 if label.startswith(("mass", "force_gain")) else 0.1
+    true, given = scene, {"mass": 1.0}
+    for name in names if not laws else ():
+        true = true.with_effects(name, "linear_drag")
+    for law in pp.catalogue:
+        if law.name in declared[: max(laws, 1)]:
+            value = 1.0 if law.name == "force_gain" else 0.1
+            given |= {law.variable(parameter): value for parameter in law.parameters}
     rng, n = np.random.default_rng(seed), rows // 4
     start = rng.normal(size=(4, bodies, 6)) * [0.3, 0.3, 1.0, 0.2, 0.2, 1.0]
     start[..., 0] += 100.0 * np.arange(bodies)
     pushes = rng.normal(0, [1, 1, 0.01], (4, n // 4 + 1, bodies, 3)).repeat(4, axis=1)[:, :n]
-    states = np.concatenate([start[:, None], _predicted(true, given, start, pushes)], axis=1)
+    states = np.concatenate(
+        [start[:, None], pp.Transition(true, given).predict(start, pushes)], axis=1
+    )
     states += rng.normal(size=states.shape) * [1e-3, 1e-3, 2e-3, 5e-3, 5e-3, 1e-2]
     return scene, pp.History.of_arrays(states, scene, pushes)
-
-
-def _predicted(scene: pp.Scene, given: dict[str, float], start: Floats, pushes: Floats) -> Floats:
-    return pp.Transition(scene, given).predict(start, pushes)
 
 
 # -- cases: each yields a name and what is run for it ----------------------------------------------
@@ -134,6 +133,8 @@ def apart(function: Callable[[], object]) -> Case:
         try:
             function()
             code = 0
+        except BaseException:
+            traceback.print_exc()
         finally:
             os._exit(code)
     _, status, usage = os.wait4(child, 0)
