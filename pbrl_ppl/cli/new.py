@@ -176,7 +176,8 @@ def recorded(
                 f"{source}: it has no column {name}; say which it is (--columns {name}=COLUMN)"
             )
     table["time"] = pd.to_numeric(table["time"], errors="coerce")
-    step = float(table.groupby(["trajectory", "body"])["time"].diff().median())
+    # pandas 2 warns of a median of missing values alone
+    step = float(table.groupby(["trajectory", "body"])["time"].diff().dropna().median())
     if not step > 0:
         raise HistoryError(
             f"{source}: its times do not rise from row to row of a body and trajectory;"
