@@ -17,6 +17,7 @@ import numpy as np
 import pandas as pd
 
 from pbrl_ppl.errors import HistoryError
+from pbrl_ppl.files import reason
 from pbrl_ppl.history.files import FOLDER, reads
 from pbrl_ppl.scene import Recording, nearest
 from pbrl_ppl.state import Bools, Floats
@@ -206,7 +207,8 @@ def _opened(path: Path) -> Iterator[AnyReader]:
         raise
     except Exception as error:  # damaged files raise errors of many kinds
         # those of rosbags say what is wrong
-        why = f" ({error})" if type(error).__name__.endswith("ReaderError") else ""
+        told = isinstance(error, FileNotFoundError) or type(error).__name__.endswith("ReaderError")
+        why = f" ({reason(error)})" if told else ""
         raise HistoryError(
             f"bag {path}: cannot be read{why}; record it to its end,"
             " or repair it with `rosbag reindex`, `ros2 bag reindex` or `mcap recover`"

@@ -443,6 +443,7 @@ def test_an_interrupt_ends_machine_code() -> None:
     ) as process:  # fmt: skip
         assert process.stdout is not None and process.stderr is not None
         assert process.stdout.readline() == "begun\n"
+        time.sleep(1.0)  # until it is in there
         process.send_signal(signal.SIGINT)
         assert process.wait(60) == 130
         assert process.stderr.read() == "interrupted; two logs are kept\n"
