@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from pbrl_ppl.posterior import Idata
     from pbrl_ppl.sampling import Calibration
 
+#: The stage of `fit` that takes longest.
+_SAMPLING = "looking for the mode, then sampling"
 #: Formats of a summary's columns; of others, four digits.
 _DIGITS = {"ess": ".0f", "r_hat": ".3f"}
 
@@ -120,7 +122,7 @@ def fit(
 
         check_history(declared, loaded, loaded.segments(1))
         earlier = None if resume is None else load_posterior(resume)
-        progress("looking for the mode, then sampling")
+        progress(_SAMPLING)
         try:
             made = sampling.physics_model(
                 declared, loaded, effects, likelihood=model.likelihood, horizon=model.horizon,
@@ -131,7 +133,11 @@ def fit(
     if sampler.method not in ("importance", "laplace", "map"):
         interrupts.keep()  # the draws of chains so far
     # the sampler shows its own progress
-    with terminal.noted_warnings("was interrupted") as caught, redirect_stdout(sys.stderr):
+    with (
+        terminal.noted_warnings("was interrupted") as caught,
+        redirect_stdout(sys.stderr),
+        terminal.still_running(terminal.Status(_SAMPLING), quiet),
+    ):
         idata = sampling.fit(made, resume=earlier, progress=not quiet, **vars(sampler))
         save_posterior(idata, to.output)
     return _fitted(idata, to.output, {type(warning) for warning in caught}, interrupts.seen)

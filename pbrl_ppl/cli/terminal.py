@@ -56,8 +56,7 @@ def stages(quiet: bool, every: float = 60.0) -> Iterator[Progress]:
     """
     console = PlainConsole(stderr=True, quiet=quiet)
     running = Status()
-    watched = nullcontext() if quiet or console.is_terminal else _alive(running, every)
-    with console.status(running), watched:
+    with console.status(running), still_running(running, quiet, every):
 
         def progress(stage: str) -> None:
             console.print(f"[{running.elapsed:5.1f} s] {in_a_line(stage)}", soft_wrap=True)
@@ -67,8 +66,11 @@ def stages(quiet: bool, every: float = 60.0) -> Iterator[Progress]:
 
 
 @contextmanager
-def _alive(running: Status, every: float) -> Iterator[None]:
-    """Write to stderr from time to time that a stage goes on."""
+def still_running(running: Status, quiet: bool, every: float = 60.0) -> Iterator[None]:
+    """Write to stderr ``every`` so many seconds that a stage goes on, unless that is a terminal."""
+    if quiet or sys.stderr.isatty():
+        yield
+        return
     ended = threading.Event()
 
     def write() -> None:
@@ -90,8 +92,8 @@ def _alive(running: Status, every: float) -> Iterator[None]:
 class Status:
     """Status line with the present stage, the time elapsed and, where known, the share done."""
 
-    def __init__(self) -> None:
-        self.name, self._begin = "starting", time.monotonic()
+    def __init__(self, name: str = "starting") -> None:
+        self.name, self._begin = name, time.monotonic()
         self.share: float | None = None
 
     @property
