@@ -404,8 +404,7 @@ def test_only_chains_are_said_not_to_converge(method, said, monkeypatch) -> None
         return SimpleNamespace(record=SimpleNamespace(**held))
 
     monkeypatch.setattr("pbrl_ppl.criticism.closing.sample", unconverged)
-    drawn = SimpleNamespace(likelihood=SimpleNamespace(simulated=False))
-    mode = _Mode(SimpleNamespace(with_physics=lambda threads: drawn))
+    mode = _Mode(SimpleNamespace(likelihood=None))
     task = SimpleNamespace(method=method, seed=1, draws=None, criteria=DEFAULT, say=print)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
