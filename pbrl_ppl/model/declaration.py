@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from functools import partial
+from typing import Any
 
 import numpy as np
 import pytensor.tensor as pt
+from pytensor import shared
+from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 from scipy.special import i0e
 
@@ -29,6 +31,8 @@ from pbrl_ppl.state import Floats
 with warnings.catch_warnings():  # PyMC 5 imports ArviZ 0.23, which announces 1.0 once a day
     warnings.filterwarnings("ignore", r"\s*ArviZ is undergoing", FutureWarning)
     import pymc as pm
+    from pymc.distributions.distribution import _support_point
+    from pymc.logprob.abstract import _logprob
 
 
 def build_model(problem: Problem) -> pm.Model:
@@ -59,24 +63,15 @@ def build_model(problem: Problem) -> pm.Model:
         if len(problem.physics.simulator.parts) > 1:
             world = SimulatorOp(physics, sensitivity, one_world=True)
             whole = world(phi, start, actions)[..., columns]
-        log_likelihood = LogLikelihoodOp(problem)
-        pm.CustomDist(
-            "next_state",
-            predicted,
-            whole,
-            sigma,
-            phi,
-            logp=lambda value, predicted, _, *noise: log_likelihood(value, predicted, *noise),
-            random=partial(_random, problem),
-            signature="(n,h,k,d),(n,h,k,d),(m),(p)->(n,h,k,d)",
-            observed=np.nan_to_num(problem.measured),
-            dims=NEXT_STATE_DIMS,
-        )
+        _NextState(
+            "next_state", predicted, whole, sigma, phi,
+            problem=problem, observed=np.nan_to_num(problem.measured), dims=NEXT_STATE_DIMS,
+        )  # fmt: skip
     return model
 
 
 def problem_in(model: pm.Model) -> Problem:
-    """Return the problem that a model was declared from; its log-likelihood's Op holds it.
+    """Return the problem that a model was declared from; its measured variable holds it.
 
     Parameters
     ----------
@@ -88,17 +83,15 @@ def problem_in(model: pm.Model) -> Problem:
     FitError
         If the model is of something else, or its variables are not those of the problem.
     """
-    observed = model.observed_RVs
-    if [variable.name for variable in observed] == ["next_state"]:
-        node = pm.logp(observed[0], model.rvs_to_values[observed[0]]).owner
-        if node is not None and isinstance(node.op, LogLikelihoodOp):
-            problem = node.op.problem
-            variables = {each.name for each in (*model.free_RVs, *model.deterministics)}
-            if variables == variable_dims(problem).keys() and not model.potentials:
-                return problem
-            raise FitError(
-                "the variables of this pm.Model were changed after physics_model; use pm.sample"
-            )
+    observed = [variable.owner.op for variable in model.observed_RVs]
+    if len(observed) == 1 and isinstance(observed[0], _NextStateRV):
+        problem: Problem = observed[0].problem
+        variables = {each.name for each in (*model.free_RVs, *model.deterministics)}
+        if variables == variable_dims(problem).keys() and not model.potentials:
+            return problem
+        raise FitError(
+            "the variables of this pm.Model were changed after physics_model; use pm.sample"
+        )
     raise FitError("this pm.Model was not made by physics_model; use pm.sample for others")
 
 
@@ -177,18 +170,66 @@ def _index(block: Block, layout: Layout, variables: dict[str, TensorVariable]) -
     return pt.stack(holders)
 
 
-def _random(
-    problem: Problem,
-    predicted: Floats,
-    whole: Floats,
-    sigma: Floats,
-    phi: Floats,
-    rng: np.random.Generator,
-    size: None = None,
-) -> Floats:
-    """Draw measurements about the predictions of one world."""
-    linearised = np.nan_to_num(problem.observations.values)
-    return problem.likelihood.random(whole, linearised, sigma, rng, problem.nu(phi))
+class _NextStateRV(RandomVariable):
+    """Measured states about the predictions of one world (Eq. 11).
+
+    A class of its own: PyMC registers one for each custom distribution, for good, with all that its
+    functions hold.
+    """
+
+    name = "next_state"
+    signature = "(n,h,k,d),(n,h,k,d),(m),(p)->(n,h,k,d)"
+    dtype = "float64"
+    _print_name = ("NextState", r"\operatorname{NextState}")
+    __props__ = (*RandomVariable.__props__, "problem")
+
+    def __init__(self, problem: Problem) -> None:
+        super().__init__()
+        self.problem = problem
+
+    def rng_fn(
+        self,
+        rng: np.random.Generator,
+        predicted: Floats,
+        whole: Floats,
+        sigma: Floats,
+        phi: Floats,
+        size: object = None,
+    ) -> Floats:
+        """Draw measurements."""
+        linearised = np.nan_to_num(self.problem.observations.values)
+        return self.problem.likelihood.random(whole, linearised, sigma, rng, self.problem.nu(phi))
+
+
+class _NextState(pm.Distribution):
+    """Distribution of `_NextStateRV`."""
+
+    rv_type = _NextStateRV
+
+    @classmethod
+    def dist(cls, *parameters: TensorVariable, **options: Any) -> TensorVariable:
+        """Return a variable with this distribution."""
+        return super().dist(parameters, **options)
+
+    @classmethod
+    def rv_op(
+        cls, *parameters: TensorVariable, problem: Problem, size: object = None, rng: object = None
+    ) -> TensorVariable:
+        """Return a variable."""
+        rng = shared(np.random.default_rng()) if rng is None else rng
+        return _NextStateRV(problem).make_node(rng, size, *parameters).default_output()
+
+
+@_logprob.register(_NextStateRV)
+def _log_likelihood(  # type: ignore[no-untyped-def]
+    op, values, rng, size, predicted, whole, *noise, **options
+):
+    return LogLikelihoodOp(op.problem)(values[0], predicted, *noise)
+
+
+@_support_point.register(_NextStateRV)
+def _expected(op, variable, rng, size, predicted, *parameters):  # type: ignore[no-untyped-def]
+    return predicted
 
 
 #: Above this concentration the von Mises density of PyMC 5 overflows; PyMC wants a concentration
