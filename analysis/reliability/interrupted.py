@@ -46,7 +46,8 @@ def judge(folder: Path, inputs: set[str], name: str, ran: Ran) -> list[str]:
         faults.append(f"traceback: {ran.err[-300:]}")
     if ran.code not in (0, 1, 3, 130):
         faults.append(f"exit code {ran.code}")
-    if ran.code == 130 and ran.err.count("interrupted; ") != 1:
+    told = ran.err.count("interrupted; ") + ran.err.count("interrupted: ")
+    if ran.code == 130 and told != 1 and ran.err:  # while arguments are read nothing has begun
         faults.append(f"no line, or several: {ran.err[-300:]}")
     keeps = name in KEEPING and ("kept in" in ran.err or "once more" in ran.err)
     if ran.code == 130 and ran.after > PATIENCE and not keeps:

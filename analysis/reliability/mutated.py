@@ -30,6 +30,10 @@ from pbrl_ppl.errors import PbrlError
 from pbrl_ppl.files import json_values
 from pbrl_ppl.posterior import load_posterior
 from pbrl_ppl.posterior.store import groups
+
+if str(Path(__file__).parents[2]) not in sys.path:  # helpers are shared with the tests
+    sys.path.insert(0, str(Path(__file__).parents[2]))
+
 from reliability.commands import Ran, run, warm
 from reliability.killed import prepare, without_pictures
 

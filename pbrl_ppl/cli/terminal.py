@@ -164,8 +164,13 @@ def interruptible(state: str = "nothing was written") -> Iterator[Interrupts]:
     try:
         with interrupts.enforced(state) if handled else nullcontext():
             yield interrupts
-    except KeyboardInterrupt:
-        raise typer.Exit(interrupted(state)) from None
+    except typer.Exit:
+        raise
+    except BaseException as error:
+        # what an interrupt broke off may have raised an error of its own
+        if interrupts.seen or isinstance(error, KeyboardInterrupt):
+            raise typer.Exit(interrupted(state)) from None
+        raise
     finally:
         if handled:
             signal.signal(signal.SIGINT, signal.default_int_handler)

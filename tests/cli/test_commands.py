@@ -22,7 +22,7 @@ import typer
 from pbrl_ppl import criticism, sampling
 from pbrl_ppl.cli import main
 from pbrl_ppl.cli.app import app
-from pbrl_ppl.cli.terminal import stages
+from pbrl_ppl.cli.terminal import interruptible, stages
 from pbrl_ppl.errors import ConvergenceWarning, FitError
 from pbrl_ppl.history import History
 from pbrl_ppl.model import problem_in
@@ -424,6 +424,19 @@ def test_an_interrupt_of_the_shell_ends_a_fit(seconds: float) -> None:
         assert process.wait(60) == 130
     assert "Traceback" not in said and said.count("interrupted; ") == 1
     assert ("kept in puck.nc" in said) == Path("puck.nc").exists()
+
+
+def test_an_error_that_an_interrupt_caused_is_an_interrupt(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """A writer of films raises another error where it is broken off."""
+    with pytest.raises(typer.Exit) as caught, interruptible("all is kept"):
+        try:
+            signal.raise_signal(signal.SIGINT)
+        finally:
+            raise IndexError
+    assert caught.value.exit_code == 130
+    assert capsys.readouterr().err == "interrupted; all is kept\n"
 
 
 #: Runs machine code for minutes, in which Python handles no signal.
