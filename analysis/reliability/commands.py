@@ -140,7 +140,10 @@ def run(
         if now - begin > limit:
             os.killpg(child, signal.SIGKILL)
         if kill is not None and math.isnan(sent) and kill(now - begin):
-            (os.killpg if by == signal.SIGINT else os.kill)(child, by)
+            try:
+                (os.killpg if by == signal.SIGINT else os.kill)(child, by)
+            except ProcessLookupError:  # it is not yet the first of its session
+                os.kill(child, by)
             sent = now
         time.sleep(0.02 if kill is None else 0.001)
     code = os.waitstatus_to_exitcode(status)

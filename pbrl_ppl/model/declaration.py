@@ -183,8 +183,8 @@ class _NextStateRV(RandomVariable):
     _print_name = ("NextState", r"\operatorname{NextState}")
     __props__ = (*RandomVariable.__props__, "problem")
 
-    def __init__(self, problem: Problem) -> None:
-        super().__init__()
+    def __init__(self, problem: Problem, **settings: Any) -> None:
+        super().__init__(**settings)
         self.problem = problem
 
     def rng_fn(

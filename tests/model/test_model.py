@@ -1,6 +1,8 @@
 """physics_model: an ordinary pm.Model with the prior of Table 1 and the likelihood of Eq. 11."""
 
+import gc
 import math
+import weakref
 from collections.abc import Mapping
 
 import numpy as np
@@ -202,6 +204,21 @@ def test_prior_predictive(cart) -> None:
     mean = problem.predict(problem.layout.to_vector(values))
     z = (predicted.values[0, 0] - mean) / prior["sigma"].values[0, 0]
     assert stats.kstest(z.ravel(), "norm").pvalue > 1e-3  # one false alarm in 1000 seeds
+
+
+def test_models_are_let_go_of(cart) -> None:
+    """PyMC holds on to the functions of its custom distributions."""
+    model = physics_model(*cart)
+    held = weakref.ref(problem_in(model))
+    del model
+    gc.collect()
+    assert held() is None
+
+
+def test_measured_variable_can_be_rewritten(cart) -> None:
+    """PyTensor makes a variable's Op anew from its properties, to draw in place."""
+    op = physics_model(*cart)["next_state"].owner.op
+    assert type(op)(**op._props_dict()) == op
 
 
 def test_graphviz(cart) -> None:
