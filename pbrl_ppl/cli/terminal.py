@@ -120,6 +120,8 @@ class Interrupts:
     def note(self, number: int, frame: FrameType | None) -> None:
         """Handle the signal."""
         self.seen = True
+        if sys.unraisablehook is sys.__unraisablehook__:
+            sys.unraisablehook = lambda _: None  # of what is half made
         signal.default_int_handler(number, frame)
 
     @contextmanager
