@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
@@ -169,6 +169,7 @@ def criticise(
     reading: options.SceneReading,
     progress: Progress,
     seed: options.Seed = 1,
+    most_transitions: options.Transitions = options.MOST_TRANSITIONS,
     simulate: Annotated[bool, typer.Option("--simulate")] = False,
 ) -> Result:
     """Rank the effects that the declared model might lack by the score test: no refit, no verdict.
@@ -180,6 +181,8 @@ def criticise(
 
     Parameters
     ----------
+    most_transitions
+        Of a longer recording pieces are used, drawn by the seed; more take more time.
     simulate
         Search for missing laws by simulation error, on short pieces, then longer ones.
     """
@@ -191,15 +194,12 @@ def criticise(
     from pbrl_ppl.files import json_fields
     from pbrl_ppl.physics import check_history
 
+    settings: dict[str, Any] = {"seed": seed, "most_transitions": most_transitions, "catalogue": catalogue}
     if simulate:
-        attribution = criticism.attribute(
-            declared, loaded, catalogue=catalogue, seed=seed, progress=progress
-        )
+        attribution = criticism.attribute(declared, loaded, progress=progress, **settings)
         return Result(json_fields(attribution), _shown_laws(attribution))
     check_history(declared, loaded, loaded.segments(1))
-    ranking = criticism.criticise(
-        declared, loaded, catalogue=catalogue, seed=seed, progress=progress
-    )
+    ranking = criticism.criticise(declared, loaded, progress=progress, **settings)
     columns = {"effect": "<", "body": "<", "S": ".1f", "dof": "", "p (corrected)": ".2g"}
     candidates = table(
         "what the declared model might lack, by the score test",

@@ -55,11 +55,14 @@ class Sampler:
     method
         importance weights proposals by the engine; metropolis runs chains; laplace takes Gaussians
         at the modes, on which the verdict then stands.
+    most_transitions
+        Of a longer recording pieces are used, drawn by the seed; more take more time.
     """
 
     seed: options.Seed = 1
     draws: Annotated[int | None, typer.Option(min=100)] = None
     method: Method = Method.IMPORTANCE
+    most_transitions: options.Transitions = options.MOST_TRANSITIONS
 
     def settings(self) -> dict[str, Any]:
         """Return arguments of `criticism.close_loop`."""

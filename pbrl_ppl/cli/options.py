@@ -52,6 +52,9 @@ OutputFile = Annotated[Path, typer.Option("-o", "--output", metavar="FILE")]
 OutputFolder = Annotated[Path, typer.Option("-o", "--output", metavar="DIR")]
 Seed = Annotated[int, typer.Option(min=0)]
 Count = Annotated[int, typer.Option(min=1)]
+Transitions = Annotated[int, typer.Option(min=100)]
+#: Of `history`, whose import takes long.
+MOST_TRANSITIONS = 3000
 
 
 @dataclass(frozen=True)

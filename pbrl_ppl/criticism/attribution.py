@@ -13,7 +13,7 @@ from pbrl_ppl.criticism.search import Search
 from pbrl_ppl.criticism.unexplained import unexplained_acceleration
 from pbrl_ppl.effects import Attached, Effect, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
-from pbrl_ppl.history import History
+from pbrl_ppl.history import MOST_TRANSITIONS, History
 from pbrl_ppl.likelihood import is_simulated
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.scene import Scene
@@ -71,6 +71,7 @@ def attribute(
     catalogue: Iterable[Effect] = full_catalogue,
     seed: int = 0,
     substeps: int | None = None,
+    most_transitions: int = MOST_TRANSITIONS,
     criteria: Criteria = DEFAULT,
     progress: Callable[[str], None] | None = None,
 ) -> Attribution:
@@ -94,6 +95,8 @@ def attribute(
         Seed of the search for the declared model's mode.
     substeps : int, optional
         Engine steps an interval to begin with; the scene's by default.
+    most_transitions : int
+        As of :func:`pbrl_ppl.close_loop`.
     criteria : Criteria
         Thresholds; see :class:`SearchCriteria`.
     progress : callable, optional
@@ -120,7 +123,7 @@ def attribute(
         [law.effect for law in found.laws]  # ['linear_drag', 'sliding_friction']
     """
     say, catalogue = progress or (lambda stage: None), tuple(catalogue)
-    mode = checked_mode(scene, history, catalogue, seed, substeps, criteria, say)
+    mode = checked_mode(scene, history, catalogue, seed, substeps, most_transitions, criteria, say)
     say(Stage.SIMULATE)
 
     def missing(now: Mode) -> tuple[Attached, ...]:
@@ -172,6 +175,7 @@ def criticise(
     catalogue: Iterable[Effect] = full_catalogue,
     seed: int = 0,
     substeps: int | None = None,
+    most_transitions: int = MOST_TRANSITIONS,
     criteria: Criteria = DEFAULT,
     progress: Callable[[str], None] | None = None,
 ) -> Ranking:
@@ -192,6 +196,8 @@ def criticise(
         Seed of the search for the mode.
     substeps : int, optional
         Engine steps an interval to begin with; the scene's by default.
+    most_transitions : int
+        As of :func:`pbrl_ppl.close_loop`.
     criteria : Criteria
         When the engine's error is small enough.
     progress : callable, optional
@@ -211,7 +217,7 @@ def criticise(
     """
     say = progress or (lambda stage: None)
     catalogue = tuple(catalogue)
-    mode = checked_mode(scene, history, catalogue, seed, substeps, criteria, say)
+    mode = checked_mode(scene, history, catalogue, seed, substeps, most_transitions, criteria, say)
     scene, effects = mode.problem.scene, mode.problem.physics.effects
     say(Stage.SCORE)
     missing = candidates(scene, effects, catalogue)

@@ -54,7 +54,14 @@ from pbrl_ppl.errors import (
     UninformedWarning,
     warn,
 )
-from pbrl_ppl.history import History, UnusedVelocity, with_units, without_measurements
+from pbrl_ppl.history import (
+    MOST_TRANSITIONS,
+    History,
+    UnusedVelocity,
+    drawn_pieces,
+    with_units,
+    without_measurements,
+)
 from pbrl_ppl.likelihood import Problem, is_simulated, single_transitions
 from pbrl_ppl.modes import (
     FilteredMode,
@@ -88,6 +95,7 @@ def close_loop(
     substeps: int | None = None,
     draws: int | None = None,
     method: str = "importance",
+    most_transitions: int = MOST_TRANSITIONS,
     criteria: Criteria = DEFAULT,
     progress: Callable[[str], None] | None = None,
 ) -> Loop:
@@ -113,6 +121,9 @@ def close_loop(
         more where these do not suffice.
     method : str
         Sampler of :func:`pbrl_ppl.fit`; with ``laplace`` the verdict relies on modes.
+    most_transitions : int
+        Of a history with more, pieces of so many in all are used, drawn by the seed, those with
+        more motion more often; ``Loop.drawn`` says so. Time grows faster than they do.
     criteria : Criteria
         Thresholds of the decisions.
     progress : callable, optional
@@ -157,7 +168,10 @@ def close_loop(
         numbered = test.numbered(after) if scene.test_is_later else test
     if substeps is not None:
         check_substeps(substeps)
-    cleaned = _cleaned(task, train, numbered)
+    drawn = partial(drawn_pieces, most=most_transitions, seed=seed)
+    (train, said), (test, also), (numbered, _) = map(drawn, (train, test, numbered))
+    parts = tuple(filter(None, (said, also and f"held out: {also}")))
+    cleaned = _cleaned(task, train, numbered, parts)
     task = replace(task, scene=with_units(scene, cleaned.train))
     found = _searched(task, _fitted(task, cleaned))
     judged = _tested(task, cleaned, found)
@@ -213,6 +227,7 @@ class _Cleaned:
     test: History
     unused: tuple[UnusedVelocity, ...]
     bad_frames: tuple[str, ...]
+    drawn: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,10 +296,10 @@ class _Judged:
     simulated: Mapping[str, float]
 
 
-def _cleaned(task: _Task, train: History, test: History) -> _Cleaned:
+def _cleaned(task: _Task, train: History, test: History, drawn: tuple[str, ...]) -> _Cleaned:
     """Check the histories and the effects; leave out what no model should be fitted to."""
-    cleaned = _Cleaned(*checked_histories(task.scene, train, test))
-    for sentence in (*(column.sentence for column in cleaned.unused), *cleaned.bad_frames):
+    cleaned = _Cleaned(*checked_histories(task.scene, train, test), drawn)
+    for sentence in (*drawn, *(column.sentence for column in cleaned.unused), *cleaned.bad_frames):
         task.say(sentence)
     for effect in task.catalogue:
         if effect not in full_catalogue:
@@ -522,6 +537,7 @@ def _put_together(task: _Task, judged: _Judged, before: Fit, after: Fit, recorde
         loo=_compared(declared.mode, revised.mode, before, after),
         velocities_not_used=cleaned.unused,
         bad_frames=cleaned.bad_frames,
+        drawn=cleaned.drawn,
         criteria=task.criteria,
         held_out=recorded,
         catalogue=task.catalogue,

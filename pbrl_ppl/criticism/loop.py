@@ -98,6 +98,8 @@ class Loop:
         Velocity columns that were computed from positions or lag them.
     bad_frames : tuple of str
         A sentence for each single bad frame that was left out, of either history.
+    drawn : tuple of str
+        A sentence on each history that was too long to be used as a whole.
     criteria : Criteria
         Thresholds of the decisions.
     held_out : History, optional
@@ -135,6 +137,7 @@ class Loop:
     loo: Comparison | None = None
     velocities_not_used: tuple[UnusedVelocity, ...] = ()
     bad_frames: tuple[str, ...] = ()
+    drawn: tuple[str, ...] = ()
     criteria: Criteria = DEFAULT
     held_out: History | None = None
     catalogue: tuple[Effect, ...] = tuple(full_catalogue)
@@ -278,6 +281,7 @@ class Loop:
                 "loo": self.loo and self.loo.to_dict(),
                 "velocities_not_used": self.velocities_not_used,
                 "bad_frames": self.bad_frames,
+                "drawn": self.drawn,
                 "provenance": self.provenance,
             }
         )

@@ -16,6 +16,7 @@ from pbrl_ppl.history import (
     History,
     UnusedVelocity,
     bad_frames,
+    drawn_pieces,
     measured_alone,
     unused_velocities,
     with_units,
@@ -168,6 +169,7 @@ def checked_mode(
     catalogue: tuple[Effect, ...],
     seed: int,
     substeps: int | None,
+    most_transitions: int,
     criteria: Criteria,
     say: Callable[[str], None],
 ) -> FilteredMode:
@@ -182,8 +184,9 @@ def checked_mode(
     """
     if substeps is not None:
         check_substeps(substeps)
+    history, drawn = drawn_pieces(history, most_transitions, seed)
     history, _, unused, bad = checked_histories(scene, history, history)
-    for sentence in (*(velocity.sentence for velocity in unused), *bad):
+    for sentence in (*filter(None, [drawn]), *(velocity.sentence for velocity in unused), *bad):
         say(sentence)
     scene = with_units(scene, history)
     effects = attach(scene, (), catalogue)

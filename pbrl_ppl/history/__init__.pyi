@@ -26,6 +26,8 @@ from .kinematics import estimate_rates as estimate_rates
 from .kinematics import fill_joints as fill_joints
 from .kinematics import joint_coordinates as joint_coordinates
 from .kinematics import lever as lever
+from .parts import MOST_TRANSITIONS as MOST_TRANSITIONS
+from .parts import drawn_pieces as drawn_pieces
 from .reading import read_recording as read_recording
 from .reading import read_scene as read_scene
 from .units import mass_contradictions as mass_contradictions

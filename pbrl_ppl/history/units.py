@@ -48,6 +48,8 @@ def with_units(scene: Scene, history: History) -> Scene:
             units = {**vars(units_of(scene, body.name)), "time": _duration(history, scene)}
             moment = body.shape.unit_moment
             seen = _measured(units, states[..., :3], wrench, moment, scene.time_step)
+            if data["assumed"].sel(body=body.name)[THETA]:  # an angle that nobody saw may turn
+                seen["turn_rate"] = max(units["turn_rate"], seen.get("turn_rate", 0.0))
             typical = {**units, **seen, **dict(body.typical)}
             body = replace(body, typical=tuple(typical.items()))
         bodies.append(body)

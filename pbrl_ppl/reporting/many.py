@@ -17,6 +17,7 @@ from pbrl_ppl.criticism import ADEQUATE, EFFECTS_ADDED
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.errors import OutputError, PbrlError
 from pbrl_ppl.files import check_folder, write_text
+from pbrl_ppl.history import MOST_TRANSITIONS
 from pbrl_ppl.posterior import load_posterior
 from pbrl_ppl.reporting import many_page
 from pbrl_ppl.reporting.logs import (
@@ -92,6 +93,7 @@ def close_loop_many(
     substeps: int | None = None,
     draws: int | None = None,
     method: str = "importance",
+    most_transitions: int = MOST_TRANSITIONS,
     catalogue: Iterable[Effect] | None = None,
     noise: Mapping[str, float] | None = None,
     estimate_velocities: bool = False,
@@ -121,7 +123,7 @@ def close_loop_many(
         Where the loops are closed; by default here, one after another. ``client.get_executor()`` of
         Dask is one, whose workers must see the files by the same paths. A process works on one log
         at a time.
-    seed, substeps, draws, method, catalogue : optional
+    seed, substeps, draws, method, most_transitions, catalogue : optional
         As of :func:`pbrl_ppl.close_loop`; each log is what that gives with this seed.
     noise : mapping of str to float, optional
         Known errors of measuring, ``{"x": 0.002}``; they replace those of the scenes.
@@ -169,7 +171,7 @@ def close_loop_many(
         {"noise": dict(noise or {}), "substeps": substeps, "time_step": time_step},
         {"estimate_velocities": estimate_velocities, "columns": dict(columns or {}),
          "units": dict(units or {}), "trim": trim},
-        {"seed": seed, "draws": draws, "method": method}
+        {"seed": seed, "draws": draws, "method": method, "most_transitions": most_transitions}
         | ({} if catalogue is None else {"catalogue": tuple(catalogue)}),
     )  # fmt: skip
     tell = progress or (lambda _: None)

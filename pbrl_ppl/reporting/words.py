@@ -196,10 +196,11 @@ def caution_in_words(loop: Loop) -> str:
 
 
 def left_out_in_words(loop: Loop) -> str:
-    """Return which bad frames were left out of the histories, the first few one by one."""
+    """Return what was left out of the histories, of bad frames the first few one by one."""
     first, more = loop.bad_frames[:LISTED], len(loop.bad_frames) - LISTED
     rest = f"; and {more} more (report.json lists them)" if more > 0 else ""
-    return f"{'; '.join(first)}{rest}." if first else ""
+    said = "; ".join((*loop.drawn, *first))
+    return f"{said}{rest}." if said else ""
 
 
 def worst_ahead(loop: Loop, kind: str) -> str:

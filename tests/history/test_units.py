@@ -61,3 +61,16 @@ def test_a_contradicted_mass_is_said() -> None:
 def test_no_command_shows_no_mass() -> None:
     frame = pushed(2.0).to_dataframe().assign(force_x=0.0)
     assert shown_mass(scene(), History.from_dataframe(frame, scene()), "sled") is None
+
+
+def test_an_angle_that_nobody_saw_may_turn() -> None:
+    """By a scale of next to no turning, drags were so large that the engine could not step."""
+    sled = Scene(time_step=0.1, normal_gravity=9.81, bodies=scene().bodies)
+    frame = pushed(2.0, 0.002).to_dataframe()
+
+    def turn_rate(theta: object) -> float:
+        history = History.from_dataframe(frame.assign(theta=theta), sled)
+        return units_of(with_units(sled, history), "sled").turn_rate
+
+    assert turn_rate(0.0) < 0.1
+    assert turn_rate("") == units_of(sled, "sled").turn_rate > 1.0

@@ -455,6 +455,7 @@ def test_save_writes_the_contract(tmp_path: Path) -> None:
         "loo",
         "velocities_not_used",
         "bad_frames",
+        "drawn",
         "provenance",
     ]
     assert list(got["added"][0]) == [

@@ -1,0 +1,92 @@
+"""Part of a recording that is too long to be judged as a whole."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import xarray as xr
+
+from pbrl_ppl.history.history import History, hashed
+from pbrl_ppl.state import Floats
+
+#: Transitions that a law is searched in. They show one of a hundredth of the motion, and a search's
+#: time grows faster than they do.
+MOST_TRANSITIONS = 3000
+#: Pieces of one trajectory that are drawn, at least.
+_PIECES = 4
+
+
+def drawn_pieces(history: History, most: int, seed: int = 0) -> tuple[History, str]:
+    """Return pieces of a history with at most so many transitions in all, and a sentence on them.
+
+    A history that has no more is returned as it is, with an empty sentence.
+
+    Trajectories are cut to a quarter of that, and the seed draws pieces, in proportion to how much
+    moves in them: a rest says little. A piece keeps its trajectory's number and time.
+
+    Parameters
+    ----------
+    history : History
+        Measured trajectories.
+    most : int
+        Transitions of the result, at most; at least 4.
+    seed : int
+        The same seed gives the same pieces.
+    """
+    if history.n_transitions <= most:
+        return history, ""
+    longest = max(most // _PIECES, 1)
+    pieces: list[tuple[int, int, int]] = []
+    complete = np.isfinite(history.dataset["start"].to_numpy()).all(axis=(2, 3))
+    for trajectory, n in enumerate(history.dataset["n_rows"].to_numpy() - 1):
+        edges = np.linspace(0, n, -(-n // longest) + 1).astype(int)
+        for first, last in pairwise(edges.tolist()):
+            begins = np.flatnonzero(complete[trajectory, first:last])  # not in a gap
+            pieces += [(trajectory, first + int(begins[0]), last)] if len(begins) else []
+    moves = _motion(history.dataset["observed"].to_numpy(), pieces)
+    moves = moves if moves.any() else np.ones(len(pieces))
+    with np.errstate(divide="ignore"):  # keys of a draw without replacement; a rest comes last
+        order = np.argsort(np.random.default_rng(seed).exponential(size=len(pieces)) / moves)
+    sizes = np.array([b - a for _, a, b in pieces])[order]
+    chosen = np.sort(order[np.cumsum(sizes) <= most])
+    parts = [_piece(history.dataset, *pieces[i]) for i in chosen]
+    joined = xr.concat(
+        parts, "trajectory", data_vars="minimal", coords="minimal", compat="override", join="outer"
+    )
+    labels = [str(label) for label in joined["trajectory"].to_numpy()]
+    drawn = History(hashed(joined.assign_coords(trajectory=labels)))
+    return drawn, (
+        f"{drawn.n_transitions} of {history.n_transitions} transitions are used, in"
+        f" {drawn.n_trajectories} pieces drawn by the seed; --most-transitions sets how many"
+    )
+
+
+def _motion(observed: Floats, pieces: list[tuple[int, int, int]]) -> Floats:
+    """Return how far coordinates move in each piece, in units of the whole, summed, (piece,)."""
+    whole = np.fmax.reduce(observed, axis=(0, 1)) - np.fmin.reduce(observed, axis=(0, 1))
+    whole[~(whole > 0.0)] = np.inf
+    ranges = []
+    for trajectory, first, last in pieces:
+        rows = observed[trajectory, first : last + 1]
+        far = np.fmax.reduce(rows) - np.fmin.reduce(rows)
+        ranges.append(np.nansum(far / whole))
+    return np.array(ranges)
+
+
+def _piece(data: xr.Dataset, trajectory: int, first: int, last: int) -> xr.Dataset:
+    """Return the rows ``first`` to ``last`` of a trajectory, as one from ``first`` on."""
+    one = data.isel(trajectory=[trajectory], time=slice(first, last + 1))
+    if first == 0 and last == data["n_rows"][trajectory] - 1:
+        return one
+    action, before = one["action"].copy(), one["before"]
+    action[:, -1] = np.nan
+    if first:
+        held = data["action"].isel(trajectory=[trajectory], time=first - 1)
+        before = before.copy(data=np.nan_to_num(held.to_numpy()))
+    return one.assign(
+        action=action, before=before, n_rows=one["n_rows"].copy(data=[last + 1 - first])
+    ).assign_coords(
+        time=np.arange(last + 1 - first),
+        trajectory=[f"{one['trajectory'].item()} from {first}"],
+    )
