@@ -194,7 +194,11 @@ def criticise(
     from pbrl_ppl.files import json_fields
     from pbrl_ppl.physics import check_history
 
-    settings: dict[str, Any] = {"seed": seed, "most_transitions": most_transitions, "catalogue": catalogue}
+    settings: dict[str, Any] = {
+        "seed": seed,
+        "most_transitions": most_transitions,
+        "catalogue": catalogue,
+    }
     if simulate:
         attribution = criticism.attribute(declared, loaded, progress=progress, **settings)
         return Result(json_fields(attribution), _shown_laws(attribution))

@@ -308,7 +308,7 @@ def propose(
         and not cuts
         and length >= 2 * shortest * time_step
     ):
-        slow = max(_slowest(times[rows], poses[rows]) for rows in groups)
+        slow = max(slowest(times[rows], poses[rows]) for rows in groups)
         parts = np.clip(length / max(slow, shortest * time_step), min(trajectories, most), most)
         cuts["every"] = float(f"{length / int(parts):.2g}")
         said.append(
@@ -318,7 +318,7 @@ def propose(
     return replace(layout, cut=tuple(cuts.items())), said
 
 
-def _slowest(times: Floats, poses: Floats) -> float:
+def slowest(times: Floats, poses: Floats) -> float:
     """Return the longest period of a coordinate (s): twice the time between means crossed."""
     periods = [0.0]
     for column in poses.T:

@@ -7,14 +7,15 @@ from itertools import pairwise
 import numpy as np
 import xarray as xr
 
+from pbrl_ppl.history.cuts import slowest
 from pbrl_ppl.history.history import History, hashed
 from pbrl_ppl.state import Floats
 
 #: Transitions that a law is searched in. They show one of a hundredth of the motion, and a search's
 #: time grows faster than they do.
 MOST_TRANSITIONS = 3000
-#: Pieces of one trajectory that are drawn, at least.
-_PIECES = 4
+#: Pieces that are drawn, at least, and transitions of one, at least.
+_PIECES, _SHORTEST = 12, 100
 
 
 def drawn_pieces(history: History, most: int, seed: int = 0) -> tuple[History, str]:
@@ -22,8 +23,9 @@ def drawn_pieces(history: History, most: int, seed: int = 0) -> tuple[History, s
 
     A history that has no more is returned as it is, with an empty sentence.
 
-    Trajectories are cut to a quarter of that, and the seed draws pieces, in proportion to how much
-    moves in them: a rest says little. A piece keeps its trajectory's number and time.
+    Trajectories are cut to pieces as long as the slowest motion, of 100 transitions or more, and at
+    most a twelfth of all. The seed draws them, in proportion to how much moves in each: a rest says
+    little. A piece keeps its trajectory's number and time.
 
     Parameters
     ----------
@@ -36,7 +38,8 @@ def drawn_pieces(history: History, most: int, seed: int = 0) -> tuple[History, s
     """
     if history.n_transitions <= most:
         return history, ""
-    longest = max(most // _PIECES, 1)
+    slow = int(_slowest_motion(history) / history.dataset.attrs["time_step"])
+    longest = max(min(max(slow, _SHORTEST), most // _PIECES), 1)
     pieces: list[tuple[int, int, int]] = []
     complete = np.isfinite(history.dataset["start"].to_numpy()).all(axis=(2, 3))
     for trajectory, n in enumerate(history.dataset["n_rows"].to_numpy() - 1):
@@ -60,6 +63,13 @@ def drawn_pieces(history: History, most: int, seed: int = 0) -> tuple[History, s
         f"{drawn.n_transitions} of {history.n_transitions} transitions are used, in"
         f" {drawn.n_trajectories} pieces drawn by the seed; --most-transitions sets how many"
     )
+
+
+def _slowest_motion(history: History) -> float:
+    """Return the longest period of a coordinate (s), in the median of the trajectories."""
+    places = history.dataset["observed"].to_numpy()[..., :3].reshape(*history.elapsed.shape, -1)
+    slow = [slowest(*one) for one in zip(history.elapsed, places, strict=True)]
+    return float(np.median(slow))
 
 
 def _motion(observed: Floats, pieces: list[tuple[int, int, int]]) -> Floats:

@@ -35,7 +35,7 @@ def test_pieces_are_of_the_recording_and_no_more_than_asked_for(rows: tuple[int,
     assert f"{drawn.n_transitions} of {history.n_transitions} transitions" in said
     whole, part = history.dataset, drawn.dataset
     for i, n in enumerate(part["n_rows"].to_numpy()):
-        assert n <= 201
+        assert n <= 101
         of, clock = int(part["number"][i]), part["clock"].to_numpy()[i, :n]
         first = int(np.nanargmin(np.abs(whole["clock"].to_numpy()[of] - clock[0])))
         for name, last in (("observed", n), ("start", n), ("action", n - 1)):
@@ -46,7 +46,7 @@ def test_pieces_are_of_the_recording_and_no_more_than_asked_for(rows: tuple[int,
         held = whole["action"].to_numpy()[of, first - 1] if first else np.zeros((1, 3))
         assert np.array_equal(part["before"].to_numpy()[i], held)
         assert np.allclose(drawn.elapsed[i, 0], 0.1 * first)
-    assert len(set(part["trajectory"].to_numpy())) == drawn.n_trajectories >= 4
+    assert len(set(part["trajectory"].to_numpy())) == drawn.n_trajectories >= 8
 
 
 def test_the_seed_draws_the_pieces() -> None:
@@ -57,7 +57,8 @@ def test_the_seed_draws_the_pieces() -> None:
 
 def test_rests_are_left_out() -> None:
     drawn, _ = drawn_pieces(recording(9000, moving=slice(4000, 5600)), 800)
-    assert (np.ptp(drawn.dataset["observed"].to_numpy()[..., 0], axis=(1, 2)) > 1.0).all()
+    x = drawn.dataset["observed"].to_numpy()[:, :, 0, 0]
+    assert (np.nanmax(x, axis=1) - np.nanmin(x, axis=1) > 1.0).all()
 
 
 def test_no_piece_begins_in_a_gap() -> None:
