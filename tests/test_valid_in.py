@@ -6,11 +6,15 @@ Some of the cases of ``analysis/reliability/valid.py``, which draws hundreds.
 import tempfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from reliability.commands import run
 from reliability.valid import commands
 
+from pbrl_ppl.history import read_recording, read_scene
+from pbrl_ppl.model import problem_in
+from pbrl_ppl.sampling import physics_model
 from tests.helpers.drawn import Case, cases, drawn_case
 
 pytestmark = [pytest.mark.one_stack, pytest.mark.slow]
@@ -41,3 +45,13 @@ def test_what_check_passes_ends_in_a_verdict(seed: int, tmp_path: Path) -> None:
     for argv, codes in commands(case, recording, checked.out):
         ran = run(argv, tmp_path)
         assert not ran.fault(codes), (case.about, argv, ran.fault(codes), ran.err[-2000:])
+
+
+def test_a_model_whose_prior_centre_has_no_prediction_is_declared(tmp_path: Path) -> None:
+    """A rod of unknown anchors has no length at the prior's centre, where the engine diverges."""
+    case = drawn_case(63, 80)
+    recording = case.write(tmp_path)
+    scene = read_scene(tmp_path / "scene.toml")
+    history = read_recording(tmp_path / recording, scene)
+    model = physics_model(scene, history, likelihood="trajectories")
+    assert np.isfinite(problem_in(model).data.smoothed_states).all()

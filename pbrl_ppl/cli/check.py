@@ -57,6 +57,9 @@ def check(
 
     check_history(declared, loaded, loaded.segments(1))
     contents, missing = _contents(declared, loaded), _missing(loaded)
+    rows, trajectories = int(loaded.dataset["n_rows"].sum()), loaded.n_trajectories
+    transitions = loaded.n_transitions
+    loaded, drawn = histories.drawn_pieces(loaded, options.MOST_TRANSITIONS, seed)
     unused = histories.unused_velocities(loaded)
     # shown at once: the prior's draws take long
     console = PlainConsole(quiet=as_json)
@@ -64,11 +67,11 @@ def check(
     for row in contents.items():
         listed.add_row(*row)
     console.print(listed)
-    console.print(_missing_table(missing, int(loaded.dataset["n_rows"].sum())))
+    console.print(_missing_table(missing, rows))
     masses = histories.mass_contradictions(declared, loaded)
-    for sentence in (*(velocity.sentence for velocity in unused), *masses):
+    for sentence in (*filter(None, [drawn]), *(velocity.sentence for velocity in unused), *masses):
         console.print(sentence, soft_wrap=True)
-    if loaded.n_trajectories < 2:
+    if trajectories < 2:
         console.print(
             "one trajectory: close-loop holds out whole ones, and needs another, --test with a file"
             " of its own, or cut = { every = ... } in [recording] (s)",
@@ -90,8 +93,8 @@ def check(
         for sentence in checked.summary:
             console.print(f"prior: {sentence}", soft_wrap=True)
     facts = {
-        "trajectories": loaded.n_trajectories,
-        "transitions": loaded.n_transitions,
+        "trajectories": trajectories,
+        "transitions": transitions,
         "missing": missing,
         "velocities_not_used": [vars(column) for column in unused],
         "unit_mismatches": histories.unit_mismatches(loaded),

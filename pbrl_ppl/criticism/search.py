@@ -583,10 +583,10 @@ class Search:
 
         Laws that replace each other in part are missed little alone: shares are in proportion.
         """
-        gains = {law: -np.log1p(-one.share) for law, one in model.evidence.items()}
-        together = -np.log1p(-Evidence.of(without, model.mode).share)
+        gains = {law: _logarithm(one.share) for law, one in model.evidence.items()}
+        together = _logarithm(Evidence.of(without, model.mode).share)
         scale = max(together / max(sum(gains.values()), 1e-300), 1.0)
-        least = -np.log1p(-self.criteria.search.main_share)
+        least = _logarithm(self.criteria.search.main_share)
         return {law for law, gain in gains.items() if scale * gain >= least}
 
     def _unconfirmed(
@@ -970,6 +970,11 @@ def is_out_of_phase(
     """
     motion = np.nanstd(values, axis=(0, 1, 2))
     return bool(((error > far * motion) & (error > more * shorter)).any())
+
+
+def _logarithm(share: float) -> float:
+    """Return by how much the logarithm of an error falls without a share of it."""
+    return -float(np.log(max(1.0 - share, 1e-15)))  # of exact data nothing is left
 
 
 def _error(mode: Mode) -> dict[str, float]:

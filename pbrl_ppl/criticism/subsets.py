@@ -65,7 +65,8 @@ class Subset:
 
 def worth(share: float, columns: int, n: float) -> float:
     """Return the log-evidence (nats) of columns that take a share of n squared residuals away."""
-    return float(-0.5 * n * np.log(1.0 - share) - 0.5 * columns * np.log(n))
+    left = max(1.0 - share, 1e-15)  # of exact data nothing
+    return float(-0.5 * n * np.log(left) - 0.5 * columns * np.log(n))
 
 
 @dataclass(frozen=True, eq=False)

@@ -61,7 +61,7 @@ def drawn_pieces(history: History, most: int, seed: int = 0) -> tuple[History, s
     drawn = History(hashed(joined.assign_coords(trajectory=labels)))
     return drawn, (
         f"{drawn.n_transitions} of {history.n_transitions} transitions are used, in"
-        f" {drawn.n_trajectories} pieces drawn by the seed; --most-transitions sets how many"
+        f" {drawn.n_trajectories} pieces drawn by the seed"
     )
 
 

@@ -220,9 +220,10 @@ def _between(begin: Floats, end: Floats, share: float, coordinates: Coordinates)
 
 
 def _guess(problem: Problem, coordinates: Coordinates, phi: Floats) -> Floats:
-    """Return first noise parameters, from residuals of single steps."""
+    """Return first noise parameters, from residuals of single steps; the prior's if all diverge."""
     residual = coordinates.of_residual(problem.residual(phi))
-    size = np.sqrt(np.nanmedian(residual**2, axis=0)) / 0.67
+    size, known = np.full(residual.shape[1], np.nan), np.isfinite(residual).any(axis=0)
+    size[known] = np.sqrt(np.nanmedian(residual[:, known] ** 2, axis=0)) / 0.67
     by_dimension = {
         d: float(np.sqrt(np.mean(size[coordinates.places % len(STATE) == d] ** 2)))
         for d in coordinates.columns
@@ -232,7 +233,8 @@ def _guess(problem: Problem, coordinates: Coordinates, phi: Floats) -> Floats:
     guess += [
         by_dimension[d] / np.sqrt(2) / dt for d in (*coordinates.rates, *coordinates.contacts)
     ]
-    return np.maximum(guess, problem.noise_prior[0] * 0.01)
+    medians = problem.noise_prior[0]
+    return np.where(np.isnan(guess), medians, np.maximum(guess, 0.01 * medians))
 
 
 def _moved(problem: FilteredProblem, before: Floats, after: Floats) -> Floats:

@@ -385,8 +385,8 @@ def _distances(
     shape = tuple(int(n) + 1 for n in np.ceil((high - low) / cell))
     centres = low + cell * np.indices(shape).reshape(2, -1).T
     # a circle that fits into the body wherever it turns, about its origin
-    probe = Body("probe", Shape.circle(max(_inner(body.shape), 0.5 * cell)))
-    alone = scene.replace(bodies=(probe, *static), joints=())
+    probe = Body(body.name, Shape.circle(max(_inner(body.shape), 0.5 * cell)))
+    alone = scene.replace(bodies=(probe, *static), joints=(), actuators=())
     poses = np.concatenate([centres, np.zeros((len(centres), 1))], axis=1)[:, None]
     free = (overlap(alone, poses) <= 0).reshape(shape)
     last = tuple(((points[1] - low) / cell).round().astype(int))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
 
@@ -244,7 +245,8 @@ def _natural(prior: Prior, x: Floats) -> Floats:
 def _spread(prior: Prior, draws: Floats) -> float:
     """Return the standard deviation on the natural scale; angular deviation of an angle (rad)."""
     if prior.family == "von_mises":
-        return float(np.sqrt(2.0 * (1.0 - np.abs(np.exp(1j * draws).mean()))))
+        resultant = min(float(np.abs(np.exp(1j * draws).mean())), 1.0)  # of equal ones just over 1
+        return math.sqrt(2.0 * (1.0 - resultant))
     return float(_natural(prior, draws).std())
 
 

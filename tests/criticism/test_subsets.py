@@ -8,7 +8,7 @@ import pytest
 import pbrl_ppl as pp
 from pbrl_ppl.criticism import search
 from pbrl_ppl.criticism.search import Evidence, Search, refit
-from pbrl_ppl.criticism.subsets import best_subsets
+from pbrl_ppl.criticism.subsets import best_subsets, worth
 from pbrl_ppl.effects import candidates
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.likelihood import in_pieces
@@ -130,3 +130,8 @@ def test_single_transitions_are_searched_as_they_are(make_history) -> None:
     assert [one.effect for one in found.added] == ["linear_drag"]
     estimate = found.added[0].parameters["coefficient"]
     assert abs(estimate.mean - 0.8) < 4 * estimate.sd  # a false alarm in 1e-4
+
+
+def test_a_law_that_leaves_nothing_of_exact_data_has_finite_evidence() -> None:
+    with np.errstate(all="raise"):
+        assert 500.0 < worth(1.0, 1, 40.0) < np.inf

@@ -14,7 +14,7 @@ from pbrl_ppl.history import History
 from pbrl_ppl.physics import Transition, overlap
 from pbrl_ppl.planning import ActionSet, Dynamics, Goal, astar, plan, search
 from pbrl_ppl.planning.astar import TimeToGo
-from pbrl_ppl.scene import Joint, Scene, Shape, Wall
+from pbrl_ppl.scene import Actuator, Joint, Scene, Shape, Wall
 from tests.helpers.pucks import ACROSS, FORCE, FREE, MASS, PUSHES, ROOM, known
 from tests.helpers.worlds import body, state
 
@@ -91,6 +91,15 @@ def test_bound_goes_around_walls(at) -> None:
     a = np.hypot(FORCE, FORCE) / MASS
     found = a / 2 * float(bound(start[None, None])[0, 0]) ** 2 + 0.1
     assert found == pytest.approx(shortest, rel=0.01)
+
+
+def test_bound_goes_around_walls_for_a_body_with_an_actuator() -> None:
+    known_of = {"gain": 1.0, "direction": 0.0}
+    jet = Actuator(name="jet", kind="thruster", body="puck", known=known_of)
+    start = ACROSS[1], PUSHES, state(-1.5, -1.0)[None]
+    driven = Dynamics.known(ROOM.replace(actuators=(jet,)), {"mass": MASS})
+    at = state(-1.5, -1.0)[None, None, None]
+    assert TimeToGo(driven, *start)(at) == pytest.approx(TimeToGo(known(ROOM), *start)(at))
 
 
 def test_bound_is_below_what_plans_take() -> None:

@@ -13,6 +13,7 @@ from pbrl_ppl.model import problem_in
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.posterior import draws, identify, uninformed
+from pbrl_ppl.posterior.identifiability import _spread
 from pbrl_ppl.sampling import fit, physics_model
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
@@ -163,3 +164,11 @@ def test_a_user_s_effect_has_to_be_passed_in(history) -> None:
     said = identify(idata, effects=(*pp.catalogue, GAIN))
     assert said.table().loc["push_gain_gain[cart]", "verdict"] == "informed"
     assert uninformed(idata, effects=(*pp.catalogue, GAIN)) == ()
+
+
+def test_equal_angles_have_no_spread() -> None:
+    """The length of the mean of equal unit vectors may be just over 1."""
+    with np.errstate(all="raise"):
+        for angle in np.linspace(-3.0, 3.0, 50):
+            spread = _spread(Prior("von_mises"), np.full(250, angle))
+            assert spread == pytest.approx(0.0, abs=1e-7)
