@@ -8,6 +8,8 @@ import hashlib
 import math
 import os
 import shutil
+import subprocess
+import sys
 import tempfile
 import time
 import tomllib
@@ -86,6 +88,44 @@ def _digest(path: Path, size: int) -> bytes:
     return digest.hexdigest().encode()
 
 
+def check_survives(path: Path, code: str, *, start: float = 60.0, rate: float = 1e6) -> None:
+    """Read a file in a process of its own first: some damaged ones end it, or never end.
+
+    Parameters
+    ----------
+    path : Path
+        The file, which the code gets as its argument.
+    code : str
+        Python that reads it. Errors are not told: who reads it after this gets them.
+    start, rate : float
+        Seconds that it may take, and bytes a second beside them.
+
+    Raises
+    ------
+    ValueError
+        If the process did not survive, or took longer.
+    """
+    limit = start + path.stat().st_size / rate
+    try:
+        ended = subprocess.run(
+            [sys.executable, "-P", "-c", code, str(path)], capture_output=True, timeout=limit
+        )
+    except subprocess.TimeoutExpired:
+        raise ValueError(f"reading it took over {limit:.0f} s: it is damaged") from None
+    if ended.returncode not in (0, 1):
+        raise ValueError("it is damaged")
+
+
+#: Reads what is in an HDF5 file.
+_READ_HDF5 = """
+import h5py, sys
+
+def read(name, item):
+    if isinstance(item, h5py.Dataset) and item.nbytes < 2**30:
+        item[()]
+
+h5py.File(sys.argv[1]).visititems(read)
+"""
 #: Bytes of arrays that a file may hold whatever its size, and for each of its bytes.
 _MOST, _PACKED = 2**30, 200
 
@@ -93,9 +133,13 @@ _MOST, _PACKED = 2**30, 200
 def check_hdf5(path: Path) -> None:
     """Raise an error where a file is not HDF5, or declares arrays far larger than itself.
 
-    xarray would take the memory of such arrays, and leaves what is no HDF5 to be closed later.
+    xarray would take the memory of such arrays, and leaves what is no HDF5 to be closed later. Of a
+    damaged file that has no seal HDF5 may read for ever.
     """
     import h5py
+
+    if is_as_sealed(path) is None and h5py.is_hdf5(path):
+        check_survives(path, _READ_HDF5)
 
     sizes: list[int] = []
 

@@ -2,15 +2,20 @@
 
 import os
 import signal
+import subprocess
+import sys
 import time
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
+import xarray as xr
 
+from pbrl_ppl import files
 from pbrl_ppl.criticism import Loop
 from pbrl_ppl.criticism import loop as loops
 from pbrl_ppl.errors import OutputError
-from pbrl_ppl.files import check_folder, write_atomically, write_text
+from pbrl_ppl.files import check_folder, check_survives, write_atomically, write_text
 
 pytestmark = pytest.mark.one_stack
 
@@ -84,3 +89,27 @@ def test_a_report_json_has_its_own_posteriors(tmp_path, monkeypatch, renamed) ->
         assert renamed >= 4
         assert set(there) == names
         assert {text.strip().strip('"') for text in there.values()} == {"new"}
+
+
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [("while True: pass", "over 1 s"), ("import os; os.abort()", "damaged"), ("1 / 0", "")],
+)
+def test_a_file_that_ends_its_reader_or_never_ends_is_refused(tmp_path, code, said) -> None:
+    """An error of Python is left to who reads the file after this."""
+    path = tmp_path / "file"
+    path.write_bytes(b"")
+    with pytest.raises(ValueError, match=said) if said else nullcontext():
+        check_survives(path, code, start=1.0)
+
+
+def test_an_unsealed_file_is_read_apart_first(tmp_path, monkeypatch) -> None:
+    path, seen = tmp_path / "other.nc", []
+    monkeypatch.setattr(files, "check_survives", lambda path, code: seen.append((path, code)))
+    xr.Dataset({"a": ("x", [1.0, 2.0])}).to_netcdf(path, engine="h5netcdf")
+    files.check_hdf5(path)
+    ((read, code),) = seen
+    assert subprocess.run([sys.executable, "-c", code, str(read)], check=True).returncode == 0
+    files.seal(path)
+    files.check_hdf5(path)
+    assert len(seen) == 1

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from pbrl_ppl.errors import HistoryError, printable
-from pbrl_ppl.files import reason
+from pbrl_ppl.files import check_survives, reason
 from pbrl_ppl.history.files import reads
 from pbrl_ppl.scene import Recording
 from pbrl_ppl.state import Floats
@@ -76,7 +74,7 @@ def read_mat(path: Path, layout: Recording) -> pd.DataFrame:
 
     with path.open("rb") as file:
         try:
-            _check_survives(path)
+            check_survives(path, "import sys, scipy.io; scipy.io.loadmat(sys.argv[1])")
             content = loadmat(file, squeeze_me=True, simplify_cells=True)
         except Exception as error:  # damaged files raise errors of many kinds
             cure = 'save it from MATLAB with "-v7", or as CSV'
@@ -91,23 +89,6 @@ def read_mat(path: Path, layout: Recording) -> pd.DataFrame:
         raise HistoryError(f"history {path}: it has no vectors of numbers; save each as a column")
     longest = max(set(lengths), key=lambda length: (lengths.count(length), length))
     return pd.DataFrame({k: column for k, column in columns.items() if len(column) == longest})
-
-
-def _check_survives(path: Path, *, start: float = 60.0, rate: float = 1e6) -> None:
-    """Read a MATLAB file in a process of its own first: some damaged ones end it, or never end.
-
-    ``start``, ``rate``: seconds that it may take, and bytes a second.
-    """
-    code = "import sys, scipy.io; scipy.io.loadmat(sys.argv[1], simplify_cells=True)"
-    limit = start + path.stat().st_size / rate
-    try:
-        ended = subprocess.run(
-            [sys.executable, "-P", "-c", code, str(path)], capture_output=True, timeout=limit
-        )
-    except subprocess.TimeoutExpired:
-        raise ValueError(f"reading it took over {limit:.0f} s") from None
-    if ended.returncode not in (0, 1):  # an error of Python is raised again
-        raise ValueError("it is damaged")
 
 
 def _add_vectors(columns: dict[str, Floats], name: str, value: object) -> None:

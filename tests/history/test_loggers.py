@@ -22,7 +22,6 @@ from pbrl_ppl.errors import (
 )
 from pbrl_ppl.history import History, read_recording
 from pbrl_ppl.history.cuts import frozen_poses, zero_poses
-from pbrl_ppl.history.foreign import _check_survives
 from pbrl_ppl.history.guesses import planar_yaw
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Body, Joint, Recording, Scene, Shape
@@ -551,16 +550,13 @@ def test_a_matlab_file(tmp_path: Path) -> None:
 
 
 def test_a_damaged_matlab_file_does_not_end_the_process(tmp_path: Path) -> None:
-    """SciPy reads one of these from memory that is not its own, and tries the other for minutes."""
+    """SciPy reads memory that is not its own."""
     path = tmp_path / "bad.mat"
     scipy.io.savemat(path, {"log": {"x": np.arange(20.0), "name": "a"}})
     whole = path.read_bytes()
     path.write_bytes(whole[:224] + b"\5" + whole[225:])
     with pytest.raises(HistoryError, match=r"not a MATLAB file .*damaged"):
         History.load(path, PUCK)
-    path.write_bytes(whole[:163] + b"\15" + whole[164:])
-    with pytest.raises(ValueError, match="over 4 s"):
-        _check_survives(path, start=4.0)
 
 
 # ``new`` ------------------------------------------------------------------------------------------
