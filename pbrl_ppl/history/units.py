@@ -246,7 +246,9 @@ def rate_factor(
         if d == THETA and off < 0.5 * min(1.0, float(np.median(np.abs(integral)))):
             return 1.0
         factor = float(np.median(change / integral))
-        varies = float(np.median(np.abs(change / integral - factor))) / (abs(factor) or np.inf)
+        if factor == 0.0:  # a coarse sensor's position stays where its velocity is noise
+            continue
+        varies = float(np.median(np.abs(change / integral - factor))) / abs(factor)
         if varies < least:
             best, least = factor, varies
     return best
