@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from reliability.commands import run
-from reliability.valid import commands
+from reliability.valid import UNKNOWN, commands
 
 from pbrl_ppl.history import read_recording, read_scene
 from pbrl_ppl.model import problem_in
@@ -55,3 +55,15 @@ def test_a_model_whose_prior_centre_has_no_prediction_is_declared(tmp_path: Path
     history = read_recording(tmp_path / recording, scene)
     model = physics_model(scene, history, likelihood="trajectories")
     assert np.isfinite(problem_in(model).data.smoothed_states).all()
+
+
+def test_bodies_of_a_joint_are_found_along_trajectories(tmp_path: Path) -> None:
+    """Check says that the loop needs them; a fit of each choice is mixed with all its noises."""
+    case = drawn_case(143, 80)
+    recording = case.write(tmp_path)
+    checked = run(["check", "scene.toml", recording, "--no-prior"], tmp_path)
+    assert UNKNOWN in checked.out
+    (fit, codes), *_ = commands(case, recording, checked.out)
+    fitted = run(fit, tmp_path)
+    assert not fitted.fault(codes), fitted.fault(codes)
+    assert "unexplained_acceleration[vx]" in fitted.out

@@ -77,6 +77,12 @@ def check(
             " of its own, or cut = { every = ... } in [recording] (s)",
             soft_wrap=True,
         )
+    if any(joint.bodies is None for joint in declared.joints):
+        console.print(
+            "which bodies a joint joins is unknown: close-loop needs them in the scene, fit finds"
+            " them",
+            soft_wrap=True,
+        )
     sized = histories.with_units(declared, loaded)
     priors = _default_priors(sized, catalogue)
     console.print(_priors_table(priors))

@@ -14,7 +14,7 @@ import typer
 from pbrl_ppl.cli import options
 from pbrl_ppl.cli.app import command
 from pbrl_ppl.cli.terminal import Progress, Result, sizes, table
-from pbrl_ppl.errors import ParameterError, PosteriorError
+from pbrl_ppl.errors import HistoryError, ParameterError, PosteriorError, RecordingWarning, warn
 from pbrl_ppl.files import json_values, write_text
 from pbrl_ppl.scene import Scene, nearest
 from pbrl_ppl.state import STATE, Floats
@@ -62,7 +62,7 @@ def simulate(
     physics, phi = _parameters(source, values, draws, seed, catalogue)
     scene = physics.scene
     scene.replace(noise=errors)  # raises where the noise is invalid
-    recorded = reading.recording(history, scene, resample=reading.resample)
+    recorded = _that_start(reading.recording(history, scene, resample=reading.resample))
     progress("simulating")
     from pbrl_ppl.physics import simulated_recording
 
@@ -76,6 +76,28 @@ def simulate(
         "parameters": dict(zip(physics.layout.labels, phi.T, strict=True)),
     }
     return Result(contents, [f"history: {to.output} ({result.n_trajectories} trajectories)"])
+
+
+def _that_start(recorded: History) -> History:
+    """Return the trajectories with a complete state to start from; warn of others."""
+    complete = np.isfinite(recorded.dataset["start"].to_numpy()).all(axis=(2, 3))
+    rows = recorded.dataset["n_rows"].to_numpy()
+    starts = [i for i, n in enumerate(rows) if complete[i, : n - 1].any()]
+    if not starts:
+        raise HistoryError(
+            "history: no trajectory has a complete state to start from; measure one, or pass"
+            " --estimate-velocities"
+        )
+    lost = sorted({*range(len(rows))} - {*starts})
+    if not lost:
+        return recorded
+    names = ", ".join(map(str, recorded.dataset["trajectory"].to_numpy()[lost]))
+    warn(
+        f"history: no complete state to start from in trajectory {names}: left out; measure one, or"
+        " pass --estimate-velocities",
+        RecordingWarning,
+    )
+    return recorded.select(starts)
 
 
 def _parameters(

@@ -47,6 +47,8 @@ def drawn_pieces(history: History, most: int, seed: int = 0) -> tuple[History, s
         for first, last in pairwise(edges.tolist()):
             begins = np.flatnonzero(complete[trajectory, first:last])  # not in a gap
             pieces += [(trajectory, first + int(begins[0]), last)] if len(begins) else []
+    if not pieces:
+        return history, ""
     moves = _motion(history.dataset["observed"].to_numpy(), pieces)
     moves = moves if moves.any() else np.ones(len(pieces))
     with np.errstate(divide="ignore"):  # keys of a draw without replacement; a rest comes last

@@ -32,6 +32,8 @@ class UnusedVelocity:
         Whether positions of the log give it; else it only lags them.
     lag : float
         By how much it is late (s); negative if early.
+    zero : bool
+        Whether it is 0 in all rows while the position moves: nobody measured it.
 
     Examples
     --------
@@ -46,11 +48,14 @@ class UnusedVelocity:
     position: str
     computed: bool
     lag: float
+    zero: bool = False
 
     @property
     def sentence(self) -> str:
         """Sentence: the column, how it was computed or by how much it lags."""
         name, late = f"{self.state} of {self.body}", f"{abs(self.lag):.3g} s"
+        if self.zero:
+            return f"{name} is 0 in all rows while {self.position} moves, and is not used"
         if 1e-3 <= abs(self.lag) < 1.0:
             late = f"{1e3 * abs(self.lag):.3g} ms"
         if not self.computed:
@@ -96,7 +101,9 @@ def unused_velocities(history: History) -> tuple[UnusedVelocity, ...]:
         for d in range(3):
             runs = _runs(history, int(body), d)
             names = (history.bodies[body], STATE[d + VELOCITY], STATE[d])
-            if (late := computed_lag(runs, dt)) is not None:
+            if _is_zero(runs):
+                unused.append(UnusedVelocity(*names, False, 0.0, zero=True))
+            elif (late := computed_lag(runs, dt)) is not None:
                 unused.append(UnusedVelocity(*names, True, late if abs(late) > 0.05 * dt else 0.0))
             elif lag := velocity_lag(runs, dt):
                 unused.append(UnusedVelocity(*names, False, lag))
@@ -244,6 +251,18 @@ def _runs(history: History, body: int, d: int, shortest: int = 5) -> Runs:
     return runs
 
 
+def _is_zero(runs: Runs, *, moves: float = 8.0) -> bool:
+    """Return whether velocities are 0 in all rows and a position moves.
+
+    ``moves``: by more than so many of its noises and finest steps.
+    """
+    if not runs or any(rate.any() for _, rate in runs):
+        return False
+    places = [position for position, _ in runs]
+    noise = max(column_noise(places, 2, robust=True), finest_step(np.concatenate(places)))
+    return max(float(np.ptp(place)) for place in places) > moves * noise
+
+
 def position_noise(runs: Runs, dt: float) -> tuple[float, float]:
     """Return the noise variances of positions and of velocities, from their kinematic residuals.
 
@@ -352,6 +371,8 @@ def computed_lag(
         inverse = np.linalg.pinv(design, rcond=1e-9)
         errors = sums.T @ inverse[len(v) :]
         a, b = inverse[: len(v)] @ y, errors @ y
+        if not b.any():  # positions that never change give no velocity
+            continue
         count = np.array([len(group) for group in groups], dtype=np.float64)
         gain = 1 - float(a @ count)
         if 1 - float(a @ (count * [(-1.0) ** group[0] for group in groups])) < pole:

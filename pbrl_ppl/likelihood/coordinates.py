@@ -222,6 +222,8 @@ def observed_coordinates(scene: Scene, history: History, *, exactness: float = 1
     known = np.array([name in stated for name in STATE])
     sensed = free & measured & ~still & ~known
     sensors = np.flatnonzero(sensed.any(axis=0))
+    if not (free & ~still)[:, VELOCITY:].any():  # all logged as constant, while places change
+        still = np.hstack([still[:, :VELOCITY]] * 2)
     rates = np.flatnonzero((free & ~still).any(axis=0)[VELOCITY:]) + VELOCITY
     sensor = np.full(len(places), -1)
     for i, (b, d) in enumerate(zip(body, dimension, strict=True)):

@@ -237,7 +237,7 @@ class TransitionLikelihood(Likelihood):
 
     def in_order(self, values: Floats) -> Floats:
         """Return one value a residual, shape (..., transition, H * body * state)."""
-        return values.reshape(*values.shape[:-3], -1)
+        return values.reshape(*values.shape[:-3], math.prod(values.shape[-3:]))
 
     def log_density(
         self, residual: Floats, sigma: Floats, measured: Bools, nu: Nu = None

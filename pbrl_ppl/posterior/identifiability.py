@@ -335,7 +335,7 @@ def _linearised(idata: Idata, effects: tuple[Effect, ...]) -> tuple[Layout, Floa
     def residual(points: Floats) -> Floats:
         states = physics.predict(points, data["start"].to_numpy(), data["actions"].to_numpy())
         z = TransitionLikelihood().whiten(observations.residual(states), sigma)
-        return np.nan_to_num(z.reshape(len(points), -1))
+        return np.nan_to_num(z.reshape(len(points), math.prod(z.shape[1:])))
 
     jacobian = posterior_slopes(residual, phi, *box(layout.priors), 1e-3 * layout.scale(phi))
     return layout, phi, jacobian

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 import xarray as xr
 
+from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import (
     Mode,
@@ -136,10 +137,19 @@ def _values(
     layout = problem.layout
     phi = np.full((*label.shape, layout.size), np.nan)
     drawn = {i: group(t, "posterior").isel(draw=slice(label.shape[1])) for i, t in traces.items()}
-    sigma = next(iter(drawn.values()))["sigma"].to_numpy().copy()
+    noise = {
+        name: next(iter(drawn.values()))[name].to_numpy().copy() for name in problem.noise_variables
+    }
     for i, posterior in drawn.items():
         here = label == i
-        sigma[here] = posterior["sigma"].to_numpy()[here]
+        for name, sigma in noise.items():
+            one = posterior[name].to_numpy() if name in posterior else np.zeros(0)
+            if one.shape != sigma.shape:
+                raise FitError(
+                    "fit: choices of the bodies that a joint joins have different coordinates;"
+                    " take --likelihood transitions, or name the bodies in the scene"
+                )
+            sigma[here] = one[here]
         for block in weighed[i].configuration.problem(problem).layout.blocks:
             values = posterior[block.name].to_numpy()
             for j, owner in enumerate(block.owners):
@@ -151,7 +161,7 @@ def _values(
     _fill_anchors(problem, phi, rng)
     named = layout.to_dict(phi)
     indices = {name: named[name].astype(int) for name in JOINT_INDICES}
-    return named | indices | {"sigma": sigma}
+    return named | indices | noise
 
 
 def _index_law(problem: Problem, joint: str, pair: Pair) -> Floats:

@@ -351,6 +351,23 @@ def test_fit_writes_a_posterior_and_simulate_takes_it(capsys: pytest.CaptureFixt
 
 
 @pytest.mark.usefixtures("puck")
+def test_simulate_leaves_out_what_has_no_state_to_start_from(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    table = pd.read_csv("train.csv")
+    for name, odd in (("x", 0), ("y", 1)):
+        table.loc[(table["trajectory"] == 1) & (table["step"] % 2 == odd), name] = np.nan
+    table.to_csv("gaps.csv", index=False)
+    simulate = ("simulate", "scene.toml", "gaps.csv", "-o", "a.csv", "--set", "mass=4")
+    assert main(list(simulate)) == 0
+    said = capsys.readouterr()
+    assert "no complete state to start from in trajectory 1: left out" in said.err
+    assert "(3 trajectories)" in said.out
+    table.loc[table["trajectory"] == 1].to_csv("gaps.csv", index=False)
+    assert "no trajectory has a complete state" in message(capsys, *simulate, "--overwrite")
+
+
+@pytest.mark.usefixtures("puck")
 def test_simulate_says_what_it_needs(capsys: pytest.CaptureFixture[str]) -> None:
     simulate = ("simulate", "scene.toml", "train.csv", "-o", "a.csv")
     assert "no value for mass[puck]" in message(capsys, *simulate)

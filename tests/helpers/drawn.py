@@ -381,9 +381,8 @@ def _plan(world: World, states: Floats, pushed: bool) -> tuple[tuple[str, ...], 
     scene, arguments = world.scene, []
     first = {body.name: states[0, 0, i] for i, body in enumerate(scene.moving)}
     for body in scene.moving:
-        if not body.kinematic:
-            numbers = ",".join(f"{value:.6g}" for value in first[body.name][:3])
-            arguments.append(f"--start={body.name}={numbers}")
+        numbers = ",".join(f"{value:.6g}" for value in first[body.name][:3])
+        arguments.append(f"--start={body.name}={numbers}")
     body = scene.dynamic[0]
     x, y, theta = first[body.name][:3]
     goal = f"{x + 0.5 * world.size:.6g},-,-"

@@ -15,6 +15,7 @@ from pbrl_ppl.history import (
     unused_velocities,
     velocity_lag,
 )
+from pbrl_ppl.likelihood import observed_coordinates
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.histories import COLUMNS
 from tests.helpers.places import RECORDED
@@ -194,6 +195,23 @@ def test_a_body_may_turn_by_more_than_half_a_turn_between_samples() -> None:
     assert not unused_velocities(own)
     computed = recorded(lambda p, v, rng: np.gradient(p, DT, axis=0), spin=fast)
     assert [each.state for each in unused_velocities(computed)] == ALL
+
+
+@pytest.mark.parametrize("rows", [8, 60])
+def test_a_velocity_that_is_zero_while_its_position_moves_was_not_measured(rows: int) -> None:
+    frame = recorded(lambda p, v, rng: 0.0 * v, n=6).to_dataframe()
+    unused = unused_velocities(History.from_dataframe(frame[frame["step"] < rows], PUCK))
+    assert [each.state for each in unused] == ALL
+    assert unused[0].sentence == "vx of puck is 0 in all rows while x moves, and is not used"
+
+
+def test_a_resting_body_s_zero_velocities_are_used() -> None:
+    frame = recorded(lambda p, v, rng: 0.0 * v, n=6).to_dataframe()
+    frame[["x", "y", "theta"]] = 0.001 * np.random.default_rng(0).normal(size=(len(frame), 3))
+    history = History.from_dataframe(frame, PUCK)
+    assert not unused_velocities(history)
+    # and a model of whole trajectories has accelerations that are unexplained
+    assert observed_coordinates(PUCK, history).rates == (3, 4, 5)
 
 
 def test_gaps_do_not_prevent_recognition_and_angles_are_unwrapped() -> None:

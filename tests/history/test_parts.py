@@ -67,6 +67,9 @@ def test_no_piece_begins_in_a_gap() -> None:
     data["start"][:, 600:1250] = np.nan
     drawn, _ = drawn_pieces(History(data), 2000)
     assert np.isfinite(drawn.dataset["start"].to_numpy()[:, 0]).all()
+    data["start"][:] = np.nan
+    never_whole = History(data)
+    assert drawn_pieces(never_whole, 2000) == (never_whole, "")
 
 
 def test_commands_use_as_many() -> None:

@@ -143,6 +143,8 @@ def test_everything_known(history) -> None:
     said = identify(mode_of(history, **CART))
     assert said.sentences == ()
     assert said.table().empty
+    posterior = quick_fit(physics_model(cart_scene(known=CART), history))
+    assert identify(posterior).table().empty
 
 
 def test_report_values_are_json(history) -> None:
