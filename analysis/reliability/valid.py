@@ -45,10 +45,12 @@ def commands(
     """
     fitted = ["scene.toml", recording]
     test = ["--test", recording] if ONE in checked else []
-    loop = "map.nc" if UNKNOWN in checked else "loop/after.nc"
+    loop, method = "loop/after.nc", "map"
+    if UNKNOWN in checked:
+        loop, method = "map.nc", "laplace"
     listed = [
         (["close-loop", *fitted, *test, "--method", "laplace", "-o", "loop"], (0, 3)),
-        (["fit", *fitted, "--method", "map", "-o", "map.nc"], (0, 3)),
+        (["fit", *fitted, "--method", method, "-o", "map.nc"], (0, 3)),
         (["report", loop, "-o", "r.html"], (0,)),
         (["simulate", loop, recording, "-o", "predicted.csv"], (0,)),
         (["plan", loop, *case.plan, "--nodes", "1000", "-o", "plan.csv"], (0, 1)),
