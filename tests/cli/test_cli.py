@@ -101,7 +101,7 @@ def test_close_loop(files: Path, calls: list[Any], capsys: pytest.CaptureFixture
     assert scene.substeps == 4
     assert train.n_transitions == test.n_transitions == 4
     assert options.pop("catalogue") == catalogue
-    assert options == {"seed": 1, "draws": None, "method": "importance"}
+    assert options == {"seed": 1, "draws": None, "method": "importance", "most_transitions": 3000}
 
 
 def test_a_status_line_has_the_stage_and_the_time_elapsed(monkeypatch: pytest.MonkeyPatch) -> None:

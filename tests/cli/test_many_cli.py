@@ -72,7 +72,7 @@ def test_many(logs: list[Settings], capsys: pytest.CaptureFixture[str]) -> None:
                     "units": {"x": "mm", "theta": "deg"},
                     "trim": False,
                 },
-                loop={"seed": 7, "draws": 300, "method": "laplace"},
+                loop={"seed": 7, "draws": 300, "method": "laplace", "most_transitions": 3000},
             )
         ]
         * 2
