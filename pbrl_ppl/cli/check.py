@@ -57,21 +57,19 @@ def check(
 
     check_history(declared, loaded, loaded.segments(1))
     contents, missing = _contents(declared, loaded), _missing(loaded)
-    rows, trajectories = int(loaded.dataset["n_rows"].sum()), loaded.n_trajectories
-    transitions = loaded.n_transitions
-    loaded, drawn = histories.drawn_pieces(loaded, options.MOST_TRANSITIONS, seed)
-    unused = histories.unused_velocities(loaded)
+    used, drawn = histories.drawn_pieces(loaded, options.MOST_TRANSITIONS, seed)
+    unused = histories.unused_velocities(used)
     # shown at once: the prior's draws take long
     console = PlainConsole(quiet=as_json)
     listed = Table(show_header=False, box=None)
     for row in contents.items():
         listed.add_row(*row)
     console.print(listed)
-    console.print(_missing_table(missing, rows))
-    masses = histories.mass_contradictions(declared, loaded)
-    for sentence in (*filter(None, [drawn]), *(velocity.sentence for velocity in unused), *masses):
+    console.print(_missing_table(missing, int(loaded.dataset["n_rows"].sum())))
+    masses = histories.mass_contradictions(declared, used)
+    for sentence in (*drawn, *(velocity.sentence for velocity in unused), *masses):
         console.print(sentence, soft_wrap=True)
-    if trajectories < 2:
+    if loaded.n_trajectories < 2:
         console.print(
             "one trajectory: close-loop holds out whole ones, and needs another, --test with a file"
             " of its own, or cut = { every = ... } in [recording] (s)",
@@ -83,7 +81,7 @@ def check(
             " them",
             soft_wrap=True,
         )
-    sized = histories.with_units(declared, loaded)
+    sized = histories.with_units(declared, used)
     priors = _default_priors(sized, catalogue)
     console.print(_priors_table(priors))
     checked = None
@@ -94,16 +92,16 @@ def check(
         from pbrl_ppl.likelihood import Problem
 
         physics = Physics(sized, attach(sized, (), catalogue))
-        problem = Problem.of(physics, loaded, horizon=informative_horizon(loaded))
+        problem = Problem.of(physics, used, horizon=informative_horizon(used))
         checked = prior_predictive_check(problem, draws=draws, seed=seed)
         for sentence in checked.summary:
             console.print(f"prior: {sentence}", soft_wrap=True)
     facts = {
-        "trajectories": trajectories,
-        "transitions": transitions,
+        "trajectories": loaded.n_trajectories,
+        "transitions": loaded.n_transitions,
         "missing": missing,
         "velocities_not_used": [vars(column) for column in unused],
-        "unit_mismatches": histories.unit_mismatches(loaded),
+        "unit_mismatches": histories.unit_mismatches(used),
         "mass_contradictions": masses,
         "typical": {body.name: dict(body.typical) for body in sized.dynamic},
         "default_priors": priors,

@@ -80,8 +80,7 @@ def simulate(
 
 def _that_start(recorded: History) -> History:
     """Return the trajectories with a complete state to start from; warn of others."""
-    complete = np.isfinite(recorded.dataset["start"].to_numpy()).all(axis=(2, 3))
-    rows = recorded.dataset["n_rows"].to_numpy()
+    complete, rows = recorded.complete, recorded.dataset["n_rows"].to_numpy()
     starts = [i for i, n in enumerate(rows) if complete[i, : n - 1].any()]
     if not starts:
         raise HistoryError(

@@ -186,7 +186,7 @@ def checked_mode(
         check_substeps(substeps)
     history, drawn = drawn_pieces(history, most_transitions, seed)
     history, _, unused, bad = checked_histories(scene, history, history)
-    for sentence in (*filter(None, [drawn]), *(velocity.sentence for velocity in unused), *bad):
+    for sentence in (*drawn, *(velocity.sentence for velocity in unused), *bad):
         say(sentence)
     scene = with_units(scene, history)
     effects = attach(scene, (), catalogue)

@@ -18,7 +18,7 @@ from scipy.stats import norm
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.results import Law, LawsOfSize, SearchLength
 from pbrl_ppl.criticism.score import named_beside, rank_candidates
-from pbrl_ppl.criticism.subsets import Regression, Subset, best_subsets, worth
+from pbrl_ppl.criticism.subsets import Regression, Subset, best_subsets, fall, worth
 from pbrl_ppl.effects import Attached, Noise, Structure
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import (
@@ -583,10 +583,10 @@ class Search:
 
         Laws that replace each other in part are missed little alone: shares are in proportion.
         """
-        gains = {law: _logarithm(one.share) for law, one in model.evidence.items()}
-        together = _logarithm(Evidence.of(without, model.mode).share)
+        gains = {law: fall(one.share) for law, one in model.evidence.items()}
+        together = fall(Evidence.of(without, model.mode).share)
         scale = max(together / max(sum(gains.values()), 1e-300), 1.0)
-        least = _logarithm(self.criteria.search.main_share)
+        least = fall(self.criteria.search.main_share)
         return {law for law, gain in gains.items() if scale * gain >= least}
 
     def _unconfirmed(
@@ -970,11 +970,6 @@ def is_out_of_phase(
     """
     motion = np.nanstd(values, axis=(0, 1, 2))
     return bool(((error > far * motion) & (error > more * shorter)).any())
-
-
-def _logarithm(share: float) -> float:
-    """Return by how much the logarithm of an error falls without a share of it."""
-    return -float(np.log(max(1.0 - share, 1e-15)))  # of exact data nothing is left
 
 
 def _error(mode: Mode) -> dict[str, float]:

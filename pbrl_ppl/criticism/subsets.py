@@ -65,8 +65,12 @@ class Subset:
 
 def worth(share: float, columns: int, n: float) -> float:
     """Return the log-evidence (nats) of columns that take a share of n squared residuals away."""
-    left = max(1.0 - share, 1e-15)  # of exact data nothing
-    return float(-0.5 * n * np.log(left) - 0.5 * columns * np.log(n))
+    return 0.5 * n * fall(share) - 0.5 * columns * float(np.log(n))
+
+
+def fall(share: float) -> float:
+    """Return by how much a logarithm falls without a share of its number."""
+    return -float(np.log(max(1.0 - share, 1e-15)))  # of exact data nothing is left
 
 
 @dataclass(frozen=True, eq=False)

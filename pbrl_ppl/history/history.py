@@ -297,8 +297,7 @@ class History:
             raise HistoryError(f"horizon is {horizon!r}, expected a whole number from 1 up")
         intervals = self.dataset["n_rows"].to_numpy() - 1
         start = self.dataset["start"].to_numpy()
-        complete = np.isfinite(start).all(axis=(-1, -2))
-        trajectory, step = _cut(complete, intervals, int(horizon))
+        trajectory, step = _cut(self.complete, intervals, int(horizon))
         if not len(step):
             raise HistoryError(
                 f"no segment of {horizon} intervals starts from a complete state; use another "
@@ -384,6 +383,11 @@ class History:
         """Time since each trajectory began, shape (trajectory, time), s; laws know no other."""
         data = self.dataset
         return np.asarray(data["clock"].to_numpy() - data["began"].to_numpy()[:, None])
+
+    @property
+    def complete(self) -> Bools:
+        """Whether the state is complete, so that pieces may start, shape (trajectory, time)."""
+        return np.asarray(np.isfinite(self.dataset["start"].to_numpy()).all(axis=(-1, -2)))
 
     def split(self, test_fraction: float = 0.25, seed: int = 0) -> tuple[History, History]:
         """Return a training and a test history, each of whole trajectories.

@@ -18,10 +18,10 @@ MOST_TRANSITIONS = 3000
 _PIECES, _SHORTEST = 12, 100
 
 
-def drawn_pieces(history: History, most: int, seed: int = 0) -> tuple[History, str]:
+def drawn_pieces(history: History, most: int, seed: int = 0) -> tuple[History, tuple[str, ...]]:
     """Return pieces of a history with at most so many transitions in all, and a sentence on them.
 
-    A history that has no more is returned as it is, with an empty sentence.
+    A history that has no more is returned as it is, without a sentence.
 
     Trajectories are cut to pieces as long as the slowest motion, of 100 transitions or more, and at
     most a twelfth of all. The seed draws them, in proportion to how much moves in each: a rest says
@@ -37,18 +37,18 @@ def drawn_pieces(history: History, most: int, seed: int = 0) -> tuple[History, s
         The same seed gives the same pieces.
     """
     if history.n_transitions <= most:
-        return history, ""
+        return history, ()
     slow = int(_slowest_motion(history) / history.dataset.attrs["time_step"])
     longest = max(min(max(slow, _SHORTEST), most // _PIECES), 1)
     pieces: list[tuple[int, int, int]] = []
-    complete = np.isfinite(history.dataset["start"].to_numpy()).all(axis=(2, 3))
+    complete = history.complete
     for trajectory, n in enumerate(history.dataset["n_rows"].to_numpy() - 1):
         edges = np.linspace(0, n, -(-n // longest) + 1).astype(int)
         for first, last in pairwise(edges.tolist()):
             begins = np.flatnonzero(complete[trajectory, first:last])  # not in a gap
             pieces += [(trajectory, first + int(begins[0]), last)] if len(begins) else []
     if not pieces:
-        return history, ""
+        return history, ()
     moves = _motion(history.dataset["observed"].to_numpy(), pieces)
     moves = moves if moves.any() else np.ones(len(pieces))
     with np.errstate(divide="ignore"):  # keys of a draw without replacement; a rest comes last
@@ -61,10 +61,11 @@ def drawn_pieces(history: History, most: int, seed: int = 0) -> tuple[History, s
     )
     labels = [str(label) for label in joined["trajectory"].to_numpy()]
     drawn = History(hashed(joined.assign_coords(trajectory=labels)))
-    return drawn, (
+    said = (
         f"{drawn.n_transitions} of {history.n_transitions} transitions are used, in"
         f" {drawn.n_trajectories} pieces drawn by the seed"
     )
+    return drawn, (said,)
 
 
 def _slowest_motion(history: History) -> float:

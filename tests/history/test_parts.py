@@ -24,7 +24,7 @@ def recording(*rows: int, moving: slice = slice(None)) -> History:
 
 def test_a_history_that_is_not_too_long_is_used_as_it_is() -> None:
     history = recording(30, 50)
-    assert drawn_pieces(history, 78) == (history, "")
+    assert drawn_pieces(history, 78) == (history, ())
 
 
 @pytest.mark.parametrize("rows", [(5000,), (400, 3000), (40,) * 60])
@@ -32,7 +32,7 @@ def test_pieces_are_of_the_recording_and_no_more_than_asked_for(rows: tuple[int,
     history = recording(*rows)
     drawn, said = drawn_pieces(history, 800, seed=3)
     assert 600 < drawn.n_transitions <= 800
-    assert f"{drawn.n_transitions} of {history.n_transitions} transitions" in said
+    assert f"{drawn.n_transitions} of {history.n_transitions} transitions" in said[0]
     whole, part = history.dataset, drawn.dataset
     for i, n in enumerate(part["n_rows"].to_numpy()):
         assert n <= 101
@@ -69,7 +69,7 @@ def test_no_piece_begins_in_a_gap() -> None:
     assert np.isfinite(drawn.dataset["start"].to_numpy()[:, 0]).all()
     data["start"][:] = np.nan
     never_whole = History(data)
-    assert drawn_pieces(never_whole, 2000) == (never_whole, "")
+    assert drawn_pieces(never_whole, 2000) == (never_whole, ())
 
 
 def test_commands_use_as_many() -> None:
