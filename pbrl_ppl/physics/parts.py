@@ -6,6 +6,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Collection, Hashable
 from dataclasses import dataclass, field
 from itertools import chain, combinations, compress, product
+from threading import Lock
 from typing import Any, TypeVar
 
 import numpy as np
@@ -124,16 +125,19 @@ def come_near(begin: Floats, end: Floats, least: float) -> Bools:
 class Memory:
     """The last few results of a function, by its arguments; they do not go into a pickle.
 
+    Threads may share it; two that ask for the same at once both compute it.
+
     A Metropolis step asks for the proposed point and the current one: the latter was just computed.
     """
 
     def __init__(self, size: int = 4) -> None:
         self._size = size
         self._known: OrderedDict[Hashable, Any] = OrderedDict()
+        self._lock = Lock()
 
-    def __getstate__(self) -> dict[str, object]:
-        """Nothing."""
-        return {"_size": self._size, "_known": OrderedDict()}
+    def __reduce__(self) -> tuple[type[Memory], tuple[int]]:
+        """Return an empty one's arguments."""
+        return Memory, (self._size,)
 
     def recall(self, arguments: tuple[Floats, ...], compute: Callable[..., R]) -> R:
         """Return ``compute(*arguments)``, from memory for equal arguments.
@@ -148,13 +152,13 @@ class Memory:
         """
         parameters, *data = arguments  # of what is large, a hash will do
         key = (parameters.tobytes(), *((array.shape, hash(array.tobytes())) for array in data))
-        if key in self._known:
-            self._known.move_to_end(key)
-        else:
-            self._known[key] = compute(*arguments)
-            if len(self._known) > self._size:
+        with self._lock:
+            known = [self._known.pop(key)] if key in self._known else []
+        result: R = known[0] if known else compute(*arguments)
+        with self._lock:
+            self._known[key] = result
+            while len(self._known) > self._size:
                 self._known.popitem(last=False)
-        result: R = self._known[key]
         return result
 
 

@@ -1,5 +1,9 @@
 """Bodies that have nothing to do with each other: found in the data, simulated apart."""
 
+import pickle
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -10,6 +14,7 @@ from pbrl_ppl.model import problem_in
 from pbrl_ppl.modes import Space
 from pbrl_ppl.parameters import inside
 from pbrl_ppl.physics import PartedSimulator, Physics, Simulator, build_layout, independent_parts
+from pbrl_ppl.physics.parts import Memory
 from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.histories import COLUMNS
@@ -137,6 +142,21 @@ def test_proposals_and_derivative_are_the_whole_s(worlds) -> None:
     slopes, expected = (one.jacobian(phi, start, actions) for one in (parted, whole))
     np.testing.assert_allclose(slopes[:, :, :2], expected[:, :, :2], atol=1e-3)
     assert np.median(np.abs(slopes - expected)) < 1e-6
+
+
+def test_threads_share_a_memory() -> None:
+    """Each gets its own argument's value, also while others push it out."""
+    memory, arguments = Memory(1), np.tile(np.arange(4.0), 5000)
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(8) as pool:
+            got = list(pool.map(lambda x: memory.recall((x,), np.exp), arguments[:, None]))
+    finally:
+        sys.setswitchinterval(interval)
+    np.testing.assert_array_equal(np.ravel(got), np.exp(arguments))
+    copy = pickle.loads(pickle.dumps(memory))
+    assert copy.recall((np.ones(1),), np.exp) == np.exp(1)
 
 
 def test_only_what_moved_is_simulated_again(worlds, monkeypatch) -> None:
