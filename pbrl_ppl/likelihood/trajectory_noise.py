@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.likelihood.coordinates import Coordinates
 from pbrl_ppl.likelihood.kalman import adjoint, gains, innovations, score, whitened
-from pbrl_ppl.parameters import Layout, change_from
+from pbrl_ppl.parameters import Layout, change_from, covariance_factor
 from pbrl_ppl.physics import Memory
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Bools, Floats, Ints
@@ -379,7 +379,7 @@ class TrajectoryNoise:
         mean, covariance = self.predictive(
             self.coordinates.of_residual(linearised - predicted), sigma
         )
-        factor = np.linalg.cholesky(covariance)
+        factor = covariance_factor(covariance)
         drawn = mean + np.einsum("kab,kb->ka", factor, rng.standard_normal(mean.shape))
         result = linearised.copy()
         body, place = self.coordinates.in_residual

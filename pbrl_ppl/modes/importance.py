@@ -21,6 +21,7 @@ from scipy.special import gammaln, logsumexp
 from pbrl_ppl.likelihood import log_posterior
 from pbrl_ppl.modes.laplace import Mode
 from pbrl_ppl.modes.space import Space
+from pbrl_ppl.parameters import covariance_factor
 from pbrl_ppl.state import Floats
 
 ProposalT = TypeVar("ProposalT", bound="Proposal")
@@ -245,7 +246,7 @@ class _StudentT:
         q = q[:, self.space.informed]
         covariance = (1.0 - retained) * np.atleast_2d(np.cov(q, rowvar=False))
         covariance += retained * self.factor @ self.factor.T
-        factor = np.asarray(np.linalg.cholesky(covariance), dtype=float)
+        factor = covariance_factor(covariance)
         return replace(self, centre=q.mean(axis=0), factor=factor)
 
 
@@ -271,7 +272,7 @@ def importance(
     space = Space.of(mode)
     centre, covariance = space.laplace(mode)
     informed = space.informed
-    factor = np.asarray(np.linalg.cholesky(covariance[np.ix_(informed, informed)]), dtype=float)
+    factor = covariance_factor(covariance[np.ix_(informed, informed)])
 
     def density(q: Floats) -> tuple[Floats, Floats]:
         return space.log_density(q), np.zeros((len(q), 0))

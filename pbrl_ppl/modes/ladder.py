@@ -23,7 +23,7 @@ from pbrl_ppl.likelihood import (
     with_defect,
     without,
 )
-from pbrl_ppl.modes.laplace import Mode, SimulatedMode, covariance_of
+from pbrl_ppl.modes.laplace import Mode, SimulatedMode, covariance_of, sandwich
 from pbrl_ppl.modes.noise import finite
 from pbrl_ppl.modes.search import find_mode
 from pbrl_ppl.parameters import box, inside, prior_residual, prior_slopes
@@ -147,7 +147,7 @@ def with_robust_covariance(mode: SimulatedMode, *, many: int = 8) -> SimulatedMo
             "arbp,rs,asbq->pq", of_dimension, errors[lags], of_dimension, optimize=True
         )
     inverse = covariance_of((mode.jacobian.T @ mode.jacobian) + np.diag(slopes**2))
-    robust = inverse @ score @ inverse
+    robust = sandwich(inverse, score)
     _, cluster = np.unique(problem.segments.trajectory, return_inverse=True)
     n = cluster.max() + 1
     if n >= many:

@@ -18,7 +18,15 @@ from pbrl_ppl.likelihood import (
     log_posterior,
 )
 from pbrl_ppl.modes.noise import FAR_OFF, best_tails, noise_gaussian, profile_sigma, tail_precision
-from pbrl_ppl.parameters import Prior, box, by_prior, differentiate, inside, prior_residual
+from pbrl_ppl.parameters import (
+    Prior,
+    box,
+    by_prior,
+    covariance_factor,
+    differentiate,
+    inside,
+    prior_residual,
+)
 from pbrl_ppl.physics import PartedSimulator
 from pbrl_ppl.state import Floats
 
@@ -26,6 +34,8 @@ from pbrl_ppl.state import Floats
 STALLED = 0.02
 #: Rounds of a climb, at most.
 ROUNDS = 40
+#: Root of a precision of nothing.
+_NONE = 1e-150
 #: Precision of a uniform angle: 1 / variance (1/rad^2).
 _CIRCLE = 3.0 / np.pi**2
 
@@ -76,9 +86,7 @@ class Mode(Generic[LikelihoodT]):
     @property
     def factor(self) -> Floats:
         """Cholesky factor of the covariance, shape (p, p)."""
-        sd = np.sqrt(np.maximum(np.diag(self.covariance), 1e-300))
-        correlation = self.covariance / np.outer(sd, sd) + 1e-15 * np.eye(len(sd))
-        return np.asarray(sd[:, None] * np.linalg.cholesky(correlation), dtype=float)
+        return covariance_factor(self.covariance)
 
     def noise_gaussian(self) -> tuple[Floats, Floats]:
         """Return the Laplace approximation of log sigma: mean and covariance.
@@ -249,7 +257,24 @@ def laplace_covariance(priors: Sequence[Prior], precision: Floats) -> Floats:
 
 
 def covariance_of(precision: Floats) -> Floats:
-    """Return the pseudo-inverse of a precision, shape (p, p), whatever the parameters' units."""
-    sd = 1.0 / np.sqrt(np.maximum(np.diag(precision), 1e-300))
-    scaled = np.linalg.pinv(precision * np.outer(sd, sd), hermitian=True)
-    return np.asarray(scaled * np.outer(sd, sd), dtype=float)
+    """Return the inverse of a precision, shape (p, p), whatever the parameters' units.
+
+    Zero for parameters of no precision; a direction's precision is at least what rounding leaves.
+    """
+    unit, values, vectors = _spectrum(precision)
+    sd = np.where(unit > _NONE, 1.0 / unit, 0.0)[:, None]
+    root = sd * vectors / np.sqrt(np.maximum(values, len(sd) * np.finfo(float).eps))
+    return np.asarray(root @ root.T, dtype=float)
+
+
+def sandwich(inverse: Floats, score: Floats) -> Floats:
+    """Return the covariance ``inverse @ score @ inverse``, which rounding leaves positive."""
+    unit, values, vectors = _spectrum(score)
+    root = inverse @ (unit[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
+    return np.asarray(root @ root.T, dtype=float)
+
+
+def _spectrum(matrix: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return the roots of a matrix's diagonal, and the spectrum in units of them."""
+    unit = np.sqrt(np.maximum(np.diag(matrix), _NONE**2))
+    return unit, *np.linalg.eigh(matrix / unit / unit[:, None])

@@ -9,6 +9,7 @@ from .layout import Layout as Layout
 from .layout import ParameterLibrary as ParameterLibrary
 from .priors import Prior as Prior
 from .priors import box as box
+from .priors import covariance_factor as covariance_factor
 from .priors import differentiate as differentiate
 from .priors import inside as inside
 from .priors import prior_draws as prior_draws

@@ -318,6 +318,17 @@ def box(priors: Sequence[Prior], *, margin: float = 1e-6) -> tuple[Floats, Float
     return support[:, 0] + margin * width, support[:, 1] - margin * width
 
 
+def covariance_factor(covariance: Floats) -> Floats:
+    """Return the Cholesky factors of covariances, which may be singular, shape (..., n, n).
+
+    With 1e-12 of the variances added: more than rounding takes from the least eigenvalue.
+    """
+    variance = np.diagonal(covariance, axis1=-2, axis2=-1)[..., None]
+    sd = np.sqrt(np.maximum(variance, 1e-300))
+    correlation = covariance / sd / sd.swapaxes(-1, -2) + 1e-12 * np.eye(covariance.shape[-1])
+    return np.asarray(sd * np.linalg.cholesky(correlation), dtype=float)
+
+
 def differentiate(
     function: Callable[[Floats], Floats], point: Floats, steps: Floats, lower: Floats, upper: Floats
 ) -> Floats:

@@ -55,6 +55,8 @@ MAX_RHAT, MIN_ESS = 1.01, 400
 #: Standard deviation of the differences (nats) above which the linearisation does not hold:
 #: draws weighted by exp(difference) would be worth exp(-4), 2 %, of their number.
 MOST = 2.0
+#: Log-likelihood (nats) below which a draw is one at which the engine diverges.
+_DIVERGED = -1e100
 #: Draws are simulated in groups of this many, or of more with at most so many transitions.
 _GROUP, _GROUP_TRANSITIONS = 64, 20_000
 #: Predicted numbers that are stored, and least and most draws with predictions, which come first.
@@ -283,7 +285,7 @@ def linearisation_errors(problem: FilteredProblem, phi: Floats, sigma: Floats) -
     errors = np.zeros((len(phi), problem.data.history.n_trajectories))
     for row, point, noise in zip(errors, phi, sigma, strict=True):
         again, stored = (
-            other.log_density(other.residual(point), noise, point)
+            np.maximum(other.log_density(other.residual(point), noise, point), _DIVERGED)
             for other in (smoothed(problem, point, noise), problem)
         )
         np.add.at(row, problem.segments.trajectory, again - stored)

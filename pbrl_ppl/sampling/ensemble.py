@@ -16,6 +16,7 @@ from scipy.special import logsumexp
 
 from pbrl_ppl.likelihood import is_independent
 from pbrl_ppl.modes import Mode, Space
+from pbrl_ppl.parameters import covariance_factor
 from pbrl_ppl.state import Bools, Floats, Ints
 
 #: Best acceptance rate of a random walk in many dimensions (Roberts, Gelman and Gilks, 1997).
@@ -151,12 +152,8 @@ class Block:
 
 def _gaussian(mean: Floats, covariance: Floats) -> _Gaussian:
     """Return a Gaussian that is never singular."""
-    covariance = np.asarray(covariance).reshape(2 * (len(mean),))
-    deviation = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    correlation = covariance / np.outer(deviation, deviation)
-    factor = np.linalg.cholesky(correlation + 1e-9 * np.eye(len(mean)))
-    inverse = solve_triangular(factor, np.eye(len(mean)), lower=True)
-    return _Gaussian(mean, deviation[:, None] * factor, inverse / deviation)
+    factor = covariance_factor(np.reshape(covariance, 2 * (len(mean),)))
+    return _Gaussian(mean, factor, solve_triangular(factor, np.eye(len(mean)), lower=True))
 
 
 @dataclass(frozen=True, eq=False)

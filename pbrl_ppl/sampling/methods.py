@@ -22,7 +22,7 @@ from pbrl_ppl.likelihood import (
     variable_dims,
 )
 from pbrl_ppl.modes import Mode, Space, library_of
-from pbrl_ppl.parameters import nearest
+from pbrl_ppl.parameters import covariance_factor, nearest
 from pbrl_ppl.posterior import (
     LIKELIHOOD,
     PARETO_K,
@@ -277,7 +277,7 @@ def _laplace(job: SamplerRun) -> Idata:
     shape = job.chains, job.method.draws
     phi = mode.draws(rng, shape[0] * shape[1])
     centre, covariance = mode.noise_gaussian()
-    noise = rng.standard_normal((len(phi), len(centre))) @ np.linalg.cholesky(covariance).T
+    noise = rng.standard_normal((len(phi), len(centre))) @ covariance_factor(covariance).T
     sigma = np.exp(centre + noise)
     values = mode.problem.named(phi.reshape(*shape, -1), sigma.reshape(*shape, -1))
     return as_trace(job.problem, values, {"accept": np.ones(shape)})
@@ -292,7 +292,7 @@ def dispersed(
     """
     space = Space.of(mode)
     mean, covariance = space.laplace(mode)
-    factor = np.linalg.cholesky(covariance + 1e-12 * np.diag(np.diag(covariance)))
+    factor = covariance_factor(covariance)
     q = mean + away * rng.standard_normal((chains, len(mean))) @ factor.T
     return [mode.problem.named(space.possible(one), space.split(one)[1]) for one in q]
 

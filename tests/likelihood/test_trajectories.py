@@ -20,6 +20,7 @@ from pbrl_ppl.likelihood import (
     smoothed,
     with_measurements,
 )
+from pbrl_ppl.likelihood.kalman import gains
 from pbrl_ppl.model import LogLikelihoodOp, build_model, problem_in
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.sampling import physics_model
@@ -291,6 +292,17 @@ def test_simulated_trajectories_have_both_noises(problem) -> None:
     # 2880 numbers: sd of the mean square 0.026, of a correlation over 2160 pairs 0.022; 4 of each
     assert abs((z**2).mean() - 1) < 0.105
     assert abs((z[:, :, 1:] * z[:, :, :-1]).mean()) < 0.086
+
+
+def test_a_sensor_far_better_than_what_was_known(problem) -> None:
+    """After a measurement of 1e-10 m of a place known to 0.1 m, the covariance is one still."""
+    sensor = np.full(6, 1e-20)
+    slope = np.eye(6) + np.diag(np.full(3, 0.004), 3)
+    arguments = slope[None], np.array([1]), np.ones((1, 6), dtype=bool), np.full((1, 6), 0.01)
+    covariance = gains(*arguments, sensor, np.zeros((1, 6, 6)), np.array([0]))[2][0]
+    np.testing.assert_allclose(np.diag(covariance), sensor, rtol=1e-3)
+    correlation = covariance / np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
+    assert np.linalg.eigvalsh(correlation).min() > 0.99
 
 
 def test_what_never_moves_has_no_noise() -> None:

@@ -12,9 +12,9 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, TransitionLikelihood
 from pbrl_ppl.modes import search, trajectory_mode
-from pbrl_ppl.modes.laplace import climb
+from pbrl_ppl.modes.laplace import climb, covariance_of, sandwich
 from pbrl_ppl.modes.search import find_mode, find_modes
-from pbrl_ppl.parameters import by_prior, differentiate
+from pbrl_ppl.parameters import by_prior, covariance_factor, differentiate
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.carts import CART, cart_scene
@@ -271,6 +271,31 @@ def test_differentiate(point, error) -> None:
     found = differentiate(function, np.array(point), steps, np.zeros(2), np.ones(2))
     np.testing.assert_allclose(found, [[3 * x**2, 0.0], [y, x]], atol=error)
     assert calls == [4]  # all columns in one call
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_covariances_of_parameters_that_nearly_depend(seed) -> None:
+    """Rounding makes none indefinite, in units from 1e-6 to 1e6."""
+    rng = np.random.default_rng(seed)
+    common, own = rng.normal(size=(2, 40, 8))
+    jacobian = common[:, :1] + 10.0 ** rng.uniform(-10, 0, 8) * own
+    jacobian *= 10.0 ** rng.uniform(-6, 6, 8)
+    precision = jacobian.T @ jacobian
+    inverse = covariance_of(precision)
+    for covariance in (inverse, sandwich(inverse, 1.5 * precision)):
+        factor = covariance_factor(covariance)
+        unit = np.sqrt(np.diag(covariance))
+        error = (factor @ factor.T - covariance) / np.outer(unit, unit)
+        np.testing.assert_allclose(error, 0.0, atol=1e-11)
+
+
+def test_covariances_are_inverses_and_sandwiches() -> None:
+    """None for a parameter without information."""
+    precision, score = np.array([[4.0, 1.0], [1.0, 3.0]]), np.array([[2.0, 0.5], [0.5, 1.0]])
+    inverse = np.linalg.inv(precision)
+    np.testing.assert_allclose(covariance_of(precision), inverse)
+    np.testing.assert_allclose(sandwich(inverse, score), inverse @ score @ inverse)
+    np.testing.assert_allclose(covariance_of(np.diag([4.0, 0.0])), np.diag([0.25, 0.0]))
 
 
 def test_recovers_the_scene_s_effect() -> None:

@@ -29,6 +29,8 @@ def test_linear_motion_has_no_error() -> None:
     errors = linearisation_errors(problem, rng.uniform(1.9, 2.1, (5, 1)), sigma)
     assert errors.shape == (5, 3)
     np.testing.assert_allclose(errors, 0.0, atol=1e-5)
+    diverged = np.full((1, 1), 1e-200)  # kg
+    assert (linearisation_errors(problem, diverged, sigma[:1]) == 0.0).all()
 
 
 @pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning")
