@@ -27,6 +27,8 @@ from pbrl_ppl.threads import in_parallel, processors
 
 #: Larger changes of a state count as divergence, in typical sizes of its coordinates.
 _FAR = 1e6
+#: Innovations beyond this many standard deviations count as divergence: squares would overflow.
+_BEYOND = 1e100
 #: Predicts next states from phi, initial states and inputs, as a simulator does.
 Engine = Callable[[Floats, Floats, Floats], Floats]
 
@@ -217,7 +219,8 @@ class TrajectoryNoise:
         Returns
         -------
         white : ndarray
-            Shape (..., transition, coordinate), dimensionless; 0 where nothing was measured.
+            Shape (..., transition, coordinate), dimensionless; 0 where nothing was measured, NaN
+            where the filter diverged.
         log_scale : ndarray
             Summed over the coordinates, shape (..., transition) as that of sigma leads.
         """
@@ -225,10 +228,13 @@ class TrajectoryNoise:
         lead = coordinates.shape[:-2]
         rows = coordinates.reshape(-1, *coordinates.shape[-2:])
         if sigma.ndim == 1:
-            return self.filtered(rows, sigma)[0].reshape(coordinates.shape), self._gains(sigma)[3]
-        sigmas = np.broadcast_to(sigma, (*lead, sigma.shape[-1])).reshape(-1, sigma.shape[-1])
-        white, log_scale = self._whitened(rows, sigmas)
-        return white.reshape(coordinates.shape), log_scale.reshape(coordinates.shape[:-1])
+            white, log_scale = self.filtered(rows, sigma)[0], self._gains(sigma)[3]
+        else:
+            sigmas = np.broadcast_to(sigma, (*lead, sigma.shape[-1])).reshape(-1, sigma.shape[-1])
+            white, log_scale = self._whitened(rows, sigmas)
+            log_scale = log_scale.reshape(coordinates.shape[:-1])
+        white = np.where(np.abs(white) < _BEYOND, white, np.nan)
+        return white.reshape(coordinates.shape), log_scale
 
     def _whitened(
         self, rows: Floats, sigmas: Floats, *, threads_from: int = 20_000

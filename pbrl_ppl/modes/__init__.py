@@ -34,6 +34,7 @@ from .search import find_mode as find_mode
 from .space import Space as Space
 from .space import constrain as constrain
 from .space import unconstrain as unconstrain
+from .trajectories import carried_mode as carried_mode
 from .trajectories import filtered_mode as filtered_mode
 from .trajectories import find_simulation_mode as find_simulation_mode
 from .trajectories import find_trajectory_mode as find_trajectory_mode

@@ -13,13 +13,14 @@ from pbrl_ppl.likelihood import (
     along_trajectories,
     corrected,
     is_filtered,
+    is_independent,
     is_simulated,
     log_posterior,
     single_transitions,
     smoothed,
     with_sensitivity,
 )
-from pbrl_ppl.modes.ladder import ladder, with_robust_covariance
+from pbrl_ppl.modes.ladder import fit_pieces, ladder, with_robust_covariance
 from pbrl_ppl.modes.laplace import FilteredMode, LocalMode, Mode, SimulatedMode, finish, profiled
 from pbrl_ppl.modes.search import find_mode
 from pbrl_ppl.parameters import change_from, inside
@@ -292,3 +293,12 @@ def tempered_mode(
         prior = tuple(median.tolist()), spread
     problem = mode.problem.with_likelihood(prior=prior)
     return with_robust_covariance(find_mode(problem, initial=mode.phi, rounds=rounds))
+
+
+def carried_mode(mode: Mode, problem: Problem) -> Mode:
+    """Return the mode of a problem near that of another one of the same parameters and data."""
+    if is_independent(problem):
+        return find_mode(problem, initial=mode.phi)
+    if is_simulated(problem):
+        return tempered_mode(fit_pieces(problem, mode.phi), problem.likelihood.prior)
+    return with_state_sensitivity(trajectory_mode(problem, mode.phi, mode.sigma))

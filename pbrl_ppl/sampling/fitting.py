@@ -15,6 +15,7 @@ from pbrl_ppl.errors import FitError, MeetingWarning, warn
 from pbrl_ppl.likelihood import Problem, is_filtered, is_independent, is_simulated
 from pbrl_ppl.modes import (
     Mode,
+    carried_mode,
     covariance_of,
     find_mode,
     find_simulation_mode,
@@ -218,7 +219,8 @@ def sample(
         joined = job.problem if cut else _joined(job.problem, *parameter_draws(job.problem, trace))
         if joined is job.problem:
             break
-        job, start, resume = replace(job, problem=joined, resume=None), None, None
+        start = start and carried_mode(job.at_mode, joined)
+        job, resume = replace(job, problem=joined, resume=None), None
     if resume is not None:
         if sizes["chain"] < job.chains:
             raise KeyboardInterrupt  # some chains have nothing new, and resume= has all of them
@@ -277,7 +279,7 @@ def _at_mode(job: SamplerRun, start: Mode | None) -> SamplerRun:
         joined = _joined(problem, mode.phi[None], mode.sigma[None])
         if joined is problem:
             return replace(job, problem=problem, mode=replace(mode, problem=problem))
-        job, start = replace(job, problem=joined), None
+        job, start = replace(job, problem=joined), start and carried_mode(mode, joined)
 
 
 def _with_robust_width(job: SamplerRun, trace: Idata) -> Idata:

@@ -14,9 +14,10 @@ from pbrl_ppl.history import from_segments
 from pbrl_ppl.likelihood import ACCELERATION, Problem, TrajectoryLikelihood, along_trajectories
 from pbrl_ppl.model import build_model, problem_in
 from pbrl_ppl.modes import Mode
+from pbrl_ppl.modes.search import find_mode
 from pbrl_ppl.physics import Physics, Simulator
 from pbrl_ppl.posterior import Fit, evaluate, from_groups, group, problem_of
-from pbrl_ppl.sampling import fit, physics_model
+from pbrl_ppl.sampling import fit, fitting, physics_model
 from pbrl_ppl.sampling.calibration import draw_truths
 from pbrl_ppl.sampling.fitting import joined_at
 from pbrl_ppl.scene import Body, Scene, Shape
@@ -183,7 +184,8 @@ def test_a_body_too_heavy_to_be_moved_is_joined_with_what_meets_it() -> None:
 
 @pytest.mark.one_stack
 @pytest.mark.filterwarnings("ignore:the draws are too few")
-def test_a_fit_finds_out_that_they_have_met() -> None:
+@pytest.mark.parametrize("given", [False, True], ids=["searched", "given a mode"])
+def test_a_fit_finds_out_that_they_have_met(given, monkeypatch) -> None:
     """A puck that bounces off a heavy one is back before it is seen again."""
     rest = {"r": 0.9, "mu_c": 0.0, "mass": 1e4}
     first = Body("a", Shape.circle(0.2), known={"r": 0.9, "mu_c": 0.0})
@@ -197,8 +199,12 @@ def test_a_fit_finds_out_that_they_have_met() -> None:
     history = from_segments(scene, start, actions, ends + 0.002 * rng.standard_normal(ends.shape))
     model = physics_model(scene, history)
     assert problem_in(model).physics.parts == (("a",), ("b",))
+    start = find_mode(problem_in(model), seed=1) if given else None
+    if given:  # all is fitted again from there
+        monkeypatch.setattr(fitting, "_SEARCHES", {})
+    sampler = {"draws": 100, "tune": 100, "chains": 2, "cores": 1, "progress": False}
     with pytest.warns(MeetingWarning, match="a, b meet"):
-        idata = fit(model, seed=1, draws=100, tune=100, chains=2, cores=1, progress=False)
+        idata = fit(model, seed=1, start=start, **sampler)
     mass = group(idata, "posterior")["mass"].values
     assert abs(mass.mean() - 2.0) < 4 * mass.std()
     assert mass.std() < 0.05

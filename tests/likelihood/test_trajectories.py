@@ -157,6 +157,7 @@ def test_the_score_of_innovations_beyond_the_numbers_is_minus_infinity(problem) 
     """A climb comes by where the filter diverges: no warning."""
     residual = 1e160 * problem.residual(PHI * 1.2)
     assert problem.likelihood.noise.score(residual, NOISE)[0] == -np.inf
+    assert np.isneginf(problem.log_density(residual, NOISE)).any()
 
 
 def test_smoothed_states_are_the_most_probable(problem) -> None:
