@@ -54,8 +54,11 @@ def autocovariance(
         for part in (by_start, by_phi, residual[..., None])
     )
     start = _orthonormal(start)
+    phi = phi / np.maximum(np.linalg.norm(phi, axis=(0, 1)), 1e-300)
     phi, last = (part - start @ (np.swapaxes(start, 1, 2) @ part) for part in (phi, last))
-    phi = _orthonormal(phi.reshape(1, pieces * rows * bodies, -1)).reshape(*last.shape[:2], -1)
+    # what initial states follow as well is left as rounding of unit columns
+    phi = _orthonormal(phi.reshape(1, pieces * rows * bodies, -1), 1.0)
+    phi = phi.reshape(*last.shape[:2], -1)
     freedom = seen.sum() - (start**2).sum() - (phi**2).sum()
     if freedom < least_freedom:
         return np.append((residual[seen] ** 2).mean(), np.zeros(rows - 1))
@@ -76,13 +79,14 @@ def autocovariance(
     return np.asarray(weight * square @ correlation / weight.sum() / (freedom - 2))
 
 
-def _orthonormal(columns: Floats, *, rank: float = 1e-6) -> Floats:
+def _orthonormal(columns: Floats, least: float = 1e-300, *, rank: float = 1e-6) -> Floats:
     """Return orthonormal columns of the same span, shape (piece, row, rank); spare ones are 0.
 
-    ``rank``: directions with a smaller singular value, relative to the largest, change no residual.
+    ``rank``: directions with a smaller singular value, relative to the largest or to ``least``,
+    change no residual.
     """
     u, s, _ = np.linalg.svd(columns, full_matrices=False)
-    kept = s > rank * s.max(axis=1, keepdims=True, initial=1e-300)
+    kept = s > rank * s.max(axis=1, keepdims=True, initial=least)
     return np.asarray((u * kept[:, None])[:, :, kept.any(axis=0)])
 
 

@@ -37,3 +37,15 @@ def test_too_few_measurements_count_as_white() -> None:
     seen = np.ones((1, 3, 1), dtype=bool)
     found = autocovariance(residual, seen, line, np.zeros((1, 3, 1, 0)))
     assert found == pytest.approx([0.02, 0.0, 0.0])
+
+
+def test_parameters_that_initial_states_follow_take_nothing() -> None:
+    """Their derivatives are left as rounding; in any unit."""
+    rng, pieces, rows = np.random.default_rng(4), 8, 12
+    seen = np.ones((pieces, rows, 1), dtype=bool)
+    lines = np.broadcast_to(np.column_stack([np.ones(rows), np.arange(rows)]), (pieces, rows, 2))
+    left = rng.standard_normal((pieces, rows, 1))
+    by_phi = lines @ np.array([[1.0, 0.0], [0.1, 1e9]])
+    lines, by_phi = lines[:, :, None], by_phi[:, :, None]
+    found = autocovariance(left, seen, lines, by_phi)
+    assert found == pytest.approx(autocovariance(left, seen, lines, by_phi[..., :0]), rel=1e-9)
