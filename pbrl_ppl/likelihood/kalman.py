@@ -70,7 +70,7 @@ def _take(p: Floats, i: int, sensor: float, gain: Floats) -> float:
             p[a, a] = 0.0
         for b in range(a):
             p[b, a] = p[a, b]
-    for a in range(d):  # the differences, where the measurement says far more than was known
+    for a in range(d):  # differences lose all digits if the sensor is far better than was known
         p[a, i] = p[i, a] = gain[a] * sensor
     return variance
 

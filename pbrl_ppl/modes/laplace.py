@@ -34,7 +34,7 @@ from pbrl_ppl.state import Floats
 STALLED = 0.02
 #: Rounds of a climb, at most.
 ROUNDS = 40
-#: Root of a precision of nothing.
+#: Root of a precision up to which a parameter has no information.
 _NONE = 1e-150
 #: Precision of a uniform angle: 1 / variance (1/rad^2).
 _CIRCLE = 3.0 / np.pi**2
