@@ -54,10 +54,10 @@ def autocovariance(
         for part in (by_start, by_phi, residual[..., None])
     )
     start = _orthonormal(start)
-    phi = phi / np.maximum(np.linalg.norm(phi, axis=(0, 1)), 1e-300)
+    # what initial states follow as well is left as rounding
+    least = max(1e-6 * float(np.linalg.norm(phi)), 1e-300)
     phi, last = (part - start @ (np.swapaxes(start, 1, 2) @ part) for part in (phi, last))
-    # what initial states follow as well is left as rounding of unit columns
-    phi = _orthonormal(phi.reshape(1, pieces * rows * bodies, -1), 1.0)
+    phi = _orthonormal(phi.reshape(1, pieces * rows * bodies, -1), least)
     phi = phi.reshape(*last.shape[:2], -1)
     freedom = seen.sum() - (start**2).sum() - (phi**2).sum()
     if freedom < least_freedom:
