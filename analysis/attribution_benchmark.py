@@ -5,21 +5,12 @@
     python analysis/attribution_benchmark.py --quick --method laplace    # a tenth of the cases
     python analysis/attribution_benchmark.py --only cart-linear_drag --verbose
     python analysis/attribution_benchmark.py --seed 1 --list             # other cases
-    python analysis/attribution_benchmark.py --measured --only pendulum-torque   # measured only
-    python analysis/attribution_benchmark.py --measured --folder runs/arm        # your recording
-    python analysis/attribution_benchmark.py --measured --write-page             # On hardware
 
 Box2D and MuJoCo make the data. A seed draws the cases: bodies (carts on a wheel, free boxes,
 pendulums, pairs, double pendulums), recordings, noises, and a hidden effect: one of the catalogue,
 one removed from it, one outside it, or none; some logs are nonsense. An oracle that knows the
 effect tests which cases are detectable; scores are over those. Every tenth case uses the loop's
-default sampler, the others Laplace's approximation.
-
-``--measured`` runs the loop on the measured recordings beside the project, one after another, each
-in its own process, and prints a Markdown table of names and held-out errors beside those of
-independent fits. One that crashes or takes longer than ``--limit`` is a row with its reason. Each
-result is a JSON file and a picture in the ``--cache`` (out/measured by default); those of the same
-code are kept. After Ctrl-C the table and the page have what is there.
+default sampler, the others Laplace's approximation. Measured recordings are on `board.py`.
 """
 
 from __future__ import annotations
@@ -33,25 +24,20 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 from attribution.cases import METHODS, Case, a_tenth, all_cases
-from attribution.measured import MEASURED, SHARED, Recording, Result, run
-from attribution.measured_page import PAGE, RESULTS, kept_results, markdown_table, write_page
 from attribution.one_case import Row, about, cache_path, load, run_case
 from attribution.scores import score
 from attribution.words import plain, score_table, table, told
 from rich.console import Console
-from running import apart, begin_worker, part, save, sources
+from running import begin_worker, part, save, sources
 
 #: Seconds that a case takes a worker, before any has been timed.
 SECONDS_A_CASE = 25.0
 #: Cases after which a worker restarts: compiled models add up in its memory.
 CASES_A_WORKER = 20
-#: Seconds after which a case, and a measured recording, fail.
-CASE_LIMIT, RECORDING_LIMIT = 180, 300
 _WIDTH = 170
 
 
@@ -163,15 +149,6 @@ def parsed() -> argparse.Namespace:
     )
     parser.add_argument("--quick", action="store_true", help="a tenth of the cases")
     parser.add_argument("--only", nargs="+", metavar="NAME", help="cases with this in their name")
-    parser.add_argument("--measured", action="store_true", help="measured recordings, and no cases")
-    parser.add_argument(
-        "--folder", type=Path, metavar="PATH",
-        help="with --measured: a recording of your own, scene.toml, train.csv and test.csv",
-    )  # fmt: skip
-    parser.add_argument(
-        "--write-page", action="store_true",
-        help="with --measured: keep results in the docs, and write their page On hardware",
-    )  # fmt: skip
     parser.add_argument("--list", action="store_true", help="print the cases' names and stop")
     parser.add_argument("--seed", type=int, default=0, help="another seed draws other cases")
     parser.add_argument("--draws", type=int, help="posterior draws a chain; the loop's by default")
@@ -185,31 +162,16 @@ def parsed() -> argparse.Namespace:
         help="run the I-th of N parts; all write to the same --cache, and --json has what is there",
     )  # fmt: skip
     parser.add_argument(
-        "--limit", type=int,
-        help=f"seconds after which a case ({CASE_LIMIT} by default) or a measured recording"
-        f" ({RECORDING_LIMIT}) fails; 0 is none",
-    )  # fmt: skip
+        "--limit", type=int, default=180, help="seconds after which a case fails; 0 is none"
+    )
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--cache", type=Path, help="folder that keeps each case's result")
     parser.add_argument("--json", metavar="FILE", help="write scores and rows; - is stdout")
     parser.add_argument("--verbose", action="store_true", help="tell each case in full")
     options = parser.parse_args()
-    if options.limit is None:
-        options.limit = RECORDING_LIMIT if options.measured else CASE_LIMIT
     for name, least in (("workers", 1), ("limit", 0), ("seed", 0)):
         if getattr(options, name) < least:
             parser.error(f"--{name} is {getattr(options, name)}, expected {least} or more")
-    if (options.folder or options.write_page) and not options.measured:
-        parser.error("--folder and --write-page are of measured recordings; add --measured")
-    if options.folder and (options.write_page or options.only):
-        parser.error(
-            "--folder is one recording, not on the page; leave out --only and --write-page"
-        )
-    if options.folder and not (options.folder / "scene.toml").is_file():
-        parser.error(
-            f"--folder {options.folder} has no scene.toml, expected scene.toml, train.csv and"
-            " test.csv; `pbrl-ppl new` makes the first"
-        )
     return options
 
 
@@ -222,80 +184,10 @@ def write(name: str | None, found: Mapping[str, object]) -> None:
         Path(name).write_text(text + "\n")
 
 
-def recordings(options: argparse.Namespace) -> list[Recording]:
-    """Return the requested measured recordings."""
-    if options.folder:
-        return [Recording(options.folder.resolve().name, options.folder)]
-    only = options.only or [""]
-    return [each for each in MEASURED if any(part in each.name for part in only)]
-
-
-def measure(options: argparse.Namespace) -> None:
-    """Run the loop on measured recordings, save each result, and print their table."""
-    chosen = recordings(options)
-    if not chosen:
-        sys.exit(f"no recording has {' or '.join(options.only)} in its name; --list prints them")
-    if options.list:
-        print("\n".join(each.name for each in chosen))
-        return
-    if options.write_page and not SHARED.is_dir():
-        sys.exit(f"--write-page needs the independent fits of the recordings at {SHARED}")
-    folder = RESULTS if options.write_page else options.cache or Path("out/measured")
-    try:
-        for recording in chosen:
-            run_once(recording, folder / f"{recording.name}.json", options)
-    except KeyboardInterrupt:
-        say("interrupted")
-    shown = chosen if options.folder else list(MEASURED)
-    found = kept_results(folder, shown)
-    if options.json != "-":
-        print(markdown_table(shown, found))
-    write(options.json, {name: asdict(result) for name, result in found.items()})
-    if options.write_page:
-        write_page()
-        say(f"wrote {PAGE}")
-
-
-def run_once(recording: Recording, path: Path, options: argparse.Namespace) -> None:
-    """Run the loop on a recording and save the result, unless one of the same code is there."""
-    if not recording.folder.is_dir():
-        say(f"{recording.name}: no recording at {recording.folder}")
-    elif is_fresh(Result.load(path), options):
-        say(f"{recording.name}: kept in {path}; delete it to run the loop again")
-    else:
-        say(f"{recording.name}: running")
-        result, picture = run_apart(recording, options)
-        result.save(path)
-        path.with_suffix(".png").unlink(missing_ok=True)
-        if picture is not None:
-            path.with_suffix(".png").write_bytes(picture)
-        say(f"{recording.name}: {result.error or result.verdict}, {result.seconds:.0f} s")
-
-
-def run_apart(recording: Recording, options: argparse.Namespace) -> tuple[Result, bytes | None]:
-    """Run the loop on a recording in its own process; one that does not end gives a failure."""
-    method, begin = options.method or "laplace", time.monotonic()
-    progress = say if options.verbose else None
-    try:
-        return apart(run, recording, options.seed, method, progress, limit=options.limit)
-    except (TimeoutError, ChildProcessError) as error:
-        seconds = time.monotonic() - begin
-        return Result.failed(recording, options.seed, method, error, seconds), None
-
-
-def is_fresh(kept: Result | None, options: argparse.Namespace) -> bool:
-    """Return whether a stored result has this code and these settings."""
-    now = (options.seed, options.method or "laplace", sources())
-    return kept is not None and kept.error is None and (kept.seed, kept.method, kept.sources) == now
-
-
 def main() -> None:
     """Run the cases and print their table and scores."""
     options = parsed()
     console = Console(stderr=options.json == "-", width=None if sys.stdout.isatty() else _WIDTH)
-    if options.measured:
-        measure(options)
-        return
     cases = chosen(options)
     if not cases:
         sys.exit(f"no case has {' or '.join(options.only)} in its name; --list prints the names")

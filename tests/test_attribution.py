@@ -422,7 +422,7 @@ def test_a_case_that_takes_too_long_is_a_failure(attribution, monkeypatch) -> No
 def settings(cache=None, **changed):
     """The command line's options."""
     usual = {"seed": 0, "draws": None, "limit": 0, "cache": cache, "workers": 1, "method": None}
-    usual |= {"part": (1, 1), "quick": False, "only": None, "measured": False, "list": False}
+    usual |= {"part": (1, 1), "quick": False, "only": None, "list": False}
     return SimpleNamespace(**usual | {"json": None, "verbose": False} | changed)
 
 

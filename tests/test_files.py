@@ -62,13 +62,11 @@ def test_a_report_json_has_its_own_posteriors(tmp_path, monkeypatch, renamed) ->
         loop = object.__new__(Loop)
         for name in ("declared", "revised"):
             object.__setattr__(loop, name, type("Fit", (), {"posterior": content}))
-        object.__setattr__(loop, "remainder", None)
         monkeypatch.setattr(Loop, "to_dict", lambda self: content)
         monkeypatch.setattr(loops, "save_posterior", lambda text, path: path.write_text(text))
         loop.save(tmp_path / "out", overwrite, page=content)
 
     save("old")
-    (tmp_path / "out" / "remainder.nc").write_text("old")
     replace, count = Path.replace, []
 
     def counted(path: Path, target: Path) -> None:

@@ -1,4 +1,4 @@
-"""Measured recordings: the script that runs the loop on them, and the page On hardware."""
+"""The board of all recordings beside the project, and the page On hardware."""
 
 import json
 import os
@@ -17,9 +17,6 @@ from pbrl_ppl.physics import Physics
 from pbrl_ppl.state import STATE
 from tests.helpers.falls import BALL, GRAVITY, fall
 from tests.helpers.places import ROOT
-
-for engine in ("Box2D", "mujoco"):
-    pytest.importorskip(engine, reason=f"{engine} makes cases; install the extra `test`")
 
 #: Drag over mass (1/s), and its mass (kg), of a sliding disc.
 RATE, MASS = 0.8, 2.0
@@ -42,10 +39,10 @@ def page(measured):
 
 
 @pytest.fixture
-def benchmark(measured):
-    import attribution_benchmark
+def board(measured):
+    import board
 
-    return attribution_benchmark
+    return board
 
 
 @pytest.fixture
@@ -78,11 +75,10 @@ def folder(tmp_path):
     return folder
 
 
-def settings(**changed):
+def settings(cache, **changed):
     """The command line's options."""
-    usual = {"folder": None, "only": None, "list": False, "write_page": False, "cache": None}
-    usual |= {"seed": 0, "method": None, "verbose": False, "json": None, "limit": 300}
-    return SimpleNamespace(**usual | changed)
+    usual = {"names": [], "limit": 300, "method": "laplace", "page": False, "raw": False}
+    return SimpleNamespace(cache=cache, **usual | changed)
 
 
 @pytest.fixture
@@ -138,29 +134,82 @@ def with_names(made, *groups):
 
 
 @pytest.mark.parametrize(
-    ("names", "right", "false", "missing"),
+    ("names", "judged", "false", "missing"),
     [
-        (["pivot_friction", "pivot_damping"], True, [], []),
-        (["pivot_friction"], True, [], ["pivot_damping"]),
-        (["pivot_friction", "angular_drag"], True, [], []),  # the same data as a law
-        (["pivot_friction", "sensor_bias"], True, [], ["pivot_damping"]),  # may be there too
-        (["constant_torque/pivot_friction"], True, [], ["pivot_damping"]),  # confounded
-        (["pivot_friction", "constant_torque"], False, ["constant_torque"], ["pivot_damping"]),
-        ([], False, [], ["pivot_friction", "pivot_damping"]),
+        (["pivot_friction", "pivot_damping"], "right", [], []),
+        (["pivot_friction", "angular_drag"], "right", [], []),  # the same data as a law
+        (["pivot_friction", "pivot_damping", "sensor_bias"], "right", [], []),  # may be there too
+        (["pivot_friction"], "partly", [], ["pivot_damping"]),
+        (["constant_torque/pivot_friction"], "partly", [], ["pivot_damping"]),  # confounded
+        (["pivot_friction", "constant_torque"], "wrong", ["constant_torque"], ["pivot_damping"]),
+        (["sensor_bias"], "missed", [], ["pivot_friction", "pivot_damping"]),
+        ([], "missed", [], ["pivot_friction", "pivot_damping"]),
     ],
 )
-def test_names_are_scored(page, result, names, right, false, missing) -> None:
+def test_names_are_judged(measured, result, names, judged, false, missing) -> None:
     recording, made = result
     made = with_names(made, *names)
-    assert page.is_right(recording, made) == right
-    assert page.false_names(recording, made) == false
-    assert page.missing_laws(recording, made) == missing
+    assert measured.judgement(recording, made) == judged
+    assert measured.false_names(recording, made) == false
+    assert measured.missing_laws(recording, made) == missing
+
+
+@pytest.mark.parametrize(
+    ("names", "expected", "judged"),
+    [
+        (["pivot_friction", "pivot_damping"], "effects-added", "unexplained"),
+        (["pivot_friction", "pivot_damping"], "effects-added, or unexplained beside", "right"),
+        (["pivot_friction"], "", "unexplained"),
+        (["pivot_friction"], "effects-added, or unexplained beside", "unexplained"),
+        (["pivot_friction", "constant_torque"], "", "wrong"),
+        (["sensor_bias"], "", "missed"),
+        ([], "", "missed"),
+    ],
+)
+def test_what_the_loop_leaves_unexplained_is_judged(
+    measured, result, names, expected, judged
+) -> None:
+    recording, made = result
+    made = replace(with_names(made, *names), verdict="unexplained")
+    assert measured.judgement(replace(recording, expected=expected), made) == judged
+
+
+def test_a_clean_recording_has_no_names(measured, result) -> None:
+    recording, made = result
+    clean = replace(recording, laws=(), also=(), expected="")
+    silent = replace(made, added=(), verdict="adequate")
+    assert measured.judgement(clean, silent) == "right"
+    assert measured.judgement(clean, made) == "wrong"
+    assert measured.judgement(clean, replace(silent, verdict="unexplained")) == "unexplained"
+    # something is there that no catalogue has
+    camera = replace(clean, outside=("camera",), also=("sensor_bias",), expected="unexplained")
+    assert measured.judgement(camera, silent) == "missed"
+    assert measured.judgement(camera, replace(silent, verdict="unexplained")) == "right"
+    assert measured.judgement(camera, with_names(made, "sensor_bias")) == "right"
+
+
+def test_a_name_on_another_body_is_wrong(measured, result) -> None:
+    recording, made = result
+    made = with_names(made, "pivot_friction", "pivot_damping")
+    assert measured.judgement(replace(recording, body="arm"), made) == "right"
+    assert measured.judgement(replace(recording, body="leg"), made) == "wrong"
+
+
+def test_without_a_verdict_a_result_is_late_or_failed(measured, result) -> None:
+    recording, made = result
+    made = with_names(made, "pivot_friction", "pivot_damping")
+    assert measured.judgement(recording, made, limit=12) == "right"
+    assert measured.judgement(recording, made, limit=11) == "late"
+    late = replace(made, verdict="late", error="no verdict in 300 s")
+    assert measured.judgement(recording, late) == "late"
+    assert measured.judgement(recording, replace(late, verdict="failed")) == "failed"
+    assert measured.judgement(recording, replace(made, verdict="not-converged")) == "failed"
 
 
 def test_bars_by_hand(page, result) -> None:
     """Errors at most 1.25 times the best law's 0.03 rad, at most 60 s; a failure passes none."""
     recording, made = result
-    good = with_names(made, "pivot_friction")
+    good = with_names(made, "pivot_friction", "pivot_damping")
     assert page.ratios(recording, good) == pytest.approx([1.2])
     assert page.bars(recording, good) == (True, True, True)
     for after in (0.038, None, np.inf):
@@ -171,15 +220,17 @@ def test_bars_by_hand(page, result) -> None:
     assert page.bars(recording, broken) == (False, False, False)
     others = [recording, replace(recording, name="leg"), replace(recording, name="head")]
     told = page.summary(others, {"arm": good, "leg": broken})
-    assert told.startswith("Of 3 recordings 2 were run. Right names and no false one: 1.")
+    assert told.startswith("Of 3 recordings 2 were run: 1 right, 1 failed.")
+    assert told.endswith("law in the catalogue: 1. At most 60 s: 1.")
 
 
 def test_failures_by_hand(page, result) -> None:
     recording, made = result
-    friction, _, bias = made.added
     assert page.failures(recording, made) == ["False name: `constant_torque`."]
+    recording = replace(recording, laws=("pivot_friction",))
+    friction, _, bias = made.added
     assert page.failures(recording, replace(made, added=(friction, bias))) == []
-    assert page.failures(recording, replace(made, added=())) == ["No right name."]
+    assert page.failures(recording, replace(made, added=())) == ["Not right: missed."]
     (far,) = page.failures(
         recording, replace(made, added=(friction,), errors=({**made.errors[0], "after": 0.06},))
     )
@@ -191,13 +242,11 @@ def test_failures_by_hand(page, result) -> None:
     assert off.endswith("0.130 to 0.170, does not hold the 0.200 of the independent fit.")
     (broken,) = page.failures(recording, replace(made, error="PbrlError: no way"))
     assert broken == "The loop failed: PbrlError: no way."
-    # a recording of a user's own: nothing is known of what is there
-    assert page.failures(replace(recording, laws=(), also=(), ahead=(), sizes={}), made) == []
 
 
 def test_a_table_has_a_row_a_recording(page, result) -> None:
     recording, made = result
-    own = replace(recording, name="own", laws=(), also=(), ahead=())
+    own = replace(recording, name="own", laws=("pivot_friction", "constant_torque"), ahead=())
     others = [replace(recording, name=name) for name in ("leg", "head")]
     broken = replace(made, verdict="failed", added=(), errors=(), error="a | b\nc", seconds=300)
     found = {"arm": made, "head": broken, "own": made}
@@ -206,12 +255,12 @@ def test_a_table_has_a_row_a_recording(page, result) -> None:
     assert {line.count("|") for line in table} == {9}
     arm, leg, head, own_row = table[2:]
     assert "`pivot_friction` of arm: torque 0.150 (0.130 to 0.170) N m" in arm
-    assert "| **no** | 0.0900 → 0.0360 rad at 0.2 s: 1.20 times |" in arm
+    assert "| **wrong** | 0.0900 → 0.0360 rad at 0.2 s: 1.20 times |" in arm
     assert arm.endswith("| 0.0900 → 0.0300 rad at 0.2 s | effects-added | 12 |")
     assert leg.endswith("| not run | – | – | 0.0900 → 0.0300 rad at 0.2 s | – | – |")
-    assert "| a / b c | **no** | – |" in head
+    assert "| a / b c | **failed** | – |" in head
     assert head.endswith("rad at 0.2 s | **failed** | **300** |")
-    assert "| – | 0.0900 → 0.0360 rad at 0.2 s | – | effects-added | 12 |" in own_row
+    assert "| right | 0.0900 → 0.0360 rad at 0.2 s | – | effects-added | 12 |" in own_row
 
 
 def test_a_page_is_written_between_its_markers_again_and_again(page, result, tmp_path) -> None:
@@ -234,7 +283,7 @@ def test_a_page_is_written_between_its_markers_again_and_again(page, result, tmp
 
 
 def test_the_page_shows_the_results_beside_it(measured, page, tmp_path) -> None:
-    """Made again of the same results it is the same: `--write-page` was run on what is there."""
+    """Made again of the same results it is the same: `--page` was run on what is there."""
     if not measured.SHARED.is_dir():
         pytest.skip(f"the independent fits are not at {measured.SHARED}")
     shutil.copytree(page.RESULTS, tmp_path / "hardware")
@@ -245,28 +294,150 @@ def test_the_page_shows_the_results_beside_it(measured, page, tmp_path) -> None:
         assert picture.stat().st_size <= 60_000
 
 
-def test_a_folder_is_run_once(benchmark, measured, result, folder, tmp_path, monkeypatch) -> None:
-    """Until the code, the seed or the method is another; a failure is tried again."""
-    _, made = result
+@pytest.fixture
+def runs(board, result, folder, monkeypatch):
+    """Recordings `arm` and `leg`, whose loops end at once, and what was run of them."""
+    recording, made = result
+    here = tuple(replace(recording, name=name, folder=folder) for name in ("arm", "leg"))
     runs = []
 
-    def quick(function, recording, seed, method, progress, *, limit):
-        runs.append((recording.name, seed, method))
-        now = {"sources": benchmark.sources(), "seed": seed, "method": method}
-        return replace(made, name=recording.name, **now), b"picture"
+    def apart(function, recording, path, method, within, *, limit):
+        runs.append((recording.name, method, within))
+        if recording.name == "leg":
+            raise ChildProcessError("exit code -9")
+        replace(made, name=recording.name, sources=board.sources()).save(path)
+        path.with_suffix(".png").write_bytes(b"picture")
 
-    monkeypatch.setattr(benchmark, "apart", quick)
-    given = settings(folder=folder, cache=tmp_path / "kept", json=str(tmp_path / "all.json"))
+    monkeypatch.setattr(board, "MEASURED", here)
+    monkeypatch.setattr(board, "RAW", ())
+    monkeypatch.setattr(board, "simulated", tuple)
+    monkeypatch.setattr(board, "SHARED", folder)
+    monkeypatch.setattr(board, "apart", apart)
+    return runs
+
+
+def shown(board, options, monkeypatch, capsys):
+    """Lines of the board."""
+    monkeypatch.setattr(board, "parsed", lambda: options)
+    board.main()
+    return capsys.readouterr().out.splitlines()
+
+
+def test_the_board_has_a_line_a_recording(board, runs, monkeypatch, tmp_path, capsys) -> None:
+    """The recordings after one that crashes are run all the same."""
+    arm, leg, total = shown(board, settings(tmp_path), monkeypatch, capsys)
+    assert arm.split()[:5] == ["arm", "wrong", "effects-added", "12", "s"]
+    assert arm.endswith("pivot_friction of arm, constant_torque of arm, sensor_bias of arm")
+    assert leg.split()[:3] == ["leg", "failed", "failed"]
+    assert leg.endswith("ChildProcessError: exit code -9")
+    assert total == "2 of 2 recordings: 1 wrong, 1 failed; 12 s"
+    assert runs == [("arm", "laplace", 300), ("leg", "laplace", 300)]
+
+
+def test_a_recording_is_run_once(board, runs, monkeypatch, tmp_path, capsys) -> None:
+    """Until the code or the method is another; a failure is tried again."""
     for _ in range(2):
-        benchmark.measure(given)
-    assert runs == [("disc", 0, "laplace")]
-    assert (tmp_path / "kept" / "disc.png").read_bytes() == b"picture"
-    assert json.loads((tmp_path / "all.json").read_text())["disc"]["verdict"] == "effects-added"
-    benchmark.measure(SimpleNamespace(**vars(given) | {"seed": 1}))
-    broken = replace(measured.Result.load(tmp_path / "kept" / "disc.json"), error="why")
-    broken.save(tmp_path / "kept" / "disc.json")
-    benchmark.measure(SimpleNamespace(**vars(given) | {"seed": 1}))
-    assert runs[1:] == [("disc", 1, "laplace")] * 2
+        shown(board, settings(tmp_path), monkeypatch, capsys)
+    assert [name for name, *_ in runs] == ["arm", "leg", "leg"]
+    shown(board, settings(tmp_path, names=["ar"], method="importance"), monkeypatch, capsys)
+    monkeypatch.setattr(board, "sources", lambda: "other")
+    shown(board, settings(tmp_path, names=["arm"]), monkeypatch, capsys)
+    assert [name for name, *_ in runs[3:]] == ["arm", "arm"]
+    # a verdict after the limit is late, and needs no run
+    (line, _) = shown(board, settings(tmp_path, names=["arm"], limit=5), monkeypatch, capsys)
+    assert line.split()[:3] == ["arm", "late", "effects-added"]
+    assert len(runs) == 5
+
+
+def test_a_late_recording_is_run_again_with_more_time(
+    board, runs, monkeypatch, tmp_path, capsys
+) -> None:
+    def apart(*given, limit):
+        runs.append(limit)
+        raise TimeoutError("no end")
+
+    monkeypatch.setattr(board, "apart", apart)
+    times = iter([0.0, 10.0, 10.0, 30.0])
+    monkeypatch.setattr(board, "children", lambda: next(times))
+    for limit in (10, 10, 20):
+        options = settings(tmp_path, names=["arm"], limit=limit)
+        line, total = shown(board, options, monkeypatch, capsys)
+        assert line.split()[:3] == ["arm", "late", "late"]
+        assert line.endswith(f"no verdict in {limit} s")
+    assert runs == [100, 200]
+    assert total == "1 of 1 recordings: 1 late; 20 s"
+
+
+def test_a_process_ends_at_its_processor_time(board, measured, folder, tmp_path) -> None:
+    """Imports take longer than a second."""
+    options = settings(tmp_path, limit=1)
+    board.run_apart(measured.Recording("disc", folder), tmp_path / "disc.json", options)
+    result = measured.Result.load(tmp_path / "disc.json")
+    assert (result.verdict, result.error) == ("late", "no verdict in 1 s")
+    assert 0.0 < result.seconds < 60.0
+
+
+def test_the_page_is_made_by_the_board(board, page, runs, monkeypatch, tmp_path, capsys) -> None:
+    """Results of measured recordings, with pictures, are kept beside it."""
+    path = tmp_path / "hardware.md"
+    path.write_text(f"{page.BEGIN}\n{page.END}\n")
+    monkeypatch.setattr(board, "RESULTS", path.with_suffix(""))
+    monkeypatch.setattr(board, "write_page", lambda: page.write_page(path, board.MEASURED))
+    shown(board, settings(tmp_path / "cache", page=True), monkeypatch, capsys)
+    assert (tmp_path / "hardware" / "arm.png").read_bytes() == b"picture"
+    text = path.read_text()
+    assert "Of 2 recordings 2 were run: 1 wrong, 1 failed." in text
+    assert "ChildProcessError: exit code -9" in text
+
+
+def test_without_recordings_the_board_says_so(board, runs, monkeypatch, tmp_path, capsys) -> None:
+    monkeypatch.setattr(board, "parsed", lambda: settings(tmp_path, names=["tail"]))
+    with pytest.raises(SystemExit, match="no recording has tail in its name"):
+        board.main()
+    monkeypatch.setattr(board, "SHARED", tmp_path / "nowhere")
+    with pytest.raises(SystemExit) as ended:
+        board.main()
+    assert ended.value.code == 2
+    assert capsys.readouterr().err.startswith("the recordings are not part of the project")
+
+
+def test_all_recordings_beside_the_project_are_on_the_board(board, measured) -> None:
+    """Each folder and each raw file, with laws that the catalogue or an actuator has."""
+    if not measured.SHARED.is_dir():
+        pytest.skip(f"no recordings at {measured.SHARED}")
+    every = board.chosen(settings(None))
+    assert len({each.name for each in every}) == len(every)
+    assert all(each.is_there for each in every)
+    told = {each.folder for each in every}
+    folders = {path.parent for path in measured.SHARED.glob("*/**/scene.toml")}
+    assert folders <= told
+    lines = (measured.SHARED / "raw" / "README.md").read_text().splitlines()
+    assert sum(line.startswith("| `") for line in lines) == len(board.RAW)
+    catalogue = {effect.name for effect in pp.catalogue} | {"pwm_dead_zone"}
+    assert all(each.right <= catalogue for each in every)
+    (pair,) = (each for each in every if each.name == "pair-linear-drag")
+    assert (pair.laws, pair.body) == (("linear_drag",), "desk")
+
+
+def test_a_raw_log_is_read_as_a_new_user_would(measured, folder) -> None:
+    """By one command and one edit of the scene that it writes."""
+    from attribution.raw import Raw
+
+    table = pd.read_csv(folder / "test.csv")
+    columns = {"x": "px", "y": "py", "theta": "yaw", "time": "t"}
+    table[["trajectory", *columns]].rename(columns=columns).to_csv(folder / "log.csv", index=False)
+    options = ("--columns", "x=px,y=py,theta=yaw,time=t", "--top", "--body", "disc=circle:0.1")
+    log = Raw(
+        "disc", folder, train="log.csv", new=options,
+        edits=(("# known = { mass", "known = { mass = 2.0 }"),), more="[noise]\nx = 0.001",
+    )  # fmt: skip
+    scene, train, test = log.load()
+    assert (dict(scene.bodies[0].known), dict(scene.noise)) == ({"mass": 2.0}, {"x": 0.001})
+    assert (train.n_trajectories, test) == (4, None)
+    with pytest.raises(ValueError, match="no line that begins 'anchor_a'"):
+        replace(log, edits=(("anchor_a", ""),)).load()
+    with pytest.raises(ValueError, match=r"^units: .* is none of x"):
+        replace(log, new=(*options, "--units", "x=m/54")).load()
 
 
 def test_forecasts_from_fitted_initial_states_by_hand(measured) -> None:
@@ -304,7 +475,7 @@ def test_errors_of_an_independent_fit_are_those_of_its_parameters(measured) -> N
         "pivot_damping_coefficient": viscous * inertia,
         "pivot_friction_torque": dry * inertia,
     }
-    scene, train, test = measured.load_recording(recording)
+    scene, train, test = recording.load()
     by_name = {effect.name: effect for effect in pp.catalogue}
     added = [by_name[name].on("arm") for name in ("pivot_damping", "pivot_friction")]
     problem = Problem.of(Physics.declare(scene, added, substeps=20, threads=1), train)
@@ -316,75 +487,26 @@ def test_errors_of_an_independent_fit_are_those_of_its_parameters(measured) -> N
         assert found == {"theta": pytest.approx(ahead.best, rel=0.03)}
 
 
-def test_recordings_that_are_not_there_are_left_out(
-    benchmark, result, tmp_path, monkeypatch, capsys
-) -> None:
-    recording, _ = result
-    monkeypatch.setattr(benchmark, "MEASURED", (recording, replace(recording, name="leg")))
-    said = []
-    monkeypatch.setattr(benchmark, "say", said.append)
-    benchmark.measure(settings(only=["ar"], cache=tmp_path))
-    assert [each.partition(" at ")[0] for each in said] == ["arm: no recording"]
-    assert capsys.readouterr().out.count("not run") == 2
-    with pytest.raises(SystemExit, match="no recording has tail in its name"):
-        benchmark.measure(settings(only=["tail"]))
-
-
-def test_a_process_that_does_not_end_or_crashes_is_told(benchmark) -> None:
-    assert benchmark.apart(abs, -3, limit=0) == 3
+def test_a_process_that_does_not_end_or_crashes_is_told(board) -> None:
+    assert board.apart(abs, -3, limit=0) == 3
     with pytest.raises(TimeoutError, match="no end after 1 s; allow more with --limit"):
-        benchmark.apart(time.sleep, 60, limit=1)
+        board.apart(time.sleep, 60, limit=1)
     with pytest.raises(ChildProcessError, match="ended with exit code 3"):
-        benchmark.apart(os._exit, 3, limit=0)
+        board.apart(os._exit, 3, limit=0)
 
 
-@pytest.mark.parametrize("error", [TimeoutError("no end"), ChildProcessError("exit code -9")])
-def test_a_recording_that_does_not_end_or_crashes_is_a_row(
-    benchmark, result, folder, tmp_path, monkeypatch, capsys, error
-) -> None:
-    """The recordings after it are run all the same."""
-    recording, made = result
-    here = [replace(recording, name=name, folder=folder) for name in ("arm", "leg")]
-
-    def apart(function, one, *given, limit):
-        assert limit == 300
-        if one.name == "arm":
-            raise error
-        return replace(made, name=one.name), b"picture"
-
-    monkeypatch.setattr(benchmark, "MEASURED", here)
-    monkeypatch.setattr(benchmark, "apart", apart)
-    benchmark.measure(settings(cache=tmp_path))
-    arm, leg = capsys.readouterr().out.splitlines()[2:]
-    assert f"| {type(error).__name__}: {error} | **no** |" in arm
-    assert "| effects-added | 12 |" in leg
-    kept = benchmark.Result.load(tmp_path / "arm.json")
-    assert kept.error == f"{type(error).__name__}: {error}"
-
-
-def test_what_is_there_is_shown_after_an_interruption(
-    benchmark, result, folder, tmp_path, monkeypatch, capsys
-) -> None:
-    recording, _ = result
-
-    def apart(*given, limit):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(benchmark, "MEASURED", [replace(recording, folder=folder)])
-    monkeypatch.setattr(benchmark, "apart", apart)
-    benchmark.measure(settings(cache=tmp_path))
-    assert "| not run |" in capsys.readouterr().out
-
-
-def test_a_failure_is_a_result(measured, folder) -> None:
+def test_a_failure_is_a_result(measured, folder, tmp_path) -> None:
     (folder / "test.csv").unlink()
-    result, picture = measured.run(measured.Recording("disc", folder))
-    assert (result.verdict, picture) == ("failed", None)
+    measured.run(measured.Recording("disc", folder), tmp_path / "disc.json")
+    result = measured.Result.load(tmp_path / "disc.json")
+    assert result.verdict == "failed"
     assert result.error.startswith("FileNotFoundError")
 
 
 @pytest.mark.slow
-def test_a_simulated_folder_is_run_as_a_measured_one(measured, folder, monkeypatch) -> None:
+def test_a_simulated_folder_is_run_as_a_measured_one(
+    measured, folder, monkeypatch, tmp_path
+) -> None:
     """Errors told are those of the loop's own models; its drag is 1.6 kg/s."""
     loops = []
 
@@ -394,8 +516,10 @@ def test_a_simulated_folder_is_run_as_a_measured_one(measured, folder, monkeypat
 
     measured_revise = measured.close_loop
     monkeypatch.setattr(measured, "close_loop", kept)
-    own = measured.Recording("disc", folder)
-    result, picture = measured.run(own)
+    own = measured.Recording("disc", folder, about="A disc.")
+    measured.run(own, tmp_path / "disc.json")
+    result = measured.Result.load(tmp_path / "disc.json")
+    picture = (tmp_path / "disc.png").read_bytes()
     assert (result.error, result.verdict) == (None, "effects-added")
     (drag,) = result.added
     assert drag["effect"] == "linear_drag"
@@ -414,7 +538,7 @@ def test_a_simulated_folder_is_run_as_a_measured_one(measured, folder, monkeypat
     assert place["after"] < 0.1 * place["before"]
     # none of the held-out trajectories is as long as 3 s
     asked = replace(own, ahead=(measured.Ahead(0.5, "position"), measured.Ahead(3.0, "angle")))
-    train, test = measured.load_recording(own)[1:]
+    train, test = own.load()[1:]
     half, long = measured.errors_ahead(asked, found, train, test)
     assert half["after"] < place["after"] * 3
     assert long["before"] is None and long["after"] is None
@@ -429,11 +553,11 @@ def test_recordings_load_with_the_coordinates_that_are_used(measured) -> None:
         pytest.skip(f"no recordings at {measured.SHARED}")
     assert len({each.name for each in measured.MEASURED}) == len(measured.MEASURED)
     for recording in there:
-        scene, train, test = measured.load_recording(recording)
+        scene, train, test = recording.load()
         for history in (train, test):
             observed = np.isfinite(history.dataset["observed"].to_numpy()).any(axis=(0, 1, 2))
             names = {name for name, seen in zip(STATE, observed, strict=True) if seen}
-            assert {"theta"} <= names
+            assert names & {"theta", "y"}
             if recording.coordinates == ("theta",):
                 assert names <= {"theta", "omega"}  # x, y, vx and vy follow from the hinge
         longest = int(test.dataset["n_rows"].min()) - 1
@@ -444,13 +568,14 @@ def test_recordings_load_with_the_coordinates_that_are_used(measured) -> None:
 
 
 @pytest.mark.long
-def test_a_measured_recording_is_run(measured) -> None:
+def test_a_measured_recording_is_run(measured, tmp_path) -> None:
     """Angle and torque alone; without friction an independent fit is off by 0.086 rad."""
     (recording,) = (each for each in measured.MEASURED if each.name == "pendulum-torque")
     if not recording.folder.is_dir():
         pytest.skip(f"no recording at {recording.folder}")
-    result, picture = measured.run(recording)
-    assert result.error is None and picture is not None
+    measured.run(recording, tmp_path / "arm.json")
+    result = measured.Result.load(tmp_path / "arm.json")
+    assert result.error is None and (tmp_path / "arm.png").is_file()
     (row,) = result.errors
     assert 0.05 < row["before"] < 0.2
     assert row["after"] <= row["before"]

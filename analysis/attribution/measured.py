@@ -1,9 +1,10 @@
-"""Measured recordings, errors of independent fits, and results of the loop."""
+"""Recordings, what is physically there, and results of the loop with their judgement."""
 
 from __future__ import annotations
 
 import json
 import re
+import resource
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -19,7 +20,7 @@ from running import sources
 
 import pbrl_ppl as pp
 from attribution.fitted_initial_states import forecast_errors
-from pbrl_ppl.criticism import Loop, close_loop
+from pbrl_ppl.criticism import NOT_CONVERGED, Loop, close_loop
 from pbrl_ppl.criticism.held_out import HeldOut, forecast
 from pbrl_ppl.criticism.refinement import checked_histories
 from pbrl_ppl.likelihood import Problem
@@ -32,9 +33,13 @@ from pbrl_ppl.state import STATE
 
 #: The recordings lie beside the project, which holds no copy.
 SHARED = Path(__file__).parents[3] / "shared"
+#: Of each loop.
+SEED = 0
+#: What the board says of a result.
+JUDGEMENTS = ("right", "partly", "missed", "wrong", "unexplained", "late", "failed")
 #: State dimensions whose errors are told together, and their unit.
 QUANTITIES = {"angle": (("theta",), "rad"), "position": (("x", "y"), "m")}
-#: The same by a reference's name.
+#: The same by a reference's name; errors of others are stated in other ways than a forecast's.
 _NAMED = {"theta": "angle"}
 _VELOCITIES = list(STATE[3:])
 
@@ -75,6 +80,8 @@ class Recording:
         Where it is.
     about, declared : str
         What was measured, and what the scene declares, one line each.
+    body : str
+        The only body on which names are right; any by default.
     coordinates : tuple of str, optional
         State dimensions that are used; all that were recorded by default.
     ahead : tuple of Ahead
@@ -99,6 +106,7 @@ class Recording:
     folder: Path
     about: str = ""
     declared: str = ""
+    body: str = ""
     coordinates: tuple[str, ...] | None = None
     ahead: tuple[Ahead, ...] = ()
     start_rows: int | None = None
@@ -118,28 +126,59 @@ class Recording:
         """The names that are right."""
         return {name for law in (*self.laws, *self.also) for name in self.names_of(law)}
 
+    @property
+    def is_there(self) -> bool:
+        """Whether its files are."""
+        return self.folder.exists()
+
+    @property
+    def inputs(self) -> tuple[Any, ...]:
+        """What the loop's result depends on beside the files: what is right does not count."""
+        return (self.coordinates,)
+
+    def load(self) -> tuple[pp.Scene, pp.History, pp.History | None]:
+        """Return scene, train and test, without velocities if these are not used."""
+        scene = pp.Scene.load(self.folder / "scene.toml")
+
+        def history(name: str) -> pp.History:
+            frame = pd.read_csv(self.folder / f"{name}.csv")
+            if self.coordinates is not None:
+                unused = [key for key in STATE if key not in self.coordinates]
+                frame = frame.assign(**dict.fromkeys(unused, np.nan))
+            return pp.History.from_dataframe(frame, scene)
+
+        return scene, history("train"), history("test")
+
 
 def with_reference(recording: Recording) -> Recording:
-    """Return a recording with the independent fits of its reference.json; itself without one."""
+    """Return a recording with the truth and the fits of its reference.json; itself without one."""
     path = recording.folder / "reference.json"
     if not path.is_file():
         return recording
     known = json.loads(path.read_text())
-    best = known.get("catalogue", known["law"])
-    law = next(name for name, own in known["steps"].items() if best.items() <= own.items())
-    rows = re.search(r"fitted by the model to (\d+) rows", known["start"])
     return replace(
         recording,
-        ahead=tuple(
-            Ahead(seconds, _NAMED[known["quantity"]], known["declared"][key], best[key], law)
-            for seconds in known["horizons_s"]
-            for key in [f"{seconds:g}"]
-        ),
-        start_rows=int(rows[1]) if rows else None,
+        **_forecasts_of(known),
         same_data=known["same_data"],
         expected=known["expected"],
         **{name: tuple(known[name]) for name in ("laws", "also", "outside")},
     )
+
+
+def _forecasts_of(known: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of a recording that a reference's independent fits give, if any."""
+    quantity = _NAMED.get(known.get("quantity", ""))
+    if quantity is None:
+        return {}
+    best = known.get("catalogue", known["law"])
+    law = next(name for name, own in known["steps"].items() if best.items() <= own.items())
+    rows = re.search(r"fitted by the model to (\d+) rows", known["start"])
+    ahead = tuple(
+        Ahead(seconds, quantity, known["declared"][key], best[key], law)
+        for seconds in known["horizons_s"]
+        for key in [f"{seconds:g}"]
+    )
+    return {"ahead": ahead, "start_rows": int(rows[1]) if rows else None}
 
 
 #: Independent fits of recordings without a reference.json are stated here; see their PROVENANCE.md.
@@ -203,6 +242,33 @@ _RECORDINGS = (
         " command; no friction, no threshold of thrust",
     ),
     Recording(
+        name="hovercraft",
+        folder=SHARED / "measured" / "hovercraft",
+        about="A palm-size hovercraft on a floor with two thrusters (EPFL, M. Pfister): motion"
+        " capture seen from above, 25 Hz, and the commanded thrusts.",
+        declared="mass, moment of inertia, thrust and lever by the lab; no drag",
+    ),
+    Recording(
+        name="rocket-coast",
+        folder=SHARED / "measured" / "rocket-coast",
+        about="A model rocket that coasts to its apogee (Erebus; RocketPy): barometric altitude"
+        " alone, 20 Hz. Train is the first part of the coast, test the rest.",
+        declared="a weighed point under gravity; no drag",
+    ),
+    Recording(
+        name="drop-basketball",
+        folder=SHARED / "measured" / "drop-basketball",
+        about="A ball that was dropped (de Silva et al. 2020): filmed, 15 Hz, one fall each for"
+        " train and test.",
+        declared="a ball under gravity; no drag",
+    ),
+    Recording(
+        name="drop-whiffleball",
+        folder=SHARED / "measured" / "drop-whiffleball",
+        about="The same of a ball with holes.",
+        declared="a ball under gravity; no drag",
+    ),
+    Recording(
         name="double-pendulum-driven",
         folder=SHARED / "data" / "real" / "double-pendulum-driven",
         about="Two arms with a motor in each hinge (DFKI double pendulum, design C.1; Wiebe et al.,"
@@ -234,7 +300,7 @@ MEASURED = tuple(map(with_reference, _RECORDINGS))
 
 @dataclass(frozen=True)
 class Result:
-    """Findings of the loop on a recording.
+    """What the loop found on a recording.
 
     Parameters
     ----------
@@ -245,16 +311,16 @@ class Result:
     seed : int
         Of the loop.
     verdict, sentence : str
-        The loop's verdict in a word and in a sentence.
+        The loop's verdict in a word and in a sentence; ``failed`` or ``late`` where it gave none.
     added : tuple of dict
         As in ``report.json``: effect, body, parameters with mean, interval and unit, and effects
         that are not separable from it.
     errors : tuple of dict
         Of each forecast: seconds, quantity, unit, before and after (root mean square).
     error : str, optional
-        Why the loop failed.
+        Why there is no verdict.
     seconds : float
-        What the loop took (s).
+        Processor time of the process until the verdict (s).
     """
 
     name: str
@@ -270,13 +336,10 @@ class Result:
     seconds: float = 0.0
 
     @classmethod
-    def failed(
-        cls, recording: Recording, seed: int, method: str, error: Exception, seconds: float
-    ) -> Result:
-        """Return the result of a loop that failed."""
-        why = f"{type(error).__name__}: {error}"
-        about = (recording.name, method, seed, sources(), pp.__version__)
-        return cls(*about, error=why, seconds=seconds)
+    def of(cls, recording: Recording, method: str, **found: Any) -> Result:
+        """Return a result by the present code, its processor time so far by default."""
+        about = (recording.name, method, SEED, sources(), pp.__version__)
+        return cls(*about, **{"seconds": time.process_time() + children()} | found)
 
     def save(self, path: Path) -> None:
         """Write the result as JSON."""
@@ -297,71 +360,110 @@ class Result:
         return tuple((each["effect"], *each["not_separable_from"]) for each in self.added)
 
 
-def load_recording(recording: Recording) -> tuple[pp.Scene, pp.History, pp.History]:
-    """Return scene, train and test, without velocities if these are not used."""
-    scene = pp.Scene.load(recording.folder / "scene.toml")
-
-    def history(name: str) -> pp.History:
-        frame = pd.read_csv(recording.folder / f"{name}.csv")
-        if recording.coordinates is not None:
-            unused = [key for key in STATE if key not in recording.coordinates]
-            frame = frame.assign(**dict.fromkeys(unused, np.nan))
-        return pp.History.from_dataframe(frame, scene)
-
-    return scene, history("train"), history("test")
+def false_names(recording: Recording, result: Result) -> list[str]:
+    """Return the added effects that are not right, and confounded with none that is."""
+    right, body = recording.right, recording.body
+    return [
+        group[0]
+        for each, group in zip(result.added, result.names, strict=True)
+        if not right & set(group) or body not in ("", each["body"])
+    ]
 
 
-def run(
-    recording: Recording,
-    seed: int = 0,
-    method: str = "laplace",
-    progress: Callable[[str], None] | None = None,
-) -> tuple[Result, bytes | None]:
-    """Run the loop on a recording.
+def missing_laws(recording: Recording, result: Result) -> list[str]:
+    """Return the laws that are physically there and were not named."""
+    named = {name for group in result.names for name in group}
+    return [law for law in recording.laws if not recording.names_of(law) & named]
+
+
+def judgement(recording: Recording, result: Result, limit: float = np.inf) -> str:
+    """Return how right a result is, one of `JUDGEMENTS`.
 
     Parameters
     ----------
     recording : Recording
-        Its folder exists.
-    seed : int
-        The same seed gives the same result.
-    method : str
-        Of the posteriors, as of ``close_loop``.
-    progress : callable, optional
-        Called with the name of each stage.
+        With what is physically there.
+    result : Result
+        The loop's. Each group of confounded effects is right if one of them is.
+    limit : float
+        Processor time (s) after which a verdict is late.
 
     Returns
     -------
-    result : Result
-        A failure too is a result.
-    picture : bytes or None
-        PNG of a held-out trajectory, measured and forecast; None of a failure.
+    str
+        ``wrong`` if a name is; ``right`` if no law is missing. ``unexplained`` if the loop says
+        that something is, beside names that are right, and this is not the expected verdict. Else
+        ``partly`` if some laws are named, and ``missed`` if none is.
     """
-    begin = time.perf_counter()
+    if result.verdict == "late" or result.seconds > limit:
+        return "late"
+    if result.error is not None or result.verdict == NOT_CONVERGED:
+        return "failed"
+    if false_names(recording, result):
+        return "wrong"
+    missing = missing_laws(recording, result)
+    some = len(missing) < len(recording.laws)
+    is_open = result.verdict == "unexplained"
+    as_expected = not missing and "unexplained" in recording.expected
+    if is_open and (some or not recording.laws) and not as_expected:
+        return "unexplained"
+    if missing:
+        return "partly" if some else "missed"
+    # of what no catalogue has, a verdict is the only trace
+    silent = not recording.laws and recording.outside and not (is_open or result.added)
+    return "missed" if silent else "right"
+
+
+def children() -> float:
+    """Return the processor time of ended child processes (s)."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def run(
+    recording: Recording,
+    path: Path,
+    method: str = "laplace",
+    limit: int = 0,
+    progress: Callable[[str], None] | None = None,
+) -> None:
+    """Run the loop on a recording and write its result, as soon as there is a verdict.
+
+    Errors of forecasts and a picture of a recording that the page shows follow.
+
+    Parameters
+    ----------
+    recording : Recording
+        Its files exist.
+    path : Path
+        The result's file (.json). The picture (.png) is beside it.
+    method : str
+        Of the posteriors, as of ``close_loop``.
+    limit : int
+        Processor time (s) after which the process ends without a verdict, and the same again for
+        the forecasts; 0 is none.
+    progress : callable, optional
+        Called with the name of each stage.
+    """
+    if limit:
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        resource.setrlimit(resource.RLIMIT_CPU, (limit, 2 * limit))
+    warnings.simplefilter("ignore")  # the result says what matters of them
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the result says what matters of them
-            scene, train, test = load_recording(recording)
-            found = close_loop(scene, train, test, seed=seed, method=method, progress=progress)
-            seconds = time.perf_counter() - begin
-            errors = errors_ahead(recording, found, train, test)
-            shown = picture(found)
-    except Exception as error:  # the other recordings are run all the same
-        seconds = time.perf_counter() - begin
-        return Result.failed(recording, seed, method, error, seconds), None
-    done = Result(
-        recording.name,
-        method,
-        seed,
-        sources(),
-        pp.__version__,
-        verdict=found.verdict,
-        sentence=verdict_in_words(found),
-        added=tuple(found.to_dict()["added"]),
-        errors=errors,
-        seconds=seconds,
-    )
-    return done, shown
+        scene, train, test = recording.load()
+        found = close_loop(scene, train, test, seed=SEED, method=method, progress=progress)
+    except Exception as error:  # it is a row of the board
+        why = f"{type(error).__name__}: {error}"
+        Result.of(recording, method, error=why).save(path)
+        return
+    sentence, added = verdict_in_words(found), tuple(found.to_dict()["added"])
+    done = Result.of(recording, method, verdict=found.verdict, sentence=sentence, added=added)
+    done.save(path)
+    if recording.about and test is not None:
+        if limit:
+            resource.setrlimit(resource.RLIMIT_CPU, (2 * limit, 2 * limit))
+        replace(done, errors=errors_ahead(recording, found, train, test)).save(path)
+        path.with_suffix(".png").write_bytes(picture(found))
 
 
 def errors_ahead(

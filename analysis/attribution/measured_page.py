@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from attribution.measured import MEASURED, QUANTITIES, Ahead, Recording, Result
+from attribution.measured import (
+    JUDGEMENTS,
+    MEASURED,
+    QUANTITIES,
+    Ahead,
+    Recording,
+    Result,
+    false_names,
+    judgement,
+    missing_laws,
+)
 from pbrl_ppl.reporting.words import number
 
 #: The page, and the folder of its results and pictures.
@@ -27,22 +38,6 @@ def kept_results(folder: Path, recordings: Iterable[Recording] = MEASURED) -> di
     return {name: result for name, result in found.items() if result is not None}
 
 
-def false_names(recording: Recording, result: Result) -> list[str]:
-    """Return the added effects that are not right, and confounded with none that is."""
-    return [group[0] for group in result.names if not recording.right & set(group)]
-
-
-def missing_laws(recording: Recording, result: Result) -> list[str]:
-    """Return the laws that are physically there and were not named."""
-    named = {name for group in result.names for name in group}
-    return [law for law in recording.laws if not recording.names_of(law) & named]
-
-
-def is_right(recording: Recording, result: Result) -> bool:
-    """Return whether right names, and no false ones, were added."""
-    return bool(result.names) and not false_names(recording, result)
-
-
 def ratios(recording: Recording, result: Result) -> list[float]:
     """Return the held-out errors over those of the best law; infinite where one is missing."""
     return [
@@ -57,29 +52,36 @@ def _ratio(row: Mapping[str, Any], best: float) -> float:
 
 
 def bars(recording: Recording, result: Result) -> tuple[bool, bool, bool]:
-    """Return whether names are right, errors as good as the best law's, and the loop quick."""
+    """Return whether it is right, errors as good as the best law's, and the loop quick."""
     own = ratios(recording, result)
     good = bool(own) and max(own) <= AS_GOOD
     quick = result.error is None and result.seconds <= QUICK
-    return is_right(recording, result), good, quick
+    return judgement(recording, result) == "right", good, quick
 
 
 def summary(recordings: Iterable[Recording], found: Mapping[str, Result]) -> str:
-    """Return a sentence: how many recordings pass each bar."""
-    names = [each for each in recordings if each.laws]
-    passed = [bars(each, found[each.name]) for each in names if each.name in found]
-    right, good, quick = (sum(own) for own in zip(*passed, strict=True)) if passed else (0, 0, 0)
+    """Return sentences: how many recordings are right, and pass each other bar."""
+    recordings = tuple(recordings)
+    there = [each for each in recordings if each.name in found]
+    judged = Counter(judgement(each, found[each.name]) for each in there)
+    passed = [bars(each, found[each.name]) for each in there]
+    _, good, quick = (sum(own) for own in zip(*passed, strict=True)) if passed else (0, 0, 0)
     return (
-        f"Of {len(names)} recordings {len(passed)} were run. Right names and no false one: {right}."
+        f"Of {len(recordings)} recordings {len(there)} were run: {counts(judged)}."
         f" Forecast errors of at most {AS_GOOD:g} times those of the best law in the catalogue:"
         f" {good}. At most {QUICK:g} s: {quick}."
     )
 
 
+def counts(judged: Mapping[str, int]) -> str:
+    """Return how often each judgement was made, those that were: ``3 right, 1 wrong``."""
+    return ", ".join(f"{judged[one]} {one}" for one in JUDGEMENTS if judged.get(one)) or "none"
+
+
 def markdown_table(recordings: Iterable[Recording], found: Mapping[str, Result]) -> str:
     """Return a table, one row per recording; bold is what does not pass a bar."""
     lines = [
-        "| recording | declared | named | right? | held-out error, declared → named | independent"
+        "| recording | declared | named | judged | held-out error, declared → named | independent"
         " fits, declared → best law | verdict | seconds |",
         "|---|---|---|---|---|---|---|---|",
     ]
@@ -97,7 +99,7 @@ def _cells(recording: Recording, result: Result | None) -> list[str]:
     )
     if result is None:
         return ["not run", "", "", best, "", ""]
-    right, _, quick = bars(recording, result)
+    judged, (right, _, quick) = judgement(recording, result), bars(recording, result)
     errors = []
     for ahead, row in _beside(recording, result):
         error = f"{_way(row['before'], row['after'])} {row['unit']} at {row['seconds']:g} s"
@@ -107,7 +109,7 @@ def _cells(recording: Recording, result: Result | None) -> list[str]:
         errors.append(error)
     return [
         "<br>".join(map(_added, result.added)) if result.error is None else _reason(result.error),
-        _bold("yes" if right else "no", right) if recording.laws else "",
+        _bold(judged, right),
         "<br>".join(errors),
         best,
         _bold(result.verdict, result.error is None),
@@ -119,11 +121,10 @@ def failures(recording: Recording, result: Result) -> list[str]:
     """Return sentences on what does not pass a bar, or differs from the independent fits."""
     if result.error is not None:
         return [f"The loop failed: {result.error}."]
-    told = []
-    if recording.laws and not any(recording.right & set(group) for group in result.names):
-        told.append("No right name.")
-    if recording.laws:
-        told += [f"False name: `{name}`." for name in false_names(recording, result)]
+    told = [f"False name: `{name}`." for name in false_names(recording, result)]
+    judged = judgement(recording, result)
+    if judged not in ("right", "wrong"):
+        told.append(f"Not right: {judged}.")
     for ahead, row in _beside(recording, result):
         if ahead.best is None:
             continue
@@ -131,7 +132,7 @@ def failures(recording: Recording, result: Result) -> list[str]:
         ratio = _ratio(row, ahead.best)
         if ratio > AS_GOOD:
             told.append(f"The {which} is {_times(ratio)} that of the best law.")
-    if recording.laws and result.seconds > QUICK:
+    if result.seconds > QUICK:
         told.append(f"It took more than {QUICK:g} s.")
     for (effect, parameter), size in recording.sizes.items():
         for each in result.added:
@@ -176,7 +177,7 @@ def _section(recording: Recording, result: Result | None, page: Path) -> str:
     """Return a recording's section: picture, declared model and findings."""
     lines = [f"## {recording.name}", "", recording.about, "", f"- Declared: {recording.declared}."]
     if recording.laws:
-        lines.append(f"- Physically there, by independent fits: {_listed(recording.laws)}.")
+        lines.append(f"- Physically there: {_listed(recording.laws)}.")
     if others := sorted(recording.right - set(recording.laws)):
         lines.append(f"- As good a name, or may be there too: {_listed(others)}.")
     if recording.outside:
@@ -200,9 +201,9 @@ def _section(recording: Recording, result: Result | None, page: Path) -> str:
         lines.append(f"{told}.")
     bad = failures(recording, result)
     lines.append(f"- **{' '.join(bad)}**" if bad else "- Passes every bar.")
-    lines.append(
-        f"- {result.seconds:.0f} s, `{result.method}`, seed {result.seed}, code {result.sources}."
-    )
+    judged = judgement(recording, result)
+    made = f"`{result.method}`, seed {result.seed}, code {result.sources}"
+    lines.append(f"- Judged: {judged}. {result.seconds:.0f} s, {made}.")
     if (page.with_suffix("") / f"{recording.name}.png").is_file():
         seen = f"{recording.name}: a held-out trajectory, measured and forecast from its start"
         lines += ["", f"![{seen}]({page.stem}/{recording.name}.png)"]

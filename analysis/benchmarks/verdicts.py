@@ -1,14 +1,12 @@
-"""Verdicts of `pbrl-ppl close-loop` on similar rigs and on all recordings beside the project.
+"""Verdicts of `pbrl-ppl close-loop` on physically similar rigs.
 
-    python analysis/benchmarks/verdicts.py similar --cache out/verdicts    # resumes after Ctrl-C
-    python analysis/benchmarks/verdicts.py recordings --cache out/verdicts
-    python analysis/benchmarks/verdicts.py similar --only cart-slope
+    python analysis/benchmarks/verdicts.py --cache out/verdicts    # resumes after Ctrl-C
+    python analysis/benchmarks/verdicts.py --only cart-slope
 
-`similar` takes the five cart recordings and turns each into those of physically similar rigs: other
-units of length, mass and time, every dimensionless number the same. Verdict, names and sizes, in
-the cart's units, must be the cart's. `recordings` runs every folder with scene.toml, train.csv and
-test.csv. Both use ``--method laplace``, one loop at a time, each in a process of its own with
-``--limit`` seconds; seconds are this machine's.
+Takes the five cart recordings beside the project and turns each into those of physically similar
+rigs: other units of length, mass and time, every dimensionless number the same. Verdict, names and
+sizes, in the cart's units, must be the cart's. Uses ``--method laplace``, one loop at a time, each
+in a process of its own with ``--limit`` seconds; seconds are this machine's.
 """
 
 from __future__ import annotations
@@ -20,6 +18,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -96,24 +95,17 @@ def row(name: str, found: dict[str, Any], scales: tuple[float, float, float] = (
 def main() -> None:
     """Run the loops and print a table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("which", choices=["similar", "recordings"])
     parser.add_argument("--only", nargs="+", metavar="NAME", help="those with this in their name")
     parser.add_argument("--limit", type=float, default=300.0, help="seconds for a loop")
     parser.add_argument("--cache", type=Path, help="folder that keeps each result")
     options = parser.parse_args()
     if not SHARED.exists():
         sys.exit("the recordings beside the project are missing")
-    folders = sorted(path.parent for path in SHARED.glob("*/**/scene.toml"))
-    jobs = [(folder, (1.0, 1.0, 1.0)) for folder in folders]
-    if options.which == "similar":
-        carts = [folder for folder in folders if folder.name.startswith("cart-")]
-        jobs = [(folder, scales) for scales in SCALES for folder in carts]
+    carts = sorted(path.parent for path in SHARED.glob("data/cart-*/scene.toml"))
     print("| recording | verdict | named | error over noise | s | processor s |")
     print("|---|---|---|---|---|---|", flush=True)
-    for folder, scales in jobs:
-        name = folder.name
-        if options.which == "similar":
-            name += " x " + " ".join(f"{scale:g}" for scale in scales)
+    for scales, folder in product(SCALES, carts):
+        name = f"{folder.name} x {' '.join(f'{scale:g}' for scale in scales)}"
         if options.only and not any(part in name for part in options.only):
             continue
         kept = options.cache and options.cache / f"{name}.json"

@@ -13,7 +13,7 @@ from typing import Any
 import typer
 
 from pbrl_ppl.cli.app import app
-from pbrl_ppl.effects import Effect, EffectParameter, catalogue
+from pbrl_ppl.effects import Command, Effect, EffectParameter, catalogue
 from pbrl_ppl.effects.effect import STAGES
 
 ROOT = Path(__file__).parents[2]
@@ -181,6 +181,12 @@ FOUND = {
     "first_order_lag": "a propeller on an arm",
     "turning_friction": "a puck that slides and turns",
 }
+#: What a recording must have for an effect, besides measurements of a dimension.
+NEEDS = {
+    "commands": "commands",
+    "places": "places that the body passes again",
+    "camera": "places from a camera",
+}
 #: Which bodies an effect suits, by the name of its condition.
 APPLIES = {
     "always": "any body that moves freely",
@@ -284,10 +290,14 @@ def effects_page(pictures: Collection[str] = ()) -> str:
         "In the formulas v is the velocity of the centroid, ω the angular velocity, u the commanded"
         " force, tau the commanded torque, m g the force on the floor, dt the sampling interval,"
         " and R(a) a rotation by the angle a.", "",
-        "| effect | stage | what it is |", "|---|---|---|",
+        "The search tries common effects first, and [unusual ones"
+        "](../explanation/decisions.md#common-laws-first) only if they explain what common ones"
+        " leave.", "",
+        "| effect | group | stage | what it is |", "|---|---|---|---|",
     ]  # fmt: skip
     text += [
-        f"| [`{effect.name}`](#{effect.name}) | {_stage(effect)} | {effect.sentence} |"
+        f"| [`{effect.name}`](#{effect.name}) | {'unusual' if effect.unusual else 'common'} |"
+        f" {_stage(effect)} | {effect.sentence} |"
         for effect in catalogue
     ]
     for stage in STAGES:
@@ -311,6 +321,12 @@ def effect_entry(effect: Effect, picture: bool = False) -> str:
         f"- Stage: {_stage(effect)}.",
         f'- In a scene: `effects = ["{effect.name}"]`.',
     ]
+    if effect.unusual:
+        text += [f"- Unusual: {effect.unusual}."]
+    needs = (*effect.needs, *["commands"] * isinstance(effect.stage, Command))
+    if needs:
+        needed = ", ".join(NEEDS.get(name, f"measurements of {name}") for name in needs)
+        text += [f"- A recording must have: {needed}."]
     if effect.name in FOUND:
         text += [f"- Found on: {FOUND[effect.name]}."]
     text += [f"- Its code: {len(_code(effect).splitlines()) - 2} lines."]

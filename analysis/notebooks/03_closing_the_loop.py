@@ -55,9 +55,9 @@ cart
 # ### The search
 #
 # Trajectories are simulated without process noise, in pieces of four rows, then longer ones. At
-# each length one linear regression gives the best subset of each size, from one to four laws: its
+# each length one linear regression gives the best subset of each size, from one to three laws: its
 # evidence after its price (nats), and the simulation error with these laws over that without. The
-# few best are refitted.
+# best are refitted. Common laws are tried first, unusual ones only if these leave more than noise.
 
 # %%
 for length in cart.search:
@@ -68,9 +68,10 @@ for length in cart.search:
 # %% [markdown]
 # ### The candidates
 #
-# A score test compares the innovations with the signature of each effect of the catalogue, after
-# projecting out the part that the declared parameters can absorb. The picture has the first
-# candidates, the strongest first. Several resemble each other; the search has decided among them.
+# A score test compares the error of the shortest pieces with the signature of each effect that the
+# search tried, after projecting out the part that the declared parameters can absorb. The picture
+# has the first candidates, the strongest first. Several resemble each other; the search has decided
+# among them.
 
 # %%
 figure = plot_candidates(cart)
@@ -80,15 +81,15 @@ figure
 # %% [markdown]
 # ### The added effect
 #
-# Its evidence by the simulation error of the longest pieces, and the share of that error that it
-# takes away: a main law takes at least a fifth. Then the rise of the expected log predictive
+# Its evidence, summed over lengths of pieces, and the share of the declared model's error on the
+# longest ones that it takes off, at least a fifth. Then the rise of the expected log predictive
 # density (elpd), to first order that of leave-one-out cross-validation.
 
 # %%
 for added in cart.added:
     print(f"{added.effect} on {added.body}: {added.sentence}")
-    kind, share = "main law" if added.main else "small correction", 100 * added.simulated_share
-    print(f"  {kind}: {added.simulated_nats:.0f} nats, {share:.0f} % of the simulation error")
+    share = 100 * added.simulated_share
+    print(f"  {added.simulated_nats:.0f} nats, {share:.0f} % off the simulation error")
     gain, se = added.elpd_difference, added.elpd_difference_se
     print(f"  elpd rises by {gain:.0f} (standard error {se:.0f})")
     for name, found in added.parameters.items():
@@ -153,8 +154,9 @@ else:
 
 # %% [markdown]
 # A real machine never equals its model exactly. Besides the added effects, read the remaining
-# residual: the verdict is `unexplained` if forecasts or accelerations still have significant
-# errors, whatever was added.
+# residual: the verdict is `unexplained` if forecasts, simulations or accelerations still have
+# significant errors, whatever was added. Hypotheses are unusual laws that would take a part of
+# these errors off: declare one to try it.
 
 # %%
 if pendulum is not None:
@@ -165,6 +167,7 @@ if pendulum is not None:
         )
         print(f"added: {added.effect} ({values}); elpd rises by {added.elpd_difference:.0f}")
     print("remains:", pendulum.unexplained.sentence if pendulum.unexplained else "nothing")
+    print("hypotheses:", [f"{one.effect} on {one.body}" for one in pendulum.hypotheses])
     print("error before:", pendulum.before.rollout_rmse)
     print("error after: ", pendulum.after.rollout_rmse)
     for name, draw in (("errors", plot_errors), ("rollout", plot_rollout)):

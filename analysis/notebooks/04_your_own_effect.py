@@ -1,9 +1,9 @@
 # %% [markdown]
 # # Writing your own effect
 #
-# The catalogue has common effects: drags, springs, delays, offsets. An effect that is particular
-# to your system takes a dozen lines: a law, its parameters with priors, and a sentence for the
-# report. You pass it as an argument; there is no registry.
+# The catalogue has effects of many rigs: drags, springs, delays, offsets. An effect that is
+# particular to your system takes a dozen lines: a law, its parameters with priors, and a sentence
+# for the report. You pass it as an argument; there is no registry.
 
 # %%
 # %matplotlib inline

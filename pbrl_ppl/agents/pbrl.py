@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
-from functools import cache
 from itertools import combinations, compress
 from typing import Any, ClassVar, Unpack, final
 
@@ -13,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from pbrl_ppl.agents.agent import Agent, AgentOptions, Revision, Task
-from pbrl_ppl.criticism import DEFAULT, Evidence, Search
+from pbrl_ppl.criticism import DEFAULT, Search, sizes_of
 from pbrl_ppl.effects import Attached, Effect, Noise, Structure, attach, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, FitError, UninformedWarning
@@ -64,54 +63,29 @@ def revise(
     """
     tried = [effect for effect in catalogue if not isinstance(effect.stage, Structure | Noise)]
     least = max(DEFAULT.search.least_nats, -np.log(level))
-    limits = replace(DEFAULT.search, least_nats=least, singles=len(tried), refits=8)
+    limits = replace(DEFAULT.search, least_nats=least, refits=8)
 
     def missing(mode: Mode) -> tuple[Attached, ...]:
         return candidates(problem.scene, mode.problem.physics.effects, tried)
 
-    @cache
-    def highest(*laws: Attached) -> Mode:
+    def highest(laws: Iterable[Attached]) -> Mode:
         return find_mode(problem.with_physics(effects=(*problem.physics.effects, *laws)), seed=seed)
 
     # priors are in units that the data show, and change with them
-    every = {(law.effect.name, law.body): law for law in missing(highest())}
-    laws = {every[one.effect, one.body]: one for one in added}
-    rivals: Mapping[Attached, tuple[Attached, ...]] = {}
-    mode = highest(*laws)
+    every = {(law.effect.name, law.body): law for law in missing(highest(()))}
+    before = {every[one.effect, one.body]: one for one in added}
+    mode = highest(before)
     error = abs(mode.problem.residual(mode.phi))
-    if not (error <= floor[:, list(problem.observations.columns)]).all():
-        found = Search(missing, replace(DEFAULT, search=limits))(highest())
-        rivals = found.confounded
-        for law, one in found.laws.items():
-            since = laws[law].transitions if law in laws else problem.segments.n
-            laws[law] = Revision(law, since, one.nats, one.share, one.confounded)
-    laws = {law: laws[law] for law in every.values() if law in laws}
-    while laws:
-        for law, kept in laws.items():
-            without = highest(*(other for other in laws if other != law))
-            worth = _evidence(without, highest(*laws), np.log(len(every)) - law.effect.log_odds)
-            laws[law] = replace(kept, attached=law, nats=worth.nats, share=worth.share)
-        lowest = min(one.nats for one in laws.values())
-        if lowest >= least:
-            break
-        # of laws that the data do not separate the earlier in the catalogue stays
-        below = min(lowest + DEFAULT.search.least_nats, least)
-        del laws[[law for law, one in laws.items() if one.nats < below][-1]]
-    for law in [one for one in rivals if one in laws]:
-        names = []
-        for rival, name in zip(rivals[law], laws[law].not_separable_from, strict=True):
-            swapped = (rival if one == law else one for one in laws)
-            if rival not in laws and _evidence(highest(*swapped), highest(*laws)).nats < least:
-                names.append(name)
-        laws[law] = replace(laws[law], not_separable_from=tuple(names))
-    return tuple(sorted(laws.values(), key=lambda law: -law.nats)), highest(*laws)
-
-
-def _evidence(before: Mode, after: Mode, price: float = 0.0) -> Evidence:
-    """Return the evidence of a model, of as many measurements as its parameters leave free."""
-    evidence = Evidence.of(before, after, price)
-    followed = np.einsum("ij,jk,ik", after.jacobian, after.covariance, after.jacobian)
-    return replace(evidence, nats=evidence.nats + float(followed * np.log1p(-evidence.share)))
+    if (error <= floor[:, list(problem.observations.columns)]).all():
+        return tuple(replace(one, attached=law) for law, one in before.items()), mode
+    begin = {law: sizes_of(mode, law) for law in before}
+    found = Search(missing, replace(DEFAULT, search=limits))(highest(()), begin).laws
+    since = {law: one.transitions for law, one in before.items()}
+    laws = [
+        Revision(law, since.get(law, problem.segments.n), one.nats, one.share, one.confounded)
+        for law, one in found.items()
+    ]
+    return tuple(sorted(laws, key=lambda law: -law.nats)), highest(found)
 
 
 #: Prediction errors up to this share of the natural sizes carry no information: they are the

@@ -239,7 +239,7 @@ def _shown_laws(attribution: Attribution) -> Iterator[str | Table]:
         )
         yield f"accepted: {', '.join(length.accepted) or 'none'}"
         yield from (f"dropped: {', '.join(length.dropped) or 'none'}", "")
-    columns = {"law": "<", "body": "<", "kind": "<", "nats": ".1f", "share of error": ""}
+    columns = {"law": "<", "body": "<", "nats": ".1f", "share of error": ""}
     yield table(
         "laws that the simulation error of trajectories shows",
         columns | {"size": "<"},
@@ -257,8 +257,8 @@ def _shown_laws(attribution: Attribution) -> Iterator[str | Table]:
 
 def _law_row(law: Law) -> list[object]:
     numbers = ((name, f"{value:.3g} ± {law.sd[name]:.2g}") for name, value in law.estimate.items())
-    kind, share = "main" if law.main else "small", f"{100 * law.share:.2g} %"
-    return [law.effect, law.body, kind, law.nats, share, sizes(numbers, law.units)]
+    share = f"{100 * law.share:.2g} %"
+    return [law.effect, law.body, law.nats, share, sizes(numbers, law.units)]
 
 
 def _candidate_row(one: Candidate) -> list[object]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -27,7 +27,7 @@ from pbrl_ppl.threads import obey_parent
 
 if TYPE_CHECKING:
     from pbrl_ppl.criticism import Loop
-    from pbrl_ppl.reporting import Source
+    from pbrl_ppl.effects import Effect
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -44,6 +44,13 @@ class Method(StrEnum):
     LAPLACE = "laplace"
 
 
+class Catalogue(StrEnum):
+    """Laws that a loop tries."""
+
+    COMMON = "common"
+    ALL = "all"
+
+
 @dataclass(frozen=True)
 class Sampler:
     """Options of a command that samples the posteriors of a loop.
@@ -57,16 +64,24 @@ class Sampler:
         at the modes, on which the verdict then stands.
     most_transitions
         Of a longer recording pieces are used, drawn by the seed; more take more time.
+    catalogue
+        common tries common laws alone, all tries unusual ones beside them from the start; by
+        default unusual ones are tried last, and added if they explain all that is left.
     """
 
     seed: options.Seed = 1
     draws: Annotated[int | None, typer.Option(min=100)] = None
     method: Method = Method.IMPORTANCE
     most_transitions: options.Transitions = options.MOST_TRANSITIONS
+    catalogue: Catalogue | None = None
 
-    def settings(self) -> dict[str, Any]:
-        """Return arguments of `criticism.close_loop`."""
-        return vars(self) | {"method": self.method.value}
+    def settings(self, effects: Sequence[Effect]) -> dict[str, Any]:
+        """Return arguments of `criticism.close_loop`, given the catalogue."""
+        if self.catalogue is Catalogue.COMMON:
+            effects = [effect for effect in effects if not effect.unusual]
+        if self.catalogue is Catalogue.ALL:
+            effects = [replace(effect, unusual="") for effect in effects]
+        return vars(self) | {"method": self.method.value, "catalogue": tuple(effects)}
 
 
 @command("close-loop", 5, "pbrl-ppl close-loop scene.toml train.csv -o report/")
@@ -80,7 +95,6 @@ def close_loop(
     progress: Progress,
     interrupts: terminal.Interrupts,
     test: Path | None = None,
-    learn_remainder: bool = False,
 ) -> Result:
     """Find what the declared model lacks, add it, refit, and report before and after.
 
@@ -92,35 +106,27 @@ def close_loop(
         Measured history (.csv, .parquet, .nc).
     test : TEST
         Held-out history; without it, a quarter of TRAIN's trajectories.
-    learn_remainder
-        Where something stays unexplained, learn a force for it, into remainder.nc; it gets no name.
     """
     progress("reading the scene and the histories")
     paths = [train] if test is None else [train, test]
     declared, histories = reading.read(scene, paths)
-    catalogue = reading.catalogue()
     progress("loading the sampler")
     import pbrl_ppl.reporting as report
     from pbrl_ppl import criticism
 
     output = to.output
-    check_folder(output, True, (*criticism.FILES, criticism.REMAINDER))
-    if learn_remainder:
-        criticism.check_scikit_learn()
-    settings = sampler.settings() | {"catalogue": catalogue}
+    check_folder(output, True, criticism.FILES)
+    settings = sampler.settings(reading.catalogue())
     run = partial(criticism.close_loop, declared, *histories, **settings)
     loop, stopped = _finished(run, progress, interrupts)
     progress("writing the report")
     files = str(scene), str(train), str(test or "")
     source = report.Source(*files, options.command_line(context))
     loop.save(output, to.overwrite, page=report.render(loop, source))
-    contents, words = loop.to_dict() | {"report": output / "report.html"}, ""
-    if learn_remainder:
-        words, path = _remainder(loop, output, source, sampler.seed, progress)
-        contents["learned_remainder"] = {"words": words, "posterior": path}
+    contents = loop.to_dict() | {"report": output / "report.html"}
     undecided = terminal.UNDECIDED if loop.verdict == criticism.NOT_CONVERGED else 0
     code = terminal.INTERRUPTED if stopped else undecided
-    return Result(contents, report.in_brief(loop, output, words), code)
+    return Result(contents, report.in_brief(loop, output), code)
 
 
 def _finished(
@@ -151,26 +157,6 @@ def _finished(
         so_far = f"so far: {'; '.join(names)}; " if names else ""
         advice = "--method laplace, fewer rows or a coarser log take less time"
         raise typer.Exit(terminal.interrupted(f"nothing was written; {so_far}{advice}")) from None
-
-
-def _remainder(
-    loop: Loop, folder: Path, source: Source, seed: int, progress: Progress
-) -> tuple[str, Path | None]:
-    """Learn a force for the residual and save it with the results.
-
-    Returns what it does, or why there is none, and its file.
-    """
-    from pbrl_ppl.errors import FitError
-    from pbrl_ppl.reporting import render
-
-    path = folder / "remainder.nc"
-    try:
-        loop = replace(loop, remainder=loop.learn_remainder(seed=seed, progress=progress))
-    except FitError as error:
-        return str(error), None
-    progress("writing the report with it")
-    loop.save(folder, overwrite=True, page=render(loop, source))
-    return loop.remainder_words, path
 
 
 @command("demo", 0, "pbrl-ppl demo")
@@ -252,13 +238,15 @@ def close_logs(
     progress("reading the manifest")
     import pbrl_ppl.reporting as report
 
-    catalogue = reading.catalogue() if reading.effect_file else None
     logs = report.read_manifest(manifest)  # its errors come before a cluster is sought
+    settings = sampler.settings(reading.catalogue())
+    if not (reading.effect_file or sampler.catalogue):
+        del settings["catalogue"]
     with _executor(jobs, scheduler) as executor:
         loops = report.close_loop_many(
             logs, output, executor=executor, progress=progress, again=overwrite,
-            source=report.Source(command=options.command_line(context)), catalogue=catalogue,
-            **sampler.settings(), **reading.scene_settings(), **reading.settings(),
+            source=report.Source(command=options.command_line(context)),
+            **settings, **reading.scene_settings(), **reading.settings(),
         )  # fmt: skip
     effects = loops.effects().drop_duplicates(["name", "effect", "body"])
     lines = [

@@ -15,7 +15,6 @@ from .loop import ADEQUATE as ADEQUATE
 from .loop import EFFECTS_ADDED as EFFECTS_ADDED
 from .loop import FILES as FILES
 from .loop import NOT_CONVERGED as NOT_CONVERGED
-from .loop import REMAINDER as REMAINDER
 from .loop import UNEXPLAINED as UNEXPLAINED
 from .loop import Loop as Loop
 from .misfit import LARGEST_SHARE as LARGEST_SHARE
@@ -27,8 +26,6 @@ from .prior_check import prior_predictive_check as prior_predictive_check
 from .rehearsal import Rehearsal as Rehearsal
 from .rehearsal import RehearsedLaw as RehearsedLaw
 from .rehearsal import rehearse as rehearse
-from .remainder import check_scikit_learn as check_scikit_learn
-from .remainder import learn_remainder as learn_remainder
 from .results import ONE_TRAJECTORY as ONE_TRAJECTORY
 from .results import Added as Added
 from .results import Candidate as Candidate
@@ -45,6 +42,6 @@ from .rivals import named_effects as named_effects
 from .score import Signature as Signature
 from .score import rank_candidates as rank_candidates
 from .score import same_physics as same_physics
-from .search import Evidence as Evidence
 from .search import Search as Search
-from .search import with_effects as with_effects
+from .table import sizes_of as sizes_of
+from .table import with_effects as with_effects

@@ -6,16 +6,15 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
-from pbrl_ppl.criticism.refinement import checked_mode
+from pbrl_ppl.criticism.refinement import Checked
 from pbrl_ppl.criticism.results import ONE_TRAJECTORY, Candidate, Law, SearchLength, Stage
-from pbrl_ppl.criticism.score import Signature, rank_candidates
+from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.criticism.search import Search
 from pbrl_ppl.criticism.unexplained import unexplained_acceleration
-from pbrl_ppl.effects import Attached, Effect, candidates
+from pbrl_ppl.effects import Effect
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.history import MOST_TRANSITIONS, History
 from pbrl_ppl.likelihood import is_simulated
-from pbrl_ppl.modes import Mode
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.threads import one_blas_thread
 
@@ -123,13 +122,8 @@ def attribute(
         [law.effect for law in found.laws]  # ['linear_drag', 'sliding_friction']
     """
     say, catalogue = progress or (lambda stage: None), tuple(catalogue)
-    mode = checked_mode(scene, history, catalogue, seed, substeps, most_transitions, criteria, say)
-    say(Stage.SIMULATE)
-
-    def missing(now: Mode) -> tuple[Attached, ...]:
-        return candidates(mode.problem.scene, now.problem.physics.effects, catalogue)
-
-    found = Search(missing, criteria, say)(mode)
+    checked = Checked.of(scene, history, catalogue, seed, substeps, most_transitions, criteria, say)
+    _, found = Search(checked.missing, criteria, say).of(checked.history, checked.mode, seed)
     problem = found.after.problem
     names = problem.observations.names
     times = problem.likelihood.tau if is_simulated(problem) else (1.0,) * len(names)
@@ -217,11 +211,10 @@ def criticise(
     """
     say = progress or (lambda stage: None)
     catalogue = tuple(catalogue)
-    mode = checked_mode(scene, history, catalogue, seed, substeps, most_transitions, criteria, say)
-    scene, effects = mode.problem.scene, mode.problem.physics.effects
+    checked = Checked.of(scene, history, catalogue, seed, substeps, most_transitions, criteria, say)
+    mode = checked.mode(checked.history)
     say(Stage.SCORE)
-    missing = candidates(scene, effects, catalogue)
-    ranked = rank_candidates(mode, missing, criteria, Signature.test_alone)
+    ranked = rank_candidates(mode, checked.missing(mode), criteria)
     excess = unexplained_acceleration(mode, criteria)
     return Ranking(
         tuple(signature.candidate for signature in ranked),

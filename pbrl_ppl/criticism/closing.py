@@ -18,7 +18,6 @@ from pbrl_ppl.criticism.misfit import (
     held_out_forecasts,
     score_test,
     simulation_test,
-    with_negligible_acceleration,
 )
 from pbrl_ppl.criticism.prior_check import informative_horizon, prior_predictive_check
 from pbrl_ppl.criticism.refinement import checked_histories, declared_mode, outliers, shift
@@ -30,14 +29,14 @@ from pbrl_ppl.criticism.results import (
     Errors,
     Estimate,
     KindOfTest,
-    Law,
     Numerical,
+    Part,
     ResidualTest,
     Stage,
     Unexplained,
 )
 from pbrl_ppl.criticism.rivals import keep_groups
-from pbrl_ppl.criticism.score import Signature, rank_candidates
+from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.criticism.search import Search, SearchResult
 from pbrl_ppl.criticism.unexplained import (
     UnexplainedAcceleration,
@@ -45,7 +44,7 @@ from pbrl_ppl.criticism.unexplained import (
     noise_without_unexplained,
     unexplained_acceleration,
 )
-from pbrl_ppl.effects import Attached, Effect, Noise, attach, candidates
+from pbrl_ppl.effects import Attached, Effect, attach, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import (
     ConvergenceWarning,
@@ -172,8 +171,9 @@ def close_loop(
     (train, said), (test, also), (numbered, _) = map(drawn, (train, test, numbered))
     cleaned = _cleaned(task, train, numbered, (*said, *(f"held out: {one}" for one in also)))
     task = replace(task, scene=with_units(scene, cleaned.train))
-    found = _searched(task, _fitted(task, cleaned))
-    judged = _tested(task, cleaned, found)
+    prior = _prior_test(task, cleaned.train)
+    declared, found = _searched(task, cleaned)
+    judged = _tested(task, cleaned, prior, declared, found)
     try:
         return _sampled(task, judged, test)
     except KeyboardInterrupt:
@@ -214,8 +214,15 @@ class _Task:
         return attach(self.scene, (), self.catalogue)
 
     def missing(self, mode: Mode) -> tuple[Attached, ...]:
-        """Return the candidate effects for a model."""
-        return candidates(self.scene, mode.problem.physics.effects, self.catalogue)
+        """Return the candidate effects for a model that its recording can show."""
+        problem = mode.problem
+        return candidates(self.scene, problem.physics.effects, self.catalogue, problem.data.history)
+
+    def declared(self, train: History) -> FilteredMode:
+        """Return the mode of the declared model on whole trajectories."""
+        return declared_mode(
+            self.scene, train, self.effects, self.seed, self.substeps, self.say, self.criteria
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,28 +234,6 @@ class _Cleaned:
     unused: tuple[UnusedVelocity, ...]
     bad_frames: tuple[str, ...]
     drawn: tuple[str, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class _Fitted:
-    """The declared model: test of its prior, and its mode of whole trajectories."""
-
-    prior: ResidualTest
-    mode: FilteredMode
-
-
-@dataclass(frozen=True, eq=False)
-class _Searched:
-    """The declared model, the laws that it lacks, and the scores of all candidates."""
-
-    declared: _Fitted
-    found: SearchResult
-    ranked: list[Signature]
-
-    @property
-    def laws(self) -> Mapping[Attached, Law]:
-        """The laws by effect and body."""
-        return self.found.laws
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,7 +271,7 @@ class _Judged:
     """The declared and the revised model with the tests of the latter's residual."""
 
     cleaned: _Cleaned
-    searched: _Searched
+    found: SearchResult
     declared: _Model
     revised: _Model
     misfit: Misfit
@@ -306,109 +291,66 @@ def _cleaned(task: _Task, train: History, test: History, drawn: tuple[str, ...])
     return cleaned
 
 
-def _fitted(task: _Task, cleaned: _Cleaned) -> _Fitted:
-    """Fit the declared model, and test whether its prior could have made the data."""
-    task.say(Stage.CHECK_PRIOR)
-    prior = _prior_test(task, cleaned.train, task.effects)
-    if not prior.passed:  # before the long fit: units may be wrong
-        hint = "the declared prior does not explain this recording"
-        hint = f"{hint}, unless a missing effect is why"
-        warn(f"{hint}: {prior.sentence}", PriorWarning)
+def _searched(task: _Task, cleaned: _Cleaned) -> tuple[FilteredMode, SearchResult]:
+    """Fit the declared model, and search for the laws that it lacks."""
     task.say(Stage.FIT)
-    mode = declared_mode(
-        task.scene, cleaned.train, task.effects, task.seed, task.substeps, task.say, task.criteria
-    )
-    return _Fitted(prior, mode)
-
-
-def _searched(task: _Task, declared: _Fitted) -> _Searched:
-    """Search for the laws that the declared model lacks."""
-    task.say(Stage.SIMULATE)
-    search, mode = Search(task.missing, task.criteria, task.say), declared.mode
+    search = Search(task.missing, task.criteria, task.say)
     try:
-        found = search(mode)
+        return search.of(cleaned.train, task.declared, task.seed)
     except HistoryError:  # initial states could follow all that was measured
-        found = search(find_mode(single_transitions(mode.problem), initial=mode.phi))
-    task.say(Stage.SCORE)
-    missing, kept = task.missing(declared.mode), Signature.without_bases
-    ranked = rank_candidates(declared.mode, missing, task.criteria, kept)
-    return _Searched(declared, found, ranked)
+        mode = task.declared(cleaned.train)
+        return mode, search(find_mode(single_transitions(mode.problem), initial=mode.phi))
 
 
-def _tested(task: _Task, cleaned: _Cleaned, searched: _Searched) -> _Judged:
+def _tested(
+    task: _Task,
+    cleaned: _Cleaned,
+    prior: ResidualTest,
+    declared: FilteredMode,
+    found: SearchResult,
+) -> _Judged:
     """Test the innovations of the model found, on the training and on the test history."""
     task.say(Stage.TEST)
     criteria = task.criteria
-    innovations = _innovations(searched)
+    innovations = filtered_mode(declared, found.after) if found.laws else declared
     train, frames = without_measurements(cleaned.train, outliers(innovations, criteria))
     if frames:  # the data change, not the laws
         task.say("; ".join(map(str, frames)))
         cleaned = replace(cleaned, train=train, bad_frames=(*cleaned.bad_frames, *map(str, frames)))
-        searched = _without_frames(task, searched, train)
-        innovations = _innovations(searched)
+        declared = task.declared(train)
+        found = found.on(declared)
+        innovations = filtered_mode(declared, found.after) if found.laws else declared
     tested = HeldOut.of(innovations, cleaned.test)
     off = outliers(replace(innovations, problem=tested.problem), criteria)
     test, more = without_measurements(cleaned.test, off)
     said = tuple(f"held out: {frame}" for frame in more)
     cleaned = replace(cleaned, test=test, bad_frames=(*cleaned.bad_frames, *said))
-    found, fitted = searched.found, searched.declared
-    revised = declared = _Model.of(found.after, innovations, test, criteria)
-    if searched.laws:
-        declared = _Model.of(found.declared, fitted.mode, test, criteria)
-    prior = fitted.prior
-    if searched.laws and not prior.passed:  # the missing effect may be why
-        labels = [label for law in searched.laws for label in law.labels]
-        values = dict(zip(innovations.problem.layout.labels, innovations.phi, strict=True))
-        fixed = {label: float(values[label]) for label in labels}
-        effects = innovations.problem.physics.effects
-        prior = _prior_test(task, cleaned.train, effects, fixed)
+    before = revised = _Model.of(found.after, innovations, test, criteria)
+    if found.laws:
+        before = _Model.of(found.declared, declared, test, criteria)
     horizon = rollout_horizon(cleaned.train, task.scene)
-    misfit = find_misfit(innovations, revised.excess, horizon=horizon, seed=task.seed)
-    misfit = misfit.with_test(prior)
-    if searched.laws:
-        misfit = with_negligible_acceleration(misfit, innovations, revised.excess)
     rollout = longest_rollout(test, horizon)
-    noise = noise_alone(innovations, revised.excess)
-    at_test = replace(innovations, problem=revised.held_out.problem)
-    misfit = misfit.with_test(held_out_forecasts(at_test, noise, rollout, criteria))
+    noise, held_out = noise_alone(innovations, revised.excess), revised.held_out
     collides = revised.mode.problem.data.breaks is not None
-    simulated = {} if collides else revised.held_out.simulated()
-    if not searched.laws:
-        problem = revised.held_out.problem
-        steps = int(problem.data.history.dataset["n_rows"].max()) - 1
-        measured = revised.held_out.measurement_errors(noise)
-        misfit = misfit.with_test(
-            simulation_test(
-                simulated,
-                measured,
-                revised.held_out.motion(),
-                steps * task.scene.time_step,
-                criteria,
-            )
-        )
-    ranked = searched.ranked
-    if searched.laws:
-        missing = task.missing(innovations)
-        ranked = rank_candidates(innovations, missing, criteria, Signature.without_bases)
-    misfit = misfit.with_test(score_test(innovations, ranked, criteria))
+    simulated = {} if collides else held_out.simulated()
+    seconds = (int(test.dataset["n_rows"].max()) - 1) * task.scene.time_step
+    # unusual laws that no climb tried are not compiled for a test
+    tried = [one for one in task.missing(innovations) if one in found.signatures]
+    ranked = rank_candidates(innovations, tried, criteria)
+    misfit = find_misfit(innovations, revised.excess, horizon=horizon, seed=task.seed)
+    if not found.laws:  # a missing effect may be why the prior does not explain the data
+        misfit = misfit.with_test(prior)
+    at_test = replace(innovations, problem=held_out.problem)
+    for test_of in (
+        held_out_forecasts(at_test, noise, rollout, criteria),
+        simulation_test(
+            simulated, held_out.measurement_errors(noise), held_out.motion(), seconds, criteria
+        ),
+        score_test(innovations, ranked, criteria),
+    ):
+        misfit = misfit.with_test(test_of)
     small = tuple(one.candidate for one in ranked[:1] if one.candidate.p_value < criteria.try_p)
-    return _Judged(cleaned, searched, declared, revised, misfit, small, rollout, simulated)
-
-
-def _innovations(searched: _Searched) -> FilteredMode:
-    """Return the filtered whole trajectories of the model found."""
-    if not searched.laws:
-        return searched.declared.mode
-    return filtered_mode(searched.declared.mode, searched.found.after)
-
-
-def _without_frames(task: _Task, searched: _Searched, train: History) -> _Searched:
-    """Return the search with its models fitted again, to a history without bad frames."""
-    mode = declared_mode(
-        task.scene, train, task.effects, task.seed, task.substeps, task.say, task.criteria
-    )
-    fitted = replace(searched.declared, mode=mode)
-    return replace(searched, declared=fitted, found=searched.found.on(train))
+    return _Judged(cleaned, found, before, revised, misfit, small, rollout, simulated)
 
 
 def _sampled(task: _Task, judged: _Judged, recorded: History) -> Loop:
@@ -421,23 +363,22 @@ def _sampled(task: _Task, judged: _Judged, recorded: History) -> Loop:
     return _put_together(task, judged, fits[0], fits[-1], recorded)
 
 
-def _prior_test(
-    task: _Task,
-    train: History,
-    effects: tuple[Attached, ...],
-    fixed: Mapping[str, float] | None = None,
-) -> ResidualTest:
-    """Test whether the prior, with some parameters held, could have made the data."""
-    horizon = informative_horizon(train)
-    problem = Problem.of(Physics(task.scene, effects, threads=2), train, horizon=horizon)
-    checked = prior_predictive_check(
-        problem, seed=task.seed, fixed=fixed, criteria=task.criteria.prior
+def _prior_test(task: _Task, train: History) -> ResidualTest:
+    """Test whether the declared prior could have made the data, and warn before the long fit."""
+    task.say(Stage.CHECK_PRIOR)
+    problem = Problem.of(
+        Physics(task.scene, task.effects, threads=2), train, horizon=informative_horizon(train)
     )
+    checked = prior_predictive_check(problem, seed=task.seed, criteria=task.criteria.prior)
     share = float(checked.dataset["share_beyond"].max())
     sentence, *more = checked.summary
     if more:
         sentence = f"{sentence}; {len(more)} more likewise"
-    return ResidualTest(KindOfTest.PRIOR, float("nan"), share, not checked.sentences, sentence)
+    passed = not checked.sentences
+    if not passed:  # units may be wrong
+        hint = "the declared prior does not explain this recording"
+        warn(f"{hint}, unless a missing effect is why: {sentence}", PriorWarning)
+    return ResidualTest(KindOfTest.PRIOR, float("nan"), share, passed, sentence)
 
 
 def _fits(task: _Task, modes: list[Mode]) -> list[Fit]:
@@ -499,7 +440,7 @@ def _put_together(task: _Task, judged: _Judged, before: Fit, after: Fit, recorde
     error_before, error_after = _errors(judged, before, after, task.seed)
     converged = all(_converged(fit, task.criteria) for fit in (before, after))
     verdict, unexplained = _verdict(
-        misfit, len(judged.searched.laws), error_before, error_after, converged, task.criteria
+        misfit, judged.found, error_before, error_after, converged, task.criteria
     )
     added = _added(judged, after)
     keep_groups(after.posterior, added)
@@ -530,8 +471,10 @@ def _put_together(task: _Task, judged: _Judged, before: Fit, after: Fit, recorde
         acceleration=_acceleration(declared.excess, revised.excess),
         correlations=misfit.correlations,
         growth=misfit.growth,
-        search=judged.searched.found.lengths,
+        search=judged.found.lengths,
         small=judged.small,
+        lesser=_parts(judged.found.small),
+        hypotheses=_parts(judged.found.hypotheses),
         identifiability=identify(after.posterior, mode=revised.mode),
         loo=_compared(declared.mode, revised.mode, before, after),
         velocities_not_used=cleaned.unused,
@@ -595,15 +538,28 @@ def _compared(declared: Mode, revised: Mode, before: Fit, after: Fit) -> Compari
     return compare(before.posterior, after.posterior) if alike else None
 
 
+def _parts(shares: Mapping[Attached, float]) -> tuple[Part, ...]:
+    """Return laws that are not added, those that take most off first."""
+    parts = [Part(law.effect.name, law.body, share) for law, share in shares.items()]
+    return tuple(sorted(parts, key=lambda one: -one.share))
+
+
 def _verdict(
-    misfit: Misfit, laws: int, before: Errors, after: Errors, converged: bool, criteria: Criteria
+    misfit: Misfit,
+    found: SearchResult,
+    before: Errors,
+    after: Errors,
+    converged: bool,
+    criteria: Criteria,
 ) -> tuple[str, Unexplained | None]:
     """Return the verdict and what is unexplained, from tests and held-out errors alone.
 
     What remains beside named laws and is small, so that forecasts are at the noise floor, changes
     no verdict; nor does an error below the noise, which says nothing of either model.
     """
-    unexplained = misfit.unexplained
+    unexplained, laws = misfit.unexplained, found.laws
+    if found.doubt:
+        return UNEXPLAINED, Unexplained("", "", NOTHING_RECORDED, 0.0, float("nan"), found.doubt)
     worse = after.normalised_rmse > (1.0 + criteria.negligible) * max(before.normalised_rmse, 1.0)
     if laws and worse:
         unexplained = unexplained or _worse(before, after)
@@ -627,26 +583,26 @@ def _worse(before: Errors, after: Errors) -> Unexplained:
 
 def _explained(judged: _Judged) -> tuple[Candidate, ...]:
     """Return the candidates with what simulations say of each, and the decision on it."""
-    searched = judged.searched
-    found, result = searched.found, []
+    found, result = judged.found, []
     groups = {rival: law for law, rivals in found.confounded.items() for rival in rivals}
-    for signature in searched.ranked:
-        law, why = signature.attached, "takes too little off the error of simulated trajectories"
+    shares = {**found.small, **found.hypotheses}
+    for law, signature in found.signatures.items():
+        why = "takes too little off the error of simulated trajectories"
         alone = found.tried.get(law)
-        if law in searched.laws:
+        if law in found.laws:
             why = "added"
+        elif law in shares:
+            why = f"takes {100 * shares[law]:.2g} % off the error of simulated trajectories"
         elif law in groups:
             why = f"explains these data as well as {groups[law].effect.name.replace('_', ' ')}"
         elif law in found.rejected:
             why = found.rejected[law]
-        elif isinstance(law.effect.stage, Noise):
-            why = "the noise's shape is scored and never added: declare it"
         result.append(
             replace(
                 signature.candidate,
                 why=why,
-                simulated_nats=alone.nats if alone else None,
-                simulated_share=alone.share if alone else None,
+                simulated_nats=alone[0] if alone else None,
+                simulated_share=alone[1] if alone else None,
             )
         )
     return tuple(result)
@@ -654,12 +610,10 @@ def _explained(judged: _Judged) -> tuple[Candidate, ...]:
 
 def _added(judged: _Judged, revised: Fit) -> tuple[Added, ...]:
     """Return the added effects with their posterior."""
-    searched, drawn = judged.searched, posterior_draws(revised.posterior)
-    found = searched.found
-    scored = {signature.attached: signature.candidate for signature in searched.ranked}
+    found, drawn = judged.found, posterior_draws(revised.posterior)
     effects = judged.revised.mode.problem.physics.effects
     added = []
-    for law, words in searched.laws.items():
+    for law, words in found.laws.items():
         bodies = [one.body for one in effects if one.effect.name == law.effect.name]
         estimates = {}
         for parameter in law.effect.parameters:
@@ -673,15 +627,14 @@ def _added(judged: _Judged, revised: Fit) -> tuple[Added, ...]:
                 effect=words.effect,
                 body=words.body,
                 sentence=words.sentence,
-                statistic=scored[law].statistic,
-                p_value=scored[law].p_value,
+                statistic=found.signatures[law].candidate.statistic,
+                p_value=found.signatures[law].candidate.p_value,
                 parameters=estimates,
                 not_separable_from=words.confounded,
                 elpd_difference=gained,
                 elpd_difference_se=error,
                 simulated_nats=words.nats,
                 simulated_share=words.share,
-                main=words.main,
             )
         )
     return tuple(added)

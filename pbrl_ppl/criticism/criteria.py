@@ -36,23 +36,38 @@ class SearchCriteria:
     least_share : float
         Share of the simulation error that laws take away, at least, on the pieces that show them.
     main_share : float
-        The same of a main law on the longest pieces; a smaller one is a small correction.
-    small_share : float
-        The same of small corrections, which are searched on the longest pieces alone.
+        The same of a main law on the longest pieces: smaller ones are not added.
     alone : float
         The same of all laws together in a recording of one trajectory, which a lasting random force
         or error follows as well: more than what remains.
+    rows, pieces : int
+        Transitions that are searched, at most, and pieces in which they are drawn, at least; the
+        laws found are refitted to all.
     refits, singles : int
         Best subsets that are refitted in a round, and single laws beside them.
+    exceeds : float
+        Unusual laws are tried where common ones leave more than this many times the error on the
+        shortest pieces, on the longest ones.
+    promise : float
+        And where one of them takes this share of that error off to first order.
+    complete : float
+        Unusual laws are added where they leave less than this many times that error.
+    incomplete : float
+        Or less than this share of the error that common laws leave.
     """
 
     least_nats: float = 3.0
     least_share: float = 0.1
     main_share: float = 0.2
-    small_share: float = 0.02
     alone: float = 0.5
+    rows: int = 1000
+    pieces: int = 4
     refits: int = 4
     singles: int = 2
+    exceeds: float = 1.03
+    promise: float = 0.4
+    complete: float = 1.15
+    incomplete: float = 1 / 3
 
 
 @dataclass(frozen=True)
@@ -113,14 +128,12 @@ class Criteria:
     worse_forecast : float
         Forecasts may have this many times the error that noise and a negligible acceleration make.
     worst_simulation : float
-        A model that lacks nothing simulates whole held-out trajectories, from initial states that
-        are fitted to them, to this many times the measurement noise: errors of a sensor may be
-        correlated.
+        Whole held-out trajectories, simulated from initial states that are fitted to them, are off
+        by at most this many times the measurement noise, or something is unexplained: errors of a
+        sensor may be correlated.
     outlier_deviations : float
         A single measurement is left out if its residual exceeds this many robust standard
         deviations: 1 of 10^14 of Gaussian noise.
-    min_remainder : float
-        Log-evidence (nats) that a learned force must gain.
     worst_rhat : float
         Chains with a larger R-hat give no verdict.
     least_ess : float
@@ -141,9 +154,8 @@ class Criteria:
     try_p: float = 0.01
     far_out: float = 6.0
     worse_forecast: float = 1.5
-    worst_simulation: float = 4.0
+    worst_simulation: float = 3.0
     outlier_deviations: float = 8.0
-    min_remainder: float = 6.0
     worst_rhat: float = 1.05
     least_ess: float = 100.0
     engine: EngineCriteria = EngineCriteria()

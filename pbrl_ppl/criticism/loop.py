@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
-from pbrl_ppl.criticism.remainder import learn_remainder, remainder_in_words
 from pbrl_ppl.criticism.results import (
     NOTHING_RECORDED,
     Acceleration,
@@ -21,6 +20,7 @@ from pbrl_ppl.criticism.results import (
     Errors,
     Growth,
     Numerical,
+    Part,
     ResidualTest,
     Rollout,
     SearchLength,
@@ -28,7 +28,7 @@ from pbrl_ppl.criticism.results import (
 )
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.effects import catalogue as full_catalogue
-from pbrl_ppl.errors import FitError, OutputError
+from pbrl_ppl.errors import OutputError
 from pbrl_ppl.files import check_folder, json_fields, json_values, temporary_folder
 from pbrl_ppl.history import History, UnusedVelocity
 from pbrl_ppl.modes import FilteredMode
@@ -39,9 +39,8 @@ from pbrl_ppl.state import Floats
 #: The verdicts; the last one means that there is none, for the chains do not agree.
 ADEQUATE, EFFECTS_ADDED, UNEXPLAINED = "adequate", "effects-added", "unexplained"
 NOT_CONVERGED = "not-converged"
-#: Files of a saved loop and its report; beside them, the posterior with a learned remainder.
+#: Files of a saved loop and its report.
 FILES = ("report.html", "report.json", "before.nc", "after.nc")
-REMAINDER = "remainder.nc"
 #: The file that is written last: where it is, the others belong to it.
 DONE = "report.json"
 
@@ -90,6 +89,10 @@ class Loop:
         What the search found on pieces of each length.
     small : tuple of Candidate
         Effect that is significant in the innovations and was not added, if there is one.
+    lesser : tuple of Part
+        Laws that simulations show and that are no main ones: they are not added.
+    hypotheses : tuple of Part
+        Unusual laws that explain a part of what remains: they are not added.
     identifiability : Identifiability or None
         Which parameters of the revised model the data inform.
     loo : Comparison or None
@@ -106,8 +109,6 @@ class Loop:
         The held-out trajectories; reports animate them.
     catalogue : tuple of Effect
         Where the names of effects are looked up.
-    remainder : InferenceData or DataTree, optional
-        A posterior that :meth:`learn_remainder` gave: reports name it, and ``save`` writes it.
     """
 
     scene: Scene
@@ -133,6 +134,8 @@ class Loop:
     growth: Growth
     search: tuple[SearchLength, ...] = ()
     small: tuple[Candidate, ...] = ()
+    lesser: tuple[Part, ...] = ()
+    hypotheses: tuple[Part, ...] = ()
     identifiability: Identifiability | None = None
     loo: Comparison | None = None
     velocities_not_used: tuple[UnusedVelocity, ...] = ()
@@ -141,7 +144,6 @@ class Loop:
     criteria: Criteria = DEFAULT
     held_out: History | None = None
     catalogue: tuple[Effect, ...] = tuple(full_catalogue)
-    remainder: Idata | None = None
 
     def __repr__(self) -> str:
         added = [f"{one.effect} on {one.body}" for one in self.added]
@@ -159,14 +161,8 @@ class Loop:
 
     @property
     def accepted(self) -> tuple[Added, ...]:
-        """Return the added effects, main laws first, or none without a verdict."""
-        main_first = tuple(sorted(self.added, key=lambda one: not one.main))
-        return () if self.verdict == NOT_CONVERGED else main_first
-
-    @property
-    def main_laws(self) -> tuple[Added, ...]:
-        """Return the main laws among the added effects; all of them where none is a main one."""
-        return tuple(one for one in self.added if one.main) or self.added
+        """Return the added effects, or none without a verdict."""
+        return () if self.verdict == NOT_CONVERGED else self.added
 
     @property
     def rejected(self) -> tuple[Candidate, ...]:
@@ -204,61 +200,6 @@ class Loop:
         """Return how far ahead rollouts predict (s)."""
         return self.rollout_horizon * self.scene.time_step
 
-    @property
-    def remainder_words(self) -> str:
-        """Return in a sentence what the learned remainder does; empty without one."""
-        if self.remainder is None:
-            return ""
-        return remainder_in_words(self.innovations[-1], self.remainder)
-
-    def learn_remainder(
-        self,
-        body: str | None = None,
-        *,
-        seed: int = 0,
-        progress: Callable[[str], None] | None = None,
-    ) -> Idata:
-        """Learn a force for the unexplained residual; the verdict and the added effects stay.
-
-        Parameters
-        ----------
-        body : str, optional
-            The body that lacks a force; by default the one with the largest residual.
-        seed : int
-            The same seed gives the same posterior.
-        progress : callable, optional
-            Called with the name of each stage.
-
-        Returns
-        -------
-        InferenceData or DataTree
-            The posterior with the effect ``learned_remainder``, to save, plan with and update; see
-            :func:`pbrl_ppl.criticism.learn_remainder`.
-
-        Raises
-        ------
-        FitError
-            If nothing is unexplained, or the residual does not depend on the body's velocity.
-
-        Examples
-        --------
-        ::
-
-            loop.verdict  # 'unexplained'
-            pp.save_posterior(loop.learn_remainder(seed=1), "remainder.nc")
-        """
-        if self.verdict != UNEXPLAINED:
-            raise FitError(f"nothing to learn: the verdict is {self.verdict}")
-        where = self.unexplained.body if self.unexplained is not None else ""
-        bodies = [moving.name for moving in self.scene.dynamic]
-        body = body or where or (bodies[0] if len(bodies) == 1 else "")
-        if not body:
-            raise FitError(f"remainder: no body stands out; give the body, one of {bodies}")
-        return learn_remainder(
-            self.revised, body, catalogue=self.catalogue, seed=seed,
-            criteria=self.criteria, progress=progress,
-        )  # fmt: skip
-
     def to_dict(self) -> dict[str, Any]:
         """Return the contents of ``report.json``; numbers that are not finite become null."""
         contents: dict[str, Any] = json_values(
@@ -268,6 +209,8 @@ class Loop:
                 "added": [_fields(added, "sentence") for added in self.added],
                 "candidates": [_fields(item, "sentence", "units") for item in self.candidates],
                 "small": [[candidate.effect, candidate.body] for candidate in self.small],
+                "lesser": self.lesser,
+                "hypotheses": self.hypotheses,
                 "search": self.search,
                 "tests": self.tests,
                 "unexplained_acceleration": self.acceleration,
@@ -285,12 +228,10 @@ class Loop:
                 "provenance": self.provenance,
             }
         )
-        if self.remainder is not None:
-            contents["learned_remainder"] = self.remainder_words
         return contents
 
     def save(self, folder: str | Path, overwrite: bool = False, *, page: str = "") -> Path:
-        """Write report.json, before.nc, after.nc (and remainder.nc), all or nothing.
+        """Write report.json, before.nc and after.nc, all or nothing.
 
         Of an earlier result in the folder ``report.json`` is removed first, and the new one is
         written last: where it is, the files belong together, even if the process was killed.
@@ -322,7 +263,7 @@ class Loop:
             pp.report(loop, "out/report.html")
         """
         folder = Path(folder)
-        nearest = check_folder(folder, overwrite, (*FILES, REMAINDER))
+        nearest = check_folder(folder, overwrite, FILES)
         try:
             # on the same file system as the folder, so that only a rename is left at the end
             with temporary_folder(nearest) as temporary:
@@ -332,14 +273,11 @@ class Loop:
                     (made / "report.html").write_text(page, encoding="utf-8")
                 save_posterior(self.posterior_before, made / "before.nc")
                 save_posterior(self.posterior_after, made / "after.nc")
-                if self.remainder is not None:
-                    save_posterior(self.remainder, made / REMAINDER)
                 text = json.dumps(self.to_dict(), indent=1, allow_nan=False)
                 (made / DONE).write_text(text + "\n", encoding="utf-8")
                 if nearest == folder:
                     # it may be a mount or a working directory: fill it, do not replace it
-                    for earlier in (DONE, REMAINDER):
-                        (folder / earlier).unlink(missing_ok=True)
+                    (folder / DONE).unlink(missing_ok=True)
                     for name in sorted((file.name for file in made.iterdir()), key=DONE.__eq__):
                         (made / name).replace(folder / name)
                 else:

@@ -57,7 +57,7 @@ class Misfit:
     growth: Growth
 
     def predicts(self, criteria: Criteria) -> bool:
-        """Return whether forecasts are as good as noise lets them be, and the prior is possible.
+        """Return whether forecasts and simulations are as good as noise lets them be.
 
         What remains is then small: significant one step ahead, and not over a forecast. Beside an
         unexplained acceleration forecasts must be near the noise; that none is known to be worse is
@@ -65,7 +65,8 @@ class Misfit:
         """
         tests = {test.name: test for test in self.tests}
         forecasts = (KindOfTest.FORECASTS, KindOfTest.HELD_OUT)
-        if not all(kind in tests and tests[kind].passed for kind in (*forecasts, KindOfTest.PRIOR)):
+        whole = (*forecasts, KindOfTest.SIMULATION)
+        if not all(kind in tests and tests[kind].passed for kind in whole):
             return False
         near = all(tests[kind].size < criteria.worse_forecast for kind in forecasts)
         return near or tests[KindOfTest.ACCELERATION].passed
@@ -76,18 +77,6 @@ class Misfit:
         if unexplained is None and not test.passed:
             unexplained = _unexplained(test)
         return replace(self, tests=(*self.tests, test), unexplained=unexplained)
-
-
-def with_negligible_acceleration(
-    misfit: Misfit, mode: FilteredMode, excess: UnexplainedAcceleration
-) -> Misfit:
-    """Return a revised model's misfit, with a negligible acceleration as unexplained if it has one.
-
-    A law that is only near the right one may leave as little as two engines differ by.
-    """
-    if misfit.unexplained is not None or not excess.remains.any():
-        return misfit
-    return replace(misfit, unexplained=_unexplained(_acceleration(mode, excess)))
 
 
 def find_misfit(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import norm
@@ -10,7 +11,7 @@ from scipy.stats import norm
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.results import Stage
 from pbrl_ppl.criticism.unexplained import unexplained_acceleration, without_acceleration
-from pbrl_ppl.effects import Attached, Effect, attach
+from pbrl_ppl.effects import Attached, Effect, attach, candidates
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import (
     History,
@@ -23,7 +24,7 @@ from pbrl_ppl.history import (
     without_bad_frames,
 )
 from pbrl_ppl.likelihood import Problem, check_moves, observed_coordinates, single_transitions
-from pbrl_ppl.modes import FilteredMode, find_mode, nearby_mode, trajectory_mode
+from pbrl_ppl.modes import FilteredMode, Mode, find_mode, nearby_mode, trajectory_mode
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Scene, check_substeps
 from pbrl_ppl.state import STATE, Floats, Ints
@@ -163,35 +164,67 @@ def _beside(size: Floats, trajectory: Ints, row: Ints) -> Floats:
     return np.fmax(table[trajectory, row], table[trajectory, row + 2])
 
 
-def checked_mode(
-    scene: Scene,
-    history: History,
-    catalogue: tuple[Effect, ...],
-    seed: int,
-    substeps: int | None,
-    most_transitions: int,
-    criteria: Criteria,
-    say: Callable[[str], None],
-) -> FilteredMode:
-    """Return the declared model's mode on a history without bad frames and unused velocities.
+@dataclass(frozen=True, eq=False)
+class Checked:
+    """A recording without bad frames and unused velocities, and how a declared model is fitted.
 
-    Raises
-    ------
-    HistoryError
-        If the history does not fit the scene.
-    EffectError
-        If the scene declares an unknown effect.
+    Parameters
+    ----------
+    scene : Scene
+        The declared scene, with natural units of the recording.
+    history : History
+        What is left of it, or pieces.
+    catalogue : tuple of Effect
+        Effects that are tried.
+    mode : callable
+        Returns the mode of the declared model on a history.
     """
-    if substeps is not None:
-        check_substeps(substeps)
-    history, drawn = drawn_pieces(history, most_transitions, seed)
-    history, _, unused, bad = checked_histories(scene, history, history)
-    for sentence in (*drawn, *(velocity.sentence for velocity in unused), *bad):
-        say(sentence)
-    scene = with_units(scene, history)
-    effects = attach(scene, (), catalogue)
-    say(Stage.FIT)
-    return declared_mode(scene, history, effects, seed, substeps, say, criteria)
+
+    scene: Scene
+    history: History
+    catalogue: tuple[Effect, ...]
+    mode: Callable[[History], FilteredMode]
+
+    @classmethod
+    def of(
+        cls,
+        scene: Scene,
+        history: History,
+        catalogue: tuple[Effect, ...],
+        seed: int,
+        substeps: int | None,
+        most_transitions: int,
+        criteria: Criteria,
+        say: Callable[[str], None],
+    ) -> Checked:
+        """Clean a recording; arguments are those of :func:`pbrl_ppl.attribute`.
+
+        Raises
+        ------
+        HistoryError
+            If the history does not fit the scene.
+        EffectError
+            If the scene declares an unknown effect.
+        """
+        if substeps is not None:
+            check_substeps(substeps)
+        history, drawn = drawn_pieces(history, most_transitions, seed)
+        history, _, unused, bad = checked_histories(scene, history, history)
+        for sentence in (*drawn, *(velocity.sentence for velocity in unused), *bad):
+            say(sentence)
+        scene = with_units(scene, history)
+        effects = attach(scene, (), catalogue)
+
+        def fit(train: History) -> FilteredMode:
+            say(Stage.FIT)
+            return declared_mode(scene, train, effects, seed, substeps, say, criteria)
+
+        return cls(scene, history, catalogue, fit)
+
+    def missing(self, mode: Mode) -> tuple[Attached, ...]:
+        """Return the candidate effects for a model that its recording can show."""
+        problem = mode.problem
+        return candidates(self.scene, problem.physics.effects, self.catalogue, problem.data.history)
 
 
 def declared_mode(

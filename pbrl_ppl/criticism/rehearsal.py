@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
-from itertools import takewhile
-from typing import NamedTuple
 
 import numpy as np
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
-from pbrl_ppl.criticism.score import ScoreTest, linearised, named_beside, null_sides
-from pbrl_ppl.criticism.search import LIKELY, is_out_of_phase
+from pbrl_ppl.criticism.scan import each_grid_point
+from pbrl_ppl.criticism.score import Library, named_beside, null_sides
 from pbrl_ppl.criticism.subsets import Term, worth
+from pbrl_ppl.criticism.table import weights
 from pbrl_ppl.criticism.trial_recording import measured, parameters_of, simulated
 from pbrl_ppl.effects import Attached, Effect, Noise, attach, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
@@ -27,8 +25,6 @@ from pbrl_ppl.threads import in_parallel, one_blas_thread
 
 #: Names are compared at this many times the least size that is seen.
 _WELL_SEEN = 3.0
-#: Sizes that are tried, as multiples of the one that is found in white noise.
-_FACTORS = 1.3 ** np.arange(20)
 
 
 @dataclass(frozen=True)
@@ -53,7 +49,8 @@ class RehearsedLaw:
         The law that is named; another one where that is the same here, or explains the recording as
         well and is simpler. Empty if unseen.
     confounded : tuple of str
-        Laws that explain a recording with three times the size as well, within the criteria's nats.
+        Laws that explain a recording with three times the size as well, within the criteria's nats;
+        unusual ones only where common ones leave much more than the noise.
     note : str
         Where it is seen, or why it is not.
     """
@@ -107,11 +104,13 @@ def rehearse(
 ) -> Rehearsal:
     """Find out which laws a recording would show, and from which size on, before it is made.
 
-    The declared model is simulated once, with measurement noise. There, without a refit, each law
-    of the catalogue is linearised as in the search of :func:`pbrl_ppl.attribute`, declared
-    parameters and initial states projected out, and the size read off at which its log-evidence and
-    its share of the simulation error pass the thresholds of :class:`SearchCriteria`. The law is
-    then added to the residual, and the same regression says which name wins.
+    The declared model is simulated once, with measurement noise. There, on the longest pieces and
+    without a refit, each law of the catalogue is linearised as in the search of
+    :func:`pbrl_ppl.attribute`, declared parameters and initial states projected out, and the size
+    computed at which its log-evidence and its share of the simulation error pass the thresholds of
+    :class:`SearchCriteria` for a main law. The law is then added to the residual, and regressions
+    on single laws say which name wins; an unusual one wins only where common ones leave much more
+    than the noise.
 
     Parameters
     ----------
@@ -164,26 +163,16 @@ def rehearse(
     commands, states = simulated(physics, phi, commands, rng)
     history, noise = measured(scene, commands, states, rng)
     physics = physics.changed(scene=with_units(scene, history))
-    problem = _apart(Problem.of(physics, history), states)
-    tried = [
-        one for one in candidates(problem.scene, physics.effects, catalogue)
-        if not isinstance(one.effect.stage, Noise)
-    ]  # fmt: skip
-    regressions: list[_Regression] = []
-    for mode in _known_modes(problem, phi, states)[::-1]:
-        seconds = mode.problem.data.horizon * scene.time_step
-        say(f"linearising {len(tried)} laws on pieces of {seconds:.3g} s")
-        longer = regressions[-1] if regressions else None
-        regressions.append(_Regression.of(mode, tried, criteria, longer))
-    say("adding each law to the simulation")
-    laws = in_parallel(partial(_rehearsed, regressions), tried)
-    return Rehearsal(
-        tuple(sorted(laws, key=lambda law: law.share)),
-        history,
-        dict(zip(physics.layout.labels, phi.tolist(), strict=True)),
-        noise,
-        regressions[0].mode.problem.data.horizon * scene.time_step,
-    )
+    mode = _known_mode(_apart(Problem.of(physics, history), states), phi, states)
+    seconds = mode.problem.data.horizon * scene.time_step
+    tried = [one for one in catalogue if not isinstance(one.stage, Noise)]
+    model = physics.scene, physics.effects, tried
+    every, able = candidates(*model), candidates(*model, history)
+    say(f"linearising {len(able)} laws on pieces of {seconds:.3g} s")
+    regression = _Regression(mode, able, criteria)
+    laws = sorted(in_parallel(regression.rehearsed, every), key=lambda law: law.share)
+    known = dict(zip(physics.layout.labels, phi.tolist(), strict=True))
+    return Rehearsal(tuple(laws), history, known, noise, seconds)
 
 
 def _apart(problem: Problem, states: Floats) -> Problem:
@@ -193,278 +182,116 @@ def _apart(problem: Problem, states: Floats) -> Problem:
     """
     rows = np.asarray(np.isfinite(states).all(axis=(2, 3)))
     touched = np.logical_and(rows[:, :-1], rows[:, 1:])
-    begin, end = states[:, :-1][touched], states[:, 1:][touched]
-    touched[touched] = touching(problem.scene, begin, end)
+    touched[touched] = touching(problem.scene, states[:, :-1][touched], states[:, 1:][touched])
     return problem.with_data(breaks=touched) if 0.0 < touched.mean() < 0.5 else problem
 
 
-def _known_modes(problem: Problem, phi: Floats, states: Floats) -> list[SimulatedMode]:
-    """Return the modes of a simulated recording at its true parameters and states.
+def _known_mode(problem: Problem, phi: Floats, states: Floats) -> SimulatedMode:
+    """Return the mode of a simulated recording at its true parameters and states.
 
-    On pieces, the shortest first, up to where an initial state is magnified.
+    On the longest pieces that do not magnify an initial state, errors as if they were white.
     """
 
     def at(length: int) -> SimulatedMode:
         return fit_pieces(in_pieces(problem, length, states), phi, rounds=0)
 
-    longest = at(max(states.shape[1] - 1, 2))
-    modes = [at(length) for length in piece_lengths(longest)[:-1]]
-    kept = [mode for mode in (*modes, longest) if growth(mode.problem) <= MOST_GROWTH]
-    return [corrected(mode) for mode in kept or [longest]]
+    mode = at(max(states.shape[1] - 1, 2))
+    shorter = piece_lengths(mode)[:-1]
+    while shorter and growth(mode.problem) > MOST_GROWTH:
+        mode = at(shorter.pop())
+    mode, white = corrected(mode), (1.0,) * len(mode.sigma)
+    return replace(mode, problem=mode.problem.with_likelihood(tau=white))
 
 
-class _Way(NamedTuple):
-    """A law of some size: by one of its parameters at a grid point, or by all of them.
-
-    Parameters
-    ----------
-    share : float
-        The size over the scale of the parameter's prior.
-    size : float
-        Change of the parameter; of a whole change, its share that is found in white noise.
-    place : int or None
-        The parameter; None for a whole change.
-    direction : ndarray
-        What a unit of it adds to the residual, to first order, in units of noise, shape (n,).
-    term : Term
-        The grid point.
-    regression : _Regression
-        Pieces of one length.
-    """
-
-    share: float
-    size: float
-    place: int | None
-    direction: Floats
-    term: Term
-    regression: _Regression
-
-
-@dataclass(frozen=True, eq=False)
 class _Regression:
-    """Regression at the true parameters on pieces of one length, and what a law adds to it.
+    """Regressions on single laws at the true parameters.
+
+    On the longest pieces: there a law that the search finds on shorter ones has to be a main one.
 
     Parameters
     ----------
     mode : SimulatedMode
         Of the declared model.
-    tests : ScoreTest
-        Its residual, and what parameters absorb.
-    terms : tuple of Term
-        A candidate at a grid point each.
-    basis : ndarray
-        Their columns, shape (n, column).
-    least_share : float
-        Share of the simulation error that a law takes away.
+    laws : sequence of Attached
+        Candidates, each of which is linearised at all its grid points.
     criteria : Criteria
-        Other thresholds.
-    longer : _Regression or None
-        That on longer pieces.
+        Thresholds.
     """
 
-    mode: SimulatedMode
-    tests: ScoreTest
-    terms: tuple[Term, ...]
-    basis: Floats
-    least_share: float
-    criteria: Criteria
-    longer: _Regression | None
+    def __init__(self, mode: SimulatedMode, laws: Sequence[Attached], criteria: Criteria) -> None:
+        library = Library(mode, criteria=criteria)
+        self.mode, self.criteria, self.test = mode, criteria, library.test()
+        self.counts = np.maximum(weights(mode), 1.0)
 
-    @classmethod
-    def of(
-        cls,
-        mode: SimulatedMode,
-        tried: Sequence[Attached],
-        criteria: Criteria,
-        longer: _Regression | None,
-    ) -> _Regression:
-        """Linearise candidates at a mode."""
-        tests, linear = linearised(mode, tried, criteria)
-        visible, width, terms = sum(map(bool, linear.values())), 0, []
-        bases = [np.zeros((len(tests.residual), 0))]
-        for law, points in linear.items():
-            price = np.log(visible * max(len(points), 1)) - law.effect.log_odds
-            for point in points:
-                columns = np.arange(width, width + point.basis.shape[1])
-                terms.append(Term(law, point, columns, float(price)))
-                bases.append(point.basis)
-                width += len(columns)
-        limits = criteria.search
-        least = limits.least_share if longer else limits.small_share
-        least = limits.alone if mode.problem.data.history.n_trajectories == 1 else least
-        return cls(mode, tests, tuple(terms), np.hstack(bases), least, criteria, longer)
+        def linearised(law: Attached) -> list[Term]:
+            points = list(each_grid_point(mode, law)) or library.points(law)[0]
+            price = float(np.log(len(laws) * max(len(points), 1))) - law.effect.log_odds
+            each = (self.test.at(point, law).about(point) for point in points)
+            return [Term(law, a, np.arange(len(a.basis.T)), price) for a in each if a.basis.size]
 
-    @cached_property
-    def counts(self) -> Floats:
-        """Degrees of freedom of each dimension, shape (state,)."""
-        return np.maximum(self.mode.problem.likelihood.initial_states.counts, 1.0)
+        self.terms = dict(zip(laws, in_parallel(linearised, laws), strict=True))
 
-    def ways(self, law: Attached) -> list[_Way]:
-        """Return the sizes of a law that pay its price in white noise, the least share first."""
-        ways, parameters, sides = list[_Way](), law.effect.parameters, null_sides(law)
-        for term in (term for term in self.terms if term.law == law):
-            linear, n = term.linear, float(self.counts.sum())
-            paid = self.criteria.search.least_nats + term.price - worth(0.0, len(term.columns), n)
-            places = linear.columns or (None,)
-            for place, unit in zip(places, np.linalg.pinv(linear.back).T, strict=True):
-                if not np.any(unit):
-                    continue
-                size = float(np.sqrt(2.0 * paid) / np.linalg.norm(unit))
-                scale = 1.0 if place is None else parameters[place].prior.scale
-                side = -1.0 if place is not None and sides[place] < 0 else 1.0
-                direction = linear.basis @ (side * unit)
-                ways.append(_Way(size / scale, size, place, direction, term, self))
-        return sorted(ways, key=lambda way: way.share)
-
-    def finds(self, way: _Way, size: float = 1.0) -> bool:
-        """Return whether what a law of a size adds is proposed and accepted.
-
-        A regression proposes it with the residual's autocorrelation time, which a slow law makes
-        long; a refit, whose residual is white, confirms it. Where longer pieces are out of phase,
-        its share does not matter.
-        """
-        n, sigma = self.counts, self.mode.sigma
-        residual, square = self.refitted(size * way.direction)
-        likelihood = self.mode.problem.likelihood
-        tau = likelihood.correlation_times(residual * sigma, sigma * np.sqrt(square))
-        share = min(float((n / tau * (1.0 - 1.0 / square)).sum() / (n / tau).sum()), 1.0 - 1e-12)
-        gain, total, q = (
-            float((0.5 * n * np.log(square)).sum()),
-            float(n.sum()),
-            len(way.term.columns),
-        )
-        accepted = gain + worth(0.0, q, total) - way.term.price >= self.criteria.search.least_nats
-        if worth(share, q, (n / tau).sum()) < way.term.price or not accepted:
-            return False
-        enough = -np.expm1(-gain / total) >= self.least_share
-        if enough and share >= 1.0 - (1.0 - LIKELY * self.least_share) ** 2:
-            return True
-        return self.longer is not None and self.longer.is_lost(way, size, sigma * np.sqrt(square))
-
-    def is_lost(self, way: _Way, size: float, shorter: Floats) -> bool:
-        """Return whether a law's error nears the motion's size; ``shorter`` is that before."""
-        values = self.mode.problem.observations.values
-        square = self.refitted(self.added(way, size))[1]
-        return is_out_of_phase(self.mode.sigma * np.sqrt(square), shorter, values)
-
-    def refitted(self, added: Floats) -> tuple[Floats, Floats]:
-        """Return the residual of a refit with what a law adds, and its squared size, (state,)."""
-        square = np.ones(len(self.counts))
-        for _ in range(3):  # noise and parameters depend on each other
-            residual = self.fitted(self.tests.residual + added, square)
-            square = np.maximum((residual**2).sum((0, 1, 2)) / self.before, 1.0)
-        return residual, square
-
-    @cached_property
-    def before(self) -> Floats:
-        """Squared residual of each dimension without any law, shape (state,)."""
-        residual = self.fitted(self.tests.residual, np.ones(len(self.counts)))
-        return np.asarray((residual**2).sum((0, 1, 2)))
-
-    def fitted(self, z: Floats, square: Floats) -> Floats:
-        """Return whitened rows after a refit of the declared parameters with other noise.
-
-        Shape (piece, H, body, state), in units of the noise; ``square`` are the squared sizes of
-        the other noise in these units, shape (state,).
-        """
-        pieces = self.mode.whitened_residual.shape
-        shape = self.mode.problem.observations.values.shape
-        column = self.mode.problem.likelihood.initial_states.column
-        weight = 1.0 / np.sqrt(square)
-        begin = np.where(column < 0, 1.0, weight[column])
-        rows = np.concatenate([np.tile(weight, shape[1] * shape[2]), begin])
-        weight = np.append(np.tile(rows, pieces[0]), np.ones(len(self.mode.phi)))
-        q = np.linalg.qr(weight[:, None] * self.tests.q)[0]
-        left = (weight * z - q @ (q.T @ (weight * z))) / weight
-        return left[: np.prod(pieces)].reshape(pieces)[:, : np.prod(shape[1:])].reshape(shape)
-
-    def least(self, way: _Way) -> _Way | None:
-        """Return the least of a few sizes from which on a law is found, or None.
-
-        A whole change has one size.
-        """
-        if way.place is None:
-            return way if way.size < 1.0 and self.finds(way) else None
-        found = takewhile(lambda each: self.finds(way, each * way.size), _FACTORS[::-1])
-        factor = min(found, default=None)
-        if factor is None:
-            return None
-        return way._replace(share=float(factor * way.share), size=float(factor * way.size))
-
-    def added(self, way: _Way, size: float) -> Floats:
-        """Return what a law adds to the residual, simulated, in units of noise, shape (n,)."""
-        law, problem = way.term.law, self.mode.problem
-        values = way.term.linear.values.astype(float)
-        if way.place is not None:
-            values[way.place] += -size if null_sides(law)[way.place] < 0 else size
-        enlarged = problem.with_physics(effects=(*problem.physics.effects, law)).medium
-        phi = np.tile(enlarged.layout.from_layout(problem.layout, self.mode.phi), (2, 1))
-        phi[:, enlarged.layout.places(law.labels)] = law.effect.null, values
-        null, there = np.nan_to_num(enlarged.whitened(phi, self.mode.sigma)).reshape(2, -1)
-        return self.tests.left(np.pad(null - there, (0, len(self.mode.phi))))
+    def least(self, term: Term, unit: Floats) -> float:
+        """Return the least multiple of a change of the residual, shape (n,), that is seen."""
+        initial, limits = self.mode.problem.likelihood.initial_states, self.criteria.search
+        n, alone = float(self.counts.sum()), self.mode.problem.data.history.n_trajectories == 1
+        main = -n * float(np.log1p(-(limits.alone if alone else limits.main_share)))
+        paid = limits.least_nats + term.price - worth(0.0, len(term.columns), n)
+        gain, shape = max(main, paid), self.mode.whitened_residual.shape
+        square = unit[: np.prod(shape)].reshape(shape) ** 2
+        rows, begin = np.split(square, [initial.seen[0].size], axis=1)
+        square = initial.totals(rows.reshape(initial.seen.shape), begin) / self.counts
+        # the first is enough if every dimension shows as much as the one that shows most
+        squares = np.geomspace(1.0, 1e6, 300) * np.expm1(2.0 * gain / n) / max(square.max(), 1e-300)
+        gains = 0.5 * np.log1p(squares[:, None] * square) @ self.counts
+        return float(np.sqrt(np.interp(gain, gains, squares)))
 
     def named(self, law: Attached, added: Floats) -> tuple[str, tuple[str, ...]]:
-        """Return which law is named where one adds to the residual, and those within some nats."""
-        residual, within = self.tests.residual + added, self.criteria.search.least_nats
-        towards, total = self.basis.T @ residual, float(residual @ residual)
-        nats: dict[Attached, float] = {}
-        for term in self.terms:
-            coordinates = towards[term.columns]
-            clipped = term.sizes(coordinates, self.criteria.far_out)
-            if clipped is None or not np.allclose(clipped, term.linear.sizes(coordinates)):
-                continue
-            share = min(float(coordinates @ coordinates) / total, 1.0 - 1e-12)
-            value = worth(share, len(term.columns), float(self.counts.sum())) - term.price
-            nats[term.law] = max(value, nats.get(term.law, -np.inf))
-        tied = [one for one, value in nats.items() if value > max(nats.values()) - within]
-        few = min(len(one.labels) for one in tied)
-        simple = [one for one in tied if len(one.labels) == few]
+        """Return which law is named where one adds to the residual, and others within some nats."""
+        noise, limits = self.test.residual, self.criteria.search
+        residual, common, found = noise + added, 0.0, dict.fromkeys(self.terms, -np.inf)
+        for term in (term for terms in self.terms.values() for term in terms):
+            towards = term.linear.basis.T @ residual
+            sizes = term.sizes(towards, self.criteria.far_out)
+            if sizes is not None and np.array_equal(sizes, term.linear.sizes(towards)):
+                taken, n = float(towards @ towards), float(self.counts.sum())
+                share = taken / float(residual @ residual)
+                found[term.law] = max(found[term.law], worth(share, len(towards), n) - term.price)
+                common = max(common, 0.0 if term.law.effect.unusual else taken)
+        # the search tries unusual laws where they promise to take much off what common ones leave
+        more = (1.0 - limits.promise) ** 2 * (residual @ residual - common) > noise @ noise
+        laws = [one for one in found if more or not one.effect.unusual] or [law]
+        top = max(found[one] for one in laws)
+        near = [one for one in laws if found[one] >= top - limits.least_nats]
         # of the same physics the first in the catalogue
-        first = next(one for one in simple if nats[one] > max(map(nats.__getitem__, simple)) - 1.0)
-        evidence = {one: value - one.effect.log_odds for one, value in nats.items()}
-        least = evidence.get(law, max(evidence.values())) - within
-        close = [one for one in nats if one != law and evidence[one] > least]
-        return named_beside(first, law), tuple(named_beside(one, law) for one in close)
+        first = min(near, key=lambda one: (len(one.labels), found[one] < top - 1.0))
+        return named_beside(first, law), tuple(named_beside(one, law) for one in near if one != law)
 
-
-def _rehearsed(regressions: Sequence[_Regression], law: Attached) -> RehearsedLaw:
-    """Return what is seen of a law on pieces of any length."""
-    effect, parameters = law.effect, law.effect.parameters
-    names = [parameter.name for parameter in parameters]
-    unseen = RehearsedLaw(
-        effect.name, law.body, effect.sentence, {}, {}, dict(zip(names, effect.null, strict=True)),
-        {parameter.name: parameter.unit for parameter in parameters}, np.inf, "", (),
-        "declared parameters absorb it, or it changes nothing here",
-    )  # fmt: skip
-    ways = [way for one in regressions for way in one.ways(law)]
-    if not ways:
-        return unseen
-    sized = {
-        (id(way.regression), way.place): way for way in reversed(ways) if way.place is not None
-    }
-    least: dict[tuple[int | None, bytes], _Way] = {}
-    for way in sorted(sized.values(), key=lambda way: way.share) or ways:
-        # of a whole change, each point
-        key = way.place, b"" if way.place is not None else way.term.linear.values.tobytes()
-        if key not in least or way.share < least[key].share:  # of white noise, the least
-            one = way.regression.least(way)
-            if one is not None and one.share < way.regression.criteria.far_out:
-                least[key] = min(one, least.get(key, one), key=lambda way: way.share)
-    found = sorted(least.values(), key=lambda way: way.share)
-    if not found:
-        return replace(unseen, note="too small, or like a correlated error of the sensor")
-    best, note, levels = found[0], "", dict[str, float]()
-    sizes = {names[way.place]: way.size for way in found if way.place is not None}
-    if best.place is None:
-        points = {way.term.linear.values.tobytes() for way in ways}
-        note = f"seen at {len(found)} of {len(points)} places, times or levels"
-        if len(names) == 1:
-            seen = [float(way.term.linear.values[0]) for way in found]
-            levels[names[0]] = min(seen, key=lambda level: abs(level - effect.null[0]))
-    named, confounded = best.regression.named(
-        law, best.regression.added(best, _WELL_SEEN * best.size)
-    )
-    return RehearsedLaw(
-        effect.name, law.body, effect.sentence, sizes, levels, unseen.null, unseen.units,
-        best.share, named, confounded, note,
-    )  # fmt: skip
+    def rehearsed(self, law: Attached) -> RehearsedLaw:
+        """Return what is seen of a law."""
+        effect, terms, sides = law.effect, self.terms.get(law, ()), null_sides(law)
+        ways, sizes, levels = list[tuple[float, Floats]](), dict[str, float](), list[float]()
+        for term in terms:
+            units = (term.linear.basis @ np.linalg.pinv(term.linear.back)).T
+            for place, unit in zip(term.linear.columns, units, strict=False):
+                parameter, size = effect.parameters[place], self.least(term, unit)
+                name, scale = parameter.name, parameter.prior.scale
+                if size < min(self.criteria.far_out * scale, sizes.get(name, np.inf)):
+                    sizes[name] = size
+                    well = min(_WELL_SEEN * size, 0.9 * self.criteria.far_out * scale)
+                    ways.append((size / scale, (sides[place] or 1) * well * unit))
+            if not term.linear.columns and (share := self.least(term, units[0])) < 1.0:
+                levels.append(float(term.linear.values[0]))
+                ways.append((share, units[0]))
+        share, added = min(ways, key=lambda way: way[0], default=(np.inf, np.zeros(0)))
+        named, confounded = self.named(law, added) if ways else ("", ())
+        note = "too small" if terms else "declared parameters absorb it, or nothing here shows it"
+        if ways:
+            note = "" if sizes else f"seen at {len(levels)} of {len(terms)} places, times or levels"
+        null, nearest = {one.name: one.null for one in effect.parameters}, dict[str, float]()
+        if levels and not sizes and len(null) == 1:
+            nearest = {name: min(levels, key=lambda one: abs(one - null[name])) for name in null}
+        return RehearsedLaw(
+            effect.name, law.body, effect.sentence, sizes, nearest, null,
+            {one.name: one.unit for one in effect.parameters}, share, named, confounded, note,
+        )  # fmt: skip

@@ -84,11 +84,9 @@ class Law:
         Most probable value of each parameter, its standard deviation, which allows for the
         residual's correlation, and its unit.
     nats : float
-        Log-evidence that is lost without it, less its price.
+        Log-evidence that is lost without it, less its price, summed over lengths of pieces.
     share : float
-        Share of the simulation error (root mean square) that it takes away.
-    main : bool
-        Whether it is a main law: one that takes a large share away.
+        Share of the simulation error (root mean square) on the longest ones that it takes off.
     confounded : tuple of str
         Effects that explain these data as well.
     """
@@ -101,8 +99,24 @@ class Law:
     units: Mapping[str, str]
     nats: float
     share: float
-    main: bool = True
     confounded: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Part:
+    """A law that is not added, and the share of the simulation error that it takes off.
+
+    Parameters
+    ----------
+    effect, body : str
+        Names of the effect and of the body.
+    share : float
+        Share of the error (root mean square) on the longest pieces.
+    """
+
+    effect: str
+    body: str
+    share: float
 
 
 @dataclass(frozen=True)
@@ -301,10 +315,8 @@ class Added:
         Gain of expected log predictive density over the model without it, and its standard error
         (nats).
     simulated_nats, simulated_share : float or None
-        What the simulation error of whole trajectories loses without it: net log-evidence (nats),
-        and the share of that error.
-    main : bool
-        Whether it is a main law; a small correction may stand for something else.
+        What simulations lose without it: net log-evidence, summed over lengths of pieces (nats),
+        and the share of the error on the longest ones.
     """
 
     effect: str
@@ -318,7 +330,6 @@ class Added:
     elpd_difference_se: float
     simulated_nats: float | None = None
     simulated_share: float | None = None
-    main: bool = True
 
     @property
     def chance(self) -> float:
@@ -464,5 +475,3 @@ class Stage(StrEnum):
     TEST = "testing the residual", 0.4
     SAMPLE = "sampling the posteriors", 0.5
     COMPARE = "comparing errors on held-out data", 0.99
-    LEARN = "learning a force for the residual"
-    REFIT = "fitting the model with the learned remainder"

@@ -10,7 +10,7 @@ import numpy as np
 
 from pbrl_ppl.criticism.results import Added
 from pbrl_ppl.criticism.score import rank_candidates
-from pbrl_ppl.criticism.search import with_effects
+from pbrl_ppl.criticism.table import with_effects
 from pbrl_ppl.effects import Attached, Effect, Noise
 from pbrl_ppl.errors import EffectError, PosteriorError
 from pbrl_ppl.likelihood import is_independent

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 from scipy.stats import chi2, norm
@@ -61,10 +61,6 @@ class Signature:
         """Return the test with its direction, without arrays of several values a row."""
         return replace(self, basis=self.basis[:0].copy(), linear=())
 
-    def test_alone(self) -> Signature:
-        """Return the test without arrays of n values."""
-        return replace(self.without_bases(), direction=self.direction[:0].copy())
-
 
 @dataclass(frozen=True, eq=False)
 class Linearisation:
@@ -96,112 +92,152 @@ class Linearisation:
         return values
 
 
-def _whole(signature: Signature) -> Signature:
-    return signature
-
-
 def rank_candidates(
-    mode: Mode,
-    candidates: Sequence[Attached],
-    criteria: Criteria = DEFAULT,
-    kept: Callable[[Signature], Signature] = _whole,
+    mode: Mode, candidates: Sequence[Attached], criteria: Criteria = DEFAULT
 ) -> list[Signature]:
     """Score every candidate effect at the mode of the model that lacks it, best first.
 
-    See :func:`score_candidates`.
+    See :class:`Library`; the tests are without arrays of several values a row.
     """
-    return score_candidates(mode, candidates, criteria, kept)[1]
+    library = Library(mode, criteria=criteria)
+
+    def score(attached: Attached) -> Signature:
+        signature = library.scored(attached, len(candidates)).without_bases()
+        library.forget(attached)
+        return signature
+
+    # p-values of the same physics differ by rounding; any missing effect makes tails heavy
+    return sorted(
+        in_parallel(score, candidates),
+        key=lambda one: (_of_noise(one.attached), round(one.log_p, 3)),
+    )
 
 
-def score_candidates(
-    mode: Mode,
-    candidates: Sequence[Attached],
-    criteria: Criteria = DEFAULT,
-    kept: Callable[[Signature], Signature] = _whole,
-) -> tuple[Floats, list[Signature]]:
-    """Return the whitened residual without what parameters absorb, and candidates, best first.
+class Library:
+    """Derivatives of a mode's predictions, by its parameters and by candidates, computed once.
 
-    With whitened residual r, Jacobian J of the declared parameters and signature D of a candidate
+    With whitened residual r, Jacobian J of the mode's parameters and signature D of a candidate
     (its derivative at the value where it vanishes), both r and D are projected off J: what the
-    declared parameters can absorb is no evidence. ``S = r' D (D' D)^-1 D' r`` is the score
-    statistic (C. R. Rao, 1948), chi-squared with q degrees of freedom if nothing is missing.
+    parameters can absorb is no evidence. ``S = r' D (D' D)^-1 D' r`` is the score statistic (C. R.
+    Rao, 1948), chi-squared with q degrees of freedom if nothing is missing.
 
     Parameters
     ----------
     mode : Mode
-        Mode of the declared model.
-    candidates : sequence of Attached
-        Effects that it lacks.
+        Of the model that lacks the candidates.
+    laws : tuple of Attached
+        Effects of the model in whose place candidates may come.
     criteria : Criteria
-        Which signatures are absorbed.
-    kept : callable
-        Returns what of each signature is kept, such as :meth:`Signature.without_bases`.
-
-    Returns
-    -------
-    residual : ndarray
-        Shape (n,).
-    list of Signature
-        Smallest p-value first; ties in the catalogue's order. Effects of the noise
-        stage come last.
+        How large an effect may be.
     """
-    test = _score_test(mode, len(candidates), criteria)
 
-    def score(attached: Attached) -> Signature:
-        best = _tail_score if _of_noise(attached) else _best_grid_point
-        return kept(best(mode, attached, test))
+    def __init__(
+        self, mode: Mode, laws: tuple[Attached, ...] = (), criteria: Criteria = DEFAULT
+    ) -> None:
+        self.mode, self.laws, self.criteria = mode, laws, criteria
+        self._tests: dict[tuple[Attached, ...], ScoreTest] = {}
+        self._scans: dict[Attached, tuple[list[GridPoint], list[GridPoint], list[Floats]]] = {}
 
-    # the noise's shape comes last: any missing effect makes tails heavy; p-values of the same
-    # physics differ by rounding
-    def order(signature: Signature) -> tuple[bool, float]:
-        return _of_noise(signature.attached), round(signature.log_p, 3)
+    @cached_property
+    def slopes(self) -> Floats:
+        """Derivative of predictions and priors by the mode's parameters, shape (n, p)."""
+        priors = self.mode.problem.layout.priors
+        return np.vstack([_slopes(self.mode), np.diag(prior_slopes(priors, self.mode.phi))])
 
-    return test.residual, sorted(in_parallel(score, candidates), key=order)
+    def test(self, without: tuple[Attached, ...] = ()) -> ScoreTest:
+        """Return the score tests at the mode, or to first order at that without some laws."""
+        if without not in self._tests:
+            mode, layout = self.mode, self.mode.problem.layout
+            phi, jacobian, places = mode.phi.copy(), self.slopes, list[int]()
+            residual = mode.whitened_residual.ravel()
+            for law in without:
+                here = layout.places(law.labels)
+                places += here
+                if law.effect.scan is None:
+                    change = phi[here] - law.effect.null
+                    residual = residual + jacobian[: len(residual), here] @ change
+                phi[here] = law.effect.null
+            scanned = [place for law in without if law.effect.scan for place in law.labels]
+            if scanned:  # a threshold is no slope
+                at = mode.phi.copy()
+                here = layout.places(scanned)
+                at[here] = phi[here]
+                change = mode.problem.whitened(at, mode.sigma) - mode.whitened_residual
+                residual = residual + np.nan_to_num(change).ravel()
+            residual = np.append(residual, -prior_residual(layout.priors, phi))
+            jacobian = np.delete(jacobian, places, axis=1)
+            scale = 1.0 / np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
+            q, r = np.linalg.qr(jacobian * scale)
+            # a parameter that neither the data nor the prior inform has no direction
+            q = q[:, np.abs(np.diag(r)) > 1e-10 * np.abs(np.diag(r)).max(initial=0.0)]
+            self._tests[without] = ScoreTest(q, residual - q @ (q.T @ residual), self.criteria)
+        return self._tests[without]
 
+    def scored(
+        self, attached: Attached, candidates: int, without: tuple[Attached, ...] = ()
+    ) -> Signature:
+        """Return the score test of one of so many candidates; a whole change has one sign."""
+        test = self.test(without)
+        if _of_noise(attached):
+            return _tail_score(self.mode, attached, test, candidates)
+        points, tried, units = self.points(attached)
+        judged = [(test.at(point, attached), point) for point in points]
+        judged.sort(key=lambda one: one[0].log_p)
+        best, values = _none(len(test.residual)), np.array(attached.effect.null)
+        if judged:
+            best, point = judged[0]
+            values = point.values.copy()
+            for column, size in zip(point.columns, best.size, strict=False):
+                values[column] += size
+        linear = tuple(
+            one.about(point) for one, point in judged
+            if one.statistic > 0 or attached.effect.scan is None
+        )  # fmt: skip
+        return _signature(attached, best, values, test, candidates, tried, units, linear)
 
-def linearised(
-    mode: Mode, candidates: Sequence[Attached], criteria: Criteria = DEFAULT
-) -> tuple[ScoreTest, dict[Attached, tuple[Linearisation, ...]]]:
-    """Return the score tests at a mode, and candidates linearised at every grid point.
+    def forget(self, attached: Attached) -> None:
+        """Let go of a candidate's derivatives, which take much memory in long recordings."""
+        self._scans.pop(attached, None)
 
-    Those without a scan are linearised at the null value, those of the noise not at all. Candidates
-    that the declared parameters absorb have no linearisation.
-    """
-    test = _score_test(mode, len(candidates), criteria)
+    def points(
+        self, attached: Attached, again: int = 4
+    ) -> tuple[list[GridPoint], list[GridPoint], list[Floats]]:
+        """Return where a candidate is linearised, all grid points, and changes by a unit of each.
 
-    def every(attached: Attached) -> tuple[Linearisation, ...]:
-        tried = [] if _of_noise(attached) else _points(mode, attached)
-        seen = [test.at(point, attached).about(point) for point in tried]
-        return tuple(one for one in seen if one.basis.shape[1])
-
-    return test, dict(zip(candidates, in_parallel(every, candidates), strict=True))
-
-
-def _score_test(mode: Mode, candidates: int, criteria: Criteria) -> ScoreTest:
-    """Return the score tests at a mode, with the prior as further rows of the residual."""
-    priors = mode.problem.layout.priors
-    residual = np.concatenate([mode.whitened_residual.ravel(), -prior_residual(priors, mode.phi)])
-    jacobian = np.vstack([_slopes(mode), np.diag(prior_slopes(priors, mode.phi))])
-    scale = 1.0 / np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
-    q, r = np.linalg.qr(jacobian * scale)
-    # a parameter that neither the data nor the prior inform has no direction
-    informed = np.abs(np.diag(r)) > 1e-10 * np.abs(np.diag(r)).max(initial=0.0)
-    q = q[:, informed]
-    return ScoreTest(q, residual - q @ (q.T @ residual), candidates, criteria)
-
-
-def _points(mode: Mode, attached: Attached) -> Iterable[GridPoint]:
-    """Return a candidate at every grid point of its scan, or else at its null value."""
-    if attached.effect.scan is not None:
-        return each_grid_point(mode, attached)
-    null = np.array(attached.effect.null, dtype=float)
-    return [GridPoint(null, _slopes(mode, attached), tuple(range(len(null))))]
+        Of a scan, the ``again`` leading ones beside the laws and in their place, simulated with
+        more engine steps: with these a body may pass by.
+        """
+        if attached not in self._scans:
+            mode, test = self.mode, self.test()
+            if attached.effect.scan is None:
+                null = np.array(attached.effect.null, dtype=float)
+                columns = tuple(range(len(null)))
+                if attached in self.laws:
+                    here = mode.problem.layout.places(attached.labels)
+                    slopes = self.slopes[: mode.whitened_residual.size, here]
+                else:
+                    slopes = _slopes(mode, attached)
+                point = GridPoint(null, slopes, columns)
+                self._scans[attached] = [point], [point], [test.at(point, attached).unit]
+            else:
+                tests, judged = [test, self.test(self.laws)][: 1 + bool(self.laws)], []
+                for point in each_grid_point(mode, attached):
+                    scores = [one.at(point, attached) for one in tests]
+                    judged.append(([one.log_p for one in scores], point.place, scores[0].unit))
+                leading: dict[int, Floats] = {}
+                for i in range(len(tests)):
+                    for one in sorted(judged, key=lambda one: one[0][i])[:again]:
+                        leading |= {id(one[1]): one[1].proposed} if one[0][i] < 0.0 else {}
+                proposed = np.array([*leading.values()])
+                finer = list(each_grid_point(mode, attached, proposed)) if leading else []
+                self._scans[attached] = finer, [j[1] for j in judged], [j[2] for j in judged]
+        return self._scans[attached]
 
 
 def _slopes(mode: Mode, attached: Attached | None = None) -> Floats:
     """Return the derivative of whitened predictions, shape (n, columns).
 
-    By the parameters of a candidate at its null value, or else by the declared ones. Each candidate
+    By the parameters of a candidate at its null value, or else by those of the mode. Each candidate
     is simulated by itself, for every law costs time in every engine step.
     """
     effects = mode.problem.physics.effects + (() if attached is None else (attached,))
@@ -240,10 +276,6 @@ class _Evidence:
     unit: Floats
     back: Floats
 
-    def test_alone(self) -> _Evidence:
-        """Return the evidence without arrays of n values."""
-        return replace(self, basis=self.basis[:0].copy(), direction=self.direction[:0].copy())
-
     def about(self, point: GridPoint) -> Linearisation:
         """Return the linearisation of the signature of a grid point."""
         return Linearisation(point.values, point.columns, self.basis, self.back)
@@ -265,15 +297,12 @@ class ScoreTest:
         Orthonormal directions that the declared parameters absorb, shape (n, direction).
     residual : ndarray
         Whitened residual without these directions, shape (n,).
-    candidates : int
-        Number of candidates, which p-values are corrected for.
     criteria : Criteria
         Which signatures are absorbed.
     """
 
     q: Floats
     residual: Floats
-    candidates: int
     criteria: Criteria
 
     def left(self, rows: Floats) -> Floats:
@@ -347,6 +376,7 @@ def _signature(
     evidence: _Evidence,
     values: Floats,
     test: ScoreTest,
+    candidates: int,
     tried: Sequence[GridPoint],
     units: Sequence[Floats],
     linear: tuple[Linearisation, ...] = (),
@@ -364,48 +394,15 @@ def _signature(
         sentence=effect.sentence,
         statistic=evidence.statistic,
         dof=evidence.basis.shape[1] or evidence.size.size,  # directions that are seen
-        p_value=float(min(1.0, np.exp(log_p) * test.candidates)),
+        p_value=float(min(1.0, np.exp(log_p) * candidates)),
         estimate=dict(zip(names, values.tolist(), strict=True)),
         units={parameter.name: parameter.unit for parameter in effect.parameters},
         identifiable=evidence.share,
         n_grid_points=len(tried),
-        detectable=detection_limits(effect, tried, units, test.candidates, test.criteria.residual),
+        detectable=detection_limits(effect, tried, units, candidates, test.criteria.residual),
         is_upper_limit=is_upper_limit(effect, tried),
     )
     return Signature(attached, candidate, log_p, evidence.basis, evidence.direction, linear)
-
-
-def _best_grid_point(mode: Mode, attached: Attached, test: ScoreTest, again: int = 4) -> Signature:
-    """Return the signature of the grid point that explains most; a whole change has one sign.
-
-    The ``again`` leading ones of a scan are simulated again with more engine steps.
-    """
-    scanned = attached.effect.scan is not None
-    judged = []
-    for point in _points(mode, attached):
-        score = test.at(point, attached)
-        judged.append((score.test_alone(), point.place) if scanned else (score, point))
-    tried, units = [point for _, point in judged], [score.unit for score, _ in judged]
-    if scanned:  # with more engine steps a body may pass by
-        leading = sorted(judged, key=lambda x: x[0].log_p)[:again]
-        finer: list[GridPoint] = []
-        if leading and leading[0][0].log_p < 0.0:
-            proposed = np.array([point.proposed for _, point in leading])
-            finer = list(each_grid_point(mode, attached, proposed))
-        judged = sorted(
-            ((test.at(point, attached), point) for point in finer), key=lambda x: x[0].log_p
-        )
-    best, values = _none(len(test.residual)), np.array(attached.effect.null)
-    if judged:
-        best, point = judged[0]
-        values = point.values.copy()
-        for column, size in zip(point.columns, best.size, strict=False):
-            values[column] += size
-    linear = tuple(
-        one.about(point) for one, point in judged
-        if one.statistic > 0 or attached.effect.scan is None
-    )  # fmt: skip
-    return _signature(attached, best, values, test, tried, units, linear)
 
 
 def _of_noise(attached: Attached) -> bool:
@@ -413,7 +410,7 @@ def _of_noise(attached: Attached) -> bool:
     return isinstance(attached.effect.stage, Noise)
 
 
-def _tail_score(mode: Mode, attached: Attached, test: ScoreTest) -> Signature:
+def _tail_score(mode: Mode, attached: Attached, test: ScoreTest, candidates: int) -> Signature:
     """Return the score test of the noise's tail: the kurtosis, with sigma's score projected out.
 
     The derivative of Student-t's log-density by the reciprocal of its degrees of freedom at zero is
@@ -442,7 +439,7 @@ def _tail_score(mode: Mode, attached: Attached, test: ScoreTest) -> Signature:
     point = GridPoint(values, np.zeros((0, 1)), (0,))
     if heavier and len(values) == 1:
         values = values + score / variance
-    return _signature(attached, evidence, values, test, [point], [evidence.unit])
+    return _signature(attached, evidence, values, test, candidates, [point], [evidence.unit])
 
 
 def same_physics(first: Signature, second: Signature, cosine: float = 0.9999) -> bool:

@@ -12,17 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
-from pbrl_ppl.criticism.score import (
-    Linearisation,
-    Signature,
-    null_sides,
-    same_physics,
-    score_candidates,
-)
+from pbrl_ppl.criticism.score import Library, Linearisation, Signature, null_sides, same_physics
 from pbrl_ppl.effects import Attached
-from pbrl_ppl.modes import Mode
 from pbrl_ppl.state import Floats, Ints
+from pbrl_ppl.threads import in_parallel
 
 #: A whole change, as by an obstacle, is of size 1: it is at least this share of it in a subset.
 _LEAST_CHANGE = 0.5
@@ -57,11 +50,6 @@ class Subset:
         """The laws, in the order of the catalogue."""
         return tuple(self.sizes)
 
-    @property
-    def evidence(self) -> float:
-        """Log-evidence less its price, prior odds aside."""
-        return self.nats - sum(law.effect.log_odds for law in self.laws)
-
 
 def worth(share: float, columns: int, n: float) -> float:
     """Return the log-evidence (nats) of columns that take a share of n squared residuals away."""
@@ -84,7 +72,7 @@ class Regression:
     same : dict of Attached to tuple of Attached
         Candidates that are the same physics here, by the one that is tried for them.
     signatures : tuple of Signature
-        Score tests of all candidates.
+        Score tests of all candidates, best first.
     """
 
     subsets: tuple[Subset, ...]
@@ -98,15 +86,6 @@ class Regression:
         for subset in self.subsets:
             best.setdefault(len(subset.laws), subset)
         return tuple(best[size] for size in sorted(best))
-
-    def alternatives(self, subset: Subset, law: Attached) -> list[Subset]:
-        """Return the subsets with another law in the place of one, best first."""
-        rest = set(subset.laws) - {law}
-        return [
-            other for other in self.subsets
-            if len(other.laws) == len(subset.laws)
-            and law not in other.laws and rest < set(other.laws)
-        ]  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,31 +112,31 @@ class Term:
 
 
 def best_subsets(
-    mode: Mode,
+    library: Library,
     candidates: Sequence[Attached],
-    criteria: Criteria = DEFAULT,
+    without: tuple[Attached, ...] = (),
     *,
     leaders: int = 14,
     beside: int = 8,
     beam: int = 12,
-    largest: int = 4,
+    largest: int = 3,
     independent: float = 1e-5,
 ) -> Regression:
     """Search the subsets of a few laws that explain the residual of a mode.
 
     A subset S of laws with q columns is worth ``-n/2 log(1 - |P_S r|^2 / |r|^2) - q/2 log n`` less
     its price, with the whitened residual r, the projection P_S on the laws' signatures, both
-    without what parameters and initial states absorb, and n measurements over their autocorrelation
-    times. Subsets whose least-squares sizes break a sign that a prior sets are left out.
+    without what parameters and initial states absorb, and n degrees of freedom. Subsets whose
+    least-squares sizes break a sign that a prior sets are left out.
 
     Parameters
     ----------
-    mode : Mode
+    library : Library
         Of a model that lacks the candidates.
     candidates : sequence of Attached
         Effects to choose from.
-    criteria : Criteria
-        How large an effect may be.
+    without : tuple of Attached
+        Laws of the model that are left out, to first order.
     leaders : int
         Candidates that take most of the residual away, of which subsets are made.
     beside : int
@@ -169,9 +148,11 @@ def best_subsets(
     independent : float
         Least ratio of the eigenvalues of a subset's normal equations.
     """
-    residual, signatures = score_candidates(mode, candidates, criteria)
+    residual, problem = library.test(without).residual, library.mode.problem
+    signatures = in_parallel(lambda one: library.scored(one, len(candidates), without), candidates)
+    signatures.sort(key=lambda one: round(one.log_p, 3))
     total = float(residual @ residual)
-    n = max(float(mode.problem.likelihood.counts(mode.problem.observations).sum()), 2.0)
+    n = max(float(problem.likelihood.counts(problem.observations).sum()), 2.0)
     distinct, same = _distinct(signatures, candidates)
     if not distinct or total <= 0.0:
         return Regression((), same, tuple(signatures))
@@ -185,7 +166,8 @@ def best_subsets(
             columns = np.arange(width, width + linear.basis.shape[1])
             terms.append(Term(law, linear, columns, float(price)))
             width += len(columns)
-    equations = _NormalEquations.of(tuple(terms), residual, n, criteria.far_out, independent)
+    far_out = library.criteria.far_out
+    equations = _NormalEquations.of(tuple(terms), residual, n, far_out, independent)
     order = {law: place for place, law in enumerate(candidates)}
     tried = equations.search([order[term.law] for term in terms], beam, largest)
     best = sorted(tried, key=lambda subset: -subset.nats)

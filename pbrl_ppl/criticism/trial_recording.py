@@ -21,17 +21,11 @@ def parameters_of(physics: Physics, given: Mapping[str, float]) -> Floats:
     """Return the parameters that are given by label or name, others at the prior's centre, (p,)."""
     labels = physics.layout.labels
     names = [label.partition("[")[0] for label in labels]
-    for name in given:
-        if name not in (*labels, *names):
-            raise ParameterError(
-                f'parameters: there is no parameter "{name}"{nearest(name, [*names, *labels])}'
-            )
-    return np.array(
-        [
-            given.get(label, given.get(name, prior.centre))
-            for label, name, prior in zip(labels, names, physics.layout.priors, strict=True)
-        ]
-    )
+    both = [*names, *labels]
+    for name in sorted({*given} - {*both}):
+        raise ParameterError(f'parameters: there is no parameter "{name}"{nearest(name, both)}')
+    priors = zip(labels, names, physics.layout.priors, strict=True)
+    return np.array([given.get(one, given.get(name, prior.centre)) for one, name, prior in priors])
 
 
 def measured(
@@ -53,8 +47,7 @@ def measured(
     noisy = states + free * sd * rng.standard_normal(states.shape)
     dataset["observed"] = dataset["observed"].copy(data=np.where(seen, noisy, np.nan))
     dataset["start"] = dataset["start"].copy(data=states)
-    recorded = seen.any(axis=(0, 1, 2))
-    noise = {name: float(sd[d]) for d, name in enumerate(STATE) if recorded[d]}
+    noise = {name: float(sd[d]) for d, name in enumerate(STATE) if seen[..., d].any()}
     return History(dataset), noise
 
 
@@ -107,13 +100,13 @@ def _proposed(
     most = np.zeros((len(bodies), 3))
     for i, body in enumerate(bodies):
         units, hinged = units_of(scene, body.name), is_pivoted(scene, body)
+        shares = (0.0, 0.0, 1.0) if hinged else (1.0, 1.0, turn)
+        most[i] = push * np.array(shares) * (units.force, units.force, units.torque)
         states[:, 0, i] = (*(body.pose or (0.0, 0.0, 0.0)), 0.0, 0.0, 0.0)
         if hinged:  # the hinge says where it is
             states[:, 0, i, [0, 1, 3, 4]] = np.nan
-        force = 0.0 if hinged else push * units.force
-        most[i] = force, force, (1.0 if hinged else turn) * push * units.torque
     count = -(-intervals // (4 * hold))
     size = rng.uniform(-1.0, 1.0, (trajectories, count, len(bodies), 3)) * most
     pieces = np.stack([size, 0.0 * size, -size, 0.0 * size], axis=2)
-    wrenches = np.repeat(pieces.reshape(trajectories, -1, len(bodies), 3), hold, axis=1)
+    wrenches = pieces.reshape(trajectories, -1, len(bodies), 3).repeat(hold, axis=1)
     return History.of_arrays(states, scene, wrenches[:, :intervals])

@@ -4,9 +4,6 @@ from .catalogue import attach as attach
 from .catalogue import candidates as candidates
 from .catalogue import catalogue as catalogue
 from .catalogue import check_names as check_names
-from .drag import LEARNED_REMAINDER as LEARNED_REMAINDER
-from .drag import LearnedRemainder as LearnedRemainder
-from .drag import learned_remainder as learned_remainder
 from .effect import Attached as Attached
 from .effect import Clock as Clock
 from .effect import Command as Command

@@ -209,6 +209,7 @@ rate_limit = Effect(
     log_odds=-2.0,
     family="late command",
     applies=sends_wrenches,
+    unusual="few actuators are slower than their commands in a straight line; most lag",
 )
 
 
@@ -232,6 +233,7 @@ actuator_backlash = Effect(
     log_odds=-2.0,
     family="late command",
     applies=sends_wrenches,
+    unusual="play needs a train of gears, and friction turns a command round likewise",
 )
 
 
@@ -278,6 +280,7 @@ dead_zone = Effect(
     log_odds=-2.0,
     family="shape of the command",
     applies=sends_wrenches,
+    unusual="friction of the body eats small commands likewise, and every rig has that",
 )
 
 
@@ -306,6 +309,7 @@ force_cutoff = Effect(
     log_odds=-3.0,
     family="shape of the command",
     applies=sends_wrenches,
+    unusual="few drives switch: most give less and less",
 )
 
 
@@ -326,6 +330,7 @@ saturation = Effect(
     log_odds=-2.0,
     family="shape of the command",
     applies=sends_wrenches,
+    unusual="commands are mostly limited before they are logged",
 )
 
 
@@ -422,6 +427,7 @@ gain_by_sign = Effect(
     Command(_by_sign),
     log_odds=-1.0,
     family="shape of the command",
+    unusual="few drives push more one way; a constant force looks the same",
 )
 
 
@@ -444,6 +450,7 @@ command_power = Effect(
     constants=("force", "torque"),
     log_odds=-1.0,
     family="shape of the command",
+    unusual="a power of the command stands in for friction, which takes small commands",
 )
 
 
@@ -467,6 +474,7 @@ gain_by_speed = Effect(
     constants=("speed", "turn_rate"),
     log_odds=-1.0,
     family="shape of the command",
+    unusual="a drag looks the same wherever commands are of one size",
 )
 
 
@@ -489,6 +497,8 @@ gain_by_place = Effect(
     Command(_by_place),
     constants=("x", "y", "range"),
     log_odds=-2.0,
+    unusual="few drives push more at one place; it takes any misfit of a place",
+    needs=("places",),
 )
 
 
@@ -506,6 +516,7 @@ fading_gain = Effect(
     "f = u exp(-a t)",
     Command(_fade, timed=True),
     log_odds=-3.0,
+    unusual="batteries and motors fade over hours, recordings last minutes",
 )
 
 
@@ -537,4 +548,5 @@ power_limit = Effect(
     log_odds=-3.0,
     family="shape of the command",
     applies=sends_wrenches,
+    unusual="drives are seldom commanded beyond their power",
 )

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import difflib
+from collections import Counter
 from collections.abc import Iterable
+
+import numpy as np
 
 from pbrl_ppl.effects import actuators, drag, forces, friction, obstacles, sensors, springs
 from pbrl_ppl.effects.actuation import actuation, laws_of_actuators
-from pbrl_ppl.effects.effect import Attached, Effect
+from pbrl_ppl.effects.effect import Attached, Command, Effect, is_pivoted
 from pbrl_ppl.errors import EffectError
+from pbrl_ppl.history import History
 from pbrl_ppl.scene import Scene
+from pbrl_ppl.state import STATE, THETA, Floats
 
 #: Of effects that the data cannot separate, the earlier one is named: friction of a joint before
 #: drag on a body, which looks the same on a single pendulum, and the simpler before the richer.
@@ -200,19 +205,71 @@ def check_names(effects: Iterable[Effect]) -> None:
 
 
 def candidates(
-    scene: Scene, declared: Iterable[Attached], effects: Iterable[Effect] = catalogue
+    scene: Scene,
+    declared: Iterable[Attached],
+    effects: Iterable[Effect] = catalogue,
+    history: History | None = None,
 ) -> tuple[Attached, ...]:
     """Return every applicable effect on every body that the model does not have yet.
 
-    Their priors are in SI units; see :func:`pbrl_ppl.scene.units_of`.
+    Their priors are in SI units; see :func:`pbrl_ppl.scene.units_of`. Of a history only those that
+    it can show: see ``Effect.needs``.
     """
     present = {(attached.effect.name, attached.body) for attached in declared}
     everywhere = [(effect, body) for effect in effects for body in scene.dynamic]
     own = [
         (effect, body) for body in scene.dynamic for effect in laws_of_actuators(scene, body.name)
     ]
+    shown = {body.name: _shown(scene, body.name, history) for body in scene.dynamic}
     return tuple(
         effect.on(body.name).in_si(scene)
         for effect, body in (*everywhere, *own)
-        if (effect.name, body.name) not in present and effect.applies(scene, body)
+        if (effect.name, body.name) not in present
+        and effect.applies(scene, body)
+        and (history is None or _needed(effect) <= shown[body.name])
     )
+
+
+def _needed(effect: Effect) -> set[str]:
+    """Return what a recording must have to show an effect."""
+    return {*effect.needs, *(["commands"] if isinstance(effect.stage, Command) else [])}
+
+
+def _shown(scene: Scene, body: str, history: History | None) -> set[str]:
+    """Return what a recording has of a body, in the words of ``Effect.needs``."""
+    if history is None:
+        return set()
+    of_body = history.dataset.sel(body=body)
+    observed = of_body["observed"].to_numpy()
+    far = np.fmax.reduce(observed, axis=(0, 1)) - np.fmin.reduce(observed, axis=(0, 1))
+    shown = {name for d, name in enumerate(STATE) if (far[[d % 3, d % 3 + 3]] > 0).any()}
+    if np.nan_to_num(of_body["action"].to_numpy()).any():
+        shown.add("commands")
+    layout = scene.recording
+    if layout is not None and layout.camera is not None:
+        shown |= {"camera"} if layout.camera else set()
+    elif {"x", "y"} <= shown:
+        shown.add("camera")
+    poses = of_body["start"].to_numpy()
+    turns = is_pivoted(scene, scene.body(body))
+    if _repeats(np.mod(poses[..., [THETA]], 2.0 * np.pi) if turns else poses[..., :2]):
+        shown.add("places")
+    return shown
+
+
+def _repeats(poses: Floats, *, cells: int = 5, least: float = 0.25) -> bool:
+    """Return whether a body comes back to its places (trajectory, time, coordinate).
+
+    A place is a cell of its range, ``cells`` each way, which it passes twice: after it was
+    elsewhere, or in another trajectory. ``least``: share of the cells.
+    """
+    low, high = np.fmin.reduce(poses, axis=(0, 1)), np.fmax.reduce(poses, axis=(0, 1))
+    moves = np.nan_to_num(high - low) > 0
+    share = (poses[..., moves] - low[moves]) / (high - low)[moves]
+    passed: Counter[tuple[int, ...]] = Counter()
+    for one in share:
+        rows = one[np.isfinite(one).all(axis=-1)]
+        visited = np.minimum((cells * rows).astype(int), cells - 1)
+        new = np.append(True, (np.diff(visited, axis=0) != 0).any(axis=1))[: len(visited)]
+        passed.update(map(tuple, visited[new].tolist()))
+    return sum(n > 1 for n in passed.values()) >= least * max(len(passed), 1)

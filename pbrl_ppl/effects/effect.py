@@ -472,6 +472,12 @@ class Effect:
     log_odds : float
         Logarithm of the prior odds that a rig has this effect, beside common ones such as drag,
         friction or a constant force (nats, at most 0): part of the price of a law in a search.
+    unusual : str
+        Why few rigs have this effect, in a sentence; empty for a common one. A search tries unusual
+        effects last, and adds them only where they explain what common ones leave.
+    needs : tuple of str
+        What a recording must have for it, besides commands for a law of the command: ``commands``;
+        ``places`` that repeat; a ``camera``; or measurements of a dimension, such as ``theta``.
     force : callable, optional
         Short for ``stage=Force(force)``.
 
@@ -507,6 +513,8 @@ class Effect:
     constants: tuple[str | float, ...] = ()
     family: str = ""
     log_odds: float = 0.0
+    unusual: str = ""
+    needs: tuple[str, ...] = ()
     force: InitVar[Law | None] = None
 
     def __post_init__(self, force: Law | None) -> None:

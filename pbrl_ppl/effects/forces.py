@@ -78,6 +78,7 @@ body_force = Effect(
     "Newton's second law with a force that turns with the body",
     Force(_body_force),
     log_odds=-1.0,
+    needs=("theta",),
 )
 
 
@@ -112,6 +113,7 @@ push_offset = Effect(
     "moment of a force about a point, tau = r x F",
     Force(_moment_of_push),
     log_odds=-1.0,
+    needs=("commands",),
 )
 
 
@@ -143,6 +145,8 @@ cogging = Effect(
     scan=_scan_counts,
     log_odds=-3.0,
     family="place and angle",
+    unusual="few drives have magnets or teeth that are felt beside their friction",
+    needs=("places",),
 )
 
 
@@ -184,6 +188,8 @@ ripple = Effect(
     scan=_scan_waves,
     log_odds=-5.0,
     family="place and angle",
+    unusual="floors with waves are rare; it takes any misfit of a place",
+    needs=("places",),
 )
 
 
@@ -226,6 +232,7 @@ periodic_force = Effect(
     applies=is_unpivoted,
     scan=ScanWith(_scan_periods, ((0.0,), (0.5 * np.pi,))),
     log_odds=-6.0,
+    unusual="it takes any oscillation, and few rigs are shaken",
 )
 
 
@@ -243,6 +250,7 @@ periodic_torque = Effect(
     Force(_periodic_torque, timed=True),
     scan=ScanWith(_scan_periods, ((),)),
     log_odds=-6.0,
+    unusual="it takes any oscillation, and few rigs are shaken",
 )
 
 
@@ -261,6 +269,7 @@ inertia_scale = Effect(
     "moment of inertia about the centroid as a free parameter",
     Properties(_scale_moment),
     log_odds=-2.0,
+    unusual="the moment of inertia is mostly declared as free where it is not known",
 )
 
 
@@ -311,6 +320,7 @@ mass_change = Effect(
     Properties(_scale_mass, timed=True),
     scan=_scan_begins,
     log_odds=-8.0,
+    unusual="few rigs lose or take up a load within a recording",
 )
 
 
@@ -355,4 +365,5 @@ sloshing = Effect(
     applies=is_unpivoted,
     scan=_scan_frequencies,
     log_odds=-4.0,
+    unusual="few rigs carry a liquid or a loose part",
 )

@@ -106,6 +106,7 @@ pivot_stribeck = Effect(
     scan=_SCAN_TURN_RATES,
     log_odds=-2.0,
     family="dry friction",
+    unusual="few recordings are slow and clean enough to show it beside dry friction",
 )
 
 
@@ -143,6 +144,8 @@ pivot_angle_friction = Effect(
     applies=is_pivoted,
     log_odds=-3.0,
     family="dry friction",
+    unusual="few hinges rub at one side; it takes any misfit of an angle",
+    needs=("places",),
 )
 
 
@@ -158,6 +161,7 @@ pivot_one_way_damping = Effect(
     Force(_damp_one_way),
     applies=is_pivoted,
     log_odds=-3.0,
+    unusual="few hinges have a one-way clutch or a damper with a valve",
 )
 
 
@@ -200,6 +204,7 @@ pivot_hysteresis = Effect(
     scan=_scan_bends,
     log_odds=-3.0,
     family="dry friction",
+    unusual="four numbers that take any misfit beside dry friction",
 )
 
 
@@ -266,6 +271,7 @@ sliding_stribeck = Effect(
     applies=_is_pressed,
     scan=_SCAN_SPEEDS,
     log_odds=-2.0,
+    unusual="few recordings are slow and clean enough to show it beside dry friction",
 )
 
 
@@ -283,6 +289,7 @@ slider_stribeck = Effect(
     scan=_SCAN_SPEEDS,
     log_odds=-2.0,
     family="dry friction",
+    unusual="few recordings are slow and clean enough to show it beside dry friction",
 )
 
 
@@ -305,6 +312,8 @@ slider_place_friction = Effect(
     constants=("x", "y", "range"),
     log_odds=-3.0,
     family="dry friction",
+    unusual="few rails rub at one end; it takes any misfit of a place",
+    needs=("places",),
 )
 
 
@@ -323,6 +332,8 @@ friction_by_place = Effect(
     applies=_is_pressed,
     constants=("x", "y", "range"),
     log_odds=-3.0,
+    unusual="few floors are rough at one end; it takes any misfit of a place",
+    needs=("places",),
 )
 
 
@@ -356,4 +367,5 @@ wheel = Effect(
     applies=_lacks_wheel,
     scan=_scan_wheels,
     log_odds=-2.0,
+    unusual="wheels are seen, and declared",
 )

@@ -145,4 +145,6 @@ hidden_obstacle = Effect(
     Structure(_discs),
     scan=_scan,
     log_odds=-8.0,
+    unusual="obstacles are seen; three numbers that take any misfit of a place",
+    needs=("places",),
 )

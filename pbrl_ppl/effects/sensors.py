@@ -59,6 +59,7 @@ sensor_bias = Effect(
     "additive sensor bias",
     _undone_by_opposites(_add_bias),
     log_odds=-2.0,
+    unusual="a zero that is off shows as gravity or a constant force, too",
 )
 
 
@@ -89,6 +90,7 @@ sensor_scale = Effect(
     "scale factor error of a sensor",
     Sensor(_multiply, _divide),
     log_odds=-4.0,
+    unusual="scales are calibrated, and a mass or a gain that is off looks the same",
 )
 
 
@@ -108,6 +110,8 @@ frame_rotation = Effect(
     "rotation between two frames",
     _undone_by_opposites(_turned),
     log_odds=-2.0,
+    unusual="most logs have one frame; it is a force across the commands, too",
+    needs=("x", "y"),
 )
 
 
@@ -137,6 +141,8 @@ askew_camera = Effect(
     applies=is_unpivoted,
     log_odds=-6.0,
     family="place and angle",
+    unusual="it takes any misfit of a place where nothing else stands",
+    needs=("places", "camera"),
 )
 
 
@@ -189,6 +195,8 @@ encoder_eccentricity = Effect(
     applies=is_pivoted,
     log_odds=-6.0,
     family="place and angle",
+    unusual="it takes any misfit of an angle; encoders are seldom off by as much",
+    needs=("places", "theta"),
 )
 
 askew_angle = Effect(
@@ -201,6 +209,8 @@ askew_angle = Effect(
     applies=is_pivoted,
     log_odds=-6.0,
     family="place and angle",
+    unusual="it takes any misfit of an angle; few cameras look so askew",
+    needs=("places", "camera"),
 )
 
 
@@ -227,6 +237,7 @@ sensor_drift = Effect(
     "sensor drift, x + a t",
     _undone_by_opposites(_drift, timed=True),
     log_odds=-4.0,
+    unusual="encoders and cameras do not drift within a recording",
 )
 
 

@@ -76,6 +76,8 @@ spring = Effect(
     scan=_scan_anchors,
     log_odds=-3.0,
     family="place and angle",
+    unusual="cables and springs are seen; three numbers that take any misfit of a place",
+    needs=("places",),
 )
 
 
@@ -113,6 +115,8 @@ torsion_spring = Effect(
     scan=_scan_angles,
     log_odds=-3.0,
     family="place and angle",
+    unusual="cables and springs are seen; a turned hinge or a constant torque is commoner",
+    needs=("places",),
 )
 
 
@@ -136,6 +140,8 @@ cubic_spring = Effect(
     scan=_scan_anchors,
     log_odds=-4.0,
     family="place and angle",
+    unusual="springs that harden are rare, and it takes any misfit of a place",
+    needs=("places",),
 )
 
 
@@ -169,6 +175,8 @@ cubic_torsion_spring = Effect(
     scan=ScanWith(_scan_range, (0.1, 0.5, 0.9)),
     log_odds=-3.0,
     family="place and angle",
+    unusual="springs that harden are rare, and it takes any misfit of an angle",
+    needs=("places",),
 )
 
 
@@ -194,6 +202,8 @@ upper_stop = Effect(
     scan=ScanWith(_scan_range, (0.7, 0.9)),
     log_odds=-4.0,
     family="place and angle",
+    unusual="stops are seen, and seldom reached",
+    needs=("places",),
 )
 
 lower_stop = Effect(
@@ -205,6 +215,8 @@ lower_stop = Effect(
     scan=ScanWith(_scan_range, (0.3, 0.1)),
     log_odds=-4.0,
     family="place and angle",
+    unusual="stops are seen, and seldom reached",
+    needs=("places",),
 )
 
 
@@ -246,6 +258,8 @@ cable = Effect(
     scan=_scan_cables,
     log_odds=-5.0,
     family="place and angle",
+    unusual="cables are seen, and mostly slack",
+    needs=("places",),
 )
 
 
@@ -298,6 +312,8 @@ point_attractor = Effect(
     scan=_scan_places,
     log_odds=-8.0,
     family="place and angle",
+    unusual="few rigs have magnets",
+    needs=("places",),
 )
 
 
@@ -386,4 +402,6 @@ distance_joint = Effect(
     applies=is_unjoined,
     scan=_scan_rods,
     log_odds=-8.0,
+    unusual="rods are seen",
+    needs=("places",),
 )

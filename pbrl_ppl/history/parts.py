@@ -14,18 +14,20 @@ from pbrl_ppl.state import Floats
 #: Transitions that a law is searched in. They show one of a hundredth of the motion, and a search's
 #: time grows faster than they do.
 MOST_TRANSITIONS = 3000
-#: Pieces that are drawn, at least, and transitions of one, at least.
-_PIECES, _SHORTEST = 12, 100
+#: Transitions of a piece, at least.
+_SHORTEST = 100
 
 
-def drawn_pieces(history: History, most: int, seed: int = 0) -> tuple[History, tuple[str, ...]]:
+def drawn_pieces(
+    history: History, most: int, seed: int = 0, *, pieces: int = 12
+) -> tuple[History, tuple[str, ...]]:
     """Return pieces of a history with at most so many transitions in all, and a sentence on them.
 
     A history that has no more is returned as it is, without a sentence.
 
     Trajectories are cut to pieces as long as the slowest motion, of 100 transitions or more, and at
-    most a twelfth of all. The seed draws them, in proportion to how much moves in each: a rest says
-    little. A piece keeps its trajectory's number and time.
+    most one of ``pieces`` equal parts of all. The seed draws them, in proportion to how much moves
+    in each: a rest says little. A piece keeps its trajectory's number and time.
 
     Parameters
     ----------
@@ -35,30 +37,32 @@ def drawn_pieces(history: History, most: int, seed: int = 0) -> tuple[History, t
         Transitions of the result, at most; at least 4.
     seed : int
         The same seed gives the same pieces.
+    pieces : int
+        Pieces that are drawn, at least.
     """
     if history.n_transitions <= most:
         return history, ()
     slow = int(_slowest_motion(history) / history.dataset.attrs["time_step"])
-    longest = max(min(max(slow, _SHORTEST), most // _PIECES), 1)
-    pieces: list[tuple[int, int, int]] = []
+    longest = max(min(max(slow, _SHORTEST), most // pieces), 1)
+    parts: list[tuple[int, int, int]] = []
     complete = history.complete
     for trajectory, n in enumerate(history.dataset["n_rows"].to_numpy() - 1):
         edges = np.linspace(0, n, -(-n // longest) + 1).astype(int)
         for first, last in pairwise(edges.tolist()):
             begins = np.flatnonzero(complete[trajectory, first:last])  # not in a gap
-            pieces += [(trajectory, first + int(begins[0]), last)] if len(begins) else []
-    if not pieces:
+            parts += [(trajectory, first + int(begins[0]), last)] if len(begins) else []
+    if not parts:
         return history, ()
-    moves = _motion(history.dataset["observed"].to_numpy(), pieces)
-    moves = moves if moves.any() else np.ones(len(pieces))
+    moves = _motion(history.dataset["observed"].to_numpy(), parts)
+    moves = moves if moves.any() else np.ones(len(parts))
     with np.errstate(divide="ignore"):  # keys of a draw without replacement; a rest comes last
-        order = np.argsort(np.random.default_rng(seed).exponential(size=len(pieces)) / moves)
-    sizes = np.array([b - a for _, a, b in pieces])[order]
+        order = np.argsort(np.random.default_rng(seed).exponential(size=len(parts)) / moves)
+    sizes = np.array([b - a for _, a, b in parts])[order]
     chosen = np.sort(order[np.cumsum(sizes) <= most])
-    parts = [_piece(history.dataset, *pieces[i]) for i in chosen]
     joined = xr.concat(
-        parts, "trajectory", data_vars="minimal", coords="minimal", compat="override", join="outer"
-    )
+        [_piece(history.dataset, *parts[i]) for i in chosen],
+        "trajectory", data_vars="minimal", coords="minimal", compat="override", join="outer",
+    )  # fmt: skip
     labels = [str(label) for label in joined["trajectory"].to_numpy()]
     drawn = History(hashed(joined.assign_coords(trajectory=labels)))
     said = (

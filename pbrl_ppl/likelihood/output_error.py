@@ -76,11 +76,14 @@ class InitialStates:
     def counts(self) -> Floats:
         """Degrees of freedom of each observed dimension, shape (state,).
 
-        Its measurements, less its part of the initial coordinates that are inferred (restricted
-        likelihood: H. D. Patterson and R. Thompson, Biometrika 58, 1971).
+        Its measurements, less its part of the directions that initial states can take up
+        (restricted likelihood: H. D. Patterson and R. Thompson, Biometrika 58, 1971).
         """
         total = max(self.measured.sum(), 1.0)
-        return np.asarray(self.measured * max(total - self.unknown, 1.0) / total)
+        u, _ = self.basis(np.ones(self.measured.shape))
+        seen = np.concatenate([self.seen.reshape(len(u), -1), np.isfinite(self.begin)], axis=1)
+        taken = float((u**2)[seen].sum())
+        return np.asarray(self.measured * max(total - taken, 1.0) / total)
 
     def rows(self, residual: Floats, weight: Floats) -> Floats:
         """Return weighted residuals with those of the start, shape (..., piece, row).

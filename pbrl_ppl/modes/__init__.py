@@ -8,7 +8,6 @@ from .configurations import index_law as index_law
 from .configurations import stored as stored
 from .importance import adaptive_importance as adaptive_importance
 from .importance import systematic as systematic
-from .importance import trajectory_evidence as trajectory_evidence
 from .joint_search import weigh as weigh
 from .ladder import MOST_GROWTH as MOST_GROWTH
 from .ladder import corrected as corrected

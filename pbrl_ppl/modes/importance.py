@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.special import gammaln, logsumexp
 
-from pbrl_ppl.likelihood import log_posterior
 from pbrl_ppl.modes.laplace import Mode
 from pbrl_ppl.modes.space import Space
 from pbrl_ppl.parameters import covariance_factor
@@ -192,25 +191,6 @@ def laplace(mode: Mode) -> Marginal:
     informed = space.informed
     log_det = np.linalg.slogdet(2 * np.pi * covariance[np.ix_(informed, informed)])[1]
     return Marginal(float(space.log_density(centre[None])[0] + 0.5 * log_det))
-
-
-def trajectory_evidence(mode: Mode) -> float:
-    """Return the Laplace approximation of the log-evidence of whole trajectories.
-
-    States are integrated out by the filter; of the noise parameters the logarithm is normal, as an
-    unexplained acceleration may well be nothing.
-
-    Parameters
-    ----------
-    mode : Mode
-        Of whole trajectories.
-    """
-    centre, of_noise = mode.noise_gaussian()
-    value = float(log_posterior(mode.problem, mode.phi, np.exp(centre)) + centre.sum())
-    log_dets = (
-        np.linalg.slogdet(2 * np.pi * covariance)[1] for covariance in (of_noise, mode.covariance)
-    )
-    return value + 0.5 * float(sum(log_dets))
 
 
 @dataclass(frozen=True, eq=False)

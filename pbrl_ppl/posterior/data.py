@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 import xarray as xr
 
-from pbrl_ppl.effects import Effect, LearnedRemainder, catalogue
+from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.history import History, Segments, from_segments
 from pbrl_ppl.likelihood import (
@@ -55,7 +55,6 @@ def record_of(problem: Problem, seed: int, method: str) -> PosteriorRecord:
         laws = (law.effect.name for law in attached if law.body == body.name)
         scene = scene.with_effects(body.name, *laws)
     median, spread = problem.noise_prior
-    tables = [e.effect.table for e in attached if isinstance(e.effect, LearnedRemainder)]
     return PosteriorRecord(
         scene=scene,
         effects=tuple((law.effect.name, law.body) for law in attached),
@@ -73,7 +72,6 @@ def record_of(problem: Problem, seed: int, method: str) -> PosteriorRecord:
         likelihood=likelihood.name,
         nu=problem.likelihood.nu,
         library=problem.library,
-        learned_remainder=tables[-1] if tables else None,
         cells=problem.likelihood.noise.coordinates if is_filtered(problem) else None,
     )
 

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, fields
 import numpy as np
 import pandas as pd
 
-from pbrl_ppl.effects import LEARNED_REMAINDER, Effect, catalogue
+from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.likelihood import Observations, TransitionLikelihood
 from pbrl_ppl.modes import Mode, posterior_slopes
 from pbrl_ppl.parameters import JOINT_INDICES, Layout, Prior, box, inside, nearest, wheels
@@ -231,7 +231,7 @@ def _prior_draws(layout: Layout, *, n_draws: int = 20_000) -> dict[str, Floats]:
         f"{block.name}[{owner}]": prior.sample(rng, n_draws)
         for block in layout.blocks
         for owner, prior in zip(block.owners, block.priors, strict=True)
-        if (owner not in free or block.of != "joint") and LEARNED_REMAINDER not in block.name
+        if owner not in free or block.of != "joint"
     }
     folded = dict(zip(layout.labels, nearest(layout, layout.columns(draws)).T, strict=True))
     return {label: folded[label] for label in draws}

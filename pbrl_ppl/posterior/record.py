@@ -10,7 +10,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from pbrl_ppl.effects import Attached, Effect, attach, catalogue, learned_remainder
+from pbrl_ppl.effects import Effect, attach, catalogue
 from pbrl_ppl.errors import PbrlError, PosteriorError
 from pbrl_ppl.likelihood import (
     Coordinates,
@@ -134,8 +134,6 @@ class PosteriorRecord:
         Degrees of freedom of Student-t noise; Gaussian without it.
     library : ParameterLibrary, optional
         Parameter sets of which each body has one.
-    learned_remainder : str, optional
-        Table of the learned remainder among the effects.
     cells : Coordinates, optional
         Which noise parameter each coordinate is subject to, where the fit is of whole trajectories.
     mode : StoredMode, optional
@@ -186,7 +184,6 @@ class PosteriorRecord:
     likelihood: str | None = None
     nu: float | None = None
     library: ParameterLibrary | None = None
-    learned_remainder: str | None = None
     cells: Coordinates | None = None
     mode: StoredMode | None = None
     linearisation: Linearisation | None = None
@@ -256,7 +253,7 @@ class PosteriorRecord:
         """
         return Physics(
             self.scene,
-            _attached(self.scene, self.learned_remainder, effects),
+            attach(self.scene, (), effects),
             self.substeps,
             threads,
             tolerance=Physics.tolerance if self.tolerance is None else self.tolerance,
@@ -404,12 +401,6 @@ def stored_mode(problem: Problem, idata: Idata) -> ParameterPoint:
     return ParameterPoint(phi, sigma, choice)
 
 
-def _attached(scene: Scene, table: str | None, effects: Iterable[Effect]) -> tuple[Attached, ...]:
-    """Return the effects of a scene, and the learned remainder of a table where there is one."""
-    learned = () if table is None else (learned_remainder(str(table)),)
-    return attach(scene, (), (*effects, *learned))
-
-
 def scene_of(idata: Idata) -> Scene:
     """Return the scene that a posterior was fitted with, added effects included.
 
@@ -427,8 +418,8 @@ def scene_of(idata: Idata) -> Scene:
 
 def layout_of(idata: Idata, effects: Iterable[Effect] = catalogue) -> Layout:
     """Return the layout of a posterior's parameters."""
-    scene, fields = scene_of(idata), stored_fields(idata, ("learned_remainder",))
-    return build_layout(scene, _attached(scene, fields.get("learned_remainder"), effects))
+    scene = scene_of(idata)
+    return build_layout(scene, attach(scene, (), effects))
 
 
 def stored_fields(idata: Idata, names: Iterable[str] | None = None) -> dict[str, Any]:

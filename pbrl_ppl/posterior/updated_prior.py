@@ -11,7 +11,7 @@ from scipy.optimize import brentq, least_squares
 from scipy.special import i0e, i1e
 from scipy.stats import truncnorm
 
-from pbrl_ppl.effects import LEARNED_REMAINDER, Effect, catalogue
+from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.modes import NONE, index_law
 from pbrl_ppl.parameters import JOINT_INDICES, ParameterLibrary, Prior, nearest
@@ -67,8 +67,7 @@ def updated_scene(idata: Idata, *, effects: Iterable[Effect] = catalogue) -> Sce
     draws |= {x: folded[:, i] for i, x in enumerate(layout.labels) if x in draws}
     priors: dict[str, dict[str, float]] = {}
     for block in layout.blocks:
-        # a learned remainder belongs to one recording and cannot be declared in a scene
-        if block.of != "body" or LEARNED_REMAINDER in block.name:
+        if block.of != "body":
             continue
         for owner, prior in zip(block.owners, block.priors, strict=True):
             label = f"{block.name}[{owner}]"
@@ -81,11 +80,8 @@ def updated_scene(idata: Idata, *, effects: Iterable[Effect] = catalogue) -> Sce
                 )
             matched = moment_matched(prior, draws[label])
             priors[label] = {k: getattr(matched, k) for k in matched.hyper_names}
-    bodies = []
-    for body in scene.bodies:
-        laws = tuple(name for name in body.effects if name != LEARNED_REMAINDER)
-        bodies.append(with_priors(replace(body, effects=laws), priors))
-    return scene.replace(bodies=tuple(bodies), joints=_joints(idata, scene))
+    bodies = tuple(with_priors(body, priors) for body in scene.bodies)
+    return scene.replace(bodies=bodies, joints=_joints(idata, scene))
 
 
 def with_priors(body: Body, priors: Mapping[str, Mapping[str, float]]) -> Body:

@@ -107,7 +107,7 @@ def plot_added(loop: Loop, width: float = style.WIDE, most: int = 12) -> Figure:
             least = 1e-12 * abs(estimate.mean) + np.finfo(float).tiny
             _mark_null(axes, null, estimate.mean, max(estimate.sd, least))
         axes.set(ylim=(-0.14, 1.15), yticks=[])
-        title = f"{plain(added.effect)} on {added.body}{' (small)' * (not added.main)}"
+        title = f"{plain(added.effect)} on {added.body}"
         style.name_axes(axes, title, f"{plain(name)} ({estimate.unit})")
     return figure
 

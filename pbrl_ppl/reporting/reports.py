@@ -203,7 +203,7 @@ def _or_why(compute: Callable[[], T]) -> tuple[T | None, str]:
         return None, f"Not available: {error}"
 
 
-def in_brief(loop: Loop, folder: str | Path, remainder: str = "") -> list[str]:
+def in_brief(loop: Loop, folder: str | Path) -> list[str]:
     """Return a summary of a closed loop in about ten lines.
 
     Parameters
@@ -212,9 +212,7 @@ def in_brief(loop: Loop, folder: str | Path, remainder: str = "") -> list[str]:
         Result of :func:`pbrl_ppl.close_loop`.
     folder : str or pathlib.Path
         Folder of the results, to name in commands.
-    remainder : str
-        What a learned remainder does, or why there is none; empty if none was requested.
     """
     brief = templates().get_template("brief.txt.jinja")
-    text = brief.render(result=loop, folder=Path(folder), remainder=remainder)
+    text = brief.render(result=loop, folder=Path(folder))
     return [line.rstrip() for line in text.splitlines() if line.strip()]

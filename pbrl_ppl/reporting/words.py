@@ -18,7 +18,10 @@ from pbrl_ppl.criticism import (
     acceleration_in_words,
     share_in_words,
 )
+from pbrl_ppl.posterior import interval, scalars
 from pbrl_ppl.reporting.style import UNITS
+from pbrl_ppl.scene import state_sizes
+from pbrl_ppl.state import STATE
 
 #: Candidates and bad frames that are listed one by one.
 LISTED = 4
@@ -26,6 +29,8 @@ LISTED = 4
 _SMALL = 0.05
 #: A held-out error above this many times the noise needs an explanation.
 _TOO_LARGE = 1.5
+#: A dimension that moves by less than this share of its natural size does not.
+_STILL = 1e-4
 
 
 def verdict_in_words(loop: Loop) -> str:
@@ -34,7 +39,7 @@ def verdict_in_words(loop: Loop) -> str:
     It is the first line of the report and of the summary in a terminal.
     """
     if loop.verdict == NOT_CONVERGED:
-        named = [_named(one) for one in loop.main_laws]
+        named = [_named(one) for one in loop.added]
         so_far = f" (found so far: {_listed(named, 'and')})" if named else ""
         return (
             f"No verdict: the chains have not converged{so_far}; take more draws (--draws),"
@@ -50,7 +55,7 @@ def _found(loop: Loop) -> str:
             return "No effect in the catalogue explains the residual"
         matters = " that matters" if loop.small or loop.acceleration.remaining else ""
         return f"Nothing{matters} was found missing"
-    first, *more = loop.main_laws
+    first, *more = loop.added
     sentence = _listed([_named(one) for one in (first, *more)], "and")
     if not more and has_size(first):
         (size,) = first.parameters.values()
@@ -203,16 +208,88 @@ def left_out_in_words(loop: Loop) -> str:
     return f"{said}{rest}." if said else ""
 
 
-def worst_ahead(loop: Loop, kind: str) -> str:
-    """Return the state dimension with the worst error of a kind, over the noise floor, or none."""
+def moved_most(loop: Loop, kind: str) -> str:
+    """Return the state dimension whose held-out error of a kind changed most; empty if none moves.
+
+    If none changed, that with the largest error over the noise floor.
+    """
     before, after, floor = (getattr(e, kind) for e in (loop.before, loop.after, loop.noise_floor))
+    moves = set(before)
+    if loop.held_out is not None:
+        observed = loop.held_out.dataset["observed"].to_numpy()
+        spread = np.fmax.reduce(observed, axis=(0, 1)) - np.fmin.reduce(observed, axis=(0, 1))
+        spread = np.nan_to_num(spread).max(axis=0)
+        sizes = dict(zip(STATE, spread / state_sizes(loop.scene), strict=True))
+        moves = {name for name in before if sizes[name] > _STILL}
 
-    def times_floor(name: str) -> float:
-        far = after.get(name, 0.0)
-        return float(far if np.isposinf(far) else before[name] / (floor.get(name) or np.inf))
+    def change(name: str) -> tuple[float, float]:
+        first, last = before[name], after.get(name, before[name])
+        if np.isposinf(last):
+            return np.inf, 0.0
+        changed = abs(np.log(max(first, 1e-300) / max(last, 1e-300)))
+        return round(float(changed), 2), first / (floor.get(name) or np.inf)
 
-    names = before if kind == "rollout_rmse" else [name for name in before if name in floor]
-    return max(names, key=times_floor, default="")
+    return max(moves, key=change, default="")
+
+
+def held_out_in_words(loop: Loop) -> str:
+    """Return the held-out error in the unit of the dimension that moved most; empty without one."""
+    whole = loop.held_out is not None and bool(loop.after.simulated_rmse)
+    kind = "simulated_rmse" if whole else "rollout_rmse"
+    if not (name := moved_most(loop, kind)):
+        return ""
+    before, after = getattr(loop.before, kind)[name], getattr(loop.after, kind).get(name)
+    said = f"{error(before)} -> {error(after)}" if loop.added else error(before)
+    unit = f" {UNITS[name]}" if np.isfinite(before if after is None else after) else ""
+    less = ""
+    if loop.added and after is not None and 0.0 < after < before < np.inf:
+        less = f" ({100 * (1 - after / before):.0f} % less)"
+    seconds, start = loop.rollout_seconds, "ahead"
+    if whole and loop.held_out is not None:
+        rows = int(loop.held_out.dataset["n_rows"].max()) - 1
+        seconds, start = rows * loop.scene.time_step, "from fitted initial states"
+    floor = getattr(loop.noise_floor, kind).get(name)
+    noise = f"; noise {number(floor)}{unit}" if floor is not None and unit else ""
+    return f"Held-out error of {name} {number(seconds)} s {start}: {said}{unit}{less}{noise}."
+
+
+def left_aside_in_words(loop: Loop) -> list[str]:
+    """Return sentences on laws that were found and not added, with their shares of the error."""
+    said = [
+        f"{_law(one.effect, one.body)} takes {percent(one.share)} off the error of the longest"
+        " simulations: too little to be added."
+        for one in loop.lesser
+    ]
+    if loop.hypotheses:
+        names = [f"{_law(one.effect, one.body)} ({percent(one.share)})" for one in loop.hypotheses]
+        said.append(
+            f"Of what remains one of these would take a part off: {_listed(names, 'or')}; few rigs"
+            " have it, so it was not added: declare it to try."
+        )
+    return [f"{one[:1].upper()}{one[1:]}" for one in said]
+
+
+def gains_inferred(loop: Loop) -> list[str]:
+    """Return the gains that the scene leaves to be inferred, with their intervals."""
+    said = []
+    for label, values in scalars(loop.posterior_after).items():
+        name = str(label)
+        if "gain" in name.partition("[")[0].split("_") and name not in _added_labels(loop):
+            low, high = interval(values.to_numpy())
+            digits = digits_of(low, high)
+            ends = f"94 % {number(low, digits)} to {number(high, digits)}"
+            said.append(f"{plain(name)} {number(float(np.mean(values)), digits)} ({ends})")
+    return said
+
+
+def _added_labels(loop: Loop) -> set[str]:
+    """Return the labels of the parameters of added effects."""
+    return {f"{e.effect}_{name}[{e.body}]" for e in loop.added for name in e.parameters}
+
+
+def _law(effect: str, body: str) -> str:
+    """Write an effect and its body."""
+    return f"{plain(effect)} on the {plain(body)}"
 
 
 def plain(name: str) -> str:

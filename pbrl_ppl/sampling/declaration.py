@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pbrl_ppl.effects import LEARNED_REMAINDER, Attached, Effect, attach, catalogue
+from pbrl_ppl.effects import Attached, Effect, attach, catalogue
 from pbrl_ppl.history import History, with_units
 from pbrl_ppl.likelihood import TransitionLikelihood, declared_problem
 from pbrl_ppl.parameters import ParameterLibrary
@@ -143,7 +143,7 @@ def try_own_effects(physics: Physics, history: History) -> None:
         bodies=tuple(replace(body, effects=(), known=(), prior=()) for body in scene.bodies)
     )
     implied = {attached.effect.name for attached in attach(bare)}  # of actuators, for example
-    known = {effect.name for effect in catalogue} | {LEARNED_REMAINDER} | implied
+    known = {effect.name for effect in catalogue} | implied
     effects = {attached.effect.name: attached.effect for attached in physics.effects}
     for name in effects.keys() - known:
         try_effect(effects[name], physics.scene, history)

@@ -67,6 +67,9 @@ class Recording:
         Where trajectories are cut: ``every`` so many seconds, at ``gaps`` longer than so many
         seconds, at ``rests`` of at least so many seconds, at ``jumps`` of a velocity by more than
         so many m/s between rows.
+    camera : bool, optional
+        Whether places come from a camera, whose laws are then tried; by default where x and y are
+        measured.
     topics : tuple of (str, str or tuple of str)
         Topic, or topics, of each body in a ROS bag or an MCAP file.
 
@@ -94,6 +97,7 @@ class Recording:
     resample: bool = False
     trim: bool = False
     cut: Pairs = ()
+    camera: bool | None = None
     topics: Pairs = ()
 
     def __post_init__(self) -> None:
@@ -127,7 +131,7 @@ class Recording:
                 f"[recording]: separator is {self.separator!r}, expected one of"
                 f" {', '.join(SEPARATORS)} or one character"
             )
-        settle(self, "[recording]", header=flag, hold=flag, resample=flag, trim=flag)
+        settle(self, "[recording]", header=flag, hold=flag, resample=flag, trim=flag, camera=flag)
         if "rate" in dict(self.time):
             positive(dict(self.time)["rate"], "[recording]: time, rate")
         expected = f"one of {', '.join(VELOCITIES)}"

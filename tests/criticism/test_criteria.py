@@ -43,4 +43,4 @@ def test_the_page_has_all_thresholds() -> None:
 def test_stages_are_sentences_with_rising_shares() -> None:
     shares = [stage.share for stage in Stage if stage.share is not None]
     assert shares == sorted(shares) and shares[0] > 0 and shares[-1] < 1
-    assert f"{Stage.FIT}" == "fitting the declared model" and Stage.LEARN.share is None
+    assert f"{Stage.FIT}" == "fitting the declared model" and Stage.SCORE.share is None

@@ -60,7 +60,7 @@ def test_clean_data_of_another_engine_pass(make_history) -> None:
     found = misfit(fitted(BOX, box2d(make_history, 3)[0]))
     assert found.unexplained is None
     assert not found.predicts(DEFAULT)  # a test that is missing is not passed
-    for kind in (KindOfTest.HELD_OUT, KindOfTest.PRIOR):
+    for kind in (KindOfTest.HELD_OUT, KindOfTest.SIMULATION):
         found = found.with_test(ResidualTest(kind, 0.5, 0.0, True, "as expected"))
     assert found.predicts(DEFAULT)
     failed = found.with_test(ResidualTest(KindOfTest.PRIOR, 0.5, 1.0, False, "impossible"))

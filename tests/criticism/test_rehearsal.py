@@ -6,7 +6,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pbrl_ppl.criticism import Rehearsal, RehearsedLaw, attribute, rehearse
+from pbrl_ppl.criticism import DEFAULT, attribute
+from pbrl_ppl.criticism.rehearsal import Rehearsal, RehearsedLaw, rehearse
 from pbrl_ppl.effects import attach, catalogue
 from pbrl_ppl.errors import HistoryError, ParameterError
 from pbrl_ppl.history import History
@@ -33,8 +34,12 @@ OFFERED = {
 }  # fmt: skip
 
 
+def named(*names: str) -> list:
+    return [effect for effect in catalogue if effect.name in names]
+
+
 def offered(scene: Scene) -> list:
-    return [effect for effect in catalogue if effect.name in OFFERED[scene]]
+    return named(*OFFERED[scene])
 
 
 @cache
@@ -76,11 +81,13 @@ def found(scene: Scene, history: History) -> dict:
 @pytest.mark.slow
 @pytest.mark.parametrize("place", range(4))
 def test_a_law_is_named_from_the_stated_size_on(rehearsed, place) -> None:
-    """Alone at three times that size, under the stated name; nothing at a fifth of it."""
+    """Alone above that size, under the stated name; nothing below it."""
     scene, rehearsal = rehearsed
     law = law_of(rehearsal, OFFERED[scene][place])
-    assert set(found(scene, recorded(scene, rehearsal, law, 3.0))) == {law.named}
-    assert not found(scene, recorded(scene, rehearsal, law, 0.2))
+    for times in (1.5, 3.0):
+        assert set(found(scene, recorded(scene, rehearsal, law, times))) == {law.named}
+    for times in (0.1, 0.6):
+        assert not found(scene, recorded(scene, rehearsal, law, times))
 
 
 @pytest.mark.slow
@@ -94,8 +101,7 @@ def test_confounded_laws_are_worth_as_much() -> None:
     assert "angular_drag" in found(PENDULUM, history)["pivot_damping"].confounded
     worth = [
         attribute(PENDULUM, history, catalogue=[effect]).laws[0].nats
-        for effect in catalogue
-        if effect.name in ("pivot_damping", "angular_drag")
+        for effect in named("pivot_damping", "angular_drag")
     ]
     assert abs(worth[0] - worth[1]) < 3.0
 
@@ -114,26 +120,56 @@ def test_what_is_seen_best_comes_first(rehearsed) -> None:
 
 def test_a_law_that_changes_nothing_is_unseen() -> None:
     """A pendulum that torques turn shows no gain of forces."""
-    gains = [effect for effect in catalogue if effect.name in ("force_gain", "torque_gain")]
-    seen, unseen = rehearse(PENDULUM, catalogue=gains).laws
+    seen, unseen = rehearse(PENDULUM, catalogue=named("force_gain", "torque_gain")).laws
     assert (seen.effect, unseen.effect) == ("torque_gain", "force_gain")
     assert unseen.named == "" and not unseen.sizes and not np.isfinite(unseen.share)
 
 
-def test_twice_the_noise_hides_twice_as_much_and_one_trajectory_more() -> None:
-    drag = [effect for effect in catalogue if effect.name == "pivot_damping"]
-    rehearsal = rehearse(PENDULUM, catalogue=drag)
-    (law,) = rehearsal.laws
-    (noisy,) = rehearse(PENDULUM.replace(noise={"theta": 2e-3}), catalogue=drag).laws
+def test_a_law_that_needs_what_is_not_measured_is_unseen() -> None:
+    """Drag along a puck's axes needs its angle; the same drag in any direction does not."""
+    places = PUCK.replace(noise={"x": 2e-3, "y": 2e-3})
+    seen, unseen = rehearse(places, catalogue=named("linear_drag", "drag_by_axis")).laws
+    assert (seen.effect, unseen.effect) == ("linear_drag", "drag_by_axis")
+    assert unseen.named == "" and "nothing here shows it" in unseen.note
+    both = rehearse(PUCK, catalogue=named("linear_drag", "drag_by_axis")).laws
+    assert {law.named for law in both} == {"linear_drag", "drag_by_axis"}
+
+
+def test_unusual_laws_are_named_where_common_ones_leave_much_more_than_noise() -> None:
+    """A drag of another power looks quadratic; a wrong inertia looks like no common law."""
+    laws = named("quadratic_drag", "power_drag", "torque_gain", "inertia_scale")
+    rehearsal = rehearse(PENDULUM, catalogue=laws, seed=1)
+    assert law_of(rehearsal, "power_drag").named == "quadratic_drag"
+    assert law_of(rehearsal, "inertia_scale").named == "inertia_scale"
+
+
+def test_twice_the_noise_hides_twice_as_much() -> None:
+    drag = named("pivot_damping")
+    (law,), (noisy,) = (
+        rehearse(PENDULUM.replace(noise={"theta": sd}), catalogue=drag).laws for sd in (1e-3, 2e-3)
+    )
     assert noisy.sizes["coefficient"] == pytest.approx(2 * law.sizes["coefficient"], rel=0.35)
-    single = History(rehearsal.history.dataset.isel(trajectory=[0]))
-    (alone,) = rehearse(PENDULUM, single, catalogue=drag).laws
-    assert alone.sizes["coefficient"] > 3 * law.sizes["coefficient"]
+
+
+@pytest.mark.slow
+def test_a_single_trajectory_shows_what_takes_half_of_its_error() -> None:
+    """A main law of several takes a fifth."""
+    single = History(rehearsal_of(PENDULUM).history.dataset.isel(trajectory=[0]))
+    limits = replace(DEFAULT.search, alone=DEFAULT.search.main_share)
+    rehearsal, lax = (
+        rehearse(PENDULUM, single, catalogue=offered(PENDULUM), criteria=criteria)
+        for criteria in (DEFAULT, replace(DEFAULT, search=limits))
+    )
+    law, fifth = (law_of(one, "pivot_damping") for one in (rehearsal, lax))
+    # the law's square over the noise's: 1 / 0.5^2 - 1 and 1 / 0.8^2 - 1
+    assert law.share / fifth.share == pytest.approx(np.sqrt(3.0 / 0.5625), rel=0.01)
+    assert set(found(PENDULUM, recorded(PENDULUM, rehearsal, law, 3.0))) == {"pivot_damping"}
+    assert not found(PENDULUM, recorded(PENDULUM, rehearsal, law, 0.2))
 
 
 def test_parameters_are_by_label_or_name() -> None:
     scene = PUCK.replace(bodies=(replace(PUCK.bodies[0], known=()),))
-    drag = [effect for effect in catalogue if effect.name == "linear_drag"]
+    drag = named("linear_drag")
     for name in ("mass", "mass[puck]"):
         assert (
             rehearse(scene, parameters={name: 3.0}, catalogue=drag).parameters["mass[puck]"] == 3.0

@@ -14,7 +14,7 @@ from scipy.stats import binom, chi2, norm
 from pbrl_ppl.criticism import scan, score
 from pbrl_ppl.criticism.criteria import DEFAULT
 from pbrl_ppl.criticism.scan import GridPoint, detection_limits, grid_points, is_upper_limit
-from pbrl_ppl.criticism.score import Signature, rank_candidates
+from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.effects import candidates, catalogue
 from pbrl_ppl.state import STATE
 from tests.helpers.free_puck import BOX, DISC, Disc, box2d, fitted
@@ -137,12 +137,10 @@ def test_a_ranking_does_not_hold_every_signature(mode, monkeypatch) -> None:
 
     monkeypatch.setattr(score, "each_grid_point", noted)
     tried = [EFFECTS[name].on("puck") for name in ("linear_drag", "force_cutoff", "mass_change")]
-    ranked = rank_candidates(mode, tried, kept=Signature.test_alone)
+    ranked = rank_candidates(mode, tried)
     assert made > 30 and most < 10
     for one in ranked:
-        assert not one.basis.size and not one.direction.size and not one.linear
-    whole = rank_candidates(mode, tried)
-    assert [one.candidate for one in ranked] == [one.candidate for one in whole]
+        assert not one.basis.size and not one.linear
 
 
 def test_grid_points_of_long_recordings_are_simulated_one_by_one(mode, monkeypatch) -> None:

@@ -1,4 +1,4 @@
-"""Best subsets of laws by one regression, against discs in closed form."""
+"""Best subsets of laws by one regression, and the table of models, on discs in closed form."""
 
 from dataclasses import replace
 
@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 import pbrl_ppl as pp
-from pbrl_ppl.criticism import search
-from pbrl_ppl.criticism.search import Evidence, Search, refit
+from pbrl_ppl.criticism.score import Library
 from pbrl_ppl.criticism.subsets import best_subsets, worth
+from pbrl_ppl.criticism.table import Table, share, sizes_of
 from pbrl_ppl.effects import candidates
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.likelihood import in_pieces
 from pbrl_ppl.modes import Mode, filtered_mode, fit_pieces
-from tests.helpers.free_puck import BOX, DISC, MASS, Disc, box2d, fitted, searched
+from tests.helpers.free_puck import BOX, DISC, MASS, Disc, box2d, fitted
 
 pytestmark = pytest.mark.one_stack
 NAMES = [
@@ -43,7 +43,7 @@ def dragged_and_pulled() -> Mode:
 
 def test_two_laws_are_proposed_together_with_their_joint_sizes(dragged_and_pulled) -> None:
     mode = dragged_and_pulled
-    regression = best_subsets(mode, candidates(DISC, (), OFFERED))
+    regression = best_subsets(Library(mode), candidates(DISC, (), OFFERED))
     first = regression.subsets[0]
     assert {law.effect.name for law in first.laws} == {"linear_drag", "constant_force"}
     sizes = {law.effect.name: size for law, size in first.sizes.items()}
@@ -58,7 +58,7 @@ def test_two_laws_are_proposed_together_with_their_joint_sizes(dragged_and_pulle
 def test_no_subset_breaks_a_sign(dragged_and_pulled) -> None:
     """A drag is never negative, however much that would explain."""
     mode = dragged_and_pulled
-    for subset in best_subsets(mode, candidates(DISC, (), OFFERED)).subsets:
+    for subset in best_subsets(Library(mode), candidates(DISC, (), OFFERED)).subsets:
         for law, size in subset.sizes.items():
             if law.effect.name.endswith("drag"):
                 assert size[0] >= 0.0
@@ -68,7 +68,9 @@ def test_prior_odds_are_part_of_the_price(dragged_and_pulled) -> None:
     mode, rare = dragged_and_pulled, -5.0
     (drag,) = (effect for effect in OFFERED if effect.name == "linear_drag")
     worth = [
-        best_subsets(mode, candidates(DISC, (), (replace(drag, log_odds=odds),))).subsets[0].nats
+        best_subsets(Library(mode), candidates(DISC, (), (replace(drag, log_odds=odds),)))
+        .subsets[0]
+        .nats
         for odds in (0.0, rare)
     ]
     assert worth[1] - worth[0] == pytest.approx(rare)
@@ -76,22 +78,59 @@ def test_prior_odds_are_part_of_the_price(dragged_and_pulled) -> None:
         replace(drag, log_odds=1.0)
 
 
-def test_evidence_is_the_logarithm_of_the_errors_ratio(dragged_and_pulled) -> None:
-    """Of n measurements, less half a log n for each parameter that the data inform."""
-    before = dragged_and_pulled
-    after = searched(fitted_again(before), OFFERED).after
-    assert Evidence.of(after, after).nats == 0.0
-    assert Evidence.of(after, after).share == 0.0
-    larger = replace(after, sigma=2.0 * after.sigma)
-    evidence = Evidence.of(larger, after)
-    n = after.problem.likelihood.counts(after.problem.observations).sum()
-    assert evidence.nats == pytest.approx(n * np.log(2.0))
-    assert evidence.share == pytest.approx(0.5)
+@pytest.fixture(scope="module")
+def table(dragged_and_pulled) -> Table:
+    """Models with each of some sets of laws."""
+    table = Table((), tried=6, modes={frozenset(): dragged_and_pulled})
+    laws = {law.effect.name: law for law in candidates(DISC, (), OFFERED)}
+    drag, force = laws["linear_drag"], laws["constant_force"]
+    sizes = {drag: np.array([0.8]), force: np.array([1.5, -0.6])}
+    table.fitted(dragged_and_pulled, (drag, force), sizes)
+    return table
 
 
-def fitted_again(mode: Mode) -> Mode:
-    """The same recording along whole trajectories."""
-    return fitted(DISC, mode.problem.data.history)
+def test_each_set_of_laws_is_fitted_once(table) -> None:
+    (mode,) = (table.modes[key] for key in table.modes if len(key) == 2)
+    first, second = table.laws(mode)
+    assert table.fitted(mode, (second, first)) is mode
+    assert table.without(mode, first) is table.without(mode, first)
+    assert table.laws(table.without(mode, first)) == (second,)
+
+
+def test_the_value_is_the_log_evidence_with_the_odds_of_the_laws(table) -> None:
+    """The logarithm of the errors' ratio, less half a log n a parameter, the prior, the choice."""
+    (mode,) = (table.modes[key] for key in table.modes if len(key) == 2)
+    bare, weight = table.fitted(mode, ()), table.weight
+    gain = float((weight * np.log(bare.sigma / mode.sigma)).sum())
+    laws = table.laws(mode)
+    paid = 0.5 * 3 * np.log(weight.sum()) + 2 * np.log(6)
+    paid -= sum(law.effect.log_odds for law in laws)
+    value = table.value(mode) - table.value(bare)
+    assert value == pytest.approx(gain - paid, abs=3.0)  # of the priors, which are wide
+    assert value < gain - paid + 1.0
+    louder = replace(mode, sigma=2.0 * mode.sigma)
+    assert table.value(mode) - table.value(louder) == pytest.approx(weight.sum() * np.log(2.0))
+    assert share(louder, mode, weight) == pytest.approx(0.5)
+
+
+def test_shares_of_laws_that_replace_each_other_add_up(table) -> None:
+    """A drag and a force are apart: each share is that by which the error rises without it."""
+    (mode,) = (table.modes[key] for key in table.modes if len(key) == 2)
+    for law, part in table.shares(mode).items():
+        alone = share(table.without(mode, law), mode, table.weight)
+        assert part >= alone - 1e-9
+    assert list(table.shares(mode).values()) == sorted(table.shares(mode).values(), reverse=True)
+
+
+def test_rivals_are_models_within_some_nats_that_differ_by_one_law(table) -> None:
+    (mode,) = (table.modes[key] for key in table.modes if len(key) == 2)
+    laws = {law.effect.name: law for law in candidates(DISC, (), OFFERED)}
+    drag, force, other = laws["linear_drag"], laws["constant_force"], laws["quadratic_drag"]
+    begin = {other: sizes_of(mode, drag), force: sizes_of(mode, force)}
+    worse = table.value(mode) - table.value(table.fitted(mode, (force, other), begin))
+    assert table.rivals(mode, drag, worse + 1.0) == (other,)
+    assert table.rivals(mode, drag, worse - 1.0) == ()
+    assert table.rivals(mode, force, worse + 1.0) == ()
 
 
 def test_filtered_at_a_modes_parameters_is_that_mode() -> None:
@@ -100,25 +139,6 @@ def test_filtered_at_a_modes_parameters_is_that_mode() -> None:
     again = filtered_mode(mode, mode)
     assert again.log_posterior == pytest.approx(mode.log_posterior, abs=0.5)
     np.testing.assert_array_equal(again.phi, mode.phi)
-
-
-@pytest.mark.parametrize("net", [3.1, 2.9, -2.9, -3.1])
-def test_the_other_of_two_laws_that_are_nearly_as_good_is_reported(
-    dragged_and_pulled, monkeypatch, net
-) -> None:
-    """Which of them is named is decided by 3 nats, and near that by the data's last digits."""
-    first, second = (one for one in candidates(DISC, (), OFFERED) if "drag" in one.effect.name)
-    bare = dragged_and_pulled
-    model = search._Model(refit(bare, (first,), {}), {first: 0.0})
-    monkeypatch.setattr(search, "_net", lambda *_: {second: net})
-    monkeypatch.setattr(search, "_gained", lambda *_: 9.0 * np.sign(net))
-    named, other = (second, first) if net > 3.0 else (first, second)
-    found = Search(lambda _: ())._exchanged(model, first, bare, {second: np.array([0.3])})
-    assert ([*found.earlier], [*found.rivals[named]]) == ([named], [other])
-    # on the longest pieces, where the first is named and the second among its rivals
-    kept = replace(model, rivals={first: {second: np.array([0.3])}}).fitted(whole=True)
-    again, confounded = Search(lambda _: ())._confounded(kept, set())
-    assert ([*again.earlier], confounded) == ([named], {named: (other,)})
 
 
 @pytest.mark.slow

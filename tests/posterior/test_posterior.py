@@ -294,7 +294,6 @@ CELLS = Coordinates(
 OPTIONAL = {
     "nu": 4.0,
     "library": ParameterLibrary({"light": {"mass": 1.0}, "heavy": {"mass": 2.0}}),
-    "learned_remainder": "{}",
     "cells": CELLS,
     "mode": StoredMode({"mass[cart]": 0.1 + 0.2}, {"sigma[x]": 0.1}, -1.5, {"cart": "light"}),
     "linearisation": Linearisation(16, 0.1, 0.2, 0),

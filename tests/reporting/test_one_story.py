@@ -225,10 +225,6 @@ def test_the_terminal_has_ten_lines_and_says_where_and_what_next() -> None:
     assert "detection limit" in every["adequate"][-2]
     assert "  Its omega is off in a way that depends on omega (p = 0.0020)." in every["unexplained"]
     assert "plots the residual against omega" in every["unexplained"][-2]
-    assert "--learn-remainder" in every["unexplained"][-2]
-    learned = in_brief(made_up("unexplained"), "out", "a force without a law")
-    assert learned[-3] == "Remainder: a force without a law"
-    assert "--learn-remainder" not in learned[-2]
     assert "--draws" in every["not-converged"][-2]
     alone = replace(made_up(), added=(replace(made_up().added[0], not_separable_from=()),))
     assert in_brief(alone, "out")[-2] == (

@@ -1,0 +1,198 @@
+"""Table of models on pieces of one length: each set of laws is fitted once and has one number."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pbrl_ppl.effects import Attached
+from pbrl_ppl.likelihood import LikelihoodT, Problem, is_independent, is_simulated
+from pbrl_ppl.modes import Mode, find_mode, fit_pieces
+from pbrl_ppl.parameters import inside, prior_residual, prior_slopes
+from pbrl_ppl.scene import state_sizes
+from pbrl_ppl.state import Bools, Floats
+
+
+def weights(mode: Mode, *, still: float = 1e-4) -> Floats:
+    """Return the effective number of measurements of each dimension, shape (state,).
+
+    ``still``: a dimension that moves by less than this share of its natural size counts for none.
+    """
+    observations = mode.problem.observations
+    natural = state_sizes(mode.problem.scene)[list(observations.columns)]
+    moves = np.nanstd(observations.values, axis=(0, 1, 2)) > still * natural
+    counts = mode.problem.likelihood.counts(observations)
+    if is_independent(mode.problem):  # few transitions can be followed by the parameters
+        followed = np.einsum("ij,jk,ik", mode.jacobian, mode.covariance, mode.jacobian)
+        counts = counts * max(1.0 - float(followed) / max(float(counts.sum()), 1.0), 1e-3)
+    return np.where(moves, counts, 0.0)
+
+
+def share(before: Mode, after: Mode, weight: Floats) -> float:
+    """Return the share of the error that a model takes off, over dimensions of some weights.
+
+    Of the root mean square; ``weight`` has shape (state,).
+    """
+    fall = float((weight * np.log(before.sigma / after.sigma)).sum())
+    return 1.0 - float(np.exp(-fall / max(weight.sum(), 1.0)))
+
+
+def informed(mode: Mode, *, most: float = 0.7) -> Bools:
+    """Return which parameters have a posterior of less than a share of the prior's width, (p,)."""
+    width = np.sqrt(np.maximum(np.diag(mode.covariance), 0.0))
+    return np.asarray(width * np.abs(prior_slopes(mode.problem.layout.priors, mode.phi)) < most)
+
+
+def sizes_of(mode: Mode, law: Attached) -> Floats:
+    """Return the parameters of a law at a mode, shape (q,)."""
+    return mode.phi[mode.problem.layout.places(law.labels)]
+
+
+def far_out(mode: Mode, laws: Iterable[Attached]) -> float:
+    """Return how many prior scales the sizes of laws lie from their priors' centres, at most.
+
+    Of an angle that may be any, how many turns.
+    """
+    layout = mode.problem.layout
+    places = [place for law in laws for place in layout.places(law.labels)]
+    turns = [
+        abs(mode.phi[place]) / (2.0 * np.pi)
+        for place in places
+        if layout.priors[place].family == "von_mises"
+    ]
+    off = np.abs(prior_residual(layout.priors, mode.phi)[places])
+    return float(max(off.max(initial=0.0), *turns, 0.0))
+
+
+def with_effects(
+    mode: Mode[LikelihoodT],
+    effects: tuple[Attached, ...],
+    sizes: Mapping[Attached, Floats] | None = None,
+) -> tuple[Problem[LikelihoodT], Floats]:
+    """Return a mode's problem with other effects, and where a search for its mode begins.
+
+    Parameters
+    ----------
+    mode : Mode
+        A mode of the model with the effects so far.
+    effects : tuple of Attached
+        All effects of the new model.
+    sizes : mapping, optional
+        Where the parameters of an effect begin; by default at the mode, or the prior's centre.
+    """
+    problem = mode.problem.with_physics(effects=effects)
+    layout = problem.layout
+    phi = layout.from_layout(mode.problem.layout, mode.phi)
+    for attached, values in (sizes or {}).items():
+        phi[layout.places(attached.labels)] = values
+    return problem, inside(layout.priors, phi)
+
+
+def refit(mode: Mode, effects: tuple[Attached, ...], sizes: Mapping[Attached, Floats]) -> Mode:
+    """Return the mode with other effects, under the same likelihood, from first sizes."""
+    problem, phi = with_effects(mode, effects, sizes)
+    if is_simulated(problem):
+        return fit_pieces(
+            problem, phi, rounds=8, tolerance=1.0, n_steps=1, dampings=(0.1, 10.0, 1e3)
+        )
+    # what a lacking model's parameters have made up for is far from where they are with the law
+    modes = find_mode(problem, initial=phi), find_mode(problem, seed=0)
+    return max(modes, key=lambda one: one.log_posterior)
+
+
+@dataclass(eq=False)
+class Table:
+    """Models of one recording on pieces of one length, by their laws; each is fitted once.
+
+    Parameters
+    ----------
+    declared : tuple of Attached
+        Effects that the scene declares: all others are laws.
+    tried : int
+        Candidates that a law is chosen from.
+    points : dict of Attached to int
+        Grid points that a law was chosen from, where it has a scan.
+    modes : dict of frozenset to Mode
+        The models by their laws.
+    """
+
+    declared: tuple[Attached, ...]
+    tried: int
+    points: dict[Attached, int] = field(default_factory=dict)
+    modes: dict[frozenset[Attached], Mode] = field(default_factory=dict)
+
+    def laws(self, mode: Mode) -> tuple[Attached, ...]:
+        """Return the laws of a model."""
+        return tuple(one for one in mode.problem.physics.effects if one not in self.declared)
+
+    def fitted(
+        self,
+        near: Mode,
+        laws: Collection[Attached],
+        sizes: Mapping[Attached, Floats] | None = None,
+    ) -> Mode:
+        """Return the model with these laws alone, fitted from another model if it is new."""
+        key = frozenset(laws)
+        if key not in self.modes:
+            effects = tuple(one for one in near.problem.physics.effects if one in key)
+            new = tuple(one for one in laws if one not in effects)
+            self.modes[key] = refit(near, (*self.declared, *effects, *new), sizes or {})
+        return self.modes[key]
+
+    def without(self, mode: Mode, law: Attached) -> Mode:
+        """Return a model without a law."""
+        return self.fitted(mode, [one for one in self.laws(mode) if one != law])
+
+    @property
+    def weight(self) -> Floats:
+        """Measurements over the autocorrelation times of the best model, shape (state,)."""
+        moves = weights(next(iter(self.modes.values()))) > 0
+        best = min(self.modes.values(), key=lambda mode: float(np.log(mode.sigma[moves]).sum()))
+        return weights(best)
+
+    def value(self, mode: Mode) -> float:
+        """Return the log-evidence of a model at its mode with the prior odds of its laws (nats).
+
+        Half a log n is paid for each parameter of a law that the data inform or that is scanned.
+        """
+        weight, laws, layout = self.weight, self.laws(mode), mode.problem.layout
+        narrow = informed(mode)
+        count = sum(
+            law.effect.scan is not None or bool(narrow[place])
+            for law in laws
+            for place in layout.places(law.labels)
+        )
+        prior = 0.5 * float((prior_residual(layout.priors, mode.phi) ** 2).sum())
+        odds = sum(
+            law.effect.log_odds - np.log(self.tried * self.points.get(law, 1)) for law in laws
+        )
+        fit = -float((weight * np.log(mode.sigma)).sum())
+        return float(fit - 0.5 * count * np.log(max(weight.sum(), 2.0)) - prior + odds)
+
+    def shares(self, mode: Mode) -> dict[Attached, float]:
+        """Return the share of the error that each law takes off, the largest first.
+
+        Laws that replace each other in part are missed little alone: what all take off together
+        is divided in proportion.
+        """
+        weight, laws = self.weight, self.laws(mode)
+        falls = {
+            law: -np.log1p(-max(share(self.without(mode, law), mode, weight), 0.0)) for law in laws
+        }
+        together = -np.log1p(-max(share(self.fitted(mode, ()), mode, weight), 0.0))
+        scale = max(together / max(sum(falls.values()), 1e-300), 1.0)
+        ordered = sorted(falls, key=lambda law: -falls[law])
+        return {law: -float(np.expm1(-scale * falls[law])) for law in ordered}
+
+    def rivals(self, mode: Mode, law: Attached, within: float) -> tuple[Attached, ...]:
+        """Return laws with which, in the place of one, a model is as good within some nats."""
+        rest, least = {*self.laws(mode)} - {law}, self.value(mode) - within
+        return tuple(
+            other
+            for key, fitted in self.modes.items()
+            if len(key) == len(rest) + 1 and rest < key and law not in key
+            for other in key - rest
+            if self.value(fitted) > least
+        )
