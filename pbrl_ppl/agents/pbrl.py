@@ -13,7 +13,7 @@ import pandas as pd
 
 from pbrl_ppl.agents.agent import Agent, AgentOptions, Revision, Task
 from pbrl_ppl.criticism import DEFAULT, Search, sizes_of
-from pbrl_ppl.effects import Attached, Effect, Noise, Structure, attach, candidates
+from pbrl_ppl.effects import Attached, Effect, Structure, attach, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, FitError, UninformedWarning
 from pbrl_ppl.history import from_segments, with_units
@@ -61,7 +61,7 @@ def revise(
     Mode
         Mode of the model with them.
     """
-    tried = [effect for effect in catalogue if not isinstance(effect.stage, Structure | Noise)]
+    tried = [effect for effect in catalogue if not isinstance(effect.stage, Structure)]
     least = max(DEFAULT.search.least_nats, -np.log(level))
     limits = replace(DEFAULT.search, least_nats=least, refits=8)
 

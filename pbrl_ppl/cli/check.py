@@ -232,11 +232,7 @@ def criticise(
 def _shown_laws(attribution: Attribution) -> Iterator[str | Table]:
     """Yield the search on each length of pieces, the laws found, and the simulation error."""
     for length in attribution.search:
-        yield table(
-            f"best subsets of laws on pieces of {length.seconds:.3g} s, intervals: {length.rows}",
-            {"laws": "<", "nats": ".1f", "error relative to none": ".3f"},
-            ([", ".join(best.laws), best.nats, best.error] for best in length.path),
-        )
+        yield f"pieces of {length.seconds:.3g} s, intervals: {length.rows}"
         yield f"accepted: {', '.join(length.accepted) or 'none'}"
         yield from (f"dropped: {', '.join(length.dropped) or 'none'}", "")
     columns = {"law": "<", "body": "<", "nats": ".1f", "share of error": ""}

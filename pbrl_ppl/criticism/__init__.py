@@ -32,6 +32,7 @@ from .results import Candidate as Candidate
 from .results import Errors as Errors
 from .results import Estimate as Estimate
 from .results import Law as Law
+from .results import SearchLength as SearchLength
 from .results import Stage as Stage
 from .results import Unexplained as Unexplained
 from .results import diverged_after as diverged_after

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
-from pbrl_ppl.criticism.refinement import Checked
+from pbrl_ppl.criticism.refinement import Declared
 from pbrl_ppl.criticism.results import ONE_TRAJECTORY, Candidate, Law, SearchLength, Stage
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.criticism.search import Search
@@ -122,8 +122,9 @@ def attribute(
         [law.effect for law in found.laws]  # ['linear_drag', 'sliding_friction']
     """
     say, catalogue = progress or (lambda stage: None), tuple(catalogue)
-    checked = Checked.of(scene, history, catalogue, seed, substeps, most_transitions, criteria, say)
-    _, found = Search(checked.missing, criteria, say).of(checked.history, checked.mode, seed)
+    declared = Declared(scene, catalogue, seed, substeps, criteria, say)
+    declared, history = declared.cleaned(history, most_transitions)
+    _, found = Search(declared.missing, criteria, say).of(history, declared.mode, seed)
     problem = found.after.problem
     names = problem.observations.names
     times = problem.likelihood.tau if is_simulated(problem) else (1.0,) * len(names)
@@ -211,10 +212,11 @@ def criticise(
     """
     say = progress or (lambda stage: None)
     catalogue = tuple(catalogue)
-    checked = Checked.of(scene, history, catalogue, seed, substeps, most_transitions, criteria, say)
-    mode = checked.mode(checked.history)
+    declared = Declared(scene, catalogue, seed, substeps, criteria, say)
+    declared, history = declared.cleaned(history, most_transitions)
+    mode = declared.mode(history)
     say(Stage.SCORE)
-    ranked = rank_candidates(mode, checked.missing(mode), criteria)
+    ranked = rank_candidates(mode, declared.missing(mode), criteria)
     excess = unexplained_acceleration(mode, criteria)
     return Ranking(
         tuple(signature.candidate for signature in ranked),

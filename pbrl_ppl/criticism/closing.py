@@ -20,7 +20,7 @@ from pbrl_ppl.criticism.misfit import (
     simulation_test,
 )
 from pbrl_ppl.criticism.prior_check import informative_horizon, prior_predictive_check
-from pbrl_ppl.criticism.refinement import checked_histories, declared_mode, outliers, shift
+from pbrl_ppl.criticism.refinement import Declared, checked_histories, outliers, shift
 from pbrl_ppl.criticism.results import (
     NOTHING_RECORDED,
     Acceleration,
@@ -44,7 +44,7 @@ from pbrl_ppl.criticism.unexplained import (
     noise_without_unexplained,
     unexplained_acceleration,
 )
-from pbrl_ppl.effects import Attached, Effect, attach, candidates
+from pbrl_ppl.effects import Attached, Effect
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import (
     ConvergenceWarning,
@@ -74,7 +74,7 @@ from pbrl_ppl.physics import Physics, try_effect
 from pbrl_ppl.posterior import MAX_PARETO_K, Comparison, Fit, compare, identify, interval, versions
 from pbrl_ppl.posterior import draws as posterior_draws
 from pbrl_ppl.sampling import sample
-from pbrl_ppl.scene import Scene, check_substeps
+from pbrl_ppl.scene import Scene
 from pbrl_ppl.threads import one_blas_thread
 
 #: Draws of each chain by method, then those where that is not enough.
@@ -158,15 +158,13 @@ def close_loop(
         pp.report(loop, "report.html")
     """
     say = progress or (lambda stage: None)
-    task = _Task(scene, tuple(catalogue), seed, substeps, draws, method, criteria, say)
+    task = _Task(scene, tuple(catalogue), seed, substeps, criteria, say, draws=draws, method=method)
     if test is None:
         train, test = train.split(0.25, seed)
         numbered = test
     else:  # an effect from some trajectory on still acts in a later test
         after = float(train.dataset["number"].max()) + 1.0
         numbered = test.numbered(after) if scene.test_is_later else test
-    if substeps is not None:
-        check_substeps(substeps)
     drawn = partial(drawn_pieces, most=most_transitions, seed=seed)
     (train, said), (test, also), (numbered, _) = map(drawn, (train, test, numbered))
     cleaned = _cleaned(task, train, numbered, (*said, *(f"held out: {one}" for one in also)))
@@ -195,34 +193,12 @@ class LoopInterrupted(KeyboardInterrupt):
         self.finish = finish
 
 
-@dataclass(frozen=True, eq=False)
-class _Task:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Task(Declared):
     """Arguments of :func:`close_loop`."""
 
-    scene: Scene
-    catalogue: tuple[Effect, ...]
-    seed: int
-    substeps: int | None
     draws: int | None
     method: str
-    criteria: Criteria
-    say: Callable[[str], None]
-
-    @property
-    def effects(self) -> tuple[Attached, ...]:
-        """Effects that the scene declares."""
-        return attach(self.scene, (), self.catalogue)
-
-    def missing(self, mode: Mode) -> tuple[Attached, ...]:
-        """Return the candidate effects for a model that its recording can show."""
-        problem = mode.problem
-        return candidates(self.scene, problem.physics.effects, self.catalogue, problem.data.history)
-
-    def declared(self, train: History) -> FilteredMode:
-        """Return the mode of the declared model on whole trajectories."""
-        return declared_mode(
-            self.scene, train, self.effects, self.seed, self.substeps, self.say, self.criteria
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,12 +269,11 @@ def _cleaned(task: _Task, train: History, test: History, drawn: tuple[str, ...])
 
 def _searched(task: _Task, cleaned: _Cleaned) -> tuple[FilteredMode, SearchResult]:
     """Fit the declared model, and search for the laws that it lacks."""
-    task.say(Stage.FIT)
     search = Search(task.missing, task.criteria, task.say)
     try:
-        return search.of(cleaned.train, task.declared, task.seed)
+        return search.of(cleaned.train, task.mode, task.seed)
     except HistoryError:  # initial states could follow all that was measured
-        mode = task.declared(cleaned.train)
+        mode = task.mode(cleaned.train)
         return mode, search(find_mode(single_transitions(mode.problem), initial=mode.phi))
 
 
@@ -317,7 +292,7 @@ def _tested(
     if frames:  # the data change, not the laws
         task.say("; ".join(map(str, frames)))
         cleaned = replace(cleaned, train=train, bad_frames=(*cleaned.bad_frames, *map(str, frames)))
-        declared = task.declared(train)
+        declared = task.mode(train)
         found = found.on(declared)
         innovations = filtered_mode(declared, found.after) if found.laws else declared
     tested = HeldOut.of(innovations, cleaned.test)

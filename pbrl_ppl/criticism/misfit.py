@@ -26,7 +26,6 @@ from pbrl_ppl.criticism.unexplained import (
     innovations_over_steps,
     noise_alone,
 )
-from pbrl_ppl.effects import Noise
 from pbrl_ppl.likelihood import bodies_acceleration
 from pbrl_ppl.modes import FilteredMode
 from pbrl_ppl.state import STATE, STATE_UNITS, Floats, acceleration_unit
@@ -225,10 +224,9 @@ def score_test(mode: FilteredMode, ranked: Sequence[Signature], criteria: Criter
 
     It fails where one is significant and changes a step by more than a negligible share.
     """
-    scored = [one for one in ranked if not isinstance(one.attached.effect.stage, Noise)]
-    if not scored:
+    if not ranked:
         return ResidualTest.untested(KindOfTest.CANDIDATES, "no effect of the catalogue is left")
-    first = min(scored, key=lambda one: one.candidate.p_value)
+    first = min(ranked, key=lambda one: one.candidate.p_value)
     candidate, white = first.candidate, mode.whitened_residual
     change = np.sqrt(candidate.statistic) * first.direction[: white.size].reshape(white.shape)
     share = np.sqrt((change**2).mean(axis=0)) * innovations_over_steps(mode)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from scipy.stats import norm
@@ -165,66 +166,64 @@ def _beside(size: Floats, trajectory: Ints, row: Ints) -> Floats:
 
 
 @dataclass(frozen=True, eq=False)
-class Checked:
-    """A recording without bad frames and unused velocities, and how a declared model is fitted.
+class Declared:
+    """A declared model: how it is fitted, and what it may lack.
 
     Parameters
     ----------
     scene : Scene
-        The declared scene, with natural units of the recording.
-    history : History
-        What is left of it, or pieces.
+        With natural units of the recording.
     catalogue : tuple of Effect
-        Effects that are tried.
-    mode : callable
-        Returns the mode of the declared model on a history.
+        Effects that are tried, and where declared ones are looked up.
+    seed, substeps, criteria, say
+        As of :func:`pbrl_ppl.close_loop`; ``say`` is its ``progress``.
     """
 
     scene: Scene
-    history: History
     catalogue: tuple[Effect, ...]
-    mode: Callable[[History], FilteredMode]
+    seed: int
+    substeps: int | None
+    criteria: Criteria
+    say: Callable[[str], None]
 
-    @classmethod
-    def of(
-        cls,
-        scene: Scene,
-        history: History,
-        catalogue: tuple[Effect, ...],
-        seed: int,
-        substeps: int | None,
-        most_transitions: int,
-        criteria: Criteria,
-        say: Callable[[str], None],
-    ) -> Checked:
-        """Clean a recording; arguments are those of :func:`pbrl_ppl.attribute`.
+    def __post_init__(self) -> None:
+        """Check the substeps."""
+        if self.substeps is not None:
+            check_substeps(self.substeps)
+
+    @property
+    def effects(self) -> tuple[Attached, ...]:
+        """Effects that the scene declares."""
+        return attach(self.scene, (), self.catalogue)
+
+    def cleaned(self, history: History, most: int) -> tuple[Self, History]:
+        """Return the model with units of a recording, and what is left of that.
+
+        Of a recording with more than ``most`` transitions pieces; without bad frames and unused
+        velocities.
 
         Raises
         ------
         HistoryError
             If the history does not fit the scene.
-        EffectError
-            If the scene declares an unknown effect.
         """
-        if substeps is not None:
-            check_substeps(substeps)
-        history, drawn = drawn_pieces(history, most_transitions, seed)
-        history, _, unused, bad = checked_histories(scene, history, history)
+        history, drawn = drawn_pieces(history, most, self.seed)
+        history, _, unused, bad = checked_histories(self.scene, history, history)
         for sentence in (*drawn, *(velocity.sentence for velocity in unused), *bad):
-            say(sentence)
-        scene = with_units(scene, history)
-        effects = attach(scene, (), catalogue)
-
-        def fit(train: History) -> FilteredMode:
-            say(Stage.FIT)
-            return declared_mode(scene, train, effects, seed, substeps, say, criteria)
-
-        return cls(scene, history, catalogue, fit)
+            self.say(sentence)
+        return replace(self, scene=with_units(self.scene, history)), history
 
     def missing(self, mode: Mode) -> tuple[Attached, ...]:
         """Return the candidate effects for a model that its recording can show."""
         problem = mode.problem
         return candidates(self.scene, problem.physics.effects, self.catalogue, problem.data.history)
+
+    def mode(self, train: History) -> FilteredMode:
+        """Return the model's mode on whole trajectories."""
+        self.say(Stage.FIT)
+        return declared_mode(
+            self.scene, train, self.effects, self.seed, self.substeps, self.say, self.criteria
+        )
 
 
 def declared_mode(

@@ -13,7 +13,7 @@ from pbrl_ppl.criticism.score import Library, named_beside, null_sides
 from pbrl_ppl.criticism.subsets import Term, worth
 from pbrl_ppl.criticism.table import weights
 from pbrl_ppl.criticism.trial_recording import measured, parameters_of, simulated
-from pbrl_ppl.effects import Attached, Effect, Noise, attach, candidates
+from pbrl_ppl.effects import Attached, Effect, attach, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.history import History, with_units
 from pbrl_ppl.likelihood import Problem, in_pieces
@@ -165,8 +165,7 @@ def rehearse(
     physics = physics.changed(scene=with_units(scene, history))
     mode = _known_mode(_apart(Problem.of(physics, history), states), phi, states)
     seconds = mode.problem.data.horizon * scene.time_step
-    tried = [one for one in catalogue if not isinstance(one.stage, Noise)]
-    model = physics.scene, physics.effects, tried
+    model = physics.scene, physics.effects, catalogue
     every, able = candidates(*model), candidates(*model, history)
     say(f"linearising {len(able)} laws on pieces of {seconds:.3g} s")
     regression = _Regression(mode, able, criteria)

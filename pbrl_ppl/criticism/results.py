@@ -120,25 +120,6 @@ class Part:
 
 
 @dataclass(frozen=True)
-class LawsOfSize:
-    """The best subset of laws of one size, to first order.
-
-    Parameters
-    ----------
-    laws : tuple of str
-        Names of effects and bodies.
-    nats : float
-        Log-evidence less its price.
-    error : float
-        Simulation error with them over that without.
-    """
-
-    laws: tuple[str, ...]
-    nats: float
-    error: float
-
-
-@dataclass(frozen=True)
 class SearchLength:
     """A search on pieces of one length.
 
@@ -150,8 +131,6 @@ class SearchLength:
         Its length (s).
     error : dict of str to float
         Simulation error (root mean square) of the model before, by dimension, SI units.
-    path : tuple of LawsOfSize
-        The best subset of further laws of each size, the smallest first.
     accepted, dropped : tuple of str
         Laws that were added, and those found needless beside them.
     correlated : dict of str to float
@@ -161,7 +140,6 @@ class SearchLength:
     rows: int
     seconds: float
     error: Mapping[str, float]
-    path: tuple[LawsOfSize, ...]
     accepted: tuple[str, ...]
     dropped: tuple[str, ...]
     correlated: Mapping[str, float]

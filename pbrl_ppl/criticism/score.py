@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
-from scipy.stats import chi2, norm
+from scipy.stats import chi2
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.results import Candidate
@@ -17,8 +17,8 @@ from pbrl_ppl.criticism.scan import (
     each_grid_point,
     is_upper_limit,
 )
-from pbrl_ppl.effects import Attached, Noise
-from pbrl_ppl.likelihood import Problem, is_filtered
+from pbrl_ppl.effects import Attached
+from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import Mode, posterior_slopes
 from pbrl_ppl.parameters import box, prior_residual, prior_slopes
 from pbrl_ppl.state import Floats, Ints
@@ -106,11 +106,8 @@ def rank_candidates(
         library.forget(attached)
         return signature
 
-    # p-values of the same physics differ by rounding; any missing effect makes tails heavy
-    return sorted(
-        in_parallel(score, candidates),
-        key=lambda one: (_of_noise(one.attached), round(one.log_p, 3)),
-    )
+    # p-values of the same physics differ by rounding
+    return sorted(in_parallel(score, candidates), key=lambda one: round(one.log_p, 3))
 
 
 class Library:
@@ -178,8 +175,6 @@ class Library:
     ) -> Signature:
         """Return the score test of one of so many candidates; a whole change has one sign."""
         test = self.test(without)
-        if _of_noise(attached):
-            return _tail_score(self.mode, attached, test, candidates)
         points, tried, units = self.points(attached)
         judged = [(test.at(point, attached), point) for point in points]
         judged.sort(key=lambda one: one[0].log_p)
@@ -403,43 +398,6 @@ def _signature(
         is_upper_limit=is_upper_limit(effect, tried),
     )
     return Signature(attached, candidate, log_p, evidence.basis, evidence.direction, linear)
-
-
-def _of_noise(attached: Attached) -> bool:
-    """Return whether an effect is of the noise's shape."""
-    return isinstance(attached.effect.stage, Noise)
-
-
-def _tail_score(mode: Mode, attached: Attached, test: ScoreTest, candidates: int) -> Signature:
-    """Return the score test of the noise's tail: the kurtosis, with sigma's score projected out.
-
-    The derivative of Student-t's log-density by the reciprocal of its degrees of freedom at zero is
-    (z^4 - 2 z^2 - 1) / 4; without its projection on sigma's score it is the fourth Hermite
-    polynomial over 4, of variance 3/2.
-    """
-    problem = mode.problem
-    seen = problem.observations.measured
-    if is_filtered(problem):
-        seen = problem.likelihood.noise.seen
-    whitened = test.residual[: seen.size].reshape(seen.shape)
-    # coordinates that never move have no noise, and would make all others look heavy-tailed
-    moving = seen & (np.abs(whitened).max(axis=0) > VISIBLE)
-    z = whitened[moving] if problem.nu(mode.phi) is None else np.zeros(0)
-    z = z / max(float(np.sqrt(np.mean(z**2))), 1e-300) if len(z) else z
-    score, variance = float((z**4 - 6 * z**2 + 3).sum() / 4), 1.5 * max(len(z), 1)
-    heavier = score > 0
-    evidence = replace(
-        _none(len(test.residual)),
-        statistic=score**2 / variance if heavier else 0.0,
-        log_p=float(norm.logsf(score / np.sqrt(variance))) if heavier else 0.0,
-        share=1.0,
-        unit=np.array([np.sqrt(variance) if len(z) else 0.0]),
-    )
-    values = np.array(attached.effect.null)
-    point = GridPoint(values, np.zeros((0, 1)), (0,))
-    if heavier and len(values) == 1:
-        values = values + score / variance
-    return _signature(attached, evidence, values, test, candidates, [point], [evidence.unit])
 
 
 def same_physics(first: Signature, second: Signature, cosine: float = 0.9999) -> bool:

@@ -15,11 +15,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
-from pbrl_ppl.criticism.results import Law, LawsOfSize, SearchLength, Stage
+from pbrl_ppl.criticism.results import Law, SearchLength, Stage
 from pbrl_ppl.criticism.score import Library, Signature, named_beside
 from pbrl_ppl.criticism.subsets import Regression, Subset, best_subsets
 from pbrl_ppl.criticism.table import Table, far_out, informed, refit, share, sizes_of, weights
-from pbrl_ppl.effects import Attached, Noise, Structure
+from pbrl_ppl.effects import Attached, Structure
 from pbrl_ppl.history import History, drawn_pieces
 from pbrl_ppl.likelihood import Problem, in_pieces, is_filtered, is_independent, is_simulated
 from pbrl_ppl.modes import (
@@ -280,11 +280,8 @@ class Search:
         return mode, found.on(mode)
 
     def _candidates(self, mode: Mode, unusual: bool) -> list[Attached]:
-        """Return the candidates of a model, the noise's shape aside."""
-        return [
-            one for one in self.missing(mode)
-            if not isinstance(one.effect.stage, Noise) and (unusual or not one.effect.unusual)
-        ]  # fmt: skip
+        """Return the candidates of a model, common ones alone or all."""
+        return [one for one in self.missing(mode) if unusual or not one.effect.unusual]
 
     def _is_complete(self, more: _Climb, common: _Climb) -> bool:
         """Return whether unusual laws explain all that common ones leave, or most of it."""
@@ -377,7 +374,6 @@ class Search:
                 rows=data.horizon,
                 seconds=data.horizon * mode.problem.scene.time_step,
                 error=dict(zip(names, begin.sigma.tolist(), strict=True)),
-                path=tuple(map(_laws_of_size, climb.regressions[-1].path)),
                 accepted=tuple(_name(law) for law in laws if law not in before),
                 dropped=tuple(_name(law) for law in before if law not in laws),
                 correlated=dict(zip(names, times, strict=False)),
@@ -728,9 +724,3 @@ def is_out_of_phase(
 def _name(law: Attached) -> str:
     """Return the names of an effect and its body."""
     return f"{law.effect.name} on {law.body}"
-
-
-def _laws_of_size(subset: Subset) -> LawsOfSize:
-    """Return a subset by names."""
-    names = tuple(map(_name, subset.laws))
-    return LawsOfSize(names, subset.nats, float(np.sqrt(1.0 - subset.share)))

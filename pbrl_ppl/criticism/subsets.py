@@ -79,14 +79,6 @@ class Regression:
     same: Mapping[Attached, tuple[Attached, ...]]
     signatures: tuple[Signature, ...]
 
-    @property
-    def path(self) -> tuple[Subset, ...]:
-        """The best subset of each size, the smallest first."""
-        best: dict[int, Subset] = {}
-        for subset in self.subsets:
-            best.setdefault(len(subset.laws), subset)
-        return tuple(best[size] for size in sorted(best))
-
 
 @dataclass(frozen=True, eq=False)
 class Term:

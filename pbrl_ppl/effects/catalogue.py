@@ -10,7 +10,7 @@ import numpy as np
 
 from pbrl_ppl.effects import actuators, drag, forces, friction, obstacles, sensors, springs
 from pbrl_ppl.effects.actuation import actuation, laws_of_actuators
-from pbrl_ppl.effects.effect import Attached, Command, Effect, is_pivoted
+from pbrl_ppl.effects.effect import Attached, Command, Effect, Noise, is_pivoted
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.history import History
 from pbrl_ppl.scene import Scene
@@ -212,6 +212,8 @@ def candidates(
 ) -> tuple[Attached, ...]:
     """Return every applicable effect on every body that the model does not have yet.
 
+    The noise's shape is declared, and no candidate.
+
     Their priors are in SI units; see :func:`pbrl_ppl.scene.units_of`. Of a history only those that
     it can show: see ``Effect.needs``.
     """
@@ -225,6 +227,7 @@ def candidates(
         effect.on(body.name).in_si(scene)
         for effect, body in (*everywhere, *own)
         if (effect.name, body.name) not in present
+        and not isinstance(effect.stage, Noise)
         and effect.applies(scene, body)
         and (history is None or _needed(effect) <= shown[body.name])
     )

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import cycle
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import MaxNLocator
 from scipy.stats import chi2
 
 from pbrl_ppl.criticism import Loop
@@ -62,23 +59,6 @@ def plot_candidates(loop: Loop, width: float = style.WIDE, level: float = 0.01) 
         Line2D([], [], color=style.BEFORE, linewidth=2, label=f"{100 * level:g} % threshold"),
     ]
     style.legend(figure, handles)
-    return figure
-
-
-def plot_search(loop: Loop, width: float = style.WIDE) -> Figure:
-    """Plot the simulation error over the number of further laws, one line a length of pieces."""
-    figure, (axes,) = style.blank_figure(width, 3.2)
-    shades = colormaps["Blues"](np.linspace(1.0, 0.4, len(loop.search)))[::-1]
-    for length, shade, mark in zip(loop.search, shades, cycle("o^sDv"), strict=False):
-        sizes = [0, *(len(best.laws) for best in length.path)]
-        errors = [1.0, *(best.error for best in length.path)]
-        accepted = f", {len(length.accepted)} accepted" * bool(length.accepted)
-        name = f"{length.seconds:.3g} s{accepted}"
-        axes.plot(sizes, errors, color=shade, marker=mark, label=name)
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set(xlabel="further laws in the best subset", ylabel="simulation error / error without")
-    axes.set_ylim(0.0, 1.05)
-    style.legend(figure, axes.lines)
     return figure
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 import xarray as xr
 
-from pbrl_ppl.criticism import Candidate, Errors, Loop
+from pbrl_ppl.criticism import Candidate, Errors, Loop, SearchLength
 from pbrl_ppl.effects import Sensor
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.posterior import Comparison, Identifiability, interval, scalars
@@ -253,20 +253,19 @@ def candidate_table(loop: Loop) -> Table:
     )
 
 
-def search_tables(loop: Loop) -> list[Table]:
-    """Tabulate the best subset of laws of each size, one table a length of simulated pieces."""
-    return [
-        Table(
-            f"Pieces of {length.rows} interval{'s' * (length.rows > 1)}, {length.seconds:.3g} s",
-            ("Best subset", "Evidence (nats)", "Error relative to none"),
-            [
-                (", ".join(map(plain, best.laws)), number(best.nats), number(best.error))
-                for best in length.path
-            ],
-            marks=["added" * ({*best.laws} == {*length.accepted}) for best in length.path],
-        )
-        for length in loop.search
-    ]
+def search_table(loop: Loop) -> Table:
+    """Tabulate what the search found on pieces of each length."""
+    columns: dict[str, Callable[[SearchLength], str]] = {
+        "Intervals": lambda one: str(one.rows),
+        "Seconds": lambda one: number(one.seconds),
+        "Error before": lambda one: ", ".join(
+            f"{name} {quantity(error, UNITS[name])}" for name, error in one.error.items()
+        ),
+        "Accepted": lambda one: ", ".join(map(plain, one.accepted)) or "–",
+        "Dropped": lambda one: ", ".join(map(plain, one.dropped)) or "–",
+    }
+    words = ("Error before", "Accepted", "Dropped")
+    return tabulate("The search by length of pieces", loop.search, columns, words)
 
 
 def carrier_table(evidence: Evidence, most: int = 8) -> Table:
