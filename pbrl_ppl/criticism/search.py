@@ -468,7 +468,7 @@ class Search:
         """Leave out laws without evidence, and those that take less off than a main law."""
         limits, table, before = self.criteria.search, climb.table, climb.laws
         while laws := climb.laws:
-            shares = table.shares(climb.mode)
+            shares = table.shares(climb.mode, limits.main_share)
             law = min(laws, key=lambda one: climb.earlier.get(one, limits.least_nats))
             if climb.earlier.get(law, limits.least_nats) >= limits.least_nats:
                 law = [*shares][-1]
@@ -492,7 +492,7 @@ class Search:
         """Return what a table says of its best model and of what was tried."""
         table, mode, limits = climb.table, climb.mode, self.criteria.search
         shares, declared, rejected = (
-            table.shares(mode),
+            table.shares(mode, limits.main_share),
             table.fitted(mode, ()),
             dict[Attached, str](),
         )

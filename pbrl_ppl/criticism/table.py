@@ -171,20 +171,28 @@ class Table:
         fit = -float((weight * np.log(mode.sigma)).sum())
         return float(fit - 0.5 * count * np.log(max(weight.sum(), 2.0)) - prior + odds)
 
-    def shares(self, mode: Mode) -> dict[Attached, float]:
+    def shares(self, mode: Mode, large: float) -> dict[Attached, float]:
         """Return the share of the error that each law takes off, the largest first.
 
-        Laws that replace each other in part are missed little alone: what all take off together
-        is divided in proportion.
+        Two laws that replace each other in part are missed little alone: what both take off
+        together is divided in proportion. That is asked of laws with less than a ``large`` share.
         """
         weight, laws = self.weight, self.laws(mode)
-        falls = {
-            law: -np.log1p(-max(share(self.without(mode, law), mode, weight), 0.0)) for law in laws
-        }
-        together = -np.log1p(-max(share(self.fitted(mode, ()), mode, weight), 0.0))
-        scale = max(together / max(sum(falls.values()), 1e-300), 1.0)
+
+        def fall(*gone: Attached) -> float:
+            rest = self.fitted(mode, [one for one in laws if one not in gone])
+            return max(-float(np.log1p(-min(share(rest, mode, weight), 1.0 - 1e-9))), 1e-6)
+
+        alone = {law: fall(law) for law in laws}
+        falls = dict(alone)
+        for law, own in alone.items():
+            if own < -np.log1p(-large):
+                parts = (
+                    fall(law, other) * own / (own + alone[other]) for other in laws if other != law
+                )
+                falls[law] = max(own, *parts, 0.0)
         ordered = sorted(falls, key=lambda law: -falls[law])
-        return {law: -float(np.expm1(-scale * falls[law])) for law in ordered}
+        return {law: -float(np.expm1(-falls[law])) for law in ordered}
 
     def rivals(self, mode: Mode, law: Attached, within: float) -> tuple[Attached, ...]:
         """Return laws with which, in the place of one, a model is as good within some nats."""

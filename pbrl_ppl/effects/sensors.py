@@ -58,8 +58,7 @@ sensor_bias = Effect(
     "what is measured is off by a constant: a sensor is not zeroed, or not where it is thought",
     "additive sensor bias",
     _undone_by_opposites(_add_bias),
-    log_odds=-2.0,
-    unusual="a zero that is off shows as gravity or a constant force, too",
+    log_odds=-1.0,
 )
 
 

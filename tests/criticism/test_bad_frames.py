@@ -76,7 +76,7 @@ def test_laws_are_refitted_by_simulations_without_the_frames() -> None:
     assert len(found.laws) == 1
     observed = train.dataset["observed"].copy()
     observed[1, 5, 0, 0] = np.nan
-    again = found.on(History(train.dataset.assign(observed=observed)))
+    again = found.on(fitted(DISC, History(train.dataset.assign(observed=observed))))
     for mode in (again.declared, again.after):
         assert mode.problem.likelihood.name == "simulation"
     seen = [each.problem.observations.measured.sum() for each in (found.after, again.after)]

@@ -63,7 +63,7 @@ def test_clean_data_of_another_engine_pass(make_history) -> None:
     for kind in (KindOfTest.HELD_OUT, KindOfTest.SIMULATION):
         found = found.with_test(ResidualTest(kind, 0.5, 0.0, True, "as expected"))
     assert found.predicts(DEFAULT)
-    failed = found.with_test(ResidualTest(KindOfTest.PRIOR, 0.5, 1.0, False, "impossible"))
+    failed = found.with_test(ResidualTest(KindOfTest.SIMULATION, 0.5, 9.0, False, "far off"))
     assert not failed.predicts(DEFAULT)
     assert {test.name for test in found.tests if test.tested} == {
         *RATES,

@@ -50,7 +50,7 @@ def test_two_laws_are_proposed_together_with_their_joint_sizes(dragged_and_pulle
     # to first order: the noise and the curvature leave a few hundredths
     np.testing.assert_allclose(sizes["linear_drag"], 0.8, rtol=0.1)
     np.testing.assert_allclose(sizes["constant_force"], (1.5, -0.6), rtol=0.1)
-    alone = [one for one in regression.path if len(one.laws) == 1]
+    alone = [one for one in regression.subsets if len(one.laws) == 1]
     assert alone[0].share < first.share
     assert first.nats > alone[0].nats
 
@@ -116,10 +116,24 @@ def test_the_value_is_the_log_evidence_with_the_odds_of_the_laws(table) -> None:
 def test_shares_of_laws_that_replace_each_other_add_up(table) -> None:
     """A drag and a force are apart: each share is that by which the error rises without it."""
     (mode,) = (table.modes[key] for key in table.modes if len(key) == 2)
-    for law, part in table.shares(mode).items():
+    for law, part in table.shares(mode, 0.2).items():
         alone = share(table.without(mode, law), mode, table.weight)
-        assert part >= alone - 1e-9
-    assert list(table.shares(mode).values()) == sorted(table.shares(mode).values(), reverse=True)
+        assert part == pytest.approx(alone, abs=1e-9)
+    parts = list(table.shares(mode, 0.2).values())
+    assert parts == sorted(parts, reverse=True)
+
+
+def test_two_laws_that_replace_each_other_share_what_both_take_off(table) -> None:
+    """A force and the same force of two laws: without one the other does as well."""
+    (mode,) = (table.modes[key] for key in table.modes if len(key) == 2)
+    drag, force = table.laws(mode)
+    without = {law: table.without(mode, law) for law in (drag, force)}
+    small = {law: replace(mode, sigma=1.05 * mode.sigma) for law in without}
+    copy = Table((), 6, modes=dict(table.modes))
+    copy.modes[frozenset({force})], copy.modes[frozenset({drag})] = small[drag], small[force]
+    together = share(table.fitted(mode, ()), mode, copy.weight)
+    half = 1.0 - np.sqrt(1.0 - together)  # of a fall in the logarithm
+    assert list(copy.shares(mode, 0.2).values()) == pytest.approx([half, half])
 
 
 def test_rivals_are_models_within_some_nats_that_differ_by_one_law(table) -> None:
