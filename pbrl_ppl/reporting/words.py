@@ -238,19 +238,21 @@ def held_out_in_words(loop: Loop) -> str:
     kind = "simulated_rmse" if whole else "rollout_rmse"
     if not (name := moved_most(loop, kind)):
         return ""
-    before, after = getattr(loop.before, kind)[name], getattr(loop.after, kind).get(name)
-    said = f"{error(before)} -> {error(after)}" if loop.added else error(before)
-    unit = f" {UNITS[name]}" if np.isfinite(before if after is None else after) else ""
-    less = ""
-    if loop.added and after is not None and 0.0 < after < before < np.inf:
-        less = f" ({100 * (1 - after / before):.0f} % less)"
+    before = getattr(loop.before, kind)[name]
+    after = getattr(loop.after, kind).get(name, np.nan)
+    said, last = (f"{error(before)} -> {error(after)}", after) if loop.added else ("", before)
+    said = said or error(before)
+    said += f" {UNITS[name]}" * bool(np.isfinite(last))
+    if loop.added and 0.0 < after < before < np.inf:
+        said += f", {100 * (1 - after / before):.0f} % less"
     seconds, start = loop.rollout_seconds, "ahead"
     if whole and loop.held_out is not None:
         rows = int(loop.held_out.dataset["n_rows"].max()) - 1
         seconds, start = rows * loop.scene.time_step, "from fitted initial states"
     floor = getattr(loop.noise_floor, kind).get(name)
-    noise = f"; noise {number(floor)}{unit}" if floor is not None and unit else ""
-    return f"Held-out error of {name} {number(seconds)} s {start}: {said}{unit}{less}{noise}."
+    if floor is not None and floor < before:  # a floor above the error says nothing
+        said += f" (noise floor {number(floor)} {UNITS[name]})"
+    return f"Held-out error of {name} {number(seconds)} s {start}: {said}."
 
 
 def left_aside_in_words(loop: Loop) -> list[str]:

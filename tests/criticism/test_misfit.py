@@ -68,7 +68,7 @@ def test_clean_data_of_another_engine_pass(make_history) -> None:
     assert {test.name for test in found.tests if test.tested} == {
         *RATES,
         KindOfTest.HELD_OUT,
-        KindOfTest.PRIOR,
+        KindOfTest.SIMULATION,
     }
 
 

@@ -7,10 +7,16 @@ import pytest
 from pbrl_ppl.criticism.loop import Loop
 from pbrl_ppl.criticism.results import Acceleration, Candidate, Unexplained
 from pbrl_ppl.effects import Effect, EffectParameter, catalogue
+from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.reporting import in_brief, render
 from pbrl_ppl.reporting.tables import limits_in_words
-from pbrl_ppl.reporting.words import gains_in_words, remains_in_words, verdict_in_words
+from pbrl_ppl.reporting.words import (
+    gains_in_words,
+    held_out_in_words,
+    remains_in_words,
+    verdict_in_words,
+)
 from tests.helpers.html import Page
 from tests.helpers.made_up import made_up
 from tests.helpers.revised import revised, unexplained
@@ -112,7 +118,7 @@ def test_certainty_comes_from_simulations_where_they_named_an_effect() -> None:
     sure = replace(doubtful, simulated_nats=120.0, simulated_share=0.5)
     texts = [text_of(replace(findings, added=(one,))) for one in (doubtful, sure)]
     assert "Not sure" in texts[0] and "As good as certain" in texts[1]
-    assert "simulated trajectories is 2.0 times as large, 120 nats" in texts[1]
+    assert "takes 50 % off the declared model's error in the longest simulations, 120" in texts[1]
 
 
 def test_dependence_is_shown_only_where_its_test_failed() -> None:
@@ -236,13 +242,29 @@ def test_the_terminal_has_ten_lines_and_says_where_and_what_next() -> None:
     assert nowhere[-2] == "Next: open the report; record more quantities, or longer."
 
 
-def test_the_error_far_ahead_is_of_the_dimension_that_is_worst() -> None:
-    """Worst in units of the noise floor, of the declared model."""
+def test_the_error_far_ahead_is_of_the_dimension_that_changed_most() -> None:
+    """In its unit, with what noise alone makes."""
     findings = made_up()
     far = findings.before.rollout_rmse | {"theta": 0.3}
     findings = replace(findings, before=replace(findings.before, rollout_rmse=far))
-    said = "Held-out error of theta 2.00 s ahead: 0.300 -> 0.0163 rad (noise floor 0.0160 rad)."
-    assert said in in_brief(findings, "out")
+    said = "Held-out error of theta 2.00 s ahead: 0.300 -> 0.0163 rad, 95 % less"
+    assert f"{said} (noise floor 0.0160 rad)." in in_brief(findings, "out")
+
+
+def test_a_dimension_that_does_not_move_is_not_shown() -> None:
+    """However much its error changed in rounding."""
+    loop = revised()
+    far = {"x": 0.2, "omega": 2.21e-8}
+    after = {"x": 0.1, "omega": 2.21e-9}
+    still = loop.held_out.dataset["observed"].copy()
+    still[..., 5] = 0.0
+    loop = replace(
+        loop,
+        before=replace(loop.before, simulated_rmse={}, rollout_rmse=far),
+        after=replace(loop.after, simulated_rmse={}, rollout_rmse=after),
+        held_out=History(loop.held_out.dataset.assign(observed=still)),
+    )
+    assert held_out_in_words(loop).startswith("Held-out error of x ")
 
 
 def test_effects_of_one_trajectory_are_told_with_caution() -> None:
