@@ -65,9 +65,7 @@ from .posterior import updated_scene as updated_scene
 from .reporting import ManyLoops as ManyLoops
 from .reporting import close_loop_many as close_loop_many
 from .reporting import report as report
-from .sampling import Calibration as Calibration
 from .sampling import Pooled as Pooled
-from .sampling import calibrate as calibrate
 from .sampling import fit as fit
 from .sampling import physics_model as physics_model
 from .sampling import pool as pool

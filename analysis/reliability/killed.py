@@ -39,7 +39,6 @@ COMMANDS = {
     "metropolis": (8, f"{FIT} --method metropolis --tune 100 --chains 2"),
     "close-loop": (16, "close-loop scene.toml train.csv -o out --test test.csv --method laplace"),
     "close-logs": (8, "close-logs logs.csv -o out --jobs 2 --method laplace"),
-    "calibrate": (8, "calibrate scene.toml train.csv -o out --jobs 2 --replications 2 --draws 100"),
     "report": (20, "report posterior.nc -o out.html"),
     "update": (8, "update posterior.nc test.csv -o out.nc"),
     "simulate": (20, "simulate posterior.nc test.csv -o out.csv"),
@@ -51,8 +50,6 @@ COMMANDS = {
     "new": (20, "new models/out.toml --from shopping_cart"),
     "demo": (4, "demo -o out"),
 }
-#: Commands that go on in a folder without --overwrite.
-GO_ON = ("calibrate",)
 
 
 def prepare(base: Path) -> None:
@@ -95,7 +92,7 @@ def without_pictures() -> None:
 
 def command(name: str, again: bool) -> list[str]:
     """Return the arguments of a command."""
-    overwrite = ["--overwrite"] if again and name not in GO_ON else []
+    overwrite = ["--overwrite"] if again else []
     return [*COMMANDS[name][1].split(), *overwrite]
 
 

@@ -27,10 +27,10 @@ F = TypeVar("F", bound=Callable[..., Result])
 app = typer.Typer(
     name="pbrl-ppl",
     help="A physics engine as model prior, and a loop that closes on measured data.",
-    epilog="Example: pbrl-ppl new --from shopping_cart. Exit codes: 0; 1 for a calibration that"
-    " failed, a goal that was not reached, effects that stay inseparable or at least one log that"
-    " failed; 2 for bad usage or input, with one message on stderr; 3 where chains have not"
-    " converged; 130 after an interrupt.",
+    epilog="Example: pbrl-ppl new --from shopping_cart. Exit codes: 0; 1 for a goal that was not"
+    " reached, effects that stay inseparable or at least one log that failed; 2 for bad usage or"
+    " input, with one message on stderr; 3 where chains have not converged; 130 after an"
+    " interrupt.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
@@ -166,9 +166,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        0; 1 for a calibration that failed, a goal that was not reached, effects that no allowed
-        actions are expected to tell apart, or at least one log that failed; 2 for bad usage or bad
-        input, with one message on stderr; 3 where chains have not converged; 130 if interrupted.
+        0; 1 for a goal that was not reached, effects that no allowed actions are expected to tell
+        apart, or at least one log that failed; 2 for bad usage or bad input, with one message on
+        stderr; 3 where chains have not converged; 130 if interrupted.
     """
     os.environ.setdefault("MPLBACKEND", "Agg")  # commands show no windows
     if argv is None and "forkserver" in multiprocessing.get_all_start_methods():

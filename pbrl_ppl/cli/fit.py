@@ -1,13 +1,10 @@
-"""Posterior files: ``pbrl-ppl fit``, ``update`` and ``report``; and ``calibrate`` of samplers."""
+"""Posterior files: ``pbrl-ppl fit``, ``update`` and ``report``."""
 
 from __future__ import annotations
 
 import sys
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import nullcontext, redirect_stdout
+from contextlib import redirect_stdout
 from dataclasses import dataclass
-from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,14 +15,12 @@ from pbrl_ppl import errors
 from pbrl_ppl.cli import options, terminal
 from pbrl_ppl.cli.app import command
 from pbrl_ppl.cli.terminal import Progress, Result, check_file
-from pbrl_ppl.files import check_folder, write_atomically, write_text
-from pbrl_ppl.threads import obey_parent
+from pbrl_ppl.files import write_text
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from pbrl_ppl.posterior import Idata
-    from pbrl_ppl.sampling import Calibration
 
 #: The stage of `fit` that takes longest.
 _SAMPLING = "looking for the mode, then sampling"
@@ -264,91 +259,3 @@ def report(
         raise errors.PosteriorError(f"{posterior}: {error}") from error
     write_text(page, text)
     return Result({"report": page}, [f"report: {page}"])
-
-
-@command(
-    "calibrate", 12, "pbrl-ppl calibrate scene.toml train.csv -o ranks/ --jobs 4",
-    kept="finished replications are in {output}; the same command goes on",
-)  # fmt: skip
-def calibrate(
-    scene: Path,
-    history: Path,
-    output: options.OutputFolder,
-    reading: options.SceneReading,
-    quiet: bool,
-    likelihood: str = "transitions",
-    colour: Annotated[float, typer.Option(min=0.0)] = 0.0,
-    replications: Annotated[int, typer.Option(min=2)] = 200,
-    seed: options.Seed = 1,
-    jobs: options.Count = 1,
-    draws: Annotated[int, typer.Option(min=100)] = 1500,
-) -> Result:
-    """Simulate from the prior, fit, and test whether the true values' ranks are uniform.
-
-    Parameters
-    ----------
-    history : HISTORY
-        History whose design is kept (.csv, ...).
-    output
-        Folder for results; goes on there.
-    likelihood : NAME
-        transitions (single ones from exact states, the paper's Eq. 11), trajectories (whole ones
-        with process noise, as of close-loop; it takes several times as long) or simulation
-        (trajectories without process noise, as of criticise --simulate).
-    colour
-        Correlation of neighbouring rows' errors, with --likelihood simulation.
-    replications
-        Simulated histories.
-    jobs
-        Processes.
-    draws
-        Posterior draws of each chain.
-    """
-    check_folder(output, overwrite=True)
-    declared, (design,) = reading.read(scene, [history])
-    declared, effects = reading.with_effects(declared)
-    import pbrl_ppl.reporting as reporting
-    from pbrl_ppl.sampling import calibration
-
-    # fresh processes: PyMC's threads do not survive a fork
-    processes = partial(ProcessPoolExecutor, jobs, get_context("spawn"), obey_parent)
-    with processes() if jobs > 1 else nullcontext() as pool:
-        try:
-            result = calibration.calibrate(
-                declared, design, effects=effects, likelihood=likelihood, colour=colour,
-                seed=seed, draws=draws, replications=replications, folder=output,
-                executor=pool, progress=not quiet,
-            )  # fmt: skip
-        except errors.PbrlError:
-            raise
-        except ValueError as error:  # an option that calibrate refuses
-            raise errors.FitError(f"calibrate: {error}") from None
-    result.save(output / "ranks.nc")
-    write_atomically(output / "table.csv", result.table().to_csv)
-    picture = reporting.png(reporting.plot_calibration(result))
-    write_atomically(output / "ranks.png", lambda to: to.write_bytes(picture))
-    table, page = result.table().to_dict("index"), output / "ranks.png"
-    contents = {"passed": result.passed, "parameters": table, "picture": page}
-    verdict = f"{'passed' if result.passed else 'failed'}: {page}"
-    return Result(
-        contents,
-        [*_calibrated(result).splitlines(), verdict],
-        0 if result.passed else terminal.FAILED,
-    )
-
-
-def _calibrated(calibration: Calibration) -> str:
-    """Return the columns of the table that matter, and what they should be."""
-    rows, data = calibration.table(), calibration.dataset
-    head = rows.iloc[0]
-    columns = ["p_holm", "coverage_50", "coverage_90", "ess", "r_hat", "passed"]
-    short = int((data["size"] < data["size"].max()).any("parameter").sum())
-    apart = ", ".join(rows.index[~rows["judged"]])
-    ranges = (f"{head[f'low_{level}']:.3g} to {head[f'high_{level}']:.3g}" for level in (50, 90))
-    return (
-        rows[columns].to_string(float_format="{:.4g}".format, index_names=False)
-        + f"\n{data.sizes['replication']} replications, {short} with too few effective draws;"
-        " expected of a right sampler: p_holm at least 0.01, coverages in "
-        + ", ".join(ranges)
-        + (f"\nnot judged, for errors are coloured: {apart}" if apart else "")
-    )

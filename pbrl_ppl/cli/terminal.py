@@ -25,9 +25,8 @@ from rich.text import Text
 from pbrl_ppl.errors import OutputError, printable
 from pbrl_ppl.files import json_values
 
-#: Exit codes: a failed calibration, a failed log, a goal that was not reached, or effects that stay
-#: inseparable; bad input or usage; chains that have not converged, so no verdict; an interrupt, as
-#: shells report it.
+#: Exit codes: a failed log, a goal that was not reached, or effects that stay inseparable; bad
+#: input or usage; chains that have not converged, so no verdict; an interrupt, as shells report it.
 FAILED, BAD_INPUT, UNDECIDED, INTERRUPTED = 1, 2, 3, 130
 
 #: Seconds in which an interrupted command ends by itself.

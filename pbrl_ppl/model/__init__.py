@@ -1,7 +1,6 @@
 """The PyMC model: Table 1, Eqs. 11 and 12, and the engine as a black-box pytensor Op."""
 
 from .declaration import build_model as build_model
-from .declaration import prior_predictive_draws as prior_predictive_draws
 from .declaration import problem_in as problem_in
 from .op import LogLikelihoodOp as LogLikelihoodOp
 from .op import SimulatorOp as SimulatorOp

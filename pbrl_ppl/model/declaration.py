@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -93,35 +93,6 @@ def problem_in(model: pm.Model) -> Problem:
             "the variables of this pm.Model were changed after physics_model; use pm.sample"
         )
     raise FitError("this pm.Model was not made by physics_model; use pm.sample for others")
-
-
-def prior_predictive_draws(
-    model: pm.Model, names: Sequence[str], draws: int, seed: int
-) -> dict[str, Floats]:
-    """Draw from the prior of a model with PyMC.
-
-    Parameters
-    ----------
-    model : pymc.Model
-        Returned by :func:`pbrl_ppl.physics_model`.
-    names : sequence of str
-        Variables to draw, ``next_state`` among them if wanted (Eq. 13).
-    draws : int
-        Number of draws; a larger number begins with the same draws.
-    seed : int
-        Seed of the draws.
-
-    Returns
-    -------
-    dict of str to ndarray
-        Shape (draw, ...) each.
-    """
-    if not names:
-        return {}
-    variables = [model[name] for name in names]
-    # compiling would take longer than drawing
-    drawn = pm.draw(variables, draws=draws, random_seed=seed, mode="FAST_COMPILE")
-    return dict(zip(names, drawn, strict=True))
 
 
 def _chosen(

@@ -9,7 +9,6 @@ from pbrl_ppl.reporting.many import ManyLoops as ManyLoops
 from pbrl_ppl.reporting.many import close_loop_many as close_loop_many
 from pbrl_ppl.reporting.many_page import in_words as in_words
 from pbrl_ppl.reporting.page import Source as Source
-from pbrl_ppl.reporting.posterior_plots import plot_calibration as plot_calibration
 from pbrl_ppl.reporting.posterior_plots import plot_prior_check as plot_prior_check
 from pbrl_ppl.reporting.posterior_plots import plot_rank as plot_rank
 from pbrl_ppl.reporting.posterior_plots import plot_trace as plot_trace

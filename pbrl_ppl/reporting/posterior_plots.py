@@ -1,4 +1,4 @@
-"""Plots of posteriors, of the prior against the data, and of calibration."""
+"""Plots of posteriors, and of the prior against the data."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
-from scipy.stats import binom, rankdata
+from scipy.stats import rankdata
 
 from pbrl_ppl.criticism import PriorCheck
 from pbrl_ppl.posterior import Idata, convergence, from_groups, scalars
@@ -20,7 +20,6 @@ from pbrl_ppl.reporting.posterior_summary import (
     rank_correlations,
     summary,
 )
-from pbrl_ppl.sampling import Calibration, bins
 from pbrl_ppl.state import Floats
 
 
@@ -198,37 +197,4 @@ def plot_prior_check(check: PriorCheck) -> Figure:
         axes.set_ylim(1.6, -0.6)
         x = f"change in {check.seconds:g} s ({style.UNITS[str(state)]})"
         style.name_axes(axes, f"{state} of {body}: {100 * share:.0f} % as expected", x, small=True)
-    return figure
-
-
-def plot_calibration(calibration: Calibration) -> Figure:
-    """Plot rank histograms of a simulation-based calibration, one panel a parameter.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        As made by :func:`pbrl_ppl.calibrate`.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        The band holds 99 % of each bar's heights if ranks are uniform; failed parameters stand out.
-    """
-    table, positions = calibration.table(), calibration.dataset["position"]
-    n, columns = positions.sizes["replication"], min(4, len(table))
-    figure, panels = style.blank_figure(2.6 * columns, 1.7, len(table), columns, spare=0.6)
-    count = bins(n)
-    low, high = binom.interval(0.99, n, 1 / count)
-    for axes, (label, row) in zip(panels, table.iterrows(), strict=False):
-        axes.axhspan(low, high, color=style.BAND)
-        axes.axhline(n / count, color=style.PLAIN, linewidth=1)
-        color = style.AFTER if row["passed"] else style.BEFORE
-        axes.hist(
-            positions.sel(parameter=label), bins=count, range=(0, 1), histtype="step", color=color
-        )
-        verdict = "" if row["passed"] else ", failed"
-        axes.set_title(f"{label}: p = {row['p_holm']:.2g}{verdict}", fontsize=9, color=color)
-        axes.set_ylim(bottom=0)
-    figure.supxlabel("rank of the true value among posterior draws, as a share", fontsize=9)
-    figure.supylabel("replications", fontsize=9)
     return figure

@@ -1,6 +1,5 @@
-"""Draws from the posterior: `fit` and its samplers, `update`, and whether the sampler is right."""
+"""Draws from the posterior: `fit` and its samplers, and `update`."""
 
-from .calibration import calibrate as calibrate
 from .declaration import physics_model as physics_model
 from .declaration import try_own_effects as try_own_effects
 from .fitting import DEFAULT as DEFAULT
@@ -8,6 +7,4 @@ from .fitting import fit as fit
 from .fitting import sample as sample
 from .pooling import Pooled as Pooled
 from .pooling import pool as pool
-from .ranks import Calibration as Calibration
-from .ranks import bins as bins
 from .updating import update as update

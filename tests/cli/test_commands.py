@@ -110,7 +110,6 @@ def test_options_are_alike() -> None:
         "plan",
         "suggest",
         "simulate",
-        "calibrate",
     }
     group = typer.main.get_command(app).commands
     assert {
@@ -126,7 +125,7 @@ def test_commands_read_recordings_alike() -> None:
         for name in NAMES
     }
     reading = {"--columns", "--units", "--estimate-velocities", "--trim", "--effect-file"}
-    for name in ("check", "criticise", "fit", "close-loop", "close-logs", "calibrate"):
+    for name in ("check", "criticise", "fit", "close-loop", "close-logs"):
         assert reading | {"--noise", "--substeps", "--time-step"} <= options[name], name
     for name in ("update", "simulate"):
         assert reading | {"--resample"} <= options[name], name
@@ -623,25 +622,6 @@ def test_convergence_is_judged_as_it_is_written(monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.usefixtures("puck")
-@pytest.mark.one_stack
-def test_calibrate_takes_the_likelihood_of_fit(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    seen = []
-
-    def take(scene: Scene, design: History, **options: Any) -> None:
-        seen.append((dict(scene.noise), options["likelihood"]))
-        raise FitError("that is all")
-
-    monkeypatch.setattr(sampling.calibration, "calibrate", take)
-    argv = ["calibrate", "scene.toml", "train.csv", "-o", "ranks"]
-    for options in ([], ["--likelihood", "trajectories", "--noise", "x=0.002"]):
-        assert "that is all" in message(capsys, *argv, *options)
-    assert seen == [({}, "transitions"), ({"x": 0.002}, "trajectories")]
-    assert 'unknown key "z"' in message(capsys, *argv, "--noise", "z=0.1")
-
-
-@pytest.mark.usefixtures("puck")
 @pytest.mark.parametrize("name", ["x" * 300, "/proc/none/report"])
 def test_a_folder_that_cannot_be_made_is_refused_at_once(
     name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -651,7 +631,6 @@ def test_a_folder_that_cannot_be_made_is_refused_at_once(
     for argv in (
         ["close-loop", "scene.toml", "train.csv"],
         ["close-logs", "logs.csv"],
-        ["calibrate", "scene.toml", "train.csv"],
     ):
         assert "cannot be made" in message(capsys, *argv, "-o", name)
 

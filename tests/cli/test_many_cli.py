@@ -163,7 +163,7 @@ def test_every_command_that_reads_a_recording_takes_own_tables(
     assert main(["check", *files, *own, "--time-step", "0.09", "--no-prior", "--json"]) == 0
     assert '"transitions": 4' in capsys.readouterr().out
     for command in (["fit", *files, "-o", "new.nc"], ["criticise", *files],
-                    ["calibrate", *files, "-o", "sbc"], ["update", "a.nc", files[1], "-o", "b.nc"],
+                    ["update", "a.nc", files[1], "-o", "b.nc"],
                     ["simulate", *files, "-o", "new.csv"]):  # fmt: skip
         assert main([*command, "--columns", "x"]) == 2, command
         assert "is not NAME=VALUE" in " ".join(capsys.readouterr().err.replace("│", " ").split())

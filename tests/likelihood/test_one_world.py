@@ -6,6 +6,7 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from calibration import draw_truths
 
 from pbrl_ppl.criticism import prior_predictive_check
 from pbrl_ppl.criticism.held_out import HeldOut, example_rollout
@@ -18,7 +19,6 @@ from pbrl_ppl.modes.search import find_mode
 from pbrl_ppl.physics import Physics, Simulator
 from pbrl_ppl.posterior import Fit, evaluate, from_groups, group, problem_of
 from pbrl_ppl.sampling import fit, fitting, physics_model
-from pbrl_ppl.sampling.calibration import draw_truths
 from pbrl_ppl.sampling.fitting import joined_at
 from pbrl_ppl.scene import Body, Scene, Shape
 from pbrl_ppl.state import STATE

@@ -1,16 +1,17 @@
 """Simulation-based calibration of everything that samples: prior, likelihood and sampler together.
 
-    python analysis/benchmarks/calibration.py FOLDER                  # the cart: Eq. 11
-    python analysis/benchmarks/calibration.py FOLDER --case pair      # two discs that collide
+    python analysis/benchmarks/calibration_cases.py                  # the cart: Eq. 11
+    python analysis/benchmarks/calibration_cases.py --case pair      # two discs that collide
 
-Each case is a small design: initial states, actions, and which coordinates are measured. Each
-replication is kept in the folder, where the same command goes on. ``--json`` prints one object.
+Each case is a small design: initial states, actions, and which coordinates are measured; the runner
+is ``analysis/calibration.py``. ``--json`` prints one object.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import sys
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
@@ -26,6 +27,9 @@ import pbrl_ppl as pp
 from pbrl_ppl.history import from_segments
 from pbrl_ppl.physics import Transition
 from pbrl_ppl.state import STATE, WRENCH
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from calibration import calibrate, table
 
 RECORDED = Path(__file__).parents[2] / "models" / "shopping_cart" / "recorded" / "train.csv"
 PRIOR = {
@@ -182,58 +186,57 @@ class Case:
     design : callable
         Returns the scene and the history.
     options : dict
-        Arguments of :func:`pbrl_ppl.calibrate`.
+        Arguments of ``calibrate``.
+    likelihood : str
+        As of :func:`pbrl_ppl.physics_model`.
     """
 
     design: Callable[[], Design]
     options: dict[str, Any] = field(default_factory=dict)
+    likelihood: str = "transitions"
 
 
 CASES = {
     "cart": Case(cart),
-    "trajectories": Case(lambda: cart(4, 8), {"likelihood": "trajectories"}),
+    "trajectories": Case(lambda: cart(4, 8), likelihood="trajectories"),
     "pair": Case(pair, FEW),
     "push": Case(push, FEW),
     "hinge": Case(hinge),
-    "positions": Case(positions, {"likelihood": "trajectories", **FEW}),
-    "simulation": Case(lambda: disc(3, 30), {"likelihood": "simulation", "colour": 0.8, **FEW}),
+    "positions": Case(positions, FEW, "trajectories"),
+    "simulation": Case(lambda: disc(3, 30), {"colour": 0.8, **FEW}, "simulation"),
     "laplace": Case(lambda: disc(6, 10), {"method": "laplace"}),
 }
 
 
 def main() -> None:
-    """Run the replications and print whether the ranks are uniform."""
+    """Run the simulations and print whether the ranks are uniform."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folder", type=Path)
     parser.add_argument("--case", choices=[*CASES], default="cart")
-    parser.add_argument("--replications", type=int, default=100)
+    parser.add_argument("--simulations", type=int, default=100)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--json", action="store_true")
     asked = parser.parse_args()
     case = CASES[asked.case]
-    scene, history = case.design()
-    before, began = len([*asked.folder.glob("replication-*.json")]), time.perf_counter()
+    model = pp.physics_model(*case.design(), likelihood=case.likelihood)
+    began = time.perf_counter()
     with ProcessPoolExecutor(asked.jobs, mp_context=get_context("spawn")) as pool:
-        result = pp.calibrate(
-            scene, history, replications=asked.replications, seed=4, chains=2, folder=asked.folder,
-            executor=pool, progress=not asked.json, **USUAL | case.options,
-        )  # fmt: skip
-    seconds = time.perf_counter() - began
-    table, run = result.table(), max(asked.replications - before, 1)
+        options = {"seed": 4, "chains": 2, **USUAL, **case.options}
+        data = calibrate(model, simulations=asked.simulations, run=pool.map, **options)
+    seconds, rows = time.perf_counter() - began, table(data)
     if not asked.json:
-        print(table.to_string())
-    judged = table[table["judged"]]
+        print(rows.to_string())
+    judged = rows[rows["judged"]]
     figures = {
         "case": asked.case,
-        "passed": result.passed,
-        "replications": int(result.dataset.sizes["replication"]),
-        "failures": len(result.failures),
-        "least_p_holm": float(judged["p_holm"].min()),
+        "passed": bool(judged["passed"].all()),
+        "simulations": asked.simulations,
+        "least_p": float(judged["p_corrected"].min()),
         "coverage_50": [float(judged["coverage_50"].min()), float(judged["coverage_50"].max())],
         "coverage_90": [float(judged["coverage_90"].min()), float(judged["coverage_90"].max())],
-        "max_rhat": float(table["r_hat"].max()),
-        "redrawn": int(result.dataset.attrs["redrawn"]),
-        "seconds_each": round(seconds * asked.jobs / run, 1),  # of one process, its start included
+        "max_rhat": float(rows["r_hat"].max()),
+        "redrawn": data.attrs["redrawn"],
+        # of one process, its start included
+        "seconds_each": round(seconds * asked.jobs / asked.simulations, 1),
     }
     print(json.dumps(figures) if asked.json else figures)
 
