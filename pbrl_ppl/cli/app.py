@@ -224,7 +224,7 @@ def _engine_fault() -> str:
     from pbrl_ppl.physics import Physics
     from pbrl_ppl.scene import Body, Scene, Shape
 
-    puck = Body("puck", Shape.circle(0.1), known={"mass": 2.0, "r": 0.0, "mu_c": 0.0})
+    puck = Body("puck", Shape.circle(0.1), known=(("mass", 2.0), ("r", 0.0), ("mu_c", 0.0)))
     push = np.array([[[[4.0, 0.0, 0.0]]]])
     try:
         physics = Physics(Scene(time_step=0.5, bodies=(puck,)), engine="chipmunk")
