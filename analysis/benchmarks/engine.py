@@ -31,8 +31,7 @@ from pbrl_ppl.effects import attach
 from pbrl_ppl.history import History, fill_joints
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.parameters import Layout, box, differentiate
-from pbrl_ppl.physics import PartedSimulator, Physics, Simulator, build_layout, calls
-from pbrl_ppl.physics.plain import set_properties
+from pbrl_ppl.physics import PartedSimulator, Physics, Simulator, build_layout, calls, compiled
 from pbrl_ppl.physics.world import World
 from pbrl_ppl.scene import Joint, Wall
 
@@ -207,9 +206,12 @@ def _bare(fn, world, start, step, substeps):  # type: ignore[no-untyped-def]
 def bare(simulator: Simulator, phi: np.ndarray, start: np.ndarray) -> Callable[[], None]:
     """Return the engine's bare C stepping of the same world from the same states."""
     world = World(simulator.physics.scene)
+    world.space.iterations = world.iterations
     given = simulator._properties(phi[None])
-    set_properties(world, given.bodies[0, 0], given.joints[0])
     where = calls.pointers(world)
+    first = given.bodies[0, 0]
+    compiled.set_properties(calls.FUNCTIONS, where, first, given.joints[0])
+    compiled.set_strengths(calls.FUNCTIONS, where, first, True)
 
     def run() -> None:
         _bare(calls.FUNCTIONS, where, start, TIME_STEP / SUBSTEPS, SUBSTEPS)

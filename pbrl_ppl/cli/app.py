@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import multiprocessing
 import os
+import platform
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -200,19 +201,53 @@ def _check_arguments(argv: Sequence[str]) -> None:
             )
 
 
-def _show_version(value: bool) -> None:
-    if value:
-        typer.echo(f"pbrl-ppl {__version__}")
+def _show_version(context: typer.Context, value: bool) -> None:
+    if not value:
+        return
+    typer.echo(f"pbrl-ppl {__version__}")
+    if not context.params.get("verbose"):
         raise typer.Exit
+    from pbrl_ppl.posterior import versions
+
+    folder, fault = str(Path(__file__).parents[1]), _engine_fault()
+    shown = versions() | {"platform": platform.platform(), "folder": folder}
+    shown["engine"] = fault or "compiled, works"
+    for name, text in shown.items():
+        typer.echo(f"{name:12} {printable(text)}")
+    raise typer.Exit(terminal.FAILED if fault else 0)
+
+
+def _engine_fault() -> str:
+    """Return what is wrong with the compiled engine, which pushes a puck; "" where it works."""
+    import numpy as np
+
+    from pbrl_ppl.physics import Physics
+    from pbrl_ppl.scene import Body, Scene, Shape
+
+    puck = Body("puck", Shape.circle(0.1), known=(("mass", 2.0), ("r", 0.0), ("mu_c", 0.0)))
+    push = np.array([[[[4.0, 0.0, 0.0]]]])
+    try:
+        physics = Physics(Scene(time_step=0.5, bodies=(puck,)), engine="chipmunk")
+        speed = physics.predict(np.zeros(0), np.zeros((1, 1, 6)), push)[0, 0, 0, 3]
+    except PbrlError as error:
+        return in_a_line(error)
+    wrong = not abs(speed - 1.0) < 1e-9
+    return f"wrong: {speed:g} m/s where 1 is right; please report this" if wrong else ""
 
 
 @app.callback()
 def _options(
-    show_version: Annotated[
+    # eager: known before --version is
+    verbose: Annotated[
         bool,
         typer.Option(
-            "--version", callback=_show_version, is_eager=True, help="Show the version and leave."
+            "--verbose", "-v", is_eager=True,
+            help="With --version: also of the packages, and whether the compiled engine works.",
         ),
     ] = False,
-) -> None:
+    show_version: Annotated[
+        bool,
+        typer.Option("--version", callback=_show_version, help="Show the version and leave."),
+    ] = False,
+) -> None:  # fmt: skip
     """Options before any command."""

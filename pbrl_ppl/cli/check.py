@@ -1,24 +1,18 @@
-"""``pbrl-ppl check`` and ``criticise`` of a recording, and ``doctor`` of the installation."""
+"""``pbrl-ppl check`` and ``criticise`` of a recording."""
 
 from __future__ import annotations
 
-import os
-import platform
-import sys
-import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 from rich.table import Column, Table
 
 from pbrl_ppl.cli import options
 from pbrl_ppl.cli.app import command
-from pbrl_ppl.cli.terminal import FAILED, PlainConsole, Progress, Result, sizes, table
+from pbrl_ppl.cli.terminal import PlainConsole, Progress, Result, sizes, table
 from pbrl_ppl.state import STATE
 
 if TYPE_CHECKING:
@@ -262,74 +256,3 @@ def _candidate_row(one: Candidate) -> list[object]:
     # where the declared parameters absorb the effect, its size is not identifiable
     seen = sizes(numbers, one.units) if one.statistic > 0 else ""
     return [one.effect, one.body, one.statistic, one.dof, one.p_value, seen]
-
-
-@command("doctor", 13, "pbrl-ppl doctor --json")
-def doctor(progress: Progress) -> Result:
-    """Report versions, whether the compiled engine loop works, and the number of threads.
-
-    Exits with 1 if the compiled loop is wrong; where there is none, a slow one serves.
-    """
-    progress("loading the packages")
-    import threadpoolctl
-
-    from pbrl_ppl.posterior import versions
-
-    found, system = versions(), platform.platform()
-    progress("trying the engine")
-    engine = _tried_engine()
-    pools = threadpoolctl.threadpool_info()
-    counted = {str(pool["user_api"]): int(pool["num_threads"]) for pool in pools}
-    threads = {"processors": _processors(), **counted}
-    package = str(Path(__file__).parents[1])
-    slow = "" if engine.path == "compiled" else ": a Python loop, slow; no compiled one here"
-    shown = found | {
-        "platform": system,
-        "engine": f"{engine.path}{slow}, {engine.microseconds_per_transition:.1f} us a"
-        f" transition, {engine.difference:.1g} from the plain loop",
-        "threads": ", ".join(f"{number} {name}" for name, number in threads.items()),
-        "package": package,
-    }
-    wrong = engine.difference > 1e-9  # the paths agree to rounding
-    error = "error: the compiled engine loop is wrong here; please report this" if wrong else ""
-    facts = {"versions": found, "platform": system, "engine": engine, "threads": threads}
-    facts |= {"package": package, "ok": not wrong}
-    lines = [f"{name:12} {text}" for name, text in shown.items()]
-    return Result(facts, lines, FAILED if wrong else 0, error)
-
-
-def _processors() -> int:
-    """Return the number of processors that this process may use."""
-    if sys.platform == "linux":
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-@dataclass(frozen=True)
-class TriedEngine:
-    """The engine loop's kind, its difference from the plain loop, and its speed."""
-
-    path: str
-    difference: float
-    microseconds_per_transition: float
-
-
-def _tried_engine() -> TriedEngine:
-    """Simulate a puck that hits a wall in both loops, and compare."""
-    from pbrl_ppl.physics import Physics, calls
-    from pbrl_ppl.scene import Body, Scene, Shape, Wall
-
-    # so that there are contacts
-    puck = Body("puck", Shape.circle(0.1), known=(("r", 0.5), ("mu_c", 0.3)))
-    scene = Scene(time_step=0.1, bodies=(puck,), walls=(Wall((1.0, -1.0), (1.0, 1.0)),))
-    start = np.zeros((100, 1, 6))
-    start[:, 0, 0], start[:, 0, 3] = np.linspace(0.0, 0.8, 100), 2.0
-    actions = np.zeros((100, 1, 1, 3))
-    fast, slow = Physics(scene), Physics(scene, engine="python")
-    states = [physics.predict(np.ones(1), start, actions) for physics in (fast, slow)]
-    begin = time.perf_counter()
-    fast.predict(np.ones(1), start, actions)
-    spent = time.perf_counter() - begin
-    path = "compiled" if calls.AVAILABLE else "plain"
-    difference = float(np.abs(states[0] - states[1]).max())
-    return TriedEngine(path, difference, 1e6 * spent / len(start))

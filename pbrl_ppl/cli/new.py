@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 import shutil
-import sys
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -25,7 +24,6 @@ from pbrl_ppl.errors import (
     OutputError,
     RecordingWarning,
     SceneError,
-    printable,
 )
 from pbrl_ppl.files import write_atomically, write_text
 from pbrl_ppl.scene import WORLD, Actuator, Body, Joint, Recording, Scene, Shape, nearest, toml_of
@@ -34,7 +32,7 @@ from pbrl_ppl.state import Floats
 if TYPE_CHECKING:
     import pandas as pd
 
-#: How ``--body`` and a question's answer write an outline.
+#: How ``--body`` writes an outline.
 SHAPES = "box:0.9x0.55, circle:0.1 or polygon:0,2/-1,-1/1,-1, in m"
 
 
@@ -304,11 +302,11 @@ def new(
     overwrite: bool = False,
     quiet: bool,
 ) -> Result:
-    """Write a commented scene, from options or from a few questions; or copy a model.
+    """Write a commented scene, from options and a recording; or copy a model.
 
-    Asks at a terminal for what the options leave open. Joints, walls, wheels and what is known of a
-    body are in the scene as examples to uncomment. Models to copy: apartment, namo, pendulum and
-    shopping_cart; recordings that a model has go beside the scene.
+    Joints, walls, wheels and what is known of a body are in the scene as examples to uncomment.
+    Models to copy: apartment, namo, pendulum and shopping_cart; recordings that a model has go
+    beside the scene.
 
     Parameters
     ----------
@@ -346,11 +344,8 @@ def new(
         shapes = outlines(bodies or [])
         if history is not None:
             recording = recorded(history, layout, [*shapes], time_step)
-        try:
-            answers = _asked(shapes, side, time_step, history, recording)
-        except typer.Abort:  # Ctrl-C at a question
-            raise KeyboardInterrupt from None
-        text = scene_text(*answers, recording)
+        shapes, time_step = _complete(shapes, time_step, history, recording)
+        text = scene_text(shapes, bool(side), time_step, recording)
         Scene.from_toml(text)  # written whole and valid, or not at all
         write_text(scene, text)
         written = [scene]
@@ -408,39 +403,22 @@ def _copied(model: str, scene: Path, overwrite: bool) -> list[Path]:
     return list(copies)
 
 
-def _asked(
-    given: Mapping[str, Shape],
-    side: bool | None,
-    time_step: float | None,
-    history: Path | None,
-    found: Recorded,
-) -> tuple[dict[str, Shape], bool, float]:
-    """Return shapes, whether seen from the side, and time step, asked for where not given."""
-    names, shapes = [*(found.names or given)], dict(given)
+def _complete(
+    given: Mapping[str, Shape], time_step: float | None, history: Path | None, found: Recorded
+) -> tuple[dict[str, Shape], float]:
+    """Return shapes and time step, from options and a recording that give all of them."""
+    names = [*(found.names or given)]
     time_step = found.time_step if time_step is None else time_step
-    for name in shapes:
+    for name in given:
         if name not in names:
             raise SceneError(
                 f"--body: {history} has no rows of {name!r}, only of {', '.join(names)}"
             )
-    lacking = [f"--body {name}={SHAPES}" for name in names or ["NAME"] if name not in shapes]
+    lacking = [f"--body {name}={SHAPES}" for name in names or ["NAME"] if name not in given]
     lacking += ["--time-step"] if time_step is None else []
-    if lacking and not sys.stdin.isatty():
-        raise SceneError(f"new: there is no terminal to ask at; give {', '.join(lacking)}")
-    if lacking and side is None:
-        side = typer.prompt("Seen from the top or the side?", default="top") == "side"
-    if not names:
-        names = [typer.prompt("What is the body that moves called?", default="cart")]
-    for name in names:
-        while name not in shapes:
-            answer = typer.prompt(f"Outline of {printable(name)} ({SHAPES})")
-            try:
-                shapes |= outlines([f"{name}={answer}"])
-            except SceneError as error:
-                typer.echo(in_a_line(error), err=True)
-    if time_step is None:
-        time_step = typer.prompt("Time between two rows of the recording (s)", type=float)
-    return {name: shapes[name] for name in names}, bool(side), time_step
+    if lacking or time_step is None:
+        raise SceneError(f"new: options are missing; give {', '.join(lacking)}")
+    return {name: given[name] for name in names}, time_step
 
 
 def scene_text(shapes: Mapping[str, Shape], side: bool, time_step: float, found: Recorded) -> str:

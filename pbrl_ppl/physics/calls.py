@@ -2,7 +2,7 @@
 
 A vector argument of the C functions is a struct of two doubles passed by value. Under the System V
 and AArch64 calling conventions that is the same as two doubles, which is what is passed here; on
-other platforms :data:`AVAILABLE` is false and the reference path serves.
+other platforms :data:`AVAILABLE` is false, and there is no engine.
 """
 
 from __future__ import annotations
@@ -136,6 +136,12 @@ def _addresses(names: Sequence[str]) -> dict[str, int]:
 
 _FOUND = _addresses([*Functions._fields, *SETTERS])
 AVAILABLE = bool(_FOUND)
+#: What to say where they are not.
+MISSING = (
+    f"there is no engine on {platform.system()} {platform.machine()} with pymunk {pymunk.version}:"
+    " Chipmunk's C functions cannot be called from compiled code; use Linux or macOS on x86-64 or"
+    " ARM64 (on Windows, in WSL), and a pymunk that pyproject.toml allows"
+)
 FUNCTIONS = Functions(*map(_FOUND.get, Functions._fields)) if AVAILABLE else None
 
 

@@ -179,7 +179,7 @@ def place_bodies(fn, world, bodies, state):  # type: ignore[no-untyped-def]
 
 @compiled
 def set_discs(fn, world, discs):  # type: ignore[no-untyped-def]
-    """Place the hidden discs, as in `plain.set_discs`.
+    """Place the hidden discs.
 
     They are removed and added again, since the order of contacts depends on their earlier places.
     """

@@ -43,9 +43,9 @@ class Physics(PhysicsSettings):
     engine : str
         ``auto``: the contact-free fast path, and Chipmunk for intervals in which bodies come near
         each other; ``chipmunk``: Chipmunk for all; ``contact-free``: the fast path alone, an error
-        where it does not hold; ``python``: Chipmunk stepped by a plain Python loop. All agree to
-        rounding for free bodies. For joined bodies, bodies on friction, and before and after a
-        contact, those of Chipmunk have its error of the first order in the step.
+        where it does not hold. All agree to rounding for free bodies. For joined bodies, bodies on
+        friction, and before and after a contact, that of Chipmunk has its error of the first order
+        in the step.
     parts : tuple of tuple of str, optional
         Moving bodies grouped into parts that never interact; all in one part by default.
     together : tuple of str
@@ -56,7 +56,7 @@ class Physics(PhysicsSettings):
     Raises
     ------
     SimulationError
-        If substeps or threads are below 1, or the engine is unknown or not available.
+        If substeps or threads are below 1, the engine is unknown, or there is none on the platform.
     ParameterError
         If a body's ``prior`` names a parameter that it does not have.
 

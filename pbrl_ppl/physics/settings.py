@@ -19,7 +19,7 @@ from pbrl_ppl.state import Floats
 
 Parts = tuple[tuple[str, ...], ...]
 #: Engines by name; see :class:`Physics`.
-ENGINES = ("auto", "chipmunk", "contact-free", "python")
+ENGINES = ("auto", "chipmunk", "contact-free")
 
 
 @dataclass(frozen=True)
@@ -52,13 +52,12 @@ class PhysicsSettings:
             )
         if not 1e-12 <= self.tolerance <= 1e-2:
             raise SimulationError(f"tolerance is {self.tolerance:g}, expected 1e-12 to 1e-2")
-        available = ENGINES if calls.AVAILABLE else ("auto", "python")
-        if self.engine not in available:
+        if self.engine not in ENGINES:
             raise SimulationError(
-                f"engine is {self.engine!r}, expected one of {', '.join(available)}"
-                + " (others need compiled calls of Chipmunk, which this platform lacks)"
-                * (self.engine in ENGINES)
+                f"engine is {self.engine!r}, expected one of {', '.join(ENGINES)}"
             )
+        if not calls.AVAILABLE:
+            raise SimulationError(calls.MISSING)
 
     @classmethod
     def declare(

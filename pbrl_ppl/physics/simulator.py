@@ -18,7 +18,7 @@ from pbrl_ppl.effects import Clock, needs_inputs
 from pbrl_ppl.errors import SimulationError
 from pbrl_ppl.history import fill_joints, joint_coordinates
 from pbrl_ppl.parameters import Layout, differentiate
-from pbrl_ppl.physics import calls, compiled, flow, lockstep, plain
+from pbrl_ppl.physics import calls, compiled, flow, lockstep
 from pbrl_ppl.physics.calls import pointers, still
 from pbrl_ppl.physics.joints import LENGTH, on_rod
 from pbrl_ppl.physics.laws import law_tables
@@ -26,7 +26,7 @@ from pbrl_ppl.physics.motion import work_of
 from pbrl_ppl.physics.properties import EngineInput, EngineProperties
 from pbrl_ppl.physics.settings import PhysicsSettings
 from pbrl_ppl.physics.tree import MOST, tree_of
-from pbrl_ppl.physics.world import FINER, World
+from pbrl_ppl.physics.world import World
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import INPUT, STATE, THETA, VELOCITY, WRENCH, Bools, Floats, Ints
 
@@ -241,18 +241,15 @@ class Simulator:
             starts[..., upright, THETA] = self._properties.angles[upright]
             starts[..., upright, THETA + VELOCITY] = 0.0
         out = np.full((len(proposals), n, horizon, k, 6), np.nan)
-        plain = self.physics.engine == "python" or not calls.AVAILABLE
-        run = self._run_plain if plain else self._run_compiled
         if not (self._properties.tied or numbers.indices.shape[1]):
-            run(_ONE_WORLD, numbers, starts, inputs, out.reshape(-1, horizon, k, 6))
+            self._run(_ONE_WORLD, numbers, starts, inputs, out.reshape(-1, horizon, k, 6))
         else:
             for choice, rows in self._choices(numbers):
                 begin = starts[rows] if len(starts) > 1 else starts
                 count = int(rows.sum())
                 part = np.full((count * n, horizon, k, 6), np.nan)
-                run(
-                    choice, EngineInput._make(array[rows] for array in numbers), begin, inputs, part
-                )
+                chosen = EngineInput._make(array[rows] for array in numbers)
+                self._run(choice, chosen, begin, inputs, part)
                 out[rows] = part.reshape(count, n, horizon, k, 6)
         for i, sensor, values in self._properties.sensors(proposals):
             if sensor.timed and clock is not None:
@@ -377,40 +374,7 @@ class Simulator:
         discs = properties.n_discs
         return World(scene, kinds, joined, discs, patches, wheels, turners, rods)
 
-    def _run_plain(
-        self, choice: Choice, numbers: EngineInput, starts: Floats, inputs: Floats, out: Floats
-    ) -> None:
-        follows = _continues_previous(inputs)
-        if not any(getattr(one.effect.stage, "remember", None) for one in self.physics.effects):
-            follows[:] = False  # nothing remembers the intervals before
-        for item in range(len(out)):
-            p, t = divmod(item, len(inputs))
-            start = starts[p if len(starts) > 1 else 0, t]
-            total = np.zeros_like(out[item])
-            first = t
-            while follows[first]:
-                first -= 1
-            earlier = np.concatenate([*inputs[first:t], inputs[t, :1]])
-            stepped = partial(
-                plain.rollout, effects=self.physics.effects, numbers=numbers, proposal=p, item=t,
-                start=start, inputs=inputs[t], earlier=earlier,
-            )  # fmt: skip
-            for level, (count, weight) in enumerate(zip(*self.levels, strict=True)):
-                states, touched = stepped(self._new_world(choice), substeps=int(count))
-                lost = np.isnan(states).any()
-                if touched and not lost and (numbers.discs[p, :, 2] > 0).any():
-                    states, _ = stepped(self._new_world(choice), substeps=int(count) * FINER)
-                if level == 0 or np.isnan(states).any():  # diverged
-                    out[item] = states
-                if touched:
-                    break
-                total += weight * states
-            else:
-                given_path = [body.kinematic for body in self.physics.scene.moving]
-                total[:, given_path] = out[item][:, given_path]  # but for rounding it is so
-                out[item] = total
-
-    def _run_compiled(
+    def _run(
         self,
         choice: Choice,
         numbers: EngineInput,
@@ -425,7 +389,7 @@ class Simulator:
         So many engine steps are worth a thread of their own.
         """
         batch = Batch(
-            tuple(numbers[:-1]), *self._laws, _continues_previous(inputs), starts, inputs,
+            tuple(numbers[:-1]), *self._laws, continues_previous(inputs), starts, inputs,
             self.physics.scene.time_step, *self.levels, self.physics.tolerance,
         )  # fmt: skip
         steps = len(out) * inputs.shape[1] * int(self.levels[0].sum())
@@ -448,7 +412,7 @@ def _each(states: Floats, proposals: int) -> Floats:
     return np.array(np.broadcast_to(states, (proposals, *states.shape[1:])), order="C")
 
 
-def _continues_previous(inputs: Floats) -> Bools:
+def continues_previous(inputs: Floats) -> Bools:
     """Return which transitions begin where the one before ends in the recording, (transition,)."""
     follows = np.zeros(len(inputs), dtype=bool)
     if inputs.shape[-1] > len(WRENCH):

@@ -1,10 +1,11 @@
-"""Trial evaluation of a user's effect in plain Python, before it runs inside a fit."""
+"""Trial evaluation of a user's effect, in Python first, before it runs inside a fit."""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Iterable
 from concurrent.futures import Future, wait
+from itertools import product
 
 import numpy as np
 
@@ -29,11 +30,11 @@ from pbrl_ppl.state import STATE, STATE_UNITS, Floats
 
 
 def try_effect(effect: Effect, scene: Scene, history: History, patience: float = 10.0) -> None:
-    """Evaluate an effect's functions at a measured state and at parameters from its prior.
+    """Evaluate an effect's functions at measured states and at parameters from its prior.
 
-    In the compiled rollout, a law that raises would stop silently, and an endless one could not be
-    interrupted. A few measured intervals are also simulated with the effect at its null value and
-    without it, which must be the same.
+    They run in Python: in the compiled rollout, a law that raises would stop silently. Then a few
+    measured intervals are simulated with the effect at its null value and without it, which must be
+    the same.
 
     Parameters
     ----------
@@ -51,9 +52,9 @@ def try_effect(effect: Effect, scene: Scene, history: History, patience: float =
         vanish at its null value.
     """
     # what the trial simulates with is compiled first: that is no endless loop
-    plain = Physics(scene, substeps=1, extrapolate=False, engine="python")
-    centre, k = np.array([prior.centre for prior in plain.layout.priors]), len(scene.moving)
-    plain.predict(centre, np.zeros((1, k, 6)), np.zeros((1, 1, k, 3)))
+    physics = Physics(scene, substeps=1, extrapolate=False, engine="chipmunk")
+    centre, k = np.array([prior.centre for prior in physics.layout.priors]), len(scene.moving)
+    physics.predict(centre, np.zeros((1, k, 6)), np.zeros((1, 1, k, 3)))
     outcome: Future[None] = Future()
 
     def run() -> None:
@@ -95,8 +96,7 @@ def _try(effect: Effect, scene: Scene, history: History, draws: int = 4) -> None
                     f"effect {effect.name}: scan gave shape {points.shape}, expected"
                     f" (point, {len(effect.parameters)})"
                 )
-        state = _middle(history, body)
-        for row in values:
+        for state, row in product(_some_states(history, body), values):
             result = _applied(effect, state, row, body, units)
             if not np.isfinite(result).all():
                 shown = ", ".join(
@@ -134,7 +134,7 @@ def _check_null(
     states = np.nan_to_num(history.dataset["start"].to_numpy())
     segments = history.pieces(states, 1)
     chosen = np.unique(np.linspace(0, segments.n - 1, 6).astype(int))
-    without = Physics(scene, substeps=2, extrapolate=False, engine="python")
+    without = Physics(scene, substeps=2, extrapolate=False, engine="chipmunk")
     there = without.changed(effects=(effect.on(body.name),))
     values = {
         label: prior.centre
@@ -162,11 +162,13 @@ def _check_null(
         )
 
 
-def _middle(history: History, body: Body) -> Floats:
-    """Return a complete measured state of a body, or zeros, shape (6,)."""
+def _some_states(history: History, body: Body, n: int = 6) -> Floats:
+    """Return complete measured states of a body, or zeros, shape (n or fewer, 6)."""
     states = history.dataset["start"].sel(body=body.name).to_numpy().reshape(-1, 6)
     states = states[np.isfinite(states).all(axis=1)]
-    return np.asarray(states[len(states) // 2] if len(states) else np.zeros(6))
+    if not len(states):
+        return np.zeros((1, 6))
+    return np.asarray(states[np.unique(np.linspace(0, len(states) - 1, n).astype(int))])
 
 
 def _named(effect: Effect, parameters: Iterable[float]) -> dict[str, Floats]:
@@ -188,13 +190,14 @@ def _applied(effect: Effect, state: Floats, parameters: Floats, body: Body, unit
         numbers = np.array([*parameters, *effect.in_si(units).constants], dtype=float)
         wrench = np.concatenate([wrench, np.zeros(6)])  # as the compiled loop has it
         stage.law(state.copy(), command, numbers, wrench)
-        remembered = command[MEMORY:].copy()
+        slots = 3 * stage.memory if isinstance(stage, Command) else getattr(stage, "memory", 0)
+        remembered = np.zeros(slots)
         if isinstance(stage, Command) and stage.remember is not None:
             stage.remember(state.copy(), command, numbers, remembered)
         if isinstance(stage, Force) and stage.rate is not None:
             stage.rate(state.copy(), command, numbers, remembered)
             if stage.begin is not None:
-                stage.begin(state.copy(), command, numbers, command[MEMORY:])
+                stage.begin(state.copy(), command, numbers, remembered)
         return np.concatenate([wrench, remembered])
     if isinstance(stage, Properties):
         values = {name: np.ones((1, 1)) for name in (*COLUMNS, *SEEN)}

@@ -320,7 +320,14 @@ def test_check_says_what_close_loop_needs(capsys: pytest.CaptureFixture[str]) ->
 
 def test_version_and_help(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--version"]) == 0
-    assert capsys.readouterr().out.startswith("pbrl-ppl ")
+    (line,) = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(r"pbrl-ppl \d+\.\d+\.\d+", line)
+    for argv in (["--version", "-v"], ["-v", "--version"]):
+        assert main(argv) == 0
+        first, *shown = capsys.readouterr().out.splitlines()
+        assert first == line and "engine       compiled, works" in shown
+        found = dict(each.split(maxsplit=1) for each in shown)
+        assert {"python", "pymc", "numpy", "platform", "folder"} <= {*found}
     assert main(["close-loop", "--help"]) == 0
     assert "--overwrite" in capsys.readouterr().out
 

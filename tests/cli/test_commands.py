@@ -1,4 +1,4 @@
-"""The commands beside the loop: new, fit, criticise, simulate, doctor, and what all have alike."""
+"""The commands beside the loop: new, fit, criticise, simulate, and what all have alike."""
 
 import ast
 import contextlib
@@ -282,28 +282,12 @@ def test_new_copies_a_model_with_its_recordings(capsys: pytest.CaptureFixture[st
 
 @pytest.mark.usefixtures("puck")
 def test_new_says_what_it_needs(capsys: pytest.CaptureFixture[str]) -> None:
-    said = message(capsys, "new", "a.toml")  # no terminal to ask at
+    said = message(capsys, "new", "a.toml")
     assert "--body NAME=" in said and "--time-step" in said
     assert "not NAME=SHAPE" in message(capsys, "new", "a.toml", "--body", "puck=ball:1")
     options = ("--history", "train.csv", "--body", "pock=circle:0.1")
     assert "has no rows of 'pock'" in message(capsys, "new", "a.toml", *options)
     assert not Path("a.toml").exists()
-
-
-@pytest.mark.usefixtures("puck")
-def test_new_asks(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    answers = iter(["side", "box", "box:0.4", "box:0.4x0.2", 0.02])
-    monkeypatch.setattr("sys.stdin.isatty", lambda: True)
-    monkeypatch.setattr(typer, "prompt", lambda *args, **options: next(answers))
-    assert main(["new", "a.toml", "--quiet"]) == 0
-    scene = Scene.load("a.toml")
-    assert scene.moving[0].shape.size == (0.4, 0.2)
-    assert (scene.moving[0].name, scene.gravity[1], scene.time_step) == ("box", -9.81, 0.02)
-    monkeypatch.setattr(
-        typer, "prompt", lambda *args, **options: (_ for _ in ()).throw(typer.Abort)
-    )
-    assert main(["new", "b.toml", "--quiet"]) == 130
-    assert "nothing was written" in capsys.readouterr().err and not Path("b.toml").exists()
 
 
 def test_table_1_is_told_as_it_is() -> None:
@@ -532,12 +516,6 @@ def test_the_command_fits_what_python_fits(options: list[str]) -> None:
     there = load_posterior("puck.nc")
     for name, values in group(here, "posterior").items():
         np.testing.assert_array_equal(values, group(there, "posterior")[name])
-
-
-def test_doctor(capsys: pytest.CaptureFixture[str]) -> None:
-    found = answer(capsys, "doctor", "--quiet")
-    assert found["ok"] and found["engine"]["path"] == "compiled"
-    assert found["threads"]["processors"] >= 1 and "pymc" in found["versions"]
 
 
 # messages

@@ -8,9 +8,10 @@ from pbrl_ppl.errors import EffectError
 from pbrl_ppl.history import from_segments
 from pbrl_ppl.model import problem_in
 from pbrl_ppl.modes import find_mode
-from pbrl_ppl.physics import Physics, Simulator, calls
+from pbrl_ppl.physics import Physics, Simulator
 from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.scene import Body, Scene, Shape, Wall
+from tests.helpers.plain import simulator_of
 from tests.helpers.worlds import BY_NAME, G, body, predict, simulator, state
 
 pytestmark = pytest.mark.one_stack
@@ -159,12 +160,11 @@ def crowd() -> tuple[Simulator, np.ndarray, np.ndarray, np.ndarray]:
     return sim, phi, start, actions
 
 
-@pytest.mark.skipif(not calls.AVAILABLE, reason="the engine cannot be called on this platform")
 def test_paths_agree_and_nothing_is_remembered() -> None:
     sim, phi, start, actions = crowd()
     expected = sim(phi, start, actions)
     some, plain = (
-        Simulator(sim.physics.changed(engine=path))(phi, start[:8], actions[:8])
+        simulator_of(sim.physics, path)(phi, start[:8], actions[:8])
         for path in ("chipmunk", "python")
     )
     np.testing.assert_allclose(some, plain, rtol=1e-9, atol=1e-9)

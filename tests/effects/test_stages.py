@@ -21,6 +21,7 @@ from pbrl_ppl.parameters import Prior
 from pbrl_ppl.physics import Physics, Simulator, build_layout
 from pbrl_ppl.physics.world import FINER
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
+from tests.helpers.plain import simulator_of
 from tests.helpers.worlds import BY_NAME, G, body, phi_of, predict, state
 
 pytestmark = pytest.mark.one_stack
@@ -39,7 +40,7 @@ def simulate(scene, named, start, inputs, **options):
     """Predictions (n, H, body, 6) under effects on the first body, in the order they are given."""
     first = scene.dynamic[0].name
     attached = attach(scene, [BY_NAME[name].on(first) for name in named])
-    engine = Simulator(Physics(scene, attached, **options))
+    engine = simulator_of(Physics(scene, attached), **options)
     return engine(
         phi_of(engine.physics.layout, named), np.asarray(start, float), np.asarray(inputs, float)
     )
@@ -277,7 +278,7 @@ def test_both_paths_agree_with_effects_of_every_stage() -> None:
         [rng.normal(0, 5, (8, 3, 6)), np.full((8, 3, 1), 40.0), clock - 0.1, clock], axis=-1
     )[:, :, None]
     compiled, plain = (
-        Simulator(Physics(scene, attached, substeps=8, engine=path))(phi, start, given)
+        simulator_of(Physics(scene, attached), path, substeps=8)(phi, start, given)
         for path in ("chipmunk", "python")
     )
     assert compiled == pytest.approx(plain, rel=1e-9, abs=1e-9, nan_ok=True)

@@ -9,6 +9,7 @@ from pbrl_ppl.effects import Attached, Effect, attach, catalogue
 from pbrl_ppl.parameters import Layout
 from pbrl_ppl.physics import Physics, Simulator
 from pbrl_ppl.scene import Body, Scene, Shape
+from tests.helpers.plain import simulator_of
 
 G = 9.81  # m/s^2
 BY_NAME = {effect.name: effect for effect in catalogue}
@@ -28,8 +29,8 @@ def state(x=0.0, y=0.0, theta=0.0, vx=0.0, vy=0.0, omega=0.0) -> np.ndarray:
 
 
 def simulator(scene: Scene, effects: tuple[Attached | Effect, ...] = (), **options) -> Simulator:
-    attached = attach(scene, effects)
-    return Simulator(Physics(scene, attached, **options))
+    """Return a simulator; ``engine`` may also be "python", the reference."""
+    return simulator_of(Physics(scene, attach(scene, effects)), **options)
 
 
 def predict(

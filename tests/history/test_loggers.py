@@ -26,6 +26,7 @@ from pbrl_ppl.history.guesses import planar_yaw
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Body, Joint, Recording, Scene, Shape
 from tests.helpers.places import ROOT
+from tests.helpers.plain import PlainSimulator
 
 pytestmark = [pytest.mark.one_stack, pytest.mark.filterwarnings("ignore::UserWarning")]
 
@@ -402,8 +403,8 @@ def test_forces_along_the_bodys_axes_turn_with_it() -> None:
     speed = push / 2.0 / turning * np.array([np.sin(angles[1]) - np.sin(angles[0]),
                                              np.cos(angles[0]) - np.cos(angles[1])])  # fmt: skip
     np.testing.assert_allclose(end[3:5], speed, atol=1e-4)
-    plain = Physics(scene, attach(scene), engine="python")
-    np.testing.assert_allclose(plain.predict(np.zeros(0), start, actions)[0, -1, 0], end, atol=1e-4)
+    plain = PlainSimulator(physics)(np.zeros(0), start, actions)
+    np.testing.assert_allclose(plain[0, -1, 0], end, atol=1e-4)
     with pytest.raises(SceneError, match='"world" or "body"'):
         Recording(forces="ground")
 

@@ -16,7 +16,7 @@ from pbrl_ppl.errors import EffectError, HistoryError, SimulationError
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem, along_trajectories
 from pbrl_ppl.model import problem_in
-from pbrl_ppl.physics import Physics, Simulator
+from pbrl_ppl.physics import Physics
 from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, units_of
 from pbrl_ppl.state import STATE, WRENCH
@@ -24,6 +24,7 @@ from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
 from tests.helpers.marks import OBJECT_MODE
 from tests.helpers.places import MODELS
+from tests.helpers.plain import PlainSimulator
 
 BY_NAME = {effect.name: effect for effect in catalogue}
 
@@ -43,19 +44,14 @@ def pendulum() -> tuple[Scene, History]:
 
 
 def expected_logp(model: pm.Model, point: Mapping[str, np.ndarray], priors) -> float:
-    """Scipy's log-densities of the priors, and Eq. 11 on predictions of the engine's plain path.
+    """Scipy's log-densities of the priors, and Eq. 11 on predictions of the plain reference.
 
     ``priors`` gives scipy's distribution of each parameter.
     """
     problem = problem_in(model)
     layout, segments = problem.layout, problem.segments
-    simulator = Simulator(
-        Physics(
-            problem.scene,
-            problem.physics.effects,
-            substeps=problem.physics.substeps,
-            engine="python",
-        )
+    simulator = PlainSimulator(
+        Physics(problem.scene, problem.physics.effects, substeps=problem.physics.substeps)
     )
     predicted = simulator(layout.to_vector(point), segments.start, segments.actions)
     residual = segments.observed - predicted

@@ -14,14 +14,14 @@ from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.scene import WORLD, Joint, Scene
 from tests.helpers.histories import simulated_history
 from tests.helpers.joints import HINGED, NAMES, POSES, reference_anchors, scene
+from tests.helpers.plain import simulator_of
 
 KINDS = pytest.mark.parametrize("kind", ["hinge", "distance"])
 PATHS = pytest.mark.parametrize("path", ["auto", "python"])
 
 
 def simulator(*joints: Joint, **options) -> Simulator:
-    one = scene(*joints)
-    return Simulator(Physics(one, **options))
+    return simulator_of(Physics(scene(*joints)), **options)
 
 
 def data(n: int = 10) -> tuple[np.ndarray, np.ndarray]:

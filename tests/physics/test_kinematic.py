@@ -5,8 +5,9 @@ import pytest
 
 from pbrl_ppl.effects import attach, candidates
 from pbrl_ppl.errors import EffectError
-from pbrl_ppl.physics import Simulator, Transition, build_layout, calls, independent_parts
+from pbrl_ppl.physics import Simulator, Transition, build_layout, independent_parts
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
+from tests.helpers.plain import PlainSimulator
 from tests.helpers.pushes import pushed
 from tests.helpers.worlds import BY_NAME, body, simulator, state
 
@@ -105,11 +106,10 @@ def crowd() -> tuple[Simulator, np.ndarray, np.ndarray, np.ndarray]:
     return sim, phi, start, rng.normal(0, 2.0, (30, 3, 5, 3))
 
 
-@pytest.mark.skipif(not calls.AVAILABLE, reason="the engine cannot be called on this platform")
 def test_paths_agree_and_order_and_chunks_change_nothing() -> None:
     sim, phi, start, actions = crowd()
     expected = sim(phi, start, actions)
-    plain = Simulator(sim.physics.changed(engine="python"))
+    plain = PlainSimulator(sim.physics)
     np.testing.assert_allclose(
         plain(phi, start[:8], actions[:8]), expected[:, :8], rtol=1e-9, atol=1e-9
     )
@@ -146,7 +146,6 @@ def test_the_transition_takes_its_velocity_as_the_push() -> None:
     np.testing.assert_array_equal(after[6:], 0.0)
 
 
-@pytest.mark.skipif(not calls.AVAILABLE, reason="the fast path is compiled for this platform alone")
 def test_a_body_coasts_before_a_push_and_after_it() -> None:
     """A block on friction: v^2 = v_0^2 - 2 mu g s, to the tolerance, however long the steps."""
     mu, block = 0.1, body("block", Shape.circle(0.1), mass=2.0)

@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from pbrl_ppl.physics import Physics, Simulator, calls
+from pbrl_ppl.physics import Physics, Simulator
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.worlds import G, body
 
@@ -52,7 +52,6 @@ def simulator() -> Simulator:
 
 
 @pytest.mark.long
-@pytest.mark.skipif(not calls.AVAILABLE, reason="the plain path would take an hour")
 def test_ten_million_steps_leak_nothing() -> None:
     sim = simulator()
     rng = np.random.default_rng(1)
@@ -78,7 +77,6 @@ def test_ten_million_steps_leak_nothing() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not calls.AVAILABLE, reason="the plain path builds its worlds in each call")
 def test_lost_worlds_are_freed() -> None:
     sim = simulator()
     start = np.zeros((200, 3, 6))

@@ -6,20 +6,16 @@ import numpy as np
 import pytest
 
 from pbrl_ppl.effects import attach
-from pbrl_ppl.physics import Physics, Simulator, build_layout, calls, compiled, lockstep
+from pbrl_ppl.physics import Physics, Simulator, build_layout, compiled, lockstep
 from pbrl_ppl.physics.joints import HINGE, ROD
 from pbrl_ppl.physics.tree import tree_of
 from pbrl_ppl.physics.world import World
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.engines import BOX, proposals
+from tests.helpers.plain import PlainSimulator, simulator_of
 from tests.helpers.worlds import G
 
-pytestmark = [
-    pytest.mark.one_stack,
-    pytest.mark.skipif(
-        not calls.AVAILABLE, reason="the compiled path cannot call the engine on this platform"
-    ),
-]
+pytestmark = pytest.mark.one_stack
 
 PATHS = ("auto", "python")
 POST = Body("post", Shape.circle(0.05), static=True, pose=(3.0, -2.0, 0.7))
@@ -71,7 +67,7 @@ def test_it_agrees_with_the_engine(name) -> None:
     if name in ("walls", "disc"):  # of several intervals those that touch alone are the engine's
         inputs = inputs[:, :1]
     got = simulator(phi, start, inputs)
-    reference = Simulator(simulator.physics.changed(engine="python"))
+    reference = PlainSimulator(simulator.physics)
     expected = reference(phi, start, inputs)
     assert np.isfinite(expected).all()
     off = np.abs(got - expected) / (1.0 + np.abs(expected))
@@ -111,7 +107,7 @@ def test_contacts_are_left_to_the_engine() -> None:
     far = case("wheel", extrapolate=False)[0]
     touched = (near(phi, start, inputs) != far(phi, start, inputs)).any(axis=(2, 3, 4))
     assert 0.1 < touched.mean() < 0.9
-    plain = Simulator(near.physics.changed(engine="python"))(phi, start, inputs)
+    plain = PlainSimulator(near.physics)(phi, start, inputs)
     np.testing.assert_allclose(near(phi, start, inputs), plain, rtol=1e-9, atol=1e-9)
 
 
@@ -130,8 +126,7 @@ def test_one_of_several_bodies_at_a_wall_is_enough(at_the_wall) -> None:
     layout, actions = build_layout(scene), np.zeros((40, 2, 3, 3))
     phi = np.zeros(layout.size)
     ours, plain = (
-        Simulator(Physics(scene, engine=path, extrapolate=False))(phi, start, actions)
-        for path in PATHS
+        simulator_of(Physics(scene, extrapolate=False), path)(phi, start, actions) for path in PATHS
     )
     np.testing.assert_allclose(ours, plain, rtol=1e-9, atol=1e-9)
     bounced = (ours[:, -1, :, 3] > 0.4).all(axis=0) & (ours[:, -1, :, 0] > -0.85).all(axis=0)

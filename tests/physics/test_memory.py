@@ -12,6 +12,7 @@ from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Body, Joint, Scene, Shape
 from pbrl_ppl.state import Floats
 from tests.helpers.places import ROOT
+from tests.helpers.plain import simulator_of
 from tests.helpers.worlds import BY_NAME
 
 pytestmark = pytest.mark.one_stack
@@ -42,15 +43,16 @@ def physics(scene: Scene, name: str, values: dict[str, float], **settings: objec
     return found, np.array([by_label[label] for label in found.layout.labels])
 
 
-def along_x(name: str, values: dict[str, float], **settings: object) -> Floats:
+def along_x(name: str, values: dict[str, float], engine: str) -> Floats:
     """Return the speed of a pushed puck after each interval, shape (N,)."""
-    found, phi = physics(puck(), name, values, **settings)
+    found, phi = physics(puck(), name, values)
     wrench = np.zeros((1, N, 1, 3))
     wrench[0, :, 0, 0] = PUSHES
     states = np.full((1, N + 1, 1, 6), 0.0)
     history = History.of_arrays(states, puck(), wrench)
     segments = history.pieces(states, N)
-    return found.predict(phi, segments.start, found.inputs(segments))[0, :, 0, 3]
+    predict = simulator_of(found, engine)
+    return predict(phi, segments.start, found.inputs(segments))[0, :, 0, 3]
 
 
 def reached(name: str, values: dict[str, float], per: int = 2000) -> Floats:
@@ -86,14 +88,15 @@ def test_the_impulse_is_that_of_the_law(name: str, engine: str) -> None:
 def test_pieces_go_on_from_what_was_reached(name: str, engine: str) -> None:
     """Pieces of four intervals from the whole's own states are the whole."""
     scene = puck()
-    found, phi = physics(scene, name, SIZES[name], engine=engine)
+    found, phi = physics(scene, name, SIZES[name])
+    predict = simulator_of(found, engine)
     wrench = RNG.normal(0.0, 2.0, (2, N, 1, 3))
     history = History.of_arrays(np.zeros((2, N + 1, 1, 6)), scene, wrench)
     whole = history.pieces(np.zeros((2, N + 1, 1, 6)), N)
-    states = found.predict(phi, whole.start, found.inputs(whole))
+    states = predict(phi, whole.start, found.inputs(whole))
     path = np.concatenate([whole.start[:, None], states], axis=1)
     pieces = history.pieces(path, 4)
-    again = found.predict(phi, pieces.start, found.inputs(pieces))
+    again = predict(phi, pieces.start, found.inputs(pieces))
     for i in range(pieces.n):
         rows = slice(pieces.step[i] + 1, min(pieces.step[i] + 5, N + 1))
         expected = path[pieces.trajectory[i], rows]

@@ -13,14 +13,10 @@ from pbrl_ppl.physics import Physics, Simulator, build_layout, calls
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.engines import BOX, CASES, chain, mixed, proposals, ring
 from tests.helpers.places import ROOT
+from tests.helpers.plain import simulator_of
 from tests.helpers.worlds import body, simulator, state
 
-pytestmark = [
-    pytest.mark.one_stack,
-    pytest.mark.skipif(
-        not calls.AVAILABLE, reason="the compiled path cannot call the engine on this platform"
-    ),
-]
+pytestmark = pytest.mark.one_stack
 
 #: Largest difference between the plain and the compiled path, relative to values of order one.
 TOLERANCE = {"free": 1e-12, "walls": 1e-9, "chain": 1e-12, "crowd": 1e-9, "mixed": 1e-9}
@@ -34,7 +30,7 @@ def case(request):
 
 
 def like(sim: Simulator, **options) -> Simulator:
-    return Simulator(sim.physics.changed(**options))
+    return simulator_of(sim.physics, **options)
 
 
 def test_plain_and_compiled_agree(case) -> None:
@@ -202,7 +198,7 @@ def test_impossible_parameters_are_refused(path, label, value, message) -> None:
     scene = Scene(time_step=0.1, bodies=bodies)
     attached = attach(scene)
     layout = build_layout(scene, attached)
-    sim = Simulator(Physics(scene, attached, engine=path))
+    sim = simulator_of(Physics(scene, attached), path)
     phi = np.full((3, layout.size), 0.5)
     phi[1, layout.labels.index(label)] = value
     with pytest.raises(ParameterError, match=message):
@@ -214,6 +210,14 @@ def test_bad_options_are_refused(options) -> None:
     scene = Scene(time_step=0.1, bodies=(body("puck", BOX),))
     with pytest.raises(SimulationError):
         simulator(scene, **options)
+
+
+def test_a_platform_without_compiled_calls_is_refused(monkeypatch) -> None:
+    monkeypatch.setattr(calls, "AVAILABLE", False)
+    with pytest.raises(
+        SimulationError, match=r"no engine on .* with pymunk .*; use Linux or macOS"
+    ):
+        Physics(Scene(time_step=0.1, bodies=(body("puck", BOX),)))
 
 
 def test_one_substep_is_not_extrapolated() -> None:

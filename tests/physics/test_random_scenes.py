@@ -8,17 +8,13 @@ import numpy as np
 import pytest
 
 from pbrl_ppl.effects import attach, catalogue
-from pbrl_ppl.physics import Physics, Simulator, build_layout, calls
+from pbrl_ppl.physics import Physics, Simulator, build_layout
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.engines import proposals
+from tests.helpers.plain import simulator_of
 from tests.helpers.worlds import G
 
-pytestmark = [
-    pytest.mark.one_stack,
-    pytest.mark.skipif(
-        not calls.AVAILABLE, reason="the compiled path cannot call the engine on this platform"
-    ),
-]
+pytestmark = pytest.mark.one_stack
 
 SHAPES = (
     Shape.box(0.4, 0.3),
@@ -81,7 +77,7 @@ def agreement(seed: int) -> None:
     limit = bool(scene.joints) or any(one.effect.name in under for one in attached)
     fast = "chipmunk" if limit else "auto"
     ours, plain = (
-        Simulator(Physics(scene, attached, engine=path, extrapolate=False))(phi, start, inputs)
+        simulator_of(Physics(scene, attached), path, extrapolate=False)(phi, start, inputs)
         for path in (fast, "python")
     )
     alone = Simulator(Physics(scene, attached, engine=fast, extrapolate=False))

@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 
 from pbrl_ppl.effects import attach
 from pbrl_ppl.history import with_units
-from pbrl_ppl.physics import Physics
+from pbrl_ppl.physics import Physics, Simulator
 from pbrl_ppl.scene import Joint, Scene, Shape, Wall, motion_time
 from tests.helpers.histories import simulated_history
+from tests.helpers.plain import simulator_of
 from tests.helpers.similar import (
     framed,
     similar,
@@ -45,21 +46,22 @@ class Rig(NamedTuple):
     start: np.ndarray  # (transition, body, 6)
     actions: np.ndarray  # (transition, H, body, 3)
 
-    def physics(self, scene: Scene, engine: str) -> tuple[Physics, np.ndarray]:
-        """Return the physics of a scene with these effects, and phi."""
+    def simulator(self, scene: Scene, engine: str) -> tuple[Simulator, np.ndarray]:
+        """Return a simulator of a scene with these effects, and phi."""
         attached = attach(scene, [BY_NAME[name] for name in self.effects])
-        physics = Physics(scene, attached, engine=engine, tolerance=1e-10)
-        return physics, phi_of(physics.layout, self.effects)
+        physics = Physics(scene, attached, tolerance=1e-10)
+        return simulator_of(physics, engine), phi_of(physics.layout, self.effects)
 
     def predict(self, engine: str) -> np.ndarray:
-        physics, phi = self.physics(self.scene, engine)
-        return physics.predict(phi, self.start, self.actions)
+        simulator, phi = self.simulator(self.scene, engine)
+        return simulator(phi, self.start, self.actions)
 
     def similar(self, engine: str, scale: tuple[float, float, float]) -> np.ndarray:
         """Return the predictions of the similar rig in the units of this one."""
-        physics, phi = self.physics(similar(self.scene, *scale), engine)
+        simulator, phi = self.simulator(similar(self.scene, *scale), engine)
         start, actions = similar_states(self.start, *scale), similar_wrench(self.actions, *scale)
-        found = physics.predict(similar_phi(phi, physics.layout, *scale), start, actions)
+        moved = similar_phi(phi, simulator.physics.layout, *scale)
+        found = simulator(moved, start, actions)
         return similar_states(found, *(1.0 / each for each in scale))
 
 

@@ -11,13 +11,10 @@ from scipy.integrate import solve_ivp
 from pbrl_ppl.errors import SceneError, SimulationError
 from pbrl_ppl.history import History, fill_joints
 from pbrl_ppl.likelihood.coordinates import observed_coordinates
-from pbrl_ppl.physics import calls, check_placement
+from pbrl_ppl.physics import check_placement
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene, Shape
 from tests.helpers.worlds import G, body, predict, simulator, state
 
-needs_calls = pytest.mark.skipif(
-    not calls.AVAILABLE, reason="the compiled path cannot call the engine on this platform"
-)
 BOX, ARM = Shape.box(0.2, 0.1), Shape.box(0.04, 0.6)
 SLOPE = 0.5
 C, S = math.cos(0.4), math.sin(0.4)
@@ -74,8 +71,6 @@ def cart_pole_start(angle: float, rate: float, speed: float = 0.0) -> np.ndarray
 @pytest.mark.parametrize("mu", [0.0, 3.0, 20.0])
 def test_a_mass_on_an_inclined_rail(engine, mu) -> None:
     """It slows down uphill, stops, and stays or slides back, as dry friction lets it."""
-    if engine == "chipmunk" and not calls.AVAILABLE:
-        pytest.skip("no compiled calls")
     scene, speed, horizon = on_a_rail(substeps=40), 1.0, 8
     got = predict(
         scene, start_of(scene, speed=speed), horizon=horizon, effects={"slider_friction": mu},
@@ -89,7 +84,7 @@ def test_a_mass_on_an_inclined_rail(engine, mu) -> None:
     way = speed * np.minimum(t, stop) - (pull + slowing) * np.minimum(t, stop) ** 2 / 2
     way -= back * late**2 / 2
     begin = start_of(scene)[0]
-    near = 1e-9 if engine == "auto" and calls.AVAILABLE else 3e-3
+    near = 1e-9 if engine == "auto" else 3e-3
     np.testing.assert_allclose(got[:, :2], begin[:2] + way[:, None] * ALONG, atol=near)
     np.testing.assert_allclose(got[:, 3:5], v[:, None] * ALONG, atol=10 * near)
     np.testing.assert_allclose(got[:, [2, 5]], [[0.3, 0.0]] * horizon, atol=1e-12)
@@ -105,7 +100,6 @@ def test_damping_is_exponential(engine) -> None:
     np.testing.assert_allclose(got[:, 0, 3:5], speed[:, None] * ALONG, atol=1e-5)
 
 
-@needs_calls
 def test_a_pendulum_on_a_cart_is_that_of_the_textbook() -> None:
     damping, turning, push, m, big, r, steps = 0.8, 0.05, 1.3, 0.7, 1.5, 0.3, 60
     moment = m * ARM.unit_moment
@@ -156,7 +150,6 @@ def turning_start(scene: Scene) -> np.ndarray:
     return start[0, 0]
 
 
-@needs_calls
 @pytest.mark.parametrize("free", [False, True])
 def test_energy_is_kept_on_a_turning_rail(free) -> None:
     """Which a hinge holds, or which falls."""
@@ -180,7 +173,6 @@ def test_energy_is_kept_on_a_turning_rail(free) -> None:
         np.testing.assert_allclose(again[0], got, atol=1e-9)
 
 
-@needs_calls
 @pytest.mark.parametrize("change", ["turned", "backwards", "post"])
 def test_the_order_of_bodies_and_the_way_of_the_axis_do_not_matter(change) -> None:
     effects = {"slider_friction": 3.0, "slider_damping": 0.5, "com_offset": (0.02, 0.01)}
@@ -199,7 +191,6 @@ def test_the_order_of_bodies_and_the_way_of_the_axis_do_not_matter(change) -> No
         np.testing.assert_allclose(*both, atol=1e-9)
 
 
-@needs_calls
 @pytest.mark.parametrize("dry", [0.0, 0.6])
 def test_the_engines_agree(dry) -> None:
     """On a cart with a pendulum, in proportion to Chipmunk's step; a table of two sliders too."""
@@ -222,7 +213,6 @@ def test_the_engines_agree(dry) -> None:
     assert 0.8 < np.log(np.median(off[0][0]) / np.median(off[1][0])) / np.log(4) < 1.2
 
 
-@needs_calls
 def test_a_table_of_two_sliders() -> None:
     bodies = (body("low", BOX), body("high", Shape.circle(0.05), mass=0.5))
     joints = (
@@ -246,7 +236,6 @@ def test_a_table_of_two_sliders() -> None:
     np.testing.assert_allclose(one, other, atol=2e-3)
 
 
-@needs_calls
 def test_friction_on_the_floor_under_a_slider() -> None:
     """A ring of friction brakes by its whole weight, wherever it is."""
     scene = on_a_rail(gravity=(0.0, 0.0), normal_gravity=G)
@@ -258,7 +247,6 @@ def test_friction_on_the_floor_under_a_slider() -> None:
     np.testing.assert_allclose(got[:, :2], start_of(scene)[0, :2] + way[:, None] * ALONG, atol=1e-9)
 
 
-@needs_calls
 def test_a_cart_meets_an_end_stop() -> None:
     """Momentum is kept between carts on one rail, and a static body stops the second."""
     carts = [
@@ -279,10 +267,9 @@ def test_a_cart_meets_an_end_stop() -> None:
 def test_a_slider_that_turns_has_no_contacts() -> None:
     scene = turning_rail()
     with pytest.raises(SimulationError, match=r"slider of bead and arm turns.*'auto'"):
-        predict(scene, turning_start(scene), engine="python")
+        predict(scene, turning_start(scene), engine="chipmunk")
 
 
-@needs_calls
 def test_an_inferred_anchor_moves_the_line() -> None:
     scene = on_a_rail()
     (rail,) = scene.joints

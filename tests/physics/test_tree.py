@@ -10,18 +10,14 @@ from scipy.special import ellipk
 
 from pbrl_ppl.effects import Effect, EffectParameter, Force, catalogue
 from pbrl_ppl.parameters import Prior
-from pbrl_ppl.physics import Physics, Simulator, calls, compiled
+from pbrl_ppl.physics import Physics, Simulator, compiled
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.chains import LINK, cart_with_trailers, case, chain
 from tests.helpers.engines import BOX
+from tests.helpers.plain import PlainSimulator
 from tests.helpers.worlds import G
 
-pytestmark = [
-    pytest.mark.one_stack,
-    pytest.mark.skipif(
-        not calls.AVAILABLE, reason="the compiled path cannot call the engine on this platform"
-    ),
-]
+pytestmark = pytest.mark.one_stack
 
 PIVOT = ("pivot_friction", "pivot_damping")
 ON_A_WHEEL = Scene(time_step=0.1, normal_gravity=G, bodies=(Body("cart", BOX, wheel=True),))
@@ -74,14 +70,14 @@ def convergence(sim: Simulator, phi, start, inputs, coarse: int = 80) -> tuple[f
 
 
 def by_interval(sim: Simulator, phi, start, inputs, states) -> np.ndarray:
-    """Each interval alone by the plain Python loop, from where ``states`` had it.
+    """Each interval alone by the plain reference, from where ``states`` had it.
 
     ``states`` are (proposal, transition, H, body, 6).
     """
     first = np.broadcast_to(start, (len(phi), *start.shape))
     begins = np.concatenate([first[:, :, None], states[:, :, :-1]], axis=2)
     begins = begins.reshape(len(phi), -1, *start.shape[1:])
-    alone = Simulator(sim.physics.changed(engine="python", extrapolate=False))
+    alone = PlainSimulator(sim.physics.changed(extrapolate=False))
     return alone(phi, begins, inputs.reshape(-1, 1, *inputs.shape[2:])).reshape(states.shape)
 
 

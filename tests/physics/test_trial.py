@@ -84,7 +84,8 @@ def push(state, command, parameters, wrench):
 
 
 def halve(state, command, parameters, wrench):
-    wrench[:] *= 0.5 + parameters[0]
+    for i in range(3):
+        wrench[i] *= 0.5 + parameters[0]
 
 
 def heavier(properties, parameters, clock):

@@ -1,16 +1,21 @@
-"""The slow reference rollout in plain Python: a new engine world for each transition."""
+"""The slow reference of the engine's loops, in plain Python: a new world for each transition.
+
+It is written apart from the compiled code, and takes what is placed in a substep alone from there.
+"""
 
 from __future__ import annotations
 
 import math
+from functools import partial
 from itertools import pairwise
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import pymunk
 
 from pbrl_ppl.effects import Attached, Command, Force, Friction, at_stage, holder
 from pbrl_ppl.effects.effect import INTERVAL, MEMORY, MOST_MEMORY, TIME
+from pbrl_ppl.physics import Simulator
 from pbrl_ppl.physics.compiled import (
     glide,
     hinge_signal,
@@ -21,13 +26,59 @@ from pbrl_ppl.physics.compiled import (
 )
 from pbrl_ppl.physics.laws import LATE
 from pbrl_ppl.physics.properties import COLUMN, EngineInput
+from pbrl_ppl.physics.settings import PhysicsSettings
+from pbrl_ppl.physics.simulator import Choice, continues_previous
 from pbrl_ppl.physics.solids import near_contact
-from pbrl_ppl.physics.world import RING, World
+from pbrl_ppl.physics.world import FINER, RING, World
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import WRENCH, Floats
 
 Stage = TypeVar("Stage", Command, Force, Friction)
 _EXTRA = [COLUMN.extra_gravity_x, COLUMN.extra_gravity_y]
+
+
+class PlainSimulator(Simulator):
+    """A simulator whose worlds are stepped in Python, one transition after the other."""
+
+    def _run(
+        self, choice: Choice, numbers: EngineInput, starts: Floats, inputs: Floats, out: Floats
+    ) -> None:
+        follows = continues_previous(inputs)
+        if not any(getattr(one.effect.stage, "remember", None) for one in self.physics.effects):
+            follows[:] = False  # nothing remembers the intervals before
+        for item in range(len(out)):
+            p, t = divmod(item, len(inputs))
+            start = starts[p if len(starts) > 1 else 0, t]
+            total = np.zeros_like(out[item])
+            first = t
+            while follows[first]:
+                first -= 1
+            earlier = np.concatenate([*inputs[first:t], inputs[t, :1]])
+            stepped = partial(
+                rollout, effects=self.physics.effects, numbers=numbers, proposal=p, item=t,
+                start=start, inputs=inputs[t], earlier=earlier,
+            )  # fmt: skip
+            for level, (count, weight) in enumerate(zip(*self.levels, strict=True)):
+                states, touched = stepped(self._new_world(choice), substeps=int(count))
+                lost = np.isnan(states).any()
+                if touched and not lost and (numbers.discs[p, :, 2] > 0).any():
+                    states, _ = stepped(self._new_world(choice), substeps=int(count) * FINER)
+                if level == 0 or np.isnan(states).any():  # diverged
+                    out[item] = states
+                if touched:
+                    break
+                total += weight * states
+            else:
+                given_path = [body.kinematic for body in self.physics.scene.moving]
+                total[:, given_path] = out[item][:, given_path]  # but for rounding it is so
+                out[item] = total
+
+
+def simulator_of(physics: PhysicsSettings, engine: str = "auto", **changes: Any) -> Simulator:
+    """Return a simulator of the physics on an engine of `Physics`, or on "python": this one."""
+    if engine == "python":
+        return PlainSimulator(physics.changed(**changes))
+    return Simulator(physics.changed(engine=engine, **changes))
 
 
 def rollout(
