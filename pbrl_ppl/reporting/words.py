@@ -214,13 +214,13 @@ def moved_most(loop: Loop, kind: str) -> str:
     If none changed, that with the largest error over the noise floor.
     """
     before, after, floor = (getattr(e, kind) for e in (loop.before, loop.after, loop.noise_floor))
-    moves = set(before)
+    moves = list(before)
     if loop.held_out is not None:
         observed = loop.held_out.dataset["observed"].to_numpy()
         spread = np.fmax.reduce(observed, axis=(0, 1)) - np.fmin.reduce(observed, axis=(0, 1))
         spread = np.nan_to_num(spread).max(axis=0)
         sizes = dict(zip(STATE, spread / state_sizes(loop.scene), strict=True))
-        moves = {name for name in before if sizes[name] > _STILL}
+        moves = [name for name in before if sizes[name] > _STILL]
 
     def change(name: str) -> tuple[float, float]:
         first, last = before[name], after.get(name, before[name])
