@@ -255,7 +255,8 @@ def _slopes(mode: Mode, attached: Attached | None = None) -> Floats:
         return -np.nan_to_num(problem.whitened(phi, mode.sigma)).reshape(len(points), -1)
 
     coarse = partial(predict, problem=enlarged.coarse)
-    return posterior_slopes(predict, null[new], lower, upper, begin, coarse)
+    # beyond the distance that supports keep from their ends, or both ends would be one
+    return posterior_slopes(predict, null[new], lower, upper, begin, coarse, least=1e-2)
 
 
 @dataclass(frozen=True, eq=False)

@@ -162,8 +162,10 @@ def actuation(scene: Scene, body: str) -> Effect | None:
     )
 
 
-def laws_of_actuators(scene: Scene, body: str) -> tuple[Effect, ...]:
+def laws_of_actuators(scene: Scene, body: str) -> tuple[tuple[str, Effect], ...]:
     """Return what may be wrong with each actuator of a body that is declared as known.
+
+    Each with the name of the effect of the catalogue that it is of, empty if of none.
 
     Parameters
     ----------
@@ -172,36 +174,34 @@ def laws_of_actuators(scene: Scene, body: str) -> tuple[Effect, ...]:
     body : str
         Name of a dynamic body.
     """
-    laws = []
+    laws = list[tuple[str, Effect]]()
     for slot, actuator in enumerate(scene.actuators_of(body)):
         name, force = actuator.name, _kind(actuator) in (_FORCE, _WORLD_FORCE)
         if actuator.kind == "wrench" or actuator.numbers.get("gain") is not None:
             prior = Prior("log_normal", mu=0.0, sigma=0.5)
-            laws.append(
-                Effect(
-                    f"{name}_gain",
-                    (EffectParameter("factor", "1", prior, null=1.0),),
-                    f"{name} is stronger or weaker than declared by this factor",
-                    "gain of an actuator",
-                    Command(_scale, alone=WRENCH[slot]),
-                )
+            wrong_gain = Effect(
+                f"{name}_gain",
+                (EffectParameter("factor", "1", prior, null=1.0),),
+                f"{name} is stronger or weaker than declared by this factor",
+                "gain of an actuator",
+                Command(_scale, alone=WRENCH[slot]),
             )
+            laws.append(("", wrong_gain))
         gain = actuator.numbers.get("gain", 1.0 if actuator.kind == "wrench" else None)
         natural = "torque" if _kind(actuator) == _TORQUE else "force"
         if not gain or actuator.kind == "servo":  # natural is what the gain's prior or a goal has
             gain, natural = 1.0, ""
         for suffix, (law, _, sentence) in OF_COMPONENTS.items():
             known = f"{name}_{suffix}", f"{name} {sentence}", WRENCH[slot], "1", natural, abs(gain)
-            laws.append(replace(of_component(law, *known), applies=always))
+            laws.append((law.name, replace(of_component(law, *known), applies=always)))
         if force and not dict(actuator.prior).get("direction"):
-            laws.append(
-                Effect(
-                    f"{name}_direction",
-                    (EffectParameter("angle", "rad", Prior("normal", sigma=0.3)),),
-                    f"{name} points in another direction than declared: it is mounted askew",
-                    "rotation of a vector in the plane",
-                    Command(_turn, acts=False),
-                    constants=(float(slot),),
-                )
+            wrong_direction = Effect(
+                f"{name}_direction",
+                (EffectParameter("angle", "rad", Prior("normal", sigma=0.3)),),
+                f"{name} points in another direction than declared: it is mounted askew",
+                "rotation of a vector in the plane",
+                Command(_turn, acts=False),
+                constants=(float(slot),),
             )
+            laws.append(("", wrong_direction))
     return tuple(laws)

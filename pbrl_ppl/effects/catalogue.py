@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 from collections import Counter
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 
@@ -146,7 +147,7 @@ def attach(
         acting = actuation(scene, body.name)
         if acting is not None:
             own = laws_of_actuators(scene, body.name)
-            by_name |= {acting.name: acting} | {effect.name: effect for effect in own}
+            by_name |= {acting.name: acting} | {effect.name: effect for _, effect in own}
             if acting.name not in body.effects and (acting.name, body.name) not in given:
                 result.append(acting.on(body.name))
         for name in body.effects:
@@ -218,9 +219,13 @@ def candidates(
     it can show: see ``Effect.needs``.
     """
     present = {(attached.effect.name, attached.body) for attached in declared}
-    everywhere = [(effect, body) for effect in effects for body in scene.dynamic]
+    tried = {effect.name: effect for effect in effects}
+    everywhere = [(effect, body) for effect in tried.values() for body in scene.dynamic]
     own = [
-        (effect, body) for body in scene.dynamic for effect in laws_of_actuators(scene, body.name)
+        (replace(effect, unusual=getattr(tried.get(of), "unusual", "")), body)
+        for body in scene.dynamic
+        for of, effect in laws_of_actuators(scene, body.name)
+        if not of or of in tried
     ]
     shown = {body.name: _shown(scene, body.name, history) for body in scene.dynamic}
     return tuple(

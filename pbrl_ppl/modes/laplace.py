@@ -135,15 +135,19 @@ def posterior_slopes(
     upper: Floats,
     begin: Floats,
     coarse: Callable[[Floats], Floats] | None = None,
+    *,
+    least: float = 1e-3,
 ) -> Floats:
     """Return the derivative with steps of one posterior standard deviation.
 
     Friction makes kinks; a derivative over the posterior's own scale sees their average, one over a
     tiny step sees whichever side it is on. The posterior's scale comes from the derivative over the
     steps ``begin``, shape (p,), of the function or a cheaper one, ``coarse``.
+
+    ``least``: the shortest steps, as a share of ``begin``.
     """
     size = np.sqrt((differentiate(coarse or function, phi, begin, lower, upper) ** 2).sum(axis=0))
-    steps = np.clip(1.0 / np.maximum(size, 1e-300), 1e-3 * begin, 1e2 * begin)
+    steps = np.clip(1.0 / np.maximum(size, 1e-300), least * begin, 1e2 * begin)
     return differentiate(function, phi, steps, lower, upper)
 
 
