@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
+from functools import cache
 from itertools import combinations, compress
 from typing import Any, ClassVar, Unpack, final
 
@@ -12,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from pbrl_ppl.agents.agent import Agent, AgentOptions, Revision, Task
-from pbrl_ppl.criticism import DEFAULT, Search, sizes_of
+from pbrl_ppl.criticism import DEFAULT, Search, Table, share, sizes_of
 from pbrl_ppl.effects import Attached, Effect, Structure, attach, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, FitError, UninformedWarning
@@ -69,6 +70,10 @@ def revise(
         return candidates(problem.scene, mode.problem.physics.effects, tried)
 
     def highest(laws: Iterable[Attached]) -> Mode:
+        return mode_with(frozenset(laws))
+
+    @cache
+    def mode_with(laws: frozenset[Attached]) -> Mode:
         return find_mode(problem.with_physics(effects=(*problem.physics.effects, *laws)), seed=seed)
 
     # priors are in units that the data show, and change with them
@@ -80,12 +85,31 @@ def revise(
         return tuple(replace(one, attached=law) for law, one in before.items()), mode
     begin = {law: sizes_of(mode, law) for law in before}
     found = Search(missing, replace(DEFAULT, search=limits))(highest(()), begin).laws
-    since = {law: one.transitions for law, one in before.items()}
-    laws = [
-        Revision(law, since.get(law, problem.segments.n), one.nats, one.share, one.confounded)
-        for law, one in found.items()
+    table = Table(problem.physics.effects, max(len(every), 1))
+    table.modes |= {frozenset(laws): highest(laws) for laws in (found, before)}
+    laws = [*max(found, before, key=lambda laws: table.value(highest(laws)))]
+    while laws:  # from many starts: a local climb may end too low to do without a law
+        for key in (laws, *([one for one in laws if one != law] for law in laws)):
+            table.modes.setdefault(frozenset(key), highest(key))
+        mode = table.fitted(highest(()), laws)
+        nats = {law: table.value(mode) - table.value(table.without(mode, law)) for law in laws}
+        weakest = min(laws, key=lambda law: nats[law])
+        if nats[weakest] >= least:
+            break
+        laws.remove(weakest)
+    else:
+        return (), highest(())
+    revisions = [
+        Revision(
+            law,
+            before[law].transitions if law in before else problem.segments.n,
+            nats[law],
+            share(table.without(mode, law), mode, table.weight),
+            found[law].confounded if law in found else (),
+        )
+        for law in laws
     ]
-    return tuple(sorted(laws, key=lambda law: -law.nats)), highest(found)
+    return tuple(sorted(revisions, key=lambda law: -law.nats)), mode
 
 
 #: Prediction errors up to this share of the natural sizes carry no information: they are the

@@ -44,5 +44,7 @@ from .score import Signature as Signature
 from .score import rank_candidates as rank_candidates
 from .score import same_physics as same_physics
 from .search import Search as Search
+from .table import Table as Table
+from .table import share as share
 from .table import sizes_of as sizes_of
 from .table import with_effects as with_effects

@@ -98,7 +98,10 @@ def refit(mode: Mode, effects: tuple[Attached, ...], sizes: Mapping[Attached, Fl
             problem, phi, rounds=8, tolerance=1.0, n_steps=1, dampings=(0.1, 10.0, 1e3)
         )
     # what a lacking model's parameters have made up for is far from where they are with the law
-    modes = find_mode(problem, initial=phi), find_mode(problem, seed=0)
+    centre = np.array([prior.centre for prior in problem.layout.priors])
+    for attached, values in sizes.items():
+        centre[problem.layout.places(attached.labels)] = values
+    modes = [find_mode(problem, initial=begin) for begin in (phi, centre)]
     return max(modes, key=lambda one: one.log_posterior)
 
 
