@@ -125,7 +125,7 @@ class SamplerRun:
 
 
 def _importance(
-    job: SamplerRun, *, proposals: float = 1.4, tune: int = 125, thin: int = 32
+    job: SamplerRun, *, proposals: float = 1.4, tune: int = 125, thin: int = 16
 ) -> Idata:
     """Weight proposals from Gaussians; see `importance`. Chains, where weights do not suffice.
 
@@ -144,7 +144,8 @@ def _importance(
     if not points.good:
         chains = replace(job, method=replace(job.method, tune=tune, thin=thin))
         trace = _metropolis(chains, learned)
-        trace.attrs["proposals"] = f"none: chains, for their Pareto k is {k:.2g}"
+        why = f"{points.ess:.0f} of {len(points.q)} effective, Pareto k {k:.2g}"
+        trace.attrs["proposals"] = f"none: chains, for weights do not suffice ({why})"
         return trace
     phi, sigma = reference.space.split(points.q[chosen])
     values = job.problem.named(phi.reshape(*shape, -1), sigma.reshape(*shape, -1))
