@@ -138,8 +138,8 @@ def fitted(model: pm.Model, **options: Any) -> tuple[dict[str, Moments], str]:
     how += f", least ESS {min(size.values()):.0f}"
     if "pareto_k" in idata.attrs:
         how += f", Pareto k {idata.attrs['pareto_k']:.2f}"
-    if "rungs" in idata.attrs:
-        how += f" from {idata.attrs['proposals']}, {idata.attrs['rungs']} temperatures"
+    if "proposals" in idata.attrs:
+        how += f", proposals: {idata.attrs['proposals']}"
     return moments(model, idata), how
 
 

@@ -65,7 +65,7 @@ class Sampler:
     Parameters
     ----------
     method
-        importance, metropolis, paper, demetropolisz, smc, nuts, laplace or map.
+        importance, metropolis, paper, laplace or map.
     draws
         Posterior draws of each chain.
     tune

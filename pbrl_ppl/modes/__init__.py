@@ -6,6 +6,7 @@ from .configurations import Weighed as Weighed
 from .configurations import evidence_warning as evidence_warning
 from .configurations import index_law as index_law
 from .configurations import stored as stored
+from .importance import WeightedPoints as WeightedPoints
 from .importance import adaptive_importance as adaptive_importance
 from .importance import systematic as systematic
 from .joint_search import weigh as weigh

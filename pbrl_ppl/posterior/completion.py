@@ -44,10 +44,7 @@ from pbrl_ppl.state import Floats, Ints
 #: shape (draw, transition), chains joined, which need not be evaluated again.
 PARETO_K, LIKELIHOOD = "pareto_k", "log_likelihood"
 #: Attributes of a trace that are fields of the posterior's record.
-SAMPLED = (
-    "configurations", PARETO_K, SIZE, "proposals", "rungs", "acceptance", "log_evidence",
-    "updates",
-)  # fmt: skip
+SAMPLED = ("configurations", PARETO_K, SIZE, "proposals", "log_evidence", "updates")
 #: Pareto k of weights above which they miss a part of the posterior (Vehtari et al., 2024).
 MAX_PARETO_K = 0.7
 #: Largest R-hat and least effective sample size of reliable summaries (Vehtari et al., 2021).

@@ -155,11 +155,7 @@ class PosteriorRecord:
         sample size of the resampled draws, which limits every parameter's ESS.
     proposals : str, optional
         The density that was weighted: Gaussians at the modes; of older posteriors also that of few
-        engine steps.
-    rungs : int, optional
-        Temperatures at which the engine moved particles, where weights alone did not suffice.
-    acceptance : float, optional
-        Share of those moves that were accepted; 1 without any.
+        engine steps. Why chains were run where weights did not suffice.
     log_evidence : float, optional
         Of the model, about the modes that were found.
     tolerance : float, optional
@@ -196,8 +192,6 @@ class PosteriorRecord:
     pareto_k: float | None = None
     importance_ess: float | None = None
     proposals: str | None = None
-    rungs: int | None = None
-    acceptance: float | None = None
     log_evidence: float | None = None
     tolerance: float | None = None
     not_separable: tuple[tuple[str, ...], ...] | None = None

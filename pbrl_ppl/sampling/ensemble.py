@@ -23,8 +23,6 @@ from pbrl_ppl.state import Bools, Floats, Ints
 TARGET_ACCEPTANCE = 0.234
 #: Variance of a Gaussian that draws are proposed from over that of what it stands for.
 _WIDER = 1.3
-#: Checks of the particles' autocorrelation, at most.
-MAX_CHECKS = 5
 
 
 class Target(Protocol):
@@ -215,15 +213,11 @@ class Reference:
             q[:, block.places] = block.draw(n, rng)
         return self.space.prior_draws(q, rng)
 
-    def columns(self, q: Floats) -> Floats:
-        """Return the log-density of each part and of the noise, shape (n, part + 1)."""
-        parts = [block.log_density(q[:, block.places]) for block in self.parts]
-        noise = sum(block.log_density(q[:, block.places]) for block in self.noise)
-        return np.stack([*parts, noise + np.zeros(len(q))], axis=1)
-
     def log_density(self, q: Floats) -> Floats:
         """Return the log-density of particles (n, d), shape (n,)."""
-        return np.asarray(self.columns(q).sum(axis=1))
+        parts = [block.log_density(q[:, block.places]) for block in self.parts]
+        noise = sum(block.log_density(q[:, block.places]) for block in self.noise)
+        return np.asarray(np.stack([*parts, noise + np.zeros(len(q))], axis=1).sum(axis=1))
 
     def learned(self, q: Floats, retained: float = 0.0) -> Reference:
         """Return the product of Gaussians of particles; of several modes, this one.
@@ -356,36 +350,9 @@ class Ensemble:
             block.adapt(kind, float(rate))
         return np.where(accepted[:, None], y, q), np.where(accepted[:, None], there, here)
 
-    def settle(self, target: Target, max_checks: int = MAX_CHECKS) -> tuple[float, float]:
-        """Move until particles have decorrelated from their start, or for ``max_checks`` rounds.
-
-        Returns
-        -------
-        accepted : float
-            Share of accepted moves.
-        correlation : float
-            With where they were, the largest of a coordinate.
-        """
-        begin, rates = self.q.copy(), []
-        places = np.concatenate([block.places for block in self.blocks])
-        for _ in range(max_checks):
-            rates.append(self.move(target, 3))
-            correlation = _correlation(begin[:, places], self.q[:, places])
-            if correlation < 0.5:
-                break
-            self.learn()
-        return float(np.mean(rates)), correlation
-
 
 def groups(space: Space, n: int, numbers: int = 8_000_000) -> Iterator[slice]:
     """Yield groups of n particles whose predictions have at most so many numbers."""
     width = max(8, numbers // max(space.problem.measured.size, 1))
     for first in range(0, n, width):
         yield slice(first, first + width)
-
-
-def _correlation(before: Floats, after: Floats) -> float:
-    """Return the largest correlation over the columns between the particles before and after."""
-    a, b = before - before.mean(axis=0), after - after.mean(axis=0)
-    size = np.sqrt((a**2).sum(axis=0) * (b**2).sum(axis=0))
-    return float(((a * b).sum(axis=0) / np.maximum(size, 1e-300)).max(initial=0.0))

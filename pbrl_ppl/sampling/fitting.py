@@ -92,15 +92,14 @@ def fit(
         As made by ``physics_model``.
     method : str
         ``importance``: proposals from Gaussians about the modes, weighted by the engine in batches
-        of which each teaches the next, and resampled; where the weights do not suffice, particles
-        are moved by the engine at several temperatures; ``metropolis``: chains of the same moves
-        under the engine's posterior, each of which is many walkers, one after another; ``paper``:
-        one random walk a variable, by default on the schedule of the paper's Table 2 for the cart
-        (30 chains of 20,000 iterations, 1,000 of them burn-in, each tenth kept); with a library, on
-        that for the apartment (``draws=400, tune=1000, thin=10, chains=1``), each body's set
-        proposed uniformly; ``demetropolisz``; ``smc``; ``nuts``, on the finite-difference gradient;
-        ``laplace``: independent draws from the Gaussian at the mode, which no chain has checked;
-        ``map``: the mode alone, as one draw.
+        of which each teaches the next, and resampled; where the weights do not suffice, the chains
+        of ``metropolis`` from what was learned; ``metropolis``: chains, each of which is many
+        walkers, one after another; ``paper``: one random walk a variable, by default on the
+        schedule of the paper's Table 2 for the cart (30 chains of 20,000 iterations, 1,000 of them
+        burn-in, each tenth kept); with a library, on that for the apartment (``draws=400,
+        tune=1000, thin=10, chains=1``), each body's set proposed uniformly; ``laplace``:
+        independent draws from the Gaussian at the mode, which no chain has checked; ``map``: the
+        mode alone, as one draw. For PyMC's samplers, give the model to ``pm.sample``.
     seed : int
         The same seed gives the same posterior.
     draws, tune : int, optional
@@ -130,8 +129,8 @@ def fit(
         ``attrs`` the scene, effects, method, versions, seed, the hash of the data and the
         convergence. Of importance sampling there are ``pareto_k``, the shape of the weights' tail
         (at most 0.7), ``importance_ess``, the effective sample size of the draws by their weights,
-        which limits that of each parameter, ``proposals`` (what
-        was weighted), ``rungs`` and ``acceptance`` of the engine's moves, and ``log_evidence``.
+        which limits that of each parameter, ``proposals`` (what was weighted, or why chains were
+        run) and ``log_evidence``.
         Interrupted chains keep the draws so far.
 
     Raises
@@ -139,7 +138,7 @@ def fit(
     FitError
         If the model was not made by ``physics_model``, there is no such method, ``start`` is no
         mode, or both ``start`` and ``resume`` are given; for joints of unknown bodies, if there are
-        too many choices, or with ``smc``, ``start`` or ``resume``.
+        too many choices, or with ``start`` or ``resume``.
     PosteriorError
         If ``resume`` is a posterior of other data or parameters.
 
@@ -311,8 +310,6 @@ def _run(job: SamplerRun) -> Idata:
     """Return draws by a method, without what its processes warn of."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*fork.*", category=DeprecationWarning)
-        # draws from the prior, of which SMC needs some, are not compiled on the newer stack
-        warnings.filterwarnings("ignore", message="Numba will use object mode")
         return job.method.run(job)
 
 
@@ -341,19 +338,11 @@ def _check(problem: Problem, method: str, start: object, resume: Idata | None) -
             "fit: a model with a library is summed over exactly, or walked over by the method"
             " 'paper'; leave out method or use that, and leave out start and resume"
         )
-    if problem.layout.discrete.any():
-        if method == "smc":
-            raise FitError(
-                "fit: method is 'smc' and which bodies a joint joins is unknown; each choice of"
-                " bodies is sampled by itself, which tempering from the prior is not made for; use"
-                " 'metropolis', or name the bodies in the scene"
-            )
-        if argument:
-            raise FitError(
-                f"fit: {argument} was given and which bodies a joint joins is unknown; a fit cannot"
-                f" go on from one choice of bodies to all of them; leave {argument} out and raise"
-                " draws"
-            )
+    if argument and problem.layout.discrete.any():
+        raise FitError(
+            f"fit: {argument} was given and which bodies a joint joins is unknown; a fit cannot"
+            f" go on from one choice of bodies to all of them; leave {argument} out and raise draws"
+        )
 
 
 def joined_at(

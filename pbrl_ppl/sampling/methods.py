@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import cached_property, partial
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
@@ -36,9 +34,6 @@ from pbrl_ppl.posterior import (
 from pbrl_ppl.sampling.ensemble import Ensemble, Reference
 from pbrl_ppl.sampling.importance import draw_proposals, resample, stream
 from pbrl_ppl.state import Floats, Ints
-
-if TYPE_CHECKING:
-    import pymc as pm
 
 
 @dataclass(frozen=True)
@@ -88,13 +83,6 @@ class SamplerRun:
     cores: int
     progress: bool
 
-    @cached_property
-    def model(self) -> pm.Model:
-        """The problem's pm.Model, which PyMC's samplers need."""
-        from pbrl_ppl.model import build_model  # PyMC takes seconds to load
-
-        return build_model(self.problem)
-
     @property
     def chains(self) -> int:
         """Chains that are asked for, or those of the posterior to go on from."""
@@ -135,61 +123,57 @@ class SamplerRun:
             raise FitError("fit: this method begins at a mode, and there is none")
         return self.mode
 
-    def sample(self, step: object) -> Idata:
-        """Run ``pm.sample`` from the starts, without its checks of convergence."""
-        import pymc as pm
 
-        starts, thin = self.starts(), self.method.thin
-        try:
-            trace: Idata = pm.sample(
-                draws=self.method.draws * thin, tune=self.method.tune, chains=len(starts),
-                cores=min(self.cores, len(starts)), step=step, initvals=starts,
-                random_seed=self.seed, progressbar=self.progress, quiet=not self.progress,
-                compute_convergence_checks=False, discard_tuned_samples=True, model=self.model,
-            )  # fmt: skip
-        except ValueError as error:
-            if "Not enough samples" in str(error):  # PyMC's answer to an early interrupt
-                raise KeyboardInterrupt from error
-            raise
-        data = groups(trace)
-        for name in ("posterior", "sample_stats"):
-            data[name] = data[name].isel(draw=slice(thin - 1, None, thin))
-        return from_groups(data, {})
+def _importance(
+    job: SamplerRun, *, proposals: float = 1.4, tune: int = 125, thin: int = 16
+) -> Idata:
+    """Weight proposals from Gaussians; see `importance`. Chains, where weights do not suffice.
 
-
-def _importance(job: SamplerRun, *, proposals: float = 1.4) -> Idata:
-    """Weight proposals from a cheaper posterior; see `importance`.
-
-    ``proposals``: weighted proposals a draw.
+    ``proposals``: weighted proposals a draw; ``tune``, ``thin``: of the chains.
     """
     shape, seed = (job.chains, job.method.draws), stream(job.seed, job.starts())
     n = job.chains * job.method.draws
     reference = job.reference()
-    pool = draw_proposals(reference, int(proposals * n), seed)
-    chosen, k, size = resample(pool.log_weight, n, np.random.default_rng([*seed, 1]))
-    phi, sigma = reference.space.split(pool.q[chosen])
-    known = pool.log_likelihood
+    points, learned = draw_proposals(reference, int(proposals * n), seed)
+    chosen, k, size = resample(points.log_weight, n, np.random.default_rng([*seed, 1]))
+    if not np.isfinite(points.log_weight).any():
+        raise FitError(
+            f"fit: the model gives none of {len(points.q)} draws about its mode a density; start"
+            " from another mode, or use the method 'laplace'"
+        )
+    if not points.good:
+        chains = replace(job, method=replace(job.method, tune=tune, thin=thin))
+        trace = _metropolis(chains, learned)
+        why = f"{points.ess:.0f} of {len(points.q)} effective, Pareto k {k:.2g}"
+        trace.attrs["proposals"] = f"none: chains, for weights do not suffice ({why})"
+        return trace
+    phi, sigma = reference.space.split(points.q[chosen])
     values = job.problem.named(phi.reshape(*shape, -1), sigma.reshape(*shape, -1))
-    trace = as_trace(job.problem, values, {"log_weight": pool.log_weight[chosen].reshape(shape)})
+    log_weight = points.log_weight[chosen].reshape(shape)
+    trace = as_trace(job.problem, values, {"log_weight": log_weight})
     trace.attrs |= {
-        PARETO_K: k, SIZE: pool.independent_share * size,
-        LIKELIHOOD: known if known is None else known[chosen],
-        "proposals": "Gaussians at the modes", "rungs": pool.tempering_steps,
-        "acceptance": pool.accepted, "log_evidence": pool.log_z,
+        PARETO_K: k, SIZE: size, LIKELIHOOD: points.values[chosen],
+        "proposals": "Gaussians at the modes", "log_evidence": points.log_z,
     }  # fmt: skip
     return trace
 
 
-def _metropolis(job: SamplerRun, *, most_walkers: int = 20) -> Idata:
+def _metropolis(
+    job: SamplerRun, learned: Reference | None = None, *, most_walkers: int = 20
+) -> Idata:
     """Run the ensemble as chains; see `ensemble`. A chain is its walkers, one after another.
+
+    They begin at draws of ``learned``, or where it is not given at the modes' Gaussians or where
+    the posterior to go on from ends.
 
     ``most_walkers``: walkers of a chain of the ensemble.
     """
-    reference, rng = job.reference(), np.random.default_rng(stream(job.seed, job.starts()))
+    reference = learned or job.reference()
+    rng = np.random.default_rng(stream(job.seed, job.starts()))
     method, chains = job.method, job.chains
     walkers = min(most_walkers, method.draws)
     per_walker = -(-method.draws // walkers)
-    if job.resume is None:
+    if job.resume is None or learned:
         q = reference.draw(chains * walkers, rng)
     else:
         phi, sigma = last_draws(job.problem, job.resume, walkers)
@@ -228,40 +212,35 @@ def _metropolis(job: SamplerRun, *, most_walkers: int = 20) -> Idata:
 def _paper(job: SamplerRun) -> Idata:
     """Run one random-walk Metropolis step a variable, as PyMC 2 did, and keep each n-th draw.
 
-    The set of a library that each body has is proposed uniformly, body by body.
+    The set of a library that each body has is proposed uniformly, body by body. PyMC's checks of
+    convergence are left out.
     """
-    import pymc as pm
+    import pymc as pm  # takes seconds to load
 
-    discrete = job.model.discrete_value_vars
+    from pbrl_ppl.model import build_model
+
+    model, starts, thin = build_model(job.problem), job.starts(), job.method.thin
     steps = [
-        pm.CategoricalGibbsMetropolis([variable], model=job.model)
-        if job.model.rvs_to_values[variable] in discrete
-        else pm.Metropolis([variable], model=job.model)
-        for variable in job.model.free_RVs
+        pm.CategoricalGibbsMetropolis([variable], model=model)
+        if model.rvs_to_values[variable] in model.discrete_value_vars
+        else pm.Metropolis([variable], model=model)
+        for variable in model.free_RVs
     ]
-    return job.sample(steps)
-
-
-def _pymc(step: str, job: SamplerRun) -> Idata:
-    """Run a step method of PyMC on all parameters together.
-
-    ``DEMetropolisZ`` is differential evolution from each chain's past (ter Braak and Vrugt, 2008);
-    ``NUTS`` takes the finite-difference gradient: where nothing slides to a stop or collides.
-    """
-    import pymc as pm
-
-    return job.sample(getattr(pm, step)(job.model.free_RVs, model=job.model))
-
-
-def _smc(job: SamplerRun) -> Idata:
-    """Run sequential Monte Carlo from the prior: for several modes and few parameters."""
-    import pymc as pm
-
-    trace: Idata = pm.sample_smc(
-        draws=job.method.draws, chains=job.chains, cores=job.cores, random_seed=job.seed,
-        progressbar=job.progress, compute_convergence_checks=False, model=job.model,
-    )  # fmt: skip
-    return trace
+    try:
+        trace: Idata = pm.sample(
+            draws=job.method.draws * thin, tune=job.method.tune, chains=len(starts),
+            cores=min(job.cores, len(starts)), step=steps, initvals=starts,
+            random_seed=job.seed, progressbar=job.progress, quiet=not job.progress,
+            compute_convergence_checks=False, discard_tuned_samples=True, model=model,
+        )  # fmt: skip
+    except ValueError as error:
+        if "Not enough samples" in str(error):  # PyMC's answer to an early interrupt
+            raise KeyboardInterrupt from error
+        raise
+    data = groups(trace)
+    for name in ("posterior", "sample_stats"):
+        data[name] = data[name].isel(draw=slice(thin - 1, None, thin))
+    return from_groups(data, {})
 
 
 def _map(job: SamplerRun) -> Idata:
@@ -379,9 +358,6 @@ METHODS: Mapping[str, Method] = {
     "importance": Method(_importance, draws=250, tune=0, thin=1),
     "metropolis": Method(_metropolis, draws=800, tune=500, thin=4),
     "paper": Method(_paper, draws=1900, tune=1000, thin=10, chains=30),
-    "demetropolisz": Method(partial(_pymc, "DEMetropolisZ"), draws=1000, tune=2000, thin=10),
-    "smc": Method(_smc, draws=1000, tune=0, thin=1),
-    "nuts": Method(partial(_pymc, "NUTS"), draws=500, tune=500, thin=1),
     "laplace": Method(_laplace, draws=250, tune=0, thin=1),
     "map": Method(_map, draws=1, tune=0, thin=1, chains=1),
 }

@@ -1,4 +1,4 @@
-"""The ensemble's moves and its annealing on densities with closed forms."""
+"""The ensemble's moves on densities with closed forms."""
 
 from types import SimpleNamespace
 
@@ -11,7 +11,6 @@ from pbrl_ppl.likelihood import TransitionLikelihood
 from pbrl_ppl.modes import systematic
 from pbrl_ppl.modes.space import Independent
 from pbrl_ppl.sampling.ensemble import Ensemble, Reference
-from pbrl_ppl.sampling.importance import Tempered, anneal
 
 pytestmark = pytest.mark.one_stack
 
@@ -95,6 +94,13 @@ def is_gaussian(q, mean=MEAN, covariance=COVARIANCE) -> None:
             assert abs(product.mean()) < BOUND * product.std() / np.sqrt(len(z))
 
 
+def settle(ensemble, target, rounds) -> None:
+    """Move particles and learn from them in turn, as chains do while they tune."""
+    for _ in range(rounds):
+        ensemble.move(target, 3)
+        ensemble.learn()
+
+
 # -- moves -----------------------------------------------------------------------------------------
 
 
@@ -109,25 +115,17 @@ def test_a_correlated_gaussian_from_a_wrong_guess(factor) -> None:
         ensemble.move(target, 20)
         ensemble.learn()
     start = ensemble.q.copy()
-    for _ in range(3):
-        ensemble.settle(target)
+    settle(ensemble, target, 9)
     is_gaussian(ensemble.q)
     independent(ensemble.q, start)
 
 
 @pytest.mark.parametrize("adapt", [True, False])
 def test_draws_of_a_gaussian_stay_draws_of_it(adapt) -> None:
-    """And settling says how alike they are to what they were."""
     space, rng = space_of([range(3)]), np.random.default_rng(2)
     start = rng.multivariate_normal(MEAN, COVARIANCE, 3000)
     ensemble = Ensemble(Reference.of_draws(space, start), start, rng)
-    if adapt:
-        accepted, correlation = ensemble.settle(Density(gaussian))
-        assert correlation < 0.5
-        every = [np.corrcoef(a, b)[0, 1] for a, b in zip(ensemble.q.T, start.T, strict=True)]
-        assert correlation == pytest.approx(max(every))
-    else:
-        accepted = ensemble.move(Density(gaussian), 10, adapt=False)
+    accepted = ensemble.move(Density(gaussian), 10, adapt=adapt)
     assert 0.2 < accepted < 1.0
     assert (ensemble.q != start).all(axis=1).mean() > 0.9
     is_gaussian(ensemble.q)
@@ -143,8 +141,7 @@ def test_a_banana() -> None:
     start = rng.standard_normal((3000, 2))
     start[:, 1] = start[:, 0] ** 2 / 2 + 0.7 * start[:, 1]
     ensemble = Ensemble(Reference.of_draws(space, start), start, rng)
-    for _ in range(5):
-        ensemble.settle(Density(banana))
+    settle(ensemble, Density(banana), 15)
     independent(ensemble.q, start)
     x, y = ensemble.q.T
     for z in (x, (y - x**2 / 2) / 0.7):
@@ -216,8 +213,7 @@ def test_impossible_points_are_rejected() -> None:
 
     start = np.abs(rng.standard_normal((3000, 1)))
     ensemble = Ensemble(Reference.of_draws(space, start), start, rng)
-    for _ in range(4):
-        ensemble.settle(Density(positive))
+    settle(ensemble, Density(positive), 12)
     assert (ensemble.q > 0).all()
     assert stats.kstest(ensemble.q[:, 0], stats.halfnorm.cdf).pvalue > ALARM
 
@@ -270,8 +266,7 @@ def test_parts_are_accepted_by_themselves() -> None:
     # some moved the one, some the other, some both
     assert 0.05 < (moved[:, 0] & ~moved[:, 1]).mean() < 0.95
     assert 0.05 < (moved[:, 1] & ~moved[:, 0]).mean() < 0.95
-    for _ in range(5):
-        ensemble.settle(target)
+    settle(ensemble, target, 15)
     independent(ensemble.q, start)
     z = (ensemble.q[:, :2] - np.array([1.0, -1.0])) / np.exp(ensemble.q[:, 2:])
     for own in (*z.T, ensemble.q[:, 2] / 0.3):
@@ -307,121 +302,11 @@ def test_a_part_without_coordinates_and_arguments_stay_as_they_are() -> None:
     reference = Reference.of_draws(space, start)
     before = reference.parts[0].modes[0].mean.copy()
     ensemble = Ensemble(reference, start, rng)
-    ensemble.settle(One())
-    ensemble.settle(One())
+    settle(ensemble, One(), 6)
     np.testing.assert_array_equal(start, given)
     np.testing.assert_array_equal(reference.parts[0].modes[0].mean, before)
     for own in ensemble.q.T:
         assert stats.kstest(own, stats.norm.cdf).pvalue > ALARM
-
-
-# -- annealing -------------------------------------------------------------------------------------
-
-
-def log_z_errors(reference, end, runs=12, n=600, **options):
-    """Estimates of a log-evidence, with their mean's standard error."""
-    found = []
-    for seed in range(runs):
-        rng = np.random.default_rng([14, seed])
-        ensemble = Ensemble(reference, reference.draw(n, rng), rng)
-        found.append(anneal(ensemble, reference, end, **options).log_z)
-    return np.mean(found), np.std(found, ddof=1) / np.sqrt(runs)
-
-
-@pytest.mark.parametrize("worth", [0.3, np.inf])
-def test_the_evidence_of_a_gaussian(worth) -> None:
-    """Unnormalised by e^7, five widths off and narrower; t with 11 degrees of freedom: 1e-4."""
-    space = space_of([range(3)])
-    reference = about(space, (MEAN + 5 * SD, 4 * COVARIANCE))
-    end = Density(lambda q: gaussian(q) + 7.0)
-    mean, error = log_z_errors(reference, end, worth=worth)
-    assert error < 0.1
-    assert abs(mean - 7.0) < 6.0 * error
-
-
-def test_the_evidence_of_two_modes() -> None:
-    """Each by its share, 3.0 in sum; from Gaussians a third wider."""
-    space = space_of([range(3)])
-    end = Density(lambda q: two_modes(q) + 3.0)
-    mean, error = log_z_errors(two_guesses(space), end, worth=np.inf)
-    assert error < 0.1
-    assert abs(mean - 3.0) < 6.0 * error
-
-
-def test_the_evidence_of_parts_with_noise() -> None:
-    space, rng = space_of([[0], [1]], [[2]]), np.random.default_rng(15)
-    start = np.column_stack([rng.normal(3, 2, 900), rng.normal(-3, 2, 900), rng.normal(0, 1, 900)])
-    mean, error = log_z_errors(Reference.of_draws(space, start), Parts(), worth=np.inf)
-    assert error < 0.1
-    # the density of log s is that of a standard normal at log s / 0.3
-    assert abs(mean - np.log(0.3)) < 6.0 * error
-
-
-def test_annealed_particles_are_of_the_end() -> None:
-    """Also where the modes' shares in the reference, a half each, are others."""
-    space, rng = space_of([range(3)]), np.random.default_rng(16)
-    reference = two_guesses(space)
-    ensemble = Ensemble(reference, reference.draw(4000, rng), rng)
-    reached = anneal(ensemble, reference, Density(two_modes), worth=np.inf)
-    assert reached.tempering_steps >= 1
-    assert 0.0 < reached.accepted < 1.0
-    assert (reached.log_weight == 0.0).all()
-    wide = ensemble.q.mean(axis=1) > 4.0
-    assert abs(wide.mean() - 0.7) < BOUND * np.sqrt(0.21 / (4000 * reached.independent_share))
-    for which, (mean, sd, _) in ((~wide, NARROW), (wide, WIDE)):
-        size = which.sum() * reached.independent_share
-        for own in ensemble.q[which].T:
-            statistic = stats.kstest(own, stats.norm(mean, sd).cdf).statistic
-            assert statistic * np.sqrt(size) < stats.kstwobign.isf(ALARM)
-
-
-def test_weights_that_suffice_end_it_without_a_move() -> None:
-    """They weigh the start's particles: means by the weights are the end's."""
-    space, rng = space_of([range(3)]), np.random.default_rng(17)
-    reference = about(space, (MEAN + 0.3 * SD, 1.2 * COVARIANCE))
-    q = reference.draw(4000, rng)
-    ensemble = Ensemble(reference, q, rng)
-    reached = anneal(ensemble, reference, Density(gaussian))
-    assert (reached.tempering_steps, reached.accepted, reached.independent_share) == (0, 1.0, 1.0)
-    np.testing.assert_array_equal(ensemble.q, q)
-    left = reached.log_weight
-    np.testing.assert_allclose(left, gaussian(q) - reference.log_density(q))
-    weight = np.exp(left - logsumexp(left))
-    size = 1.0 / (weight**2).sum()
-    z = (weight @ q - MEAN) / SD
-    assert (np.abs(z) < BOUND / np.sqrt(size)).all()
-
-
-@pytest.mark.slow
-def test_kept_is_what_the_moves_leave_of_independent_particles() -> None:
-    """The variance of means over runs is no larger than that of as many independent draws.
-
-    A variance over 100 has a standard error of 14 %: above 1.6 of its expectation once in 1e4.
-    """
-    space, n = space_of([range(3)]), 400
-    reference = about(space, (MEAN + 1.5 * SD, COVARIANCE))
-    means, kept = [], []
-    for seed in range(100):
-        rng = np.random.default_rng([18, seed])
-        ensemble = Ensemble(reference, reference.draw(n, rng), rng)
-        reached = anneal(ensemble, reference, Density(gaussian), worth=np.inf)
-        means.append((ensemble.q.mean(axis=0) - MEAN) / SD)
-        kept.append(reached.independent_share)
-    assert 0.2 < np.mean(kept) < 1.0
-    worth = 1.0 / (n * np.var(means, axis=0))
-    assert (worth > np.mean(kept) / 1.6).all(), (worth, np.mean(kept))
-
-
-def test_a_path_is_between_its_ends() -> None:
-    start, end = about(space_of([range(3)]), (MEAN, COVARIANCE)), Density(two_modes)
-    q = np.random.default_rng(19).standard_normal((20, 3))
-    for beta in (0.3, 1.0):
-        path = Tempered(start, end, beta)
-        found = path.columns(q, path.evaluate(q))[:, 0]
-        expected = (1 - beta) * start.log_density(q) + beta * two_modes(q)
-        np.testing.assert_allclose(found, expected)
-    path = Tempered(start, Density(lambda q: np.full(len(q), -np.inf)), 0.5)
-    assert (path.columns(q, path.evaluate(q))[:, 0] == -np.inf).all()
 
 
 # -- the reference ---------------------------------------------------------------------------------

@@ -1,10 +1,8 @@
-"""Importance sampling: draws, weights, diagnostics, whatever particles go through."""
+"""Importance sampling: draws, weights, diagnostics, and chains where weights do not suffice."""
 
 import json
 import warnings
 from dataclasses import replace
-from functools import partial
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,9 +10,16 @@ from scipy.special import logsumexp
 from scipy.stats import ks_2samp, kstest, kstwobign, norm
 
 from pbrl_ppl.effects import Effect, EffectParameter
-from pbrl_ppl.errors import ConvergenceWarning, RefitWarning
+from pbrl_ppl.errors import ConvergenceWarning, FitError, RefitWarning
 from pbrl_ppl.model import problem_in
-from pbrl_ppl.modes import Space, constrain, find_mode, trajectory_mode, unconstrain
+from pbrl_ppl.modes import (
+    Space,
+    adaptive_importance,
+    constrain,
+    find_mode,
+    trajectory_mode,
+    unconstrain,
+)
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.posterior import (
     MAX_PARETO_K,
@@ -33,7 +38,7 @@ from pbrl_ppl.posterior import (
 )
 from pbrl_ppl.sampling import fit, physics_model, update
 from pbrl_ppl.sampling.ensemble import Reference
-from pbrl_ppl.sampling.importance import anneal, draw_proposals, resample
+from pbrl_ppl.sampling.importance import draw_proposals, resample
 from pbrl_ppl.scene import Body, Scene, Shape, Wall
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
@@ -68,20 +73,15 @@ def quiet(function, *arguments, **options):
         return function(*arguments, **options)
 
 
-def no_weights(first, *_, **__):
+def no_weights(*arguments, **options):
     """Adaptive importance sampling without success."""
-    return SimpleNamespace(good=False), first
+    points, last = adaptive_importance(*arguments, **(options | {"most_batches": 2}))
+    return points._replace(good=False), last
 
 
-def test_proposals_along_trajectories_are_annealed(monkeypatch) -> None:
-    """Each particle is another one."""
+@pytest.fixture
+def without_weights(monkeypatch) -> None:
     monkeypatch.setattr("pbrl_ppl.sampling.importance.adaptive_importance", no_weights)
-    scene = pucks()
-    model = physics_model(scene, pushed(scene, trajectories=3, intervals=8), substeps=4)
-    mode = trajectory_mode(problem_in(model), problem_in(model).layout.to_vector(TRUTH))
-    pool = draw_proposals(Reference.about(Space.of(mode), mode), 400, 1)
-    assert len(np.unique(pool.q, axis=0)) > 200
-    assert np.isfinite(pool.log_z)
 
 
 @pytest.fixture(scope="module")
@@ -137,40 +137,24 @@ def simple():
     return mode, *grid_moments(problem, mode)
 
 
-#: Annealing whose weights never suffice: the engine moves the particles to the end.
-TO_THE_END = partial(anneal, worth=np.inf)
-
-#: What particles go through, or how often the engine must move them, by patches.
-ANNEALED = {"importance.adaptive_importance": no_weights}
-WAYS = {
-    "Gaussians": {},
-    "annealed": ANNEALED,
-    "annealed by engine moves": ANNEALED | {"importance.anneal": TO_THE_END},
-}
-
-
-@pytest.mark.parametrize("way", WAYS)
-def test_draws_have_the_moments_of_the_posterior(simple, monkeypatch, way) -> None:
-    """Drag and a scalar sigma against a grid, over 10 seeds, whatever particles go through.
+def test_draws_have_the_moments_of_the_posterior(simple) -> None:
+    """Drag and a scalar sigma against a grid, over 10 seeds.
 
     The sum of 10 squared standardised errors is chi-squared with 10 degrees of freedom: below 35.6
     but for 1e-4. The mean sd of 10 times about 500 draws has a standard error of 1 %. So has the
     log-evidence, whose mean is within 5 standard errors of ten: 1e-3 by Student's t.
     """
-    for name, value in WAYS[way].items():
-        monkeypatch.setattr(f"pbrl_ppl.sampling.{name}", value)
     mode, mean, sd, log_evidence = simple
     problem, errors, widths, evidences = mode.problem, [], [], []
     reference = Reference.about(Space.of(mode), mode)
     for seed in range(10):
-        pool = draw_proposals(reference, 750, [seed])
-        assert (pool.tempering_steps > 0) == way.endswith("engine moves")
+        pool, _ = draw_proposals(reference, 750, [seed])
         chosen, k, size = resample(pool.log_weight, 500, np.random.default_rng(seed))
         assert k < MAX_PARETO_K
         phi, sigma = reference.space.split(pool.q[chosen])
         first = unconstrain(problem.layout.priors[0], phi[:, 0])[0]
         q = np.stack([first, np.log(sigma[:, 0])], axis=1)
-        errors.append((q.mean(axis=0) - mean) / sd * np.sqrt(pool.independent_share * size))
+        errors.append((q.mean(axis=0) - mean) / sd * np.sqrt(size))
         widths.append(q.std(axis=0) / sd)
         evidences.append(pool.log_z)
     assert (np.square(errors).sum(axis=0) < 35.6).all(), errors
@@ -269,11 +253,8 @@ def shares(root, size, at=0.3) -> tuple[float, float, float]:
     return float((root > 0).mean()), expected, float(np.sqrt(expected * (1 - expected) / size))
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_two_modes_have_their_shares(twofold, monkeypatch, way) -> None:
+def test_two_modes_have_their_shares(twofold) -> None:
     """Over four seeds, each within 4 standard errors of the prior's share: false alarm 3e-4."""
-    for name, value in WAYS[way].items():
-        monkeypatch.setattr(f"pbrl_ppl.sampling.{name}", value)
     model, mode = twofold
     for seed in range(4):
         idata = quiet(fit, model, seed=seed, start=mode, **QUICK)
@@ -299,6 +280,48 @@ def test_chains_see_both_modes(twofold) -> None:
     root = draws(idata)["breeze_root"].ravel()
     found, expected, error = shares(root, convergence(idata)[1]["breeze_root[a]"])
     assert abs(found - expected) < 4 * error, (found, expected, error)
+
+
+@pytest.mark.usefixtures("without_weights")
+def test_chains_after_weights_see_both_modes(twofold) -> None:
+    """Within 4 standard errors of the prior's share: false alarm 6e-5; and they are told of."""
+    model, mode = twofold
+    idata = quiet(fit, model, seed=1, start=mode, **QUICK)
+    assert idata.attrs["method"] == "importance"
+    assert "chains" in idata.attrs["proposals"]
+    assert not {SIZE, PARETO_K, "log_evidence"} & set(idata.attrs)
+    assert idata.attrs["max_rhat"] < 1.05
+    root = draws(idata)["breeze_root"].ravel()
+    found, expected, error = shares(root, convergence(idata)[1]["breeze_root[a]"])
+    assert abs(found - expected) < 4 * error, (found, expected, error)
+    whole = quiet(fit, model, seed=2, resume=idata, **QUICK)
+    assert group(whole, "posterior").sizes["draw"] == 500
+
+
+@pytest.mark.usefixtures("without_weights")
+def test_chains_after_weights_along_trajectories(monkeypatch) -> None:
+    """They have the moments of weighted draws, with two noises."""
+    scene = pucks()
+    model = physics_model(
+        scene, pushed(scene, trajectories=3, intervals=8), substeps=4, likelihood="trajectories"
+    )
+    mode = trajectory_mode(problem_in(model), problem_in(model).layout.to_vector(TRUTH))
+    chains = quiet(fit, model, seed=1, start=mode, **QUICK)
+    assert "chains" in chains.attrs["proposals"]
+    monkeypatch.setattr("pbrl_ppl.sampling.importance.adaptive_importance", adaptive_importance)
+    weighted = quiet(fit, model, seed=2, start=mode, **QUICK)
+    assert weighted.attrs[PARETO_K] < MAX_PARETO_K
+    agree(weighted, chains)
+
+
+def test_proposals_without_density_are_an_error(model, mode, monkeypatch) -> None:
+    def nothing(*arguments, **options):
+        points, last = no_weights(*arguments, **options)
+        return points._replace(log_weight=np.full(len(points.q), -np.inf)), last
+
+    monkeypatch.setattr("pbrl_ppl.sampling.importance.adaptive_importance", nothing)
+    with pytest.raises(FitError, match=r"the model gives none of .* start from another mode"):
+        fit(model, seed=1, start=mode, **QUICK)
 
 
 def test_more_draws_keep_both_modes(twofold) -> None:
@@ -472,9 +495,7 @@ def test_diagnostics(model, mode, fitted, tmp_path) -> None:
     attrs = fitted.attrs
     assert attrs["method"] == "importance"
     assert attrs[PARETO_K] < MAX_PARETO_K
-    assert (attrs["proposals"], attrs["rungs"], attrs["acceptance"]) == (
-        "Gaussians at the modes", 0, 1.0,
-    )  # fmt: skip
+    assert attrs["proposals"] == "Gaussians at the modes"
     assert np.isfinite(attrs["log_evidence"])
     assert attrs["min_ess"] <= attrs[SIZE] <= 1000
     assert "log_likelihood" not in attrs
@@ -488,8 +509,8 @@ def test_diagnostics(model, mode, fitted, tmp_path) -> None:
     assert dict(loaded.attrs) == dict(attrs)
     record = PosteriorRecord.of(loaded)
     assert (record.pareto_k, record.importance_ess) == (attrs[PARETO_K], attrs[SIZE])
-    assert (record.proposals, record.rungs) == (attrs["proposals"], attrs["rungs"])
-    assert (record.acceptance, record.log_evidence) == (attrs["acceptance"], attrs["log_evidence"])
+    assert record.proposals == attrs["proposals"]
+    assert record.log_evidence == attrs["log_evidence"]
 
 
 def test_no_parameter_is_worth_more_than_the_weights(fitted) -> None:
@@ -511,18 +532,6 @@ def test_weights_of_which_one_is_all_have_an_infinite_tail() -> None:
     weights, k = smoothed(np.random.default_rng(1).normal(-4e4, 8e3, 84))
     assert k == np.inf
     assert np.isfinite(weights).all() and weights.max() == pytest.approx(1.0)
-
-
-def test_engine_moves_are_counted(model, mode, monkeypatch) -> None:
-    """Where weights do not suffice the engine moves the particles, which then weigh alike."""
-    monkeypatch.setattr("pbrl_ppl.sampling.importance.adaptive_importance", no_weights)
-    monkeypatch.setattr("pbrl_ppl.sampling.importance.anneal", TO_THE_END)
-    idata = quiet(fit, model, seed=1, start=mode, **QUICK)
-    assert idata.attrs["rungs"] >= 1
-    assert 0.0 < idata.attrs["acceptance"] <= 1.0
-    assert idata.attrs[PARETO_K] == 0.0
-    assert np.ptp(group(idata, "sample_stats")["log_weight"].values) == 0.0
-    assert 300 < idata.attrs[SIZE] < 1000
 
 
 def test_too_few_draws(model, mode) -> None:
