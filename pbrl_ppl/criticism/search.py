@@ -447,7 +447,10 @@ class Search:
             elif share(now, mode, weight) < least_share or far_out(mode, key) >= most:
                 continue
             top = max(top, gain)
-            if gain >= (least if len(key) >= len(laws) else 0.0):
+            needed = least if len(key) >= len(laws) else 0.0
+            if len(key) == len(laws) and len(mode.phi) < len(now.phi):
+                needed = -least  # of two that are nearly as good the simpler one
+            if gain >= needed:
                 good.append((gain, mode))
         near = [one for one in good if one[0] > top - least]
         if not near:
@@ -683,9 +686,14 @@ def _weightless(mode: Mode, law: Attached, *, least: float = 0.9) -> str:
 
 
 def _are_alike(law: Attached, other: Attached) -> bool:
-    """Return whether another law is of an unusual law's family: their grid points say little."""
-    family = law.effect.family if law.effect.unusual else ""
-    return bool(family) and other != law and (family, law.body) == (other.effect.family, other.body)
+    """Return whether another law is a simpler one of a law's family, or any of an unusual law's.
+
+    What an unusual law's grid points promise says little.
+    """
+    of, kin = law.effect, other.effect
+    if other == law or not of.family or (of.family, law.body) != (kin.family, other.body):
+        return False
+    return bool(of.unusual) or len(other.labels) < len(law.labels)
 
 
 def _structures(subset: Subset) -> set[Attached]:
