@@ -436,7 +436,7 @@ class Search:
         """Return the best of some models, of those nearly as good the smallest; or the same."""
         table, now, laws = climb.table, climb.mode, frozenset(climb.laws)
         least, most = self.criteria.search.least_nats, self.criteria.far_out
-        good = list[tuple[float, Mode]]()
+        good = list[tuple[float, Mode, float]]()
         in_parallel(lambda key: table.fitted(now, key, moves[key]), moves)
         weight, here, top = table.weight, table.value(now), 0.0
         for key in moves:
@@ -451,17 +451,17 @@ class Search:
             if len(key) == len(laws) and len(mode.phi) < len(now.phi):
                 needed = -least  # of two that are nearly as good the simpler one
             if gain >= needed:
-                good.append((gain, mode))
+                good.append((gain, mode, needed))
         near = [one for one in good if one[0] > top - least]
         if not near:
             return now
-        _, mode = min(near, key=lambda one: (len(one[1].phi), -one[0]))
+        _, mode, needed = min(near, key=lambda one: (len(one[1].phi), -one[0]))
         # friction makes the top rough: the better model may only have been climbed from elsewhere
         kept = {law: sizes_of(now, law) for law in laws}
         again = refit(mode, now.problem.physics.effects, kept)
         if table.value(again) > here:
             table.modes[laws] = climb.mode = again
-            if table.value(mode) - table.value(again) < least:
+            if table.value(mode) - table.value(again) < needed:
                 return again
         if new := {*table.laws(mode)} - laws:
             self.say(f"simulations name {' and '.join(map(_name, new))}")
