@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from pbrl_ppl.agents.agent import Agent, AgentOptions, Revision, Task
-from pbrl_ppl.criticism import DEFAULT, Search, Table, share, sizes_of
+from pbrl_ppl.criticism import DEFAULT, Search, Table, are_alike, share, sizes_of
 from pbrl_ppl.effects import Attached, Effect, Structure, attach, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, FitError, UninformedWarning
@@ -86,8 +86,14 @@ def revise(
     begin = {law: sizes_of(mode, law) for law in before}
     found = Search(missing, replace(DEFAULT, search=limits))(highest(()), begin).laws
     table = Table(problem.physics.effects, max(len(every), 1))
-    table.modes |= {frozenset(laws): highest(laws) for laws in (found, before)}
-    laws = [*max(found, before, key=lambda laws: table.value(highest(laws)))]
+    simpler = [
+        {*found, kin} - {law} for law in found for kin in every.values() if are_alike(law, kin)
+    ]
+    sets = {frozenset(laws): highest(laws) for laws in (found, before, *simpler)}
+    table.modes |= sets
+    top = max(map(table.value, sets.values()))
+    near = [laws for laws, mode in sets.items() if table.value(mode) > top - least]
+    laws = [*min(near, key=lambda laws: len(sets[laws].phi))]
     while laws:  # from many starts: a local climb may end too low to do without a law
         for key in (laws, *([one for one in laws if one != law] for law in laws)):
             table.modes.setdefault(frozenset(key), highest(key))

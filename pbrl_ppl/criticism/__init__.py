@@ -44,6 +44,7 @@ from .score import Signature as Signature
 from .score import rank_candidates as rank_candidates
 from .score import same_physics as same_physics
 from .search import Search as Search
+from .search import are_alike as are_alike
 from .table import Table as Table
 from .table import share as share
 from .table import sizes_of as sizes_of

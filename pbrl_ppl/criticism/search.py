@@ -422,7 +422,7 @@ class Search:
                 one for one in instead.subsets
                 if one.nats > 0.5 * max(own, 0.0) and not same & {*one.laws}
             ]  # fmt: skip
-            alike = [one for one in instead.subsets if _are_alike(law, *one.laws)]
+            alike = [one for one in instead.subsets if are_alike(law, *one.laws)]
             for one in (*swaps[: self.criteria.search.singles], *alike):
                 moves.setdefault(rest | {*one.laws}, one.sizes)
         return self._best(climb, moves, 0.0)
@@ -685,7 +685,7 @@ def _weightless(mode: Mode, law: Attached, *, least: float = 0.9) -> str:
     )
 
 
-def _are_alike(law: Attached, other: Attached) -> bool:
+def are_alike(law: Attached, other: Attached) -> bool:
     """Return whether another law is a simpler one of a law's family, or any of an unusual law's.
 
     What an unusual law's grid points promise says little.
