@@ -55,15 +55,14 @@ cart
 # ### The search
 #
 # Trajectories are simulated without process noise, in pieces of four rows, then longer ones. At
-# each length one linear regression gives the best subset of each size, from one to three laws: its
-# evidence after its price (nats), and the simulation error with these laws over that without. The
-# best are refitted. Common laws are tried first, unusual ones only if these leave more than noise.
+# each length one linear regression proposes the best subsets of one to three laws, and the best are
+# refitted. Common laws are tried first, unusual ones only if these leave more than noise.
 
 # %%
 for length in cart.search:
+    errors = ", ".join(f"{name} {error:.3g}" for name, error in length.error.items())
     print(f"pieces of {length.seconds:.2g} s: added {', '.join(length.accepted) or 'nothing'}")
-    for best in length.path:
-        print(f"  {best.nats:8.0f} nats, error x {best.error:.3f}: {', '.join(best.laws)}")
+    print(f"  error before: {errors}")
 
 # %% [markdown]
 # ### The candidates

@@ -244,7 +244,7 @@ def held_out_in_words(loop: Loop) -> str:
     said = said or error(before)
     said += f" {UNITS[name]}" * bool(np.isfinite(last))
     if loop.added and 0.0 < after < before < np.inf:
-        said += f", {100 * (1 - after / before):.0f} % less"
+        said += f", {100 * (1 - after / before):.3g} % less"
     seconds, start = loop.rollout_seconds, "ahead"
     if whole and loop.held_out is not None:
         rows = int(loop.held_out.dataset["n_rows"].max()) - 1

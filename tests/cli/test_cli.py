@@ -85,7 +85,8 @@ def test_close_loop(files: Path, calls: list[Any], capsys: pytest.CaptureFixture
         "  linear drag on the cart (a force against the motion that grows with the speed):"
         " coefficient 3.00 kg/s (94 % interval 2.81 to 3.19); these data cannot tell it from"
         " quadratic drag",
-        "Held-out error of x 2.00 s ahead: 0.0192 -> 0.00816 m (noise floor 0.00800 m).",
+        "Held-out error of x 2.00 s ahead: 0.0192 -> 0.00816 m, 57.5 % less (noise floor"
+        " 0.00800 m).",
         "  The revised model passes all 2 tests of its residual.",
         "Next: pbrl-ppl suggest a/out/after.nc -o next.csv: a recording that tells these effects"
         " apart.",
@@ -102,6 +103,17 @@ def test_close_loop(files: Path, calls: list[Any], capsys: pytest.CaptureFixture
     assert train.n_transitions == test.n_transitions == 4
     assert options.pop("catalogue") == catalogue
     assert options == {"seed": 1, "draws": None, "method": "importance", "most_transitions": 3000}
+
+
+@pytest.mark.parametrize(("chosen", "unusual"), [("common", False), ("all", True)])
+def test_close_loop_chooses_the_laws(files: Path, calls: list[Any], chosen, unusual) -> None:
+    """Common laws alone, or all of them as if they were common."""
+    argv = ["close-loop", "scene.toml", "train.csv", "-o", "a/out", "-q", "--catalogue", chosen]
+    assert main(argv) == 0
+    given = calls[0][-1]["catalogue"]
+    assert not any(effect.unusual for effect in given)
+    names = [effect.name for effect in catalogue if unusual or not effect.unusual]
+    assert [effect.name for effect in given] == names
 
 
 def test_a_status_line_has_the_stage_and_the_time_elapsed(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -209,13 +209,9 @@ def test_three_commands_from_a_recording_to_criticism(
     printed = " ".join(capsys.readouterr().out.split())
     shortest = simulated["rungs"][0]
     assert shortest["accepted"] == ["linear_drag on puck"] and simulated["rejected"] == {}
-    best = shortest["path"][0]
-    assert best["laws"] == ["linear_drag on puck"]
     for said in (
-        f"s, intervals: {shortest['rows']} laws nats error relative to none",
-        f"linear_drag on puck {best['nats']:.1f} {best['error']:.3f}",
-        "accepted: linear_drag on puck dropped: none",
-        "linear_drag puck main",
+        f"s, intervals: {shortest['rows']} accepted: linear_drag on puck dropped: none",
+        "linear_drag puck",
         "simulation error over 0.5 s",
     ):
         assert said in printed

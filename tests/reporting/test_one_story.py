@@ -247,7 +247,7 @@ def test_the_error_far_ahead_is_of_the_dimension_that_changed_most() -> None:
     findings = made_up()
     far = findings.before.rollout_rmse | {"theta": 0.3}
     findings = replace(findings, before=replace(findings.before, rollout_rmse=far))
-    said = "Held-out error of theta 2.00 s ahead: 0.300 -> 0.0163 rad, 95 % less"
+    said = "Held-out error of theta 2.00 s ahead: 0.300 -> 0.0163 rad, 94.6 % less"
     assert f"{said} (noise floor 0.0160 rad)." in in_brief(findings, "out")
 
 
