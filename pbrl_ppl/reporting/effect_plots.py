@@ -1,4 +1,4 @@
-"""Plots of effects: their search, scores, posteriors and evidence; residual forces."""
+"""Plots of effects: their scores and posteriors; residual forces."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from scipy.stats import chi2
 from pbrl_ppl.criticism import Loop
 from pbrl_ppl.posterior import scalars
 from pbrl_ppl.reporting import style
-from pbrl_ppl.reporting.evidence import Evidence, Law, bin_means
+from pbrl_ppl.reporting.residual_force import Law, bin_means
 from pbrl_ppl.reporting.words import plain
 from pbrl_ppl.scene import units_of
 from pbrl_ppl.state import Floats
@@ -104,31 +104,6 @@ def _mark_null(axes: Axes, null: float, mean: float, sd: float) -> None:
     axes.annotate(text, (x, 0.93), xycoords="axes fraction", ha=side, fontsize=8)
 
 
-def plot_evidence(evidence: Evidence, width: float = style.WIDE) -> Figure:
-    """Plot the gain of log-likelihood by measured number, speed, place, time and contact."""
-    figure, panels = style.blank_figure(width, 8.0 / 3, 6, 2)
-    gains, body = evidence.by_transition, evidence.body
-    sums = dict(list(evidence.by_cell.items())[:12])
-    values = list(sums.values())
-    style.bars(panels[0], list(sums), values, [_colour(value) for value in values])
-    panels[0].grid(visible=False, axis="y")
-    style.name_axes(panels[0], "by what was measured", "gain in all (nats)")
-    along = {f"speed of {body}": (evidence.speed, "m/s"),
-             "time in the trajectory": (evidence.time, "s")}  # fmt: skip
-    for axes, (name, (x, unit)) in zip(panels[1:], along.items(), strict=False):
-        _means(axes, x, gains, "o-")
-        style.name_axes(axes, f"by {name}", f"{name} ({unit})", "gain a transition (nats)")
-    _in_place(figure, panels[3], evidence)
-    _by_contact(panels[4], evidence)
-    _shares(panels[5], evidence)
-    return figure
-
-
-def _colour(gain: float) -> str:
-    """Return the colour of a gain of the revised model, or of a loss."""
-    return style.AFTER if gain >= 0 else style.BEFORE
-
-
 def _means(axes: Axes, x: Floats, y: Floats, marks: str) -> None:
     """Draw the means of y in bins of x, with two standard errors."""
     bins = bin_means(x, y)
@@ -137,46 +112,6 @@ def _means(axes: Axes, x: Floats, y: Floats, marks: str) -> None:
         markersize=4, linewidth=1.2, label="mean ± 2 se",
     )  # fmt: skip
     style.zero_line(axes)
-
-
-def _in_place(figure: Figure, axes: Axes, evidence: Evidence) -> None:
-    gains = evidence.by_transition
-    edge = max(float(np.quantile(np.abs(gains), 0.98)), 1e-9)  # a few would hide the rest
-    order = np.argsort(np.abs(gains))
-    x, y = evidence.position[order].T
-    points = axes.scatter(
-        x, y, c=gains[order], s=12, cmap="coolwarm_r", vmin=-edge, vmax=edge, edgecolors="#555555",
-        linewidths=0.3,
-    )  # fmt: skip
-    figure.colorbar(points, ax=axes, shrink=0.85, label="gain (nats)")
-    axes.axis("equal")
-    style.name_axes(axes, f"by place of {evidence.body}", "x (m)", "y (m)")
-
-
-def _by_contact(axes: Axes, evidence: Evidence) -> None:
-    groups = {"free": ~evidence.touching, "touching": evidence.touching}
-    for place, which in enumerate(groups.values()):
-        if which.any():
-            mean = evidence.by_transition[which].mean()
-            axes.bar(place, mean, width=0.6, color=_colour(mean))
-    names = [f"{name}\n{which.sum()} transitions" for name, which in groups.items()]
-    axes.set_xticks([0, 1], names)
-    style.zero_line(axes)
-    axes.set_xlim(-0.6, 1.6)
-    style.name_axes(axes, "by contact", y="gain a transition (nats)")
-
-
-def _shares(axes: Axes, evidence: Evidence) -> None:
-    gains = np.sort(np.maximum(evidence.by_transition, 0.0))[::-1]
-    shares = 100 * np.cumsum(np.r_[0.0, gains]) / max(float(gains.sum()), 1e-300)
-    count = len(evidence.carriers())
-    at = (100 * count / len(gains), 80)
-    axes.plot(np.linspace(0, 100, len(shares)), shares, color=style.AFTER)
-    axes.plot([0, 100], [0, 100], color=style.PLAIN, linestyle=":", linewidth=1)
-    axes.plot(*at, "o", color=style.BEFORE)
-    style.label(axes, f"{count} transitions\nhold 80 %", at, (8, -24))
-    x = "transitions, largest gain first (%)"
-    style.name_axes(axes, "by transition", x, "share of the gains (%)")
 
 
 def plot_laws(laws: Sequence[Law], width: float = style.WIDE) -> Figure:

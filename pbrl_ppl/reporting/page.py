@@ -17,10 +17,10 @@ from matplotlib.figure import Figure
 from pbrl_ppl.reporting import (
     effect_plots,
     error_plots,
-    evidence,
     motion,
     posterior_plots,
     posterior_summary,
+    residual_force,
     scene_plots,
     tables,
     words,
@@ -28,8 +28,8 @@ from pbrl_ppl.reporting import (
 from pbrl_ppl.reporting.style import NARROW, WIDE, png
 
 _MODULES = (
-    words, tables, evidence, motion, posterior_summary, effect_plots, error_plots, posterior_plots,
-    scene_plots,
+    words, tables, residual_force, motion, posterior_summary, effect_plots, error_plots,
+    posterior_plots, scene_plots,
 )  # fmt: skip
 
 

@@ -30,7 +30,6 @@ LOOP_SECTIONS = (
     Section("rollout"),
     Section("scene", "The scene and the recording", "Scene"),
     Section("search", "Search for missing laws", "Search"),
-    Section("evidence", "Evidence for the added effects", "Evidence"),
     Section("unexplained", "The unexplained residual", "Unexplained"),
     Section("errors", "Errors on held-out recordings", "Errors"),
     Section("tests", "Residual tests", "Residual tests"),

@@ -13,7 +13,6 @@ from pbrl_ppl.criticism import Candidate, Errors, Loop, SearchLength
 from pbrl_ppl.effects import Sensor
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.posterior import Comparison, Identifiability, interval, scalars
-from pbrl_ppl.reporting.evidence import Evidence
 from pbrl_ppl.reporting.posterior_summary import Parameters, prior_draws
 from pbrl_ppl.reporting.style import UNITS
 from pbrl_ppl.reporting.words import (
@@ -266,24 +265,6 @@ def search_table(loop: Loop) -> Table:
     }
     words = ("Error before", "Accepted", "Dropped")
     return tabulate("The search by length of pieces", loop.search, columns, words)
-
-
-def carrier_table(evidence: Evidence, most: int = 8) -> Table:
-    """Tabulate the transitions that carry most of the evidence."""
-    shown = np.argsort(-evidence.by_transition, kind="stable")[:most].tolist()
-    columns: dict[str, Callable[[int], Cell]] = {
-        "Trajectory": lambda i: str(evidence.trajectory[i]),
-        "Time (s)": lambda i: f"{evidence.time[i]:.4g}",
-        "Gain (nats)": lambda i: number(evidence.by_transition[i]),
-        "Mostly in": lambda i: evidence.names[int(np.argmax(evidence.nats[i]))],
-        "Speed (m/s)": lambda i: number(evidence.speed[i]),
-        "Force x (N)": lambda i: number(evidence.wrench[i, 0]),
-        "Force y (N)": lambda i: number(evidence.wrench[i, 1]),
-        "Torque (N m)": lambda i: number(evidence.wrench[i, 2]),
-        "Touching": lambda i: yes_or_no(evidence.touching[i]),
-    }
-    caption = f"The {len(shown)} transitions with most evidence"
-    return tabulate(caption, shown, columns, {"Mostly in", "Touching"})
 
 
 def parameter_table(parameters: Parameters) -> Table:

@@ -43,7 +43,7 @@ def test_page_stands_alone(verdict: str) -> None:
 @pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning")
 def test_page_plays_the_held_out_motions() -> None:
     for loop, models in ((revised(), ["before", "after"]), (unexplained(), ["before"])):
-        stands_alone(html := render(loop), pictures=11 if len(models) == 2 else 10)
+        stands_alone(html := render(loop), pictures=10)
         motion = Page(html).motion
         assert motion["models"] == models
         assert len(motion["motions"]) == 6

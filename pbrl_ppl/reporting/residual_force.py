@@ -1,122 +1,15 @@
-"""Evidence for added effects, and residual forces against recorded quantities."""
+"""Residual forces against recorded quantities."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from pbrl_ppl.criticism import QUANTITIES, Loop, recorded_quantities
 from pbrl_ppl.likelihood import FilteredProblem
-from pbrl_ppl.modes import FilteredMode
-from pbrl_ppl.state import STATE, Bools, Floats, Ints, acceleration_unit
-
-
-@dataclass(frozen=True, eq=False)
-class Evidence:
-    """Log-likelihood that the added effects gain, by measured number of the fitted recording.
-
-    Parameters
-    ----------
-    nats : ndarray
-        Log-likelihood that each measured number gains given those before it, shape (transition,
-        coordinate), each model with its noise, at its mode, whole trajectories filtered.
-    names : tuple of str
-        Names of the observed coordinates: dimension and, with several bodies, body.
-    body : str
-        Body of the first added effect, to which ``speed`` and ``position`` belong.
-    speed : ndarray
-        Speed of the body at the transition's start (m/s), shape (transition,).
-    position : ndarray
-        Position of the body (m), shape (transition, 2).
-    time : ndarray
-        Time since the trajectory's first row (s), shape (transition,).
-    touching : ndarray of bool
-        Whether bodies touch, shape (transition,).
-    trajectory : ndarray of str
-        Label of the trajectory, shape (transition,).
-    wrench : ndarray
-        Command on the body (N, N, N m), shape (transition, 3).
-    """
-
-    nats: Floats
-    names: tuple[str, ...]
-    body: str
-    speed: Floats
-    position: Floats
-    time: Floats
-    touching: Bools
-    trajectory: NDArray[np.str_]
-    wrench: Floats
-
-    @property
-    def by_transition(self) -> Floats:
-        """Gain of each transition (nats), shape (transition,)."""
-        return np.asarray(self.nats.sum(axis=1))
-
-    @property
-    def by_cell(self) -> dict[str, float]:
-        """Gain by observed coordinate (nats), largest first."""
-        sums = zip(self.names, self.nats.sum(axis=0).tolist(), strict=True)
-        return dict(sorted(sums, key=lambda item: -item[1]))
-
-    def carriers(self, share: float = 0.8) -> Ints:
-        """Return the fewest transitions that hold this share of the gains, largest first."""
-        gains = self.by_transition
-        order = np.argsort(-gains, kind="stable")
-        total = np.cumsum(np.maximum(gains[order], 0.0))
-        if total[-1] <= 0:
-            return order[:0]
-        return order[: int(np.searchsorted(total, share * total[-1])) + 1]
-
-
-def find_evidence(loop: Loop) -> Evidence | None:
-    """Return the gain of the revised model by measured number.
-
-    None where nothing was added.
-    """
-    before, last = loop.innovations
-    if last is before:
-        return None
-    after = last.problem
-    nats = _log_density(last) - _log_density(before)
-    noise, segments = after.likelihood.noise, after.segments
-    moving = [body.name for body in after.scene.moving]
-    body = loop.added[0].body
-    index = moving.index(body)
-    places = np.divmod(noise.coordinates.places, len(STATE))
-    seen = set(places[0].tolist())
-    states = segments.start[:, index]
-    labels = after.data.history.dataset["trajectory"].to_numpy().astype(str)
-    return Evidence(
-        nats=nats,
-        names=tuple(
-            STATE[cell] if len(seen) == 1 else f"{STATE[cell]} of {moving[which]}"
-            for which, cell in zip(*places, strict=True)
-        ),
-        body=body,
-        speed=np.hypot(states[:, 3], states[:, 4]),
-        position=states[:, :2],
-        time=np.asarray(segments.step * after.scene.time_step),
-        touching=noise.touching,
-        trajectory=labels[segments.trajectory],
-        wrench=segments.actions[:, 0, index],
-    )
-
-
-def _log_density(mode: FilteredMode) -> Floats:
-    """Return the log-likelihood of each measured number given those before it."""
-    problem, phi, sigma = mode.problem, mode.phi, mode.sigma
-    noise = problem.likelihood.noise
-    cells = -0.5 * problem.robust(phi, sigma) ** 2 - np.log(noise.scale(sigma))
-    whole = problem.log_density(problem.residual(phi), sigma, phi)
-    # the density's constant, shared evenly
-    rest = (whole - np.where(noise.seen, cells, 0.0).sum(axis=1))[:, None]
-    rest = rest / np.maximum(noise.seen.sum(axis=1, keepdims=True), 1)
-    return np.where(noise.seen, cells + rest, 0.0)
+from pbrl_ppl.state import STATE, Floats, acceleration_unit
 
 
 class Bins(NamedTuple):

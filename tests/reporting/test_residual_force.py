@@ -1,4 +1,4 @@
-"""Where the evidence is, which law is wanted, and the motions that a report plays."""
+"""Which law is wanted, and the motions that a report plays."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -10,47 +10,20 @@ from pbrl_ppl.criticism.dependence import FEATURES, PRODUCTS
 from pbrl_ppl.criticism.results import Unexplained, diverged_after
 from pbrl_ppl.history import History
 from pbrl_ppl.modes import trajectory_mode
-from pbrl_ppl.posterior import Fit, compare
-from pbrl_ppl.reporting import render
-from pbrl_ppl.reporting.effect_plots import plot_evidence, plot_laws
-from pbrl_ppl.reporting.evidence import bin_means, find_evidence, find_laws
+from pbrl_ppl.posterior import Fit
+from pbrl_ppl.reporting.effect_plots import plot_laws
 from pbrl_ppl.reporting.motion import animation, distance, divergence_in_words, held_out_motions
+from pbrl_ppl.reporting.residual_force import bin_means, find_laws
 from pbrl_ppl.sampling import fit, physics_model
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.free_puck import DISC, Disc
-from tests.helpers.html import Page
 from tests.helpers.made_up import made_up
 from tests.helpers.revised import DRAG, diverging, recordings, revised, unexplained
 
 pytestmark = pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning")
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_evidence_adds_up_and_is_where_the_drag_is() -> None:
-    findings = revised()
-    evidence = find_evidence(findings)
-    gain = compare(findings.posterior_before, findings.posterior_after).elpd_difference
-    assert evidence.nats.shape == (72, 6)
-    assert evidence.nats.sum() == pytest.approx(
-        gain, rel=0.1
-    )  # of the most probable draws, not left out
-    assert sum(evidence.by_cell.values()) == pytest.approx(evidence.nats.sum())
-    assert set(list(evidence.by_cell)[:2]) == {"vx", "vy"}
-    # a drag is seen where the puck is fast
-    fast = evidence.speed > np.median(evidence.speed)
-    assert evidence.by_transition[fast].mean() > 1.4 * evidence.by_transition[~fast].mean()
-    carriers = evidence.carriers()
-    gains = np.maximum(evidence.by_transition, 0.0)
-    assert gains[carriers].sum() >= 0.8 * gains.sum() > gains[carriers[:-1]].sum()
-    assert not evidence.touching.any()
-    assert evidence.trajectory[12] == "1" and evidence.time[12] == 0.0
-    assert f"{evidence.nats.sum():,.0f} nats likelier" in Page(render(findings)).text
-    assert len(plot_evidence(evidence).axes) == 7  # with the map's scale
-
-
-def test_no_evidence_where_nothing_was_added_or_recorded() -> None:
-    assert find_evidence(unexplained()) is None
-    assert find_evidence(made_up()) is None
+def test_no_law_where_nothing_is_unexplained_or_recorded() -> None:
     assert find_laws(revised()) == []
     assert find_laws(made_up("unexplained")) == []
 
