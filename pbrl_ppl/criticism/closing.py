@@ -537,7 +537,7 @@ def _verdict(
         return UNEXPLAINED, Unexplained("", "", NOTHING_RECORDED, 0.0, float("nan"), found.doubt)
     worse = after.normalised_rmse > (1.0 + criteria.negligible) * max(before.normalised_rmse, 1.0)
     if laws and worse:
-        unexplained = unexplained or _worse(before, after)
+        unexplained = _worse(before, after)
     if not converged:
         return NOT_CONVERGED, unexplained
     if (laws and worse) or (unexplained is not None and not (laws and misfit.predicts(criteria))):

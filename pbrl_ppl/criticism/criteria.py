@@ -45,13 +45,12 @@ class SearchCriteria:
         laws found are refitted to all.
     refits, singles : int
         Best subsets that are refitted in a round, and single laws beside them.
-    exceeds : float
-        Unusual laws are tried where common ones leave more than this many times the error on the
-        shortest pieces, on the longest ones.
     promise : float
-        And where one of them takes this share of that error off to first order.
+        Unusual laws are tried where one of them takes this share of what common ones leave beyond
+        the noise off, to first order.
     complete : float
-        Unusual laws are added where they leave less than this many times that error.
+        They are added where they leave less than this many times the error on the shortest pieces,
+        on the longest ones, and common laws more.
     incomplete : float
         Or less than this share of the error that common laws leave.
     """
@@ -64,7 +63,6 @@ class SearchCriteria:
     pieces: int = 4
     refits: int = 4
     singles: int = 2
-    exceeds: float = 1.03
     promise: float = 0.4
     complete: float = 1.15
     incomplete: float = 1 / 3

@@ -92,7 +92,7 @@ def each_grid_point(
         phi = np.zeros((len(points), enlarged.layout.size))
         phi[:, declared] = mode.phi
         phi[:, places] = points
-        return -np.nan_to_num(enlarged.whitened(phi, mode.sigma)).reshape(len(points), -1)
+        return -enlarged.whitened(phi, mode.sigma).reshape(len(points), -1)
 
     free = np.isnan(proposed)
     steps = 1e-3 * np.array([parameter.prior.scale for parameter in effect.parameters])
@@ -114,6 +114,7 @@ def each_grid_point(
                 signature = ((ends[:, 0] - ends[:, 1]) / width[:, None]).T
             else:
                 signature = (states[rows] - states[0]).T
+            signature = np.nan_to_num(signature, posinf=0.0, neginf=0.0)  # where it diverged
             if np.any(signature):
                 yield GridPoint(values, signature, columns)
 

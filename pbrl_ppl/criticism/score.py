@@ -249,14 +249,20 @@ def _slopes(mode: Mode, attached: Attached | None = None) -> Floats:
     lower, upper = (bound[new] for bound in box(layout.priors))  # a mass of 0 is at the end
     begin = 1e-3 * np.array([layout.priors[place].scale for place in new])
 
+    diverged = np.zeros(mode.whitened_residual.size, dtype=bool)
+
     def predict(points: Floats, problem: Problem = enlarged) -> Floats:
         phi = np.tile(null, (len(points), 1))
         phi[:, new] = points
-        return -np.nan_to_num(problem.whitened(phi, mode.sigma)).reshape(len(points), -1)
+        white = problem.whitened(phi, mode.sigma).reshape(len(points), -1)
+        diverged[~np.isfinite(white).all(axis=0)] = True
+        return -np.nan_to_num(white)
 
     coarse = partial(predict, problem=enlarged.coarse)
     # beyond the distance that supports keep from their ends, or both ends would be one
-    return posterior_slopes(predict, null[new], lower, upper, begin, coarse, least=1e-2)
+    slopes = posterior_slopes(predict, null[new], lower, upper, begin, coarse, least=1e-2)
+    slopes[diverged] = 0.0
+    return slopes
 
 
 @dataclass(frozen=True, eq=False)

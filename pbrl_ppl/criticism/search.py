@@ -18,7 +18,16 @@ from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.results import Law, SearchLength, Stage
 from pbrl_ppl.criticism.score import Library, Signature, named_beside
 from pbrl_ppl.criticism.subsets import Regression, Subset, best_subsets
-from pbrl_ppl.criticism.table import Table, far_out, informed, refit, share, sizes_of, weights
+from pbrl_ppl.criticism.table import (
+    Table,
+    far_out,
+    informed,
+    moving,
+    refit,
+    share,
+    sizes_of,
+    weights,
+)
 from pbrl_ppl.effects import Attached, Structure
 from pbrl_ppl.history import History, drawn_pieces
 from pbrl_ppl.likelihood import Problem, in_pieces, is_filtered, is_independent, is_simulated
@@ -211,7 +220,7 @@ class Search:
         common = best = self._climbed(short, lengths, laws or {}, unusual=single)
         hypotheses: Mapping[Attached, float] = {}
         several = mode.problem.data.history.n_trajectories > 1 and not single
-        if several and common.excess > limits.exceeds:
+        if several and common.excess > limits.complete:
             promise, hypotheses = self._promised(common)
             if promise > limits.promise:
                 self.say("common laws leave more than the noise: trying unusual ones")
@@ -233,7 +242,7 @@ class Search:
         limits, alone, best = self.criteria.search, dict[Attached, float](), 0.0
         for mode in common.modes[::-1]:
             beyond = 1.0 - 1.0 / max(common.excess_of(mode), 1.0)
-            if beyond < 1.0 - 1.0 / limits.exceeds or best > limits.promise:
+            if beyond < 1.0 - 1.0 / limits.complete or best > limits.promise:
                 break
             laws = common.table.laws(mode)
             library, now = self._library(mode, laws), 0.0
@@ -343,7 +352,9 @@ class Search:
         if is_simulated_mode(mode):
             mode = corrected(mode)
             white = (1.0,) * len(mode.problem.likelihood.tau)
-            mode = replace(mode, problem=mode.problem.with_likelihood(tau=white))
+            # rounding of what does not move is no error of a law
+            sigma = np.where(moving(mode), mode.sigma, np.inf)
+            mode = replace(mode, problem=mode.problem.with_likelihood(tau=white), sigma=sigma)
         return Library(mode, laws, self.criteria)
 
     def _improve(self, climb: _Climb, rounds: int = 8) -> None:

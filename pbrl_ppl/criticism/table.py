@@ -15,19 +15,29 @@ from pbrl_ppl.scene import state_sizes
 from pbrl_ppl.state import Bools, Floats
 
 
-def weights(mode: Mode, *, still: float = 1e-4) -> Floats:
-    """Return the effective number of measurements of each dimension, shape (state,).
-
-    ``still``: a dimension that moves by less than this share of its natural size counts for none.
-    """
+def moving(mode: Mode, *, still: float = 1e-4) -> Bools:
+    """Return which dimensions move by more than a share of their natural size, shape (state,)."""
     observations = mode.problem.observations
     natural = state_sizes(mode.problem.scene)[list(observations.columns)]
-    moves = np.nanstd(observations.values, axis=(0, 1, 2)) > still * natural
+    return np.asarray(np.nanstd(observations.values, axis=(0, 1, 2)) > still * natural)
+
+
+def weights(mode: Mode) -> Floats:
+    """Return the effective number of measurements of each dimension, shape (state,).
+
+    A dimension that does not move counts for none.
+    """
+    observations = mode.problem.observations
     counts = mode.problem.likelihood.counts(observations)
     if is_independent(mode.problem):  # few transitions can be followed by the parameters
         followed = np.einsum("ij,jk,ik", mode.jacobian, mode.covariance, mode.jacobian)
         counts = counts * max(1.0 - float(followed) / max(float(counts.sum()), 1.0), 1e-3)
-    return np.where(moves, counts, 0.0)
+    return np.where(moving(mode), counts, 0.0)
+
+
+def log_error(mode: Mode) -> Floats:
+    """Return the logarithm of a mode's errors, finite where nothing moves, shape (state,)."""
+    return np.asarray(np.log(np.maximum(mode.sigma, 1e-300)))
 
 
 def share(before: Mode, after: Mode, weight: Floats) -> float:
@@ -35,7 +45,7 @@ def share(before: Mode, after: Mode, weight: Floats) -> float:
 
     Of the root mean square; ``weight`` has shape (state,).
     """
-    fall = float((weight * np.log(before.sigma / after.sigma)).sum())
+    fall = float((weight * (log_error(before) - log_error(after))).sum())
     return 1.0 - float(np.exp(-fall / max(weight.sum(), 1.0)))
 
 
@@ -151,8 +161,8 @@ class Table:
     @property
     def weight(self) -> Floats:
         """Measurements over the autocorrelation times of the best model, shape (state,)."""
-        moves = weights(next(iter(self.modes.values()))) > 0
-        best = min(self.modes.values(), key=lambda mode: float(np.log(mode.sigma[moves]).sum()))
+        moves = moving(next(iter(self.modes.values())))
+        best = min(self.modes.values(), key=lambda mode: float(log_error(mode)[moves].sum()))
         return weights(best)
 
     def value(self, mode: Mode) -> float:
@@ -171,7 +181,7 @@ class Table:
         odds = sum(
             law.effect.log_odds - np.log(self.tried * self.points.get(law, 1)) for law in laws
         )
-        fit = -float((weight * np.log(mode.sigma)).sum())
+        fit = -float((weight * log_error(mode)).sum())
         return float(fit - 0.5 * count * np.log(max(weight.sum(), 2.0)) - prior + odds)
 
     def shares(self, mode: Mode, large: float) -> dict[Attached, float]:

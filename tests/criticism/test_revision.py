@@ -82,18 +82,16 @@ def test_clean_data_are_adequate(adequate) -> None:
 
 @pytest.mark.slow
 def test_adequate_says_what_would_have_been_seen(adequate) -> None:
-    """Sizes that are found in test_criticism are above those; an obstacle has none."""
+    """Sizes that are found in test_criticism are above those."""
     sizes = {one.effect: one.detectable for one in adequate.candidates}
     for effect, parameter, hidden in (
         ("linear_drag", "coefficient", 0.06),
         ("constant_force", "force_x", 0.1),
         ("actuator_delay", "share", 0.12),
         ("constant_torque", "torque", 0.004),
-        ("dead_zone", "threshold", 0.3),
-        ("force_cutoff", "threshold", 2.0),
     ):
         assert 0 < sizes[effect][parameter] < hidden
-    assert sizes["hidden_obstacle"] == {}
+    assert "hidden_obstacle" not in sizes  # unusual laws were not tried
 
 
 @pytest.mark.slow
