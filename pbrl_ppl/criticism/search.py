@@ -225,7 +225,7 @@ class Search:
             if promise > limits.promise:
                 self.say("common laws leave more than the noise: trying unusual ones")
                 begin = {law: sizes_of(common.mode, law) for law in common.laws}
-                more = self._climbed(short, lengths, begin, unusual=True)
+                more = self._climbed(short, lengths, begin, True, common.modes)
                 common.regressions.append(more.regressions[0])
                 if self._is_complete(more, common):
                     best, hypotheses = more, {}
@@ -310,18 +310,20 @@ class Search:
         lengths: Sequence[int],
         laws: Mapping[Attached, Floats],
         unusual: bool,
+        beside: Sequence[Mode] = (),
     ) -> _Climb:
         """Return the main laws that pieces of growing length show.
 
         ``short``: the declared model on the shortest pieces. ``laws``: those to begin with, and
-        their sizes.
+        their sizes. ``beside``: models at each length, of which a complete explanation leaves less:
+        the climb ends where it does not.
         """
         declared = short.problem.physics.effects
         tried = max(len(self._candidates(short, unusual)), 1)
         table = Table(declared, tried, modes={frozenset(): short})
         climb = _Climb(table.fitted(short, laws, laws), table, unusual)
-        for length in lengths:
-            if length > lengths[0]:
+        for i, length in enumerate(lengths):
+            if i:
                 longer = _carried(climb.mode, length)
                 if _is_lost(climb.mode, longer):
                     # out of phase: what is significant and takes little away is taken on trial
@@ -335,7 +337,11 @@ class Search:
                 climb.mode = longer
                 climb.table.modes[frozenset(climb.laws)] = longer
             self._improve(climb)
-            climb.noise = climb.mode.sigma if length == lengths[0] else climb.noise
+            climb.noise = climb.noise if i else climb.mode.sigma
+            if 0 < i < len(beside):
+                better = share(beside[i], climb.mode, weights(climb.mode))
+                if better < self.criteria.search.least_share:
+                    return climb
         self._leave_out(climb)
         return climb
 
