@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 from scipy.integrate import solve_ivp
 
-from pbrl_ppl.criticism import attribute
+from pbrl_ppl.criticism import attribute, close_loop
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History
@@ -48,6 +48,43 @@ def test_one_fall_is_said_to_be_one() -> None:
     found = attribute(BALL, fall(1, terminal=TERMINAL), catalogue=some("quadratic_drag"))
     assert [law.effect for law in found.laws] == ["quadratic_drag"]
     assert any("record a second" in sentence for sentence in found.sentences)
+
+
+def slowed(times: float) -> History:
+    """Four falls whose clock runs so many times too slowly, with errors of 1 mm."""
+    rng, time = np.random.default_rng(2), BALL.time_step * np.arange(40) / times
+    states = np.zeros((4, 40, 1, 6))
+    states[..., 3:] = np.nan
+    for one, speed in zip(states, (1.0, 2.0, 3.0, 4.0), strict=True):
+        one[:, 0, 1] = speed * time - 0.5 * GRAVITY * time**2 + rng.normal(0.0, 1e-3, 40)
+    return History.of_arrays(states, BALL, np.zeros((4, 39, 1, 3)))
+
+
+def test_a_force_of_the_size_of_the_weight_is_no_law() -> None:
+    """Exported at a quarter of the frames: gravity seems 9.81 / 16."""
+    found = attribute(BALL, slowed(4.0))
+    assert not found.laws
+    assert any("falls with 6.2 % of gravity" in why for why in found.rejected.values())
+    loop = close_loop(BALL, slowed(4.0), method="laplace", seed=1)
+    assert loop.verdict == "unexplained" and not loop.added
+    assert "a wrong unit of time or length" in loop.unexplained.sentence
+
+
+def test_one_trajectory_shows_no_unusual_law() -> None:
+    """However well it would fit: a drag is named, or nothing."""
+    said: list[str] = []
+    unusual = [one for one in catalogue if one.unusual]
+    found = attribute(BALL, fall(1, terminal=TERMINAL), catalogue=unusual, progress=said.append)
+    assert not found.laws and not any("unusual" in one for one in said)
+
+
+def test_unusual_laws_wait_for_common_ones_that_leave_something() -> None:
+    """Common laws explain four falls in air with white errors: none is tried beside the drag."""
+    said: list[str] = []
+    falls = fall(3, terminal=TERMINAL, trajectories=4, memory=0.0)
+    found = attribute(BALL, falls, seed=1, progress=said.append)
+    assert [law.effect for law in found.laws] == ["quadratic_drag"]
+    assert not any("trying unusual ones" in one for one in said)
 
 
 def test_gaps_longer_than_the_shortest_pieces() -> None:
