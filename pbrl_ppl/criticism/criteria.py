@@ -38,8 +38,8 @@ class SearchCriteria:
     main_share : float
         The same of a main law on the longest pieces: smaller ones are not added.
     alone : float
-        The same of all laws together in a recording of one trajectory, which a lasting random force
-        or error follows as well: more than what remains.
+        The same in a recording of one trajectory, which a lasting random force or error follows as
+        well: more than what remains.
     rows, pieces : int
         Transitions that are searched, at most, and pieces in which they are drawn, at least; the
         laws found are refitted to all.

@@ -487,12 +487,15 @@ class Search:
     def _leave_out(self, climb: _Climb) -> None:
         """Leave out laws without evidence, and those that take less off than a main law."""
         limits, table, before = self.criteria.search, climb.table, climb.laws
+        # a lasting error of the sensor or a random force follows a single trajectory as well
+        single = climb.mode.problem.data.history.n_trajectories == 1
+        least = limits.alone if single else limits.main_share
         while laws := climb.laws:
             shares = table.shares(climb.mode, limits.main_share)
             law = min(laws, key=lambda one: climb.earlier.get(one, limits.least_nats))
             if climb.earlier.get(law, limits.least_nats) >= limits.least_nats:
                 law = [*shares][-1]
-                if shares[law] >= limits.main_share:
+                if shares[law] >= least:
                     break
                 climb.small[law] = shares[law]
             climb.mode = table.without(climb.mode, law)
@@ -516,11 +519,6 @@ class Search:
             table.fitted(mode, ()),
             dict[Attached, str](),
         )
-        alone = mode.problem.data.history.n_trajectories == 1
-        if shares and alone and share(declared, mode, table.weight) < limits.alone:
-            # a lasting error of the sensor or a random force follows a single trajectory as well
-            why = "takes too little off the error of a single trajectory"
-            rejected, shares, mode = dict.fromkeys(shares, why), {}, declared
         doubt = next(filter(None, (_weightless(mode, law) for law in shares)), "")
         if doubt:
             rejected, shares, mode = dict.fromkeys(shares, doubt), {}, declared
