@@ -514,24 +514,20 @@ class Search:
     ) -> SearchResult:
         """Return what a table says of its best model and of what was tried."""
         table, mode, limits = climb.table, climb.mode, self.criteria.search
-        shares, declared, rejected = (
-            table.shares(mode, limits.main_share),
-            table.fitted(mode, ()),
-            dict[Attached, str](),
-        )
+        shares, declared = table.shares(mode, limits.main_share), table.fitted(mode, ())
+        rejected = dict[Attached, str]()
         doubt = next(filter(None, (_weightless(mode, law) for law in shares)), "")
         if doubt:
             rejected, shares, mode = dict.fromkeys(shares, doubt), {}, declared
-        before = declared
         if is_simulated_mode(mode):
             mode = with_robust_covariance(fit_pieces_closely(mode.problem, mode.phi))
-            before = declared if shares else mode
-            if is_simulated_mode(before) and shares:
-                before = with_robust_covariance(before)
-        confounded = {
-            law: (*climb.same.get(law, ()), *table.rivals(climb.mode, law, limits.least_nats))
-            for law in shares
-        }
+        before = declared if shares else mode
+        if shares and is_simulated_mode(before):
+            before = with_robust_covariance(before)
+        confounded = dict[Attached, tuple[Attached, ...]]()
+        for law in shares:  # a law of the same physics may have been refitted as well
+            rivals = table.rivals(climb.mode, law, limits.least_nats)
+            confounded[law] = tuple(dict.fromkeys((*climb.same.get(law, ()), *rivals)))
         laws = {
             law: law_of(mode, law, climb.earlier.get(law, 0.0), part, confounded[law])
             for law, part in shares.items()
