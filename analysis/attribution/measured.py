@@ -23,6 +23,7 @@ from attribution.fitted_initial_states import forecast_errors
 from pbrl_ppl.criticism import NOT_CONVERGED, Loop, close_loop
 from pbrl_ppl.criticism.held_out import HeldOut, forecast
 from pbrl_ppl.criticism.refinement import checked_histories
+from pbrl_ppl.history import thinned
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import trajectory_mode
 from pbrl_ppl.physics import Physics
@@ -42,6 +43,10 @@ QUANTITIES = {"angle": (("theta",), "rad"), "position": (("x", "y"), "m")}
 #: The same by a reference's name; errors of others are stated in other ways than a forecast's.
 _NAMED = {"theta": "angle"}
 _VELOCITIES = list(STATE[3:])
+#: Names in the catalogue of what references call outside of it.
+_SINCE = {"load_dependent_friction": "pivot_load_friction", "stribeck": "pivot_stribeck"}
+#: Laws that have another one in them.
+_WITH = {"pivot_friction": {"pivot_load_friction", "pivot_stribeck"}}
 
 
 @dataclass(frozen=True)
@@ -118,13 +123,15 @@ class Recording:
     sizes: Mapping[tuple[str, str], float] = field(default_factory=dict)
 
     def names_of(self, law: str) -> set[str]:
-        """Return the names of a law: its own, and those of the same data."""
-        return {law, *self.same_data.get(law, ())}
+        """Return the names of a law: its own, those of the same data, and of what has it in it."""
+        since = {_SINCE.get(each, each) for each in self.outside}
+        return {law, *self.same_data.get(law, ()), *(since & _WITH.get(law, set()))}
 
     @property
     def right(self) -> set[str]:
-        """The names that are right."""
-        return {name for law in (*self.laws, *self.also) for name in self.names_of(law)}
+        """The names that are right, those too of what was in no catalogue and is now."""
+        since = (_SINCE.get(law, law) for law in self.outside)
+        return {name for law in (*self.laws, *self.also, *since) for name in self.names_of(law)}
 
     @property
     def is_there(self) -> bool:
@@ -215,6 +222,8 @@ _RECORDINGS = (
         ahead=(Ahead(0.2, "angle", 0.086, 0.029, "dry friction and a command 8 ms late"),),
         laws=("pivot_friction",),
         also=("actuator_delay", "sensor_bias"),
+        # the outline is nominal, mass and inertia are free: all turn the angle of rest
+        same_data={"sensor_bias": ("gravity_tilt", "com_offset")},
         sizes={("pivot_friction", "torque"): 0.143},
     ),
     Recording(
@@ -471,6 +480,9 @@ def errors_ahead(
 ) -> tuple[dict[str, Any], ...]:
     """Return held-out errors of each forecast, before and after; None for short trajectories."""
     scene = found.scene
+    step = round(scene.time_step / train.dataset.attrs["time_step"])
+    _, (train, test), _ = thinned(scene, train, test)
+    start_rows = recording.start_rows and max(recording.start_rows // step, 3)
     train, test, *_ = checked_histories(scene, train, test)
     by_name = {effect.name: effect for effect in pp.catalogue}
     added = [by_name[each.effect].on(each.body) for each in found.added]
@@ -482,7 +494,7 @@ def errors_ahead(
         physics = Physics.declare(scene, effects, substeps=found.numerical.substeps_used, threads=2)
         problem, drawn = Problem.of(physics, train), draws(posterior)
         phi = problem.layout.to_vectors(drawn, len(drawn["sigma"])).mean(axis=0)
-        forecasts.append(_forecasts(problem, phi, test, recording.start_rows))
+        forecasts.append(_forecasts(problem, phi, test, start_rows))
     own = found.rollout_horizon * scene.time_step
     asked = recording.ahead or tuple(Ahead(own, quantity) for quantity in QUANTITIES)
     rows = []

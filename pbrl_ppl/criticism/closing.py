@@ -58,6 +58,7 @@ from pbrl_ppl.history import (
     History,
     UnusedVelocity,
     drawn_pieces,
+    thinned,
     with_units,
     without_measurements,
 )
@@ -158,16 +159,18 @@ def close_loop(
         pp.report(loop, "report.html")
     """
     say = progress or (lambda stage: None)
-    task = _Task(scene, tuple(catalogue), seed, substeps, criteria, say, draws=draws, method=method)
     if test is None:
         train, test = train.split(0.25, seed)
         numbered = test
     else:  # an effect from some trajectory on still acts in a later test
         after = float(train.dataset["number"].max()) + 1.0
         numbered = test.numbered(after) if scene.test_is_later else test
+    scene, (train, test, numbered), thin = thinned(scene, train, test, numbered)
+    task = _Task(scene, tuple(catalogue), seed, substeps, criteria, say, draws=draws, method=method)
     drawn = partial(drawn_pieces, most=most_transitions, seed=seed)
     (train, said), (test, also), (numbered, _) = map(drawn, (train, test, numbered))
-    cleaned = _cleaned(task, train, numbered, (*said, *(f"held out: {one}" for one in also)))
+    said = (*thin, *said, *(f"held out: {one}" for one in also))
+    cleaned = _cleaned(task, train, numbered, said)
     task = replace(task, scene=with_units(scene, cleaned.train))
     prior = _prior_test(task, cleaned.train)
     declared, found = _searched(task, cleaned)

@@ -20,6 +20,7 @@ from pbrl_ppl.history import (
     bad_frames,
     drawn_pieces,
     measured_alone,
+    thinned,
     unused_velocities,
     with_units,
     without_bad_frames,
@@ -207,11 +208,12 @@ class Declared:
         HistoryError
             If the history does not fit the scene.
         """
+        scene, (history,), thin = thinned(self.scene, history)
         history, drawn = drawn_pieces(history, most, self.seed)
-        history, _, unused, bad = checked_histories(self.scene, history, history)
-        for sentence in (*drawn, *(velocity.sentence for velocity in unused), *bad):
+        history, _, unused, bad = checked_histories(scene, history, history)
+        for sentence in (*thin, *drawn, *(velocity.sentence for velocity in unused), *bad):
             self.say(sentence)
-        return replace(self, scene=with_units(self.scene, history)), history
+        return replace(self, scene=with_units(scene, history)), history
 
     def missing(self, mode: Mode) -> tuple[Attached, ...]:
         """Return the candidate effects for a model that its recording can show."""

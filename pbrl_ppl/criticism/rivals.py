@@ -172,7 +172,8 @@ def fit_rivals(
             fits.append(Rival(attached, declared, chosen, declared.sigma))
             continue
         (signature,) = rank_candidates(base, [attached])
-        sizes = {attached: np.array(list(signature.candidate.estimate.values()))}
+        estimate = signature.candidate.estimate.values()
+        sizes = dict(zip(attached.labels, estimate, strict=True))
         start = with_effects(base, (*base.problem.physics.effects, attached), sizes)
         mode = trajectory_mode(*start, base.sigma)
         fits.append(Rival(attached, mode, mode.draws(rng, draws), declared.sigma))

@@ -78,12 +78,15 @@ class Linearisation:
     back : ndarray
         From coordinates in the basis to sizes of the columns (or of the whole change, which is 1),
         shape (column, direction).
+    absorbed : ndarray
+        By how much declared parameters change with coordinates in the basis, shape (p, direction).
     """
 
     values: Floats
     columns: tuple[int, ...]
     basis: Floats
     back: Floats
+    absorbed: Floats
 
     def sizes(self, coordinates: Floats) -> Floats:
         """Return the effect's parameters, shape (q,), at coordinates in the basis."""
@@ -166,8 +169,12 @@ class Library:
             scale = 1.0 / np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
             q, r = np.linalg.qr(jacobian * scale)
             # a parameter that neither the data nor the prior inform has no direction
-            q = q[:, np.abs(np.diag(r)) > 1e-10 * np.abs(np.diag(r)).max(initial=0.0)]
-            self._tests[without] = ScoreTest(q, residual - q @ (q.T @ residual), self.criteria)
+            seen = np.abs(np.diag(r)) > 1e-10 * np.abs(np.diag(r)).max(initial=0.0)
+            q, back = q[:, seen], scale[:, None] * np.linalg.pinv(r[seen])
+            absorbed = q.T @ residual
+            left = residual - q @ absorbed
+            phi = np.delete(phi, places) + back @ absorbed
+            self._tests[without] = ScoreTest(q, left, self.criteria, phi, back)
         return self._tests[without]
 
     def scored(
@@ -277,16 +284,17 @@ class _Evidence:
     direction: Floats
     unit: Floats
     back: Floats
+    absorbed: Floats
 
     def about(self, point: GridPoint) -> Linearisation:
         """Return the linearisation of the signature of a grid point."""
-        return Linearisation(point.values, point.columns, self.basis, self.back)
+        return Linearisation(point.values, point.columns, self.basis, self.back, self.absorbed)
 
 
 def _none(n: int) -> _Evidence:
     """Return no evidence for one column, over n whitened residuals."""
     nothing = np.zeros(1), np.zeros((n, 0)), np.zeros(n), np.zeros(1)
-    return _Evidence(0.0, 0.0, 0.0, *nothing, np.zeros((1, 0)))
+    return _Evidence(0.0, 0.0, 0.0, *nothing, np.zeros((1, 0)), np.zeros((0, 0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -301,11 +309,17 @@ class ScoreTest:
         Whitened residual without these directions, shape (n,).
     criteria : Criteria
         Which signatures are absorbed.
+    phi : ndarray
+        The declared parameters' optimum to first order, shape (p,).
+    back : ndarray
+        From coordinates in those directions to the parameters, shape (p, direction).
     """
 
     q: Floats
     residual: Floats
     criteria: Criteria
+    phi: Floats
+    back: Floats
 
     def left(self, rows: Floats) -> Floats:
         """Return whitened rows, shape (n, ...), without what the declared parameters absorb."""
@@ -339,6 +353,7 @@ class ScoreTest:
         size, statistic, log_p = np.zeros(columns), 0.0, 0.0
         unit = np.zeros(columns)
         basis, direction, back = np.zeros((n, 0)), np.zeros(n), np.zeros((columns, 0))
+        absorbed = np.zeros((len(self.phi), 0))
         if share > ABSORBED:
             u, s, vt = np.linalg.svd(projected, full_matrices=False)
             whole = np.linalg.norm(signature @ vt.T, axis=0)  # before the projection
@@ -347,7 +362,8 @@ class ScoreTest:
             basis = u[:, keep]
             unit = np.sqrt((projected**2).sum(axis=0)) / scales
             coordinates = basis.T @ self.residual
-            back = scales[:, None] * vt[keep].T / s[keep]
+            along = vt[keep].T / s[keep]
+            back, absorbed = scales[:, None] * along, self.back @ (self.q.T @ (signature @ along))
             size = back @ coordinates
             statistic = float(coordinates @ coordinates)
             log_p = float(chi2.logsf(statistic, max(1, int(keep.sum()))))
@@ -359,7 +375,7 @@ class ScoreTest:
                 log_p = log_p + np.log(0.5) if allowed else 0.0
             if statistic > 0:
                 direction = basis @ coordinates / np.sqrt(statistic)
-        return _Evidence(statistic, log_p, share, size, basis, direction, unit, back)
+        return _Evidence(statistic, log_p, share, size, basis, direction, unit, back, absorbed)
 
 
 def null_sides(attached: Attached) -> Ints:

@@ -217,32 +217,49 @@ class Search:
         if not single:
             states = mode.problem.data.smoothed_states
             short = fit_pieces(in_pieces(_apart(mode, lengths[0]), lengths[0], states), mode.phi)
-        common = best = self._climbed(short, lengths, laws or {}, unusual=single)
+        declared = short.problem.physics.effects
+        table = Table(
+            declared, max(len(self._candidates(short, single)), 1), {}, {frozenset(): short}
+        )
+        begin = {
+            label: value
+            for law, sizes in (laws or {}).items()
+            for label, value in zip(law.labels, sizes.tolist(), strict=True)
+        }
+        common = best = _Climb(table.fitted(short, laws or {}, begin), table, unusual=single)
+        self._climb(common, lengths)
+        self._leave_out(common)
         hypotheses: Mapping[Attached, float] = {}
         several = mode.problem.data.history.n_trajectories > 1 and not single
         if several and common.excess > limits.complete:
-            promise, hypotheses = self._promised(common)
-            if promise > limits.promise:
+            i, hypotheses = self._promised(common)
+            if i is not None:
                 self.say("common laws leave more than the noise: trying unusual ones")
-                begin = {law: sizes_of(common.mode, law) for law in common.laws}
-                more = self._climbed(short, lengths, begin, True, common.modes)
+                tried = len(self._candidates(short, True))
+                begun = common.modes[i]
+                names = frozenset(table.laws(begun))
+                table = Table(declared, tried, {**common.table.points}, {names: begun})
+                more = _Climb(begun, table, True, common.noise, lengths=common.lengths[:i])
+                self._climb(more, lengths[i:], common.modes[i:])
                 common.regressions.append(more.regressions[0])
                 if self._is_complete(more, common):
                     best, hypotheses = more, {}
+                    self._leave_out(best)
         found = self._result(best, common.regressions, hypotheses)
         return found if single else _with_contacts(found, mode, lengths[0])
 
-    def _promised(self, common: _Climb) -> tuple[float, dict[Attached, float]]:
-        """Return the share of the error beyond the noise that an unusual law may take off.
+    def _promised(self, common: _Climb) -> tuple[int | None, dict[Attached, float]]:
+        """Return at which length an unusual law may take most of the error beyond the noise off.
 
         To first order, beside the common laws, with one more, or in the place of one. The longest
         pieces are asked first, and shorter ones where these are too far off to tell. Also the
         leading ones alone, with their shares of the error on the longest pieces.
         """
-        limits, alone, best = self.criteria.search, dict[Attached, float](), 0.0
-        for mode in common.modes[::-1]:
+        limits, alone = self.criteria.search, dict[Attached, float]()
+        found: int | None = None
+        for i, mode in reversed([*enumerate(common.modes)]):
             beyond = 1.0 - 1.0 / max(common.excess_of(mode), 1.0)
-            if beyond < 1.0 - 1.0 / limits.complete or best > limits.promise:
+            if beyond < 1.0 - 1.0 / limits.complete or found is not None:
                 break
             laws = common.table.laws(mode)
             library, now = self._library(mode, laws), 0.0
@@ -255,12 +272,12 @@ class Search:
                 ).subsets:
                     unusual = [law for law in subset.laws if law.effect.unusual]
                     part = 1.0 - float(np.sqrt(total * (1.0 - subset.share) / now))
-                    if len(unusual) == 1:
-                        best = max(best, part / beyond)
+                    if len(unusual) == 1 and part > limits.promise * beyond:
+                        found = i
                     if len(unusual) == len(subset.laws) == 1 and mode is common.modes[-1]:
                         alone[unusual[0]] = max(part, alone.get(unusual[0], 0.0))
         leading = sorted(alone, key=lambda law: -alone[law])[: limits.refits]
-        return best, {law: alone[law] for law in leading if alone[law] >= limits.main_share}
+        return found, {law: alone[law] for law in leading if alone[law] >= limits.main_share}
 
     def of(
         self, train: History, fit: Callable[[History], FilteredMode], seed: int
@@ -304,24 +321,12 @@ class Search:
         left = 1.0 - share(plain, more.mode, more.table.weight)
         return more.excess < limits.complete or left < limits.incomplete
 
-    def _climbed(
-        self,
-        short: Mode,
-        lengths: Sequence[int],
-        laws: Mapping[Attached, Floats],
-        unusual: bool,
-        beside: Sequence[Mode] = (),
-    ) -> _Climb:
-        """Return the main laws that pieces of growing length show.
+    def _climb(self, climb: _Climb, lengths: Sequence[int], beside: Sequence[Mode] = ()) -> None:
+        """Find the laws that pieces of growing length show, from a model at the first.
 
-        ``short``: the declared model on the shortest pieces. ``laws``: those to begin with, and
-        their sizes. ``beside``: models at each length, of which a complete explanation leaves less:
-        the climb ends where it does not.
+        ``beside``: models at each length, of which a complete explanation leaves less: the climb
+        ends where it does not.
         """
-        declared = short.problem.physics.effects
-        tried = max(len(self._candidates(short, unusual)), 1)
-        table = Table(declared, tried, modes={frozenset(): short})
-        climb = _Climb(table.fitted(short, laws, laws), table, unusual)
         for i, length in enumerate(lengths):
             if i:
                 longer = _carried(climb.mode, length)
@@ -333,17 +338,17 @@ class Search:
                     if trial is climb.mode or _is_lost(trial, longer):
                         break
                     climb.mode = trial
-                climb.table = Table(declared, tried, climb.table.points)
+                climb.table = replace(
+                    climb.table, modes={frozenset(climb.table.laws(longer)): longer}
+                )
                 climb.mode = longer
-                climb.table.modes[frozenset(climb.laws)] = longer
             self._improve(climb)
-            climb.noise = climb.noise if i else climb.mode.sigma
-            if 0 < i < len(beside):
+            if not climb.noise.size:
+                climb.noise = climb.mode.sigma
+            if i < len(beside):
                 better = share(beside[i], climb.mode, weights(climb.mode))
                 if better < self.criteria.search.least_share:
-                    return climb
-        self._leave_out(climb)
-        return climb
+                    break
 
     def _linearised(self, climb: _Climb) -> tuple[Library, list[Attached]]:
         """Return derivatives at a climb's model, and candidates beside at most one unusual law."""
@@ -417,12 +422,15 @@ class Search:
         # friction has kinks, by which a regression underrates it
         everyday = [one for one in subsets if all(law.effect.log_odds == 0 for law in one.laws)]
         proposals += {len(one.laws): one for one in reversed(everyday)}.values()
-        moves = {frozenset((*climb.laws, *one.laws)): one.sizes for one in proposals}
+        moves = {
+            frozenset((*climb.laws, *one.laws)): one.begin(climb.mode.problem.layout.labels)
+            for one in proposals
+        }
         return self._best(climb, moves, least_share)
 
     def _exchanged(self, climb: _Climb, library: Library, candidates: Sequence[Attached]) -> Mode:
         """Return the best model without a law or with another one in its place, or the same."""
-        moves: dict[frozenset[Attached], Mapping[Attached, Floats]] = {}
+        moves: dict[frozenset[Attached], Mapping[str, float]] = {}
         for law in climb.laws:
             rest, others = frozenset(climb.laws) - {law}, candidates
             if law.effect.unusual:
@@ -433,21 +441,23 @@ class Search:
             climb.same[law] = tuple(one for one in others if one in same)
             own = max((one.nats for one in instead.subsets if same & {*one.laws}), default=0.0)
             climb.first_order[law] = own
+            labels = [one for one in library.mode.problem.layout.labels if one not in law.labels]
             if own < _CLEAR:
-                moves[rest] = {}
+                others = library.test((law,)).phi.tolist()
+                moves[rest] = dict(zip(labels, others, strict=True))
             swaps = [
                 one for one in instead.subsets
                 if one.nats > 0.5 * max(own, 0.0) and not same & {*one.laws}
             ]  # fmt: skip
             alike = [one for one in instead.subsets if are_alike(law, *one.laws)]
             for one in (*swaps[: self.criteria.search.singles], *alike):
-                moves.setdefault(rest | {*one.laws}, one.sizes)
+                moves.setdefault(rest | {*one.laws}, one.begin(labels))
         return self._best(climb, moves, 0.0)
 
     def _best(
         self,
         climb: _Climb,
-        moves: Mapping[frozenset[Attached], Mapping[Attached, Floats]],
+        moves: Mapping[frozenset[Attached], Mapping[str, float]],
         least_share: float,
     ) -> Mode:
         """Return the best of some models, of those nearly as good the smallest; or the same."""
@@ -474,7 +484,9 @@ class Search:
             return now
         _, mode, needed = min(near, key=lambda one: (len(one[1].phi), -one[0]))
         # friction makes the top rough: the better model may only have been climbed from elsewhere
-        kept = {law: sizes_of(now, law) for law in laws}
+        labels = [label for law in laws for label in law.labels]
+        at = now.phi[now.problem.layout.places(labels)].tolist()
+        kept = dict(zip(labels, at, strict=True))
         again = refit(mode, now.problem.physics.effects, kept)
         if table.value(again) > here:
             table.modes[laws] = climb.mode = again
@@ -491,13 +503,13 @@ class Search:
         single = climb.mode.problem.data.history.n_trajectories == 1
         least = limits.alone if single else limits.main_share
         while laws := climb.laws:
-            shares = table.shares(climb.mode, limits.main_share)
             law = min(laws, key=lambda one: climb.earlier.get(one, limits.least_nats))
             if climb.earlier.get(law, limits.least_nats) >= limits.least_nats:
-                law = [*shares][-1]
-                if shares[law] >= least:
+                shares = table.shares(climb.mode, limits.main_share)
+                law, part = next((one for one in shares if one[1] < least), (law, 1.0))
+                if part >= least:
                     break
-                climb.small[law] = shares[law]
+                climb.small[law] = part
             climb.mode = table.without(climb.mode, law)
         if climb.laws != before:
             better = self._exchanged(climb, *self._linearised(climb))
@@ -514,7 +526,8 @@ class Search:
     ) -> SearchResult:
         """Return what a table says of its best model and of what was tried."""
         table, mode, limits = climb.table, climb.mode, self.criteria.search
-        shares, declared = table.shares(mode, limits.main_share), table.fitted(mode, ())
+        by_share = sorted(table.shares(mode, limits.main_share), key=lambda one: -one[1])
+        shares, declared = dict(by_share), table.fitted(mode, ())
         rejected = dict[Attached, str]()
         doubt = next(filter(None, (_weightless(mode, law) for law in shares)), "")
         if doubt:

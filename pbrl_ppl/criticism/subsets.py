@@ -12,7 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pbrl_ppl.criticism.score import Library, Linearisation, Signature, null_sides, same_physics
+from pbrl_ppl.criticism.score import (
+    Library,
+    Linearisation,
+    ScoreTest,
+    Signature,
+    null_sides,
+    same_physics,
+)
 from pbrl_ppl.effects import Attached
 from pbrl_ppl.state import Floats, Ints
 from pbrl_ppl.threads import in_parallel
@@ -38,17 +45,27 @@ class Subset:
     prices : dict of Attached to float
         Logarithm of the number of candidates and grid points that each was chosen from, less the
         logarithm of its prior odds (nats).
+    phi : ndarray
+        The mode's other parameters by the joint regression, shape (p,).
     """
 
     sizes: Mapping[Attached, Floats]
     nats: float
     share: float
     prices: Mapping[Attached, float]
+    phi: Floats
 
     @property
     def laws(self) -> tuple[Attached, ...]:
         """The laws, in the order of the catalogue."""
         return tuple(self.sizes)
+
+    def begin(self, labels: Sequence[str]) -> dict[str, float]:
+        """Return where a refit begins, by the labels of parameters; ``labels`` are those of phi."""
+        begin = dict(zip(labels, self.phi.tolist(), strict=True))
+        for law, sizes in self.sizes.items():
+            begin |= dict(zip(law.labels, sizes.tolist(), strict=True))
+        return begin
 
 
 def worth(share: float, columns: int, n: float) -> float:
@@ -158,8 +175,8 @@ def best_subsets(
             columns = np.arange(width, width + linear.basis.shape[1])
             terms.append(Term(law, linear, columns, float(price)))
             width += len(columns)
-    far_out = library.criteria.far_out
-    equations = _NormalEquations.of(tuple(terms), residual, n, far_out, independent)
+    test, far_out = library.test(without), library.criteria.far_out
+    equations = _NormalEquations.of(tuple(terms), test, n, far_out, independent)
     order = {law: place for place, law in enumerate(candidates)}
     tried = equations.search([order[term.law] for term in terms], beam, largest)
     best = sorted(tried, key=lambda subset: -subset.nats)
@@ -177,6 +194,10 @@ class _NormalEquations:
     gram, towards : ndarray
         Products of all columns with each other and with the residual, shapes (column, column) and
         (column,).
+    absorbed : ndarray
+        Change of the mode's parameters with each column, shape (p, column).
+    phi : ndarray
+        These parameters without the columns, shape (p,).
     total : float
         Squared size of the residual.
     n : float
@@ -190,6 +211,8 @@ class _NormalEquations:
     terms: tuple[Term, ...]
     gram: Floats
     towards: Floats
+    absorbed: Floats
+    phi: Floats
     total: float
     n: float
     far_out: float
@@ -197,12 +220,16 @@ class _NormalEquations:
 
     @classmethod
     def of(
-        cls, terms: tuple[Term, ...], residual: Floats, n: float, far_out: float, independent: float
+        cls, terms: tuple[Term, ...], test: ScoreTest, n: float, far_out: float, independent: float
     ) -> _NormalEquations:
         """Return the equations of terms, the columns of which are in their order."""
-        basis = np.hstack([term.linear.basis for term in terms])
+        basis, residual = np.hstack([term.linear.basis for term in terms]), test.residual
+        absorbed = np.hstack([term.linear.absorbed for term in terms])
         total = float(residual @ residual)
-        return cls(terms, basis.T @ basis, basis.T @ residual, total, n, far_out, independent)
+        return cls(
+            terms, basis.T @ basis, basis.T @ residual, absorbed, test.phi, total,
+            n, far_out, independent,
+        )  # fmt: skip
 
     def solved(self, chosen: Sequence[int]) -> Subset | None:
         """Return the subset of some terms; None if they are collinear, or a size is impossible."""
@@ -222,7 +249,8 @@ class _NormalEquations:
         share = min(float(coordinates @ self.towards[columns]) / self.total, 1.0 - 1e-12)
         prices = {term.law: term.price for term in terms}
         nats = worth(share, len(columns), self.n) - sum(prices.values())
-        return Subset(sizes, nats, share, prices)
+        phi = self.phi - self.absorbed[:, columns] @ coordinates
+        return Subset(sizes, nats, share, prices, phi)
 
     def search(self, order: Sequence[int], beam: int, largest: int) -> list[Subset]:
         """Return the subsets tried: all of one or two laws, then the best with one more law.

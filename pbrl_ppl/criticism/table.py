@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -79,7 +79,7 @@ def far_out(mode: Mode, laws: Iterable[Attached]) -> float:
 def with_effects(
     mode: Mode[LikelihoodT],
     effects: tuple[Attached, ...],
-    sizes: Mapping[Attached, Floats] | None = None,
+    begin: Mapping[str, float] | None = None,
 ) -> tuple[Problem[LikelihoodT], Floats]:
     """Return a mode's problem with other effects, and where a search for its mode begins.
 
@@ -89,30 +89,58 @@ def with_effects(
         A mode of the model with the effects so far.
     effects : tuple of Attached
         All effects of the new model.
-    sizes : mapping, optional
-        Where the parameters of an effect begin; by default at the mode, or the prior's centre.
+    begin : mapping of str to float, optional
+        Where parameters begin, by their labels; by default at the mode, or the prior's centre.
     """
     problem = mode.problem.with_physics(effects=effects)
     layout = problem.layout
     phi = layout.from_layout(mode.problem.layout, mode.phi)
-    for attached, values in (sizes or {}).items():
-        phi[layout.places(attached.labels)] = values
+    begin = begin or {}
+    phi[layout.places(begin)] = [*begin.values()]
     return problem, inside(layout.priors, phi)
 
 
-def refit(mode: Mode, effects: tuple[Attached, ...], sizes: Mapping[Attached, Floats]) -> Mode:
-    """Return the mode with other effects, under the same likelihood, from first sizes."""
-    problem, phi = with_effects(mode, effects, sizes)
+def refit(mode: Mode, effects: tuple[Attached, ...], begin: Mapping[str, float]) -> Mode:
+    """Return the mode with other effects, under the same likelihood.
+
+    It is climbed from where parameters may ``begin``, by their labels, from there with new ones
+    alone, or from a part of the way: the best of these.
+    """
+    known = {*mode.problem.layout.labels}
+    new = {label: value for label, value in begin.items() if label not in known}
+    problem, phi = with_effects(mode, effects, new)
     if is_simulated(problem):
         return fit_pieces(
-            problem, phi, rounds=8, tolerance=1.0, n_steps=1, dampings=(0.1, 10.0, 1e3)
-        )
+            problem,
+            _best_start(mode, effects, phi, begin),
+            rounds=8, tolerance=1.0, n_steps=1, dampings=(0.1, 10.0, 1e3),
+        )  # fmt: skip
     # what a lacking model's parameters have made up for is far from where they are with the law
     centre = np.array([prior.centre for prior in problem.layout.priors])
-    for attached, values in sizes.items():
-        centre[problem.layout.places(attached.labels)] = values
-    modes = [find_mode(problem, initial=begin) for begin in (phi, centre)]
+    centre[problem.layout.places(new)] = [*new.values()]
+    modes = [find_mode(problem, initial=first) for first in (phi, centre)]
     return max(modes, key=lambda one: one.log_posterior)
+
+
+def _best_start(
+    mode: Mode, effects: tuple[Attached, ...], phi: Floats, begin: Mapping[str, float]
+) -> Floats:
+    """Return the best of some points to begin a climb at, shape (p,)."""
+    problem, joint = with_effects(mode, effects, begin)
+    if np.array_equal(phi, joint):
+        return phi
+    nothing = {
+        label: value
+        for one in effects
+        if one.effect.scan is None and not {*one.labels} <= {*mode.problem.layout.labels}
+        for label, value in zip(one.labels, one.effect.null, strict=True)
+    }
+    _, least = with_effects(mode, effects, nothing)
+    points = np.array([phi, joint, *(least + part * (joint - least) for part in (0.3, 0.1))])
+    left = np.nan_to_num(problem.medium.whitened(points, mode.sigma), nan=1e6)
+    prior = np.array([prior_residual(problem.layout.priors, point) for point in points])
+    cost = (left**2).reshape(len(points), -1).sum(axis=1) + (prior**2).sum(axis=1)
+    return np.asarray(points[int(np.argmin(cost))])
 
 
 @dataclass(eq=False)
@@ -144,14 +172,17 @@ class Table:
         self,
         near: Mode,
         laws: Collection[Attached],
-        sizes: Mapping[Attached, Floats] | None = None,
+        begin: Mapping[str, float] | None = None,
     ) -> Mode:
-        """Return the model with these laws alone, fitted from another model if it is new."""
+        """Return the model with these laws alone, fitted from another model if it is new.
+
+        ``begin``: where its parameters begin, by their labels; by default where they are.
+        """
         key = frozenset(laws)
         if key not in self.modes:
             effects = tuple(one for one in near.problem.physics.effects if one in key)
             new = tuple(one for one in laws if one not in effects)
-            self.modes[key] = refit(near, (*self.declared, *effects, *new), sizes or {})
+            self.modes[key] = refit(near, (*self.declared, *effects, *new), begin or {})
         return self.modes[key]
 
     def without(self, mode: Mode, law: Attached) -> Mode:
@@ -184,8 +215,8 @@ class Table:
         fit = -float((weight * log_error(mode)).sum())
         return float(fit - 0.5 * count * np.log(max(weight.sum(), 2.0)) - prior + odds)
 
-    def shares(self, mode: Mode, large: float) -> dict[Attached, float]:
-        """Return the share of the error that each law takes off, the largest first.
+    def shares(self, mode: Mode, large: float) -> Iterator[tuple[Attached, float]]:
+        """Yield each law and the share of the error that it takes off, about the smallest first.
 
         Two laws that replace each other in part are missed little alone: what both take off
         together is divided in proportion. That is asked of laws with less than a ``large`` share.
@@ -197,15 +228,14 @@ class Table:
             return max(-float(np.log1p(-min(share(rest, mode, weight), 1.0 - 1e-9))), 1e-6)
 
         alone = {law: fall(law) for law in laws}
-        falls = dict(alone)
-        for law, own in alone.items():
+        for law, own in sorted(alone.items(), key=lambda one: one[1]):
+            most = own
             if own < -np.log1p(-large):
                 parts = (
                     fall(law, other) * own / (own + alone[other]) for other in laws if other != law
                 )
-                falls[law] = max(own, *parts, 0.0)
-        ordered = sorted(falls, key=lambda law: -falls[law])
-        return {law: -float(np.expm1(-falls[law])) for law in ordered}
+                most = max(own, *parts, 0.0)
+            yield law, -float(np.expm1(-most))
 
     def rivals(self, mode: Mode, law: Attached, within: float) -> tuple[Attached, ...]:
         """Return laws with which, in the place of one, a model is as good within some nats."""

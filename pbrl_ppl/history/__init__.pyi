@@ -28,6 +28,7 @@ from .kinematics import joint_coordinates as joint_coordinates
 from .kinematics import lever as lever
 from .parts import MOST_TRANSITIONS as MOST_TRANSITIONS
 from .parts import drawn_pieces as drawn_pieces
+from .parts import thinned as thinned
 from .reading import read_recording as read_recording
 from .reading import read_scene as read_scene
 from .units import mass_contradictions as mass_contradictions

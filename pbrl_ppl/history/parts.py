@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import xarray as xr
+from scipy.interpolate import CubicSpline
 
 from pbrl_ppl.history.cuts import slowest
 from pbrl_ppl.history.history import History, hashed
+from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats
 
+#: Transitions of a recording that is finer than its motion needs.
+_ENOUGH = 1000
 #: Transitions that a law is searched in. They show one of a hundredth of the motion, and a search's
 #: time grows faster than they do.
 MOST_TRANSITIONS = 3000
+#: A spline through the rows that are kept passes others by so many times what it does through every
+#: second row, or by such a share of the motion.
+_NOISY, _SMOOTH = 1.5, 1e-3
 #: Transitions of a piece, at least.
 _SHORTEST = 100
 
@@ -70,6 +78,100 @@ def drawn_pieces(
         f" {drawn.n_trajectories} pieces drawn by the seed"
     )
     return drawn, (said,)
+
+
+def thinned(
+    scene: Scene, *histories: History, most: int = _ENOUGH
+) -> tuple[Scene, tuple[History, ...], tuple[str, ...]]:
+    """Return a scene and histories with a longer time step, if the first is finer than it moves.
+
+    Every k-th row is kept, and commands are averaged between them, so that at least ``most``
+    transitions remain and a spline through the rows that are kept passes the others by no more than
+    measurement errors. Recordings in which bodies may touch stay: a collision is an instant.
+
+    Parameters
+    ----------
+    scene : Scene
+        The declared scene.
+    *histories : History
+        Of its bodies, with its time step; the first one is judged.
+    most : int
+        Transitions from which on a recording is thinned, to no fewer.
+
+    Returns
+    -------
+    scene : Scene
+        With the longer time step.
+    histories : tuple of History
+        With it.
+    said : tuple of str
+        A sentence on it, if rows are left out.
+    """
+    train = histories[0]
+    alone = len(scene.moving) == 1 or bool(scene.joints)
+    still = scene.walls or len(scene.moving) < len(scene.bodies)
+    if still or not alone or any(body.kinematic for body in scene.moving):
+        return scene, histories, ()
+    least = None
+    for step in range(2, train.n_transitions // most + 1):
+        passed = _passed_by(train, step)
+        least = passed if least is None else least
+        if (passed > np.maximum(_NOISY * least, _SMOOTH)).any():
+            step -= 1
+            break
+    else:
+        step = train.n_transitions // most
+    if step < 2:
+        return scene, histories, ()
+    dt = float(train.dataset.attrs["time_step"]) * step
+    said = (
+        f"one row in {step} is used, each {dt:.4g} s, and commands are averaged between them: the"
+        " motion needs no more"
+    )
+    return (
+        replace(scene, time_step=dt),
+        tuple(_each(one.dataset, step, dt) for one in histories),
+        (said,),
+    )
+
+
+def _passed_by(history: History, step: int) -> Floats:
+    """Return how far splines through one row in ``step`` pass the others by, (body, state).
+
+    As a share of the motion, root mean square.
+    """
+    observed = history.dataset["observed"].to_numpy()
+    off = np.zeros((2, *observed.shape[2:]))
+    for one in observed:
+        for place in np.ndindex(one.shape[1:]):
+            values = one[(slice(None), *place)]
+            rows = np.flatnonzero(np.isfinite(values))
+            kept = rows[rows % step == 0]
+            rows = rows[(rows % step != 0) & (rows < kept.max(initial=0))]
+            if len(kept) > 3 and len(rows):
+                error = values[rows] - CubicSpline(kept, values[kept])(rows)
+                off[(slice(None), *place)] += (error**2).sum(), len(rows)
+    motion = np.nanstd(observed, axis=(0, 1)) if off[1].any() else np.ones(off.shape[1:])
+    size = np.sqrt(off[0] / np.maximum(off[1], 1.0))
+    return np.where(motion > 0.0, size / np.where(motion > 0.0, motion, 1.0), 0.0)
+
+
+def _each(data: xr.Dataset, step: int, dt: float) -> History:
+    """Return the history with one row in ``step``, each ``dt`` seconds."""
+    kept = data.isel(time=slice(None, None, step))
+    rows = (data["n_rows"] - 1) // step + 1
+    action = data["action"].to_numpy()
+    action = np.pad(action, ((0, 0), (0, -action.shape[1] % step), (0, 0), (0, 0)), "edge")
+    action = action.reshape(len(action), -1, step, *action.shape[2:]).mean(axis=2)
+    beyond = np.arange(len(kept["time"])) >= rows.to_numpy()[:, None]
+    action[np.arange(len(action)), rows.to_numpy() - 1] = np.nan
+    seen = xr.DataArray(~beyond, dims=("trajectory", "time"))
+    changed = {name: kept[name].where(seen) for name in ("observed", "start", "clock")}
+    changed |= {"action": kept["action"].copy(data=action), "n_rows": rows}
+    kept = kept.assign(changed)
+    kept = kept.assign_coords(time=np.arange(len(kept["time"])))
+    kept.attrs = {**data.attrs, "time_step": dt}
+    return History(hashed(kept))
 
 
 def _slowest_motion(history: History) -> float:
