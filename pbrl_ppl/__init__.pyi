@@ -13,11 +13,9 @@ from .criticism import Attribution as Attribution
 from .criticism import Criteria as Criteria
 from .criticism import Loop as Loop
 from .criticism import PriorCheck as PriorCheck
-from .criticism import Rehearsal as Rehearsal
 from .criticism import attribute as attribute
 from .criticism import close_loop as close_loop
 from .criticism import prior_predictive_check as prior_predictive_check
-from .criticism import rehearse as rehearse
 from .effects import Attached as Attached
 from .effects import Effect as Effect
 from .effects import EffectParameter as EffectParameter
@@ -50,6 +48,8 @@ from .planning import Target as Target
 from .planning import TransitionModel as TransitionModel
 from .planning import plan as plan
 from .planning import suggest_actions as suggest_actions
+from .planning.rehearsal import Rehearsal as Rehearsal
+from .planning.rehearsal import rehearse as rehearse
 from .posterior import Identifiability as Identifiability
 from .posterior import by_number as by_number
 from .posterior import by_trajectory as by_trajectory

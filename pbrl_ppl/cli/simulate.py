@@ -20,11 +20,11 @@ from pbrl_ppl.scene import Scene, nearest
 from pbrl_ppl.state import STATE, Floats
 
 if TYPE_CHECKING:
-    from pbrl_ppl.criticism import RehearsedLaw
     from pbrl_ppl.effects import Effect
     from pbrl_ppl.history import History
     from pbrl_ppl.parameters import Layout
     from pbrl_ppl.physics import Physics
+    from pbrl_ppl.planning.rehearsal import RehearsedLaw
 
 
 @command("simulate", 11, "pbrl-ppl simulate cart.nc plan.csv -o predicted.csv --draws 20")
@@ -205,10 +205,10 @@ def rehearse(
     declared, histories = reading.read(scene, [] if commands is None else [commands])
     catalogue = reading.catalogue()
     progress("loading the model")
-    from pbrl_ppl import criticism
+    from pbrl_ppl.planning import rehearsal
     from pbrl_ppl.posterior import versions
 
-    found = criticism.rehearse(
+    found = rehearsal.rehearse(
         declared, *histories, parameters=values, catalogue=catalogue, seed=seed,
         progress=progress,
     )  # fmt: skip

@@ -23,9 +23,6 @@ from .misfit import share_in_words as share_in_words
 from .prior_check import PriorCheck as PriorCheck
 from .prior_check import informative_horizon as informative_horizon
 from .prior_check import prior_predictive_check as prior_predictive_check
-from .rehearsal import Rehearsal as Rehearsal
-from .rehearsal import RehearsedLaw as RehearsedLaw
-from .rehearsal import rehearse as rehearse
 from .results import ONE_TRAJECTORY as ONE_TRAJECTORY
 from .results import Added as Added
 from .results import Candidate as Candidate
@@ -36,10 +33,6 @@ from .results import SearchLength as SearchLength
 from .results import Stage as Stage
 from .results import Unexplained as Unexplained
 from .results import diverged_after as diverged_after
-from .rivals import Rival as Rival
-from .rivals import fit_rivals as fit_rivals
-from .rivals import kept_groups as kept_groups
-from .rivals import named_effects as named_effects
 from .score import Signature as Signature
 from .score import rank_candidates as rank_candidates
 from .score import same_physics as same_physics

@@ -35,7 +35,6 @@ from pbrl_ppl.criticism.results import (
     Stage,
     Unexplained,
 )
-from pbrl_ppl.criticism.rivals import keep_groups
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.criticism.search import Search, SearchResult
 from pbrl_ppl.criticism.unexplained import (
@@ -72,7 +71,17 @@ from pbrl_ppl.modes import (
     tempered_mode,
 )
 from pbrl_ppl.physics import Physics, try_effect
-from pbrl_ppl.posterior import MAX_PARETO_K, Comparison, Fit, compare, identify, interval, versions
+from pbrl_ppl.posterior import (
+    MAX_PARETO_K,
+    Comparison,
+    Fit,
+    Idata,
+    PosteriorRecord,
+    compare,
+    identify,
+    interval,
+    versions,
+)
 from pbrl_ppl.posterior import draws as posterior_draws
 from pbrl_ppl.sampling import sample
 from pbrl_ppl.scene import Scene
@@ -584,6 +593,19 @@ def _explained(judged: _Judged) -> tuple[Candidate, ...]:
             )
         )
     return tuple(result)
+
+
+def keep_groups(posterior: Idata, added: Iterable[Added]) -> None:
+    """Record in a posterior's attributes which effects its recording cannot separate."""
+    groups = tuple(
+        tuple(
+            name if " on " in name else f"{name} on {one.body}"
+            for name in (one.effect, *one.not_separable_from)
+        )
+        for one in added
+        if one.not_separable_from
+    )
+    replace(PosteriorRecord.of(posterior), not_separable=groups).write(posterior)
 
 
 def _added(judged: _Judged, revised: Fit) -> tuple[Added, ...]:

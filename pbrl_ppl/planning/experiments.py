@@ -26,7 +26,8 @@ from pbrl_ppl.scene import Scene, body_sizes
 from pbrl_ppl.state import WRENCH, WRENCH_UNITS, Bools, Floats
 
 if TYPE_CHECKING:  # with the samplers, which a plan does not need
-    from pbrl_ppl.criticism import Loop, Rival
+    from pbrl_ppl.criticism import Loop
+    from pbrl_ppl.planning.rivals import Rival
     from pbrl_ppl.posterior import Idata
 
 
@@ -370,7 +371,8 @@ def suggest_actions(
         said.to_csv("next.csv")  # play it, record, and close the loop on both recordings
     """
     # with the samplers, which a plan does not need
-    from pbrl_ppl.criticism import Loop, fit_rivals, named_effects
+    from pbrl_ppl.criticism import Loop
+    from pbrl_ppl.planning.rivals import fit_rivals, named_effects
     from pbrl_ppl.posterior import scene_of
 
     progress = progress or (lambda stage: None)
@@ -417,7 +419,7 @@ def suggest_actions(
 
 def _confounded(posterior: Idata) -> tuple[str, ...]:
     """Return the first group of effects that a posterior's recording cannot separate."""
-    from pbrl_ppl.criticism import kept_groups
+    from pbrl_ppl.planning.rivals import kept_groups
 
     if groups := kept_groups(posterior):
         return groups[0]

@@ -9,12 +9,12 @@ import pytest
 
 import pbrl_ppl as pp
 from pbrl_ppl.cli import main
-from pbrl_ppl.criticism import Rival, fit_rivals, kept_groups, named_effects
+from pbrl_ppl.criticism.closing import keep_groups
 from pbrl_ppl.criticism.results import Added, Law
-from pbrl_ppl.criticism.rivals import keep_groups
 from pbrl_ppl.errors import EffectError, GoalError, PosteriorError
 from pbrl_ppl.planning import rollout
 from pbrl_ppl.planning.experiments import Separation
+from pbrl_ppl.planning.rivals import Rival, fit_rivals, kept_groups, named_effects
 from pbrl_ppl.posterior.record import scene_of
 from tests.helpers.free_puck import BOX, fitted, searched
 from tests.helpers.one_speed import SIZE, at_one_speed, record

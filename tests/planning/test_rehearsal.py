@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from pbrl_ppl.criticism import DEFAULT, attribute
-from pbrl_ppl.criticism.rehearsal import Rehearsal, RehearsedLaw, rehearse
 from pbrl_ppl.effects import attach, catalogue
 from pbrl_ppl.errors import HistoryError, ParameterError
 from pbrl_ppl.history import History
 from pbrl_ppl.physics import Physics, simulated_recording
+from pbrl_ppl.planning.rehearsal import Rehearsal, RehearsedLaw, rehearse
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene, Shape
 from pbrl_ppl.state import STATE
 

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from pbrl_ppl.criticism.results import Added
-from pbrl_ppl.criticism.score import rank_candidates
-from pbrl_ppl.criticism.table import with_effects
+from pbrl_ppl.criticism import rank_candidates, with_effects
 from pbrl_ppl.effects import Attached, Effect, Noise
 from pbrl_ppl.errors import EffectError, PosteriorError
 from pbrl_ppl.likelihood import is_independent
 from pbrl_ppl.modes import FilteredMode, trajectory_mode
-from pbrl_ppl.posterior import Fit, Idata, PosteriorRecord, stored_fields
+from pbrl_ppl.posterior import Fit, Idata, stored_fields
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats
 
@@ -47,19 +45,6 @@ class Rival:
     def name(self) -> str:
         """Return the names of the effect and of its body."""
         return f"{self.attached.effect.name}{_ON}{self.attached.body}"
-
-
-def keep_groups(posterior: Idata, added: Iterable[Added]) -> None:
-    """Record in a posterior's attributes which effects its recording cannot separate."""
-    groups = tuple(
-        tuple(
-            name if _ON in name else f"{name}{_ON}{one.body}"
-            for name in (one.effect, *one.not_separable_from)
-        )
-        for one in added
-        if one.not_separable_from
-    )
-    replace(PosteriorRecord.of(posterior), not_separable=groups).write(posterior)
 
 
 def kept_groups(posterior: Idata) -> list[tuple[str, ...]]:

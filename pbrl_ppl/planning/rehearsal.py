@@ -12,13 +12,13 @@ from pbrl_ppl.criticism.scan import each_grid_point
 from pbrl_ppl.criticism.score import Library, named_beside, null_sides
 from pbrl_ppl.criticism.subsets import Term, worth
 from pbrl_ppl.criticism.table import weights
-from pbrl_ppl.criticism.trial_recording import measured, parameters_of, simulated
 from pbrl_ppl.effects import Attached, Effect, attach, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.history import History, with_units
 from pbrl_ppl.likelihood import Problem, in_pieces
 from pbrl_ppl.modes import MOST_GROWTH, SimulatedMode, corrected, fit_pieces, growth, piece_lengths
 from pbrl_ppl.physics import Physics, touching
+from pbrl_ppl.planning.trial_recording import measured, parameters_of, simulated
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats
 from pbrl_ppl.threads import in_parallel, one_blas_thread
