@@ -10,7 +10,7 @@ import numpy as np
 from pbrl_ppl.effects import Attached
 from pbrl_ppl.likelihood import LikelihoodT, Problem, is_independent, is_simulated
 from pbrl_ppl.modes import Mode, find_mode, fit_pieces
-from pbrl_ppl.parameters import inside, prior_residual, prior_slopes
+from pbrl_ppl.parameters import inside, prior_residual, prior_slopes, stepped
 from pbrl_ppl.scene import state_sizes
 from pbrl_ppl.state import Bools, Floats
 
@@ -126,20 +126,24 @@ def _best_start(
     mode: Mode, effects: tuple[Attached, ...], phi: Floats, begin: Mapping[str, float]
 ) -> Floats:
     """Return the best of some points to begin a climb at, shape (p,)."""
-    problem, joint = with_effects(mode, effects, begin)
+    layout = mode.problem.layout
+    step = [begin.get(label, now) - now for label, now in zip(layout.labels, mode.phi, strict=True)]
+    known = zip(layout.labels, stepped(layout.priors, mode.phi, np.array(step)), strict=True)
+    moved = {**begin, **{label: float(value) for label, value in known if label in begin}}
+    problem, joint = with_effects(mode, effects, moved)
     if np.array_equal(phi, joint):
         return phi
     nothing = {
         label: value
         for one in effects
-        if one.effect.scan is None and not {*one.labels} <= {*mode.problem.layout.labels}
+        if one.effect.scan is None and not {*one.labels} <= {*layout.labels}
         for label, value in zip(one.labels, one.effect.null, strict=True)
     }
     _, least = with_effects(mode, effects, nothing)
     points = np.array([phi, joint, *(least + part * (joint - least) for part in (0.3, 0.1))])
     left = np.nan_to_num(problem.medium.whitened(points, mode.sigma), nan=1e6)
-    prior = np.array([prior_residual(problem.layout.priors, point) for point in points])
-    cost = (left**2).reshape(len(points), -1).sum(axis=1) + (prior**2).sum(axis=1)
+    prior_cost = np.array([prior_residual(problem.layout.priors, point) for point in points])
+    cost = (left**2).reshape(len(points), -1).sum(axis=1) + (prior_cost**2).sum(axis=1)
     return np.asarray(points[int(np.argmin(cost))])
 
 

@@ -26,7 +26,7 @@ from pbrl_ppl.likelihood import (
 from pbrl_ppl.modes.laplace import Mode, SimulatedMode, covariance_of, sandwich
 from pbrl_ppl.modes.noise import finite
 from pbrl_ppl.modes.search import find_mode
-from pbrl_ppl.parameters import box, inside, prior_residual, prior_slopes
+from pbrl_ppl.parameters import box, inside, prior_residual, prior_slopes, stepped
 from pbrl_ppl.state import Floats
 from pbrl_ppl.threads import one_blas_thread
 
@@ -447,7 +447,7 @@ class _Step:
             scaled = self.precision * np.outer(sd, sd) + damping * np.eye(len(sd))
             step = sd * np.linalg.solve(scaled, sd * self.gradient)
             if np.isfinite(step).all():  # where the engine diverges there is no slope
-                phi = inside(self.problem.layout.priors, phi + step)
+                phi = stepped(self.problem.layout.priors, phi, step)
         left = self.rows - self.by_phi @ (phi - self.phi)
         change = (self.back @ (np.swapaxes(self.u, 1, 2) @ left[..., None]))[..., 0]
         states = self.start.copy()

@@ -15,6 +15,7 @@ from .priors import inside as inside
 from .priors import prior_draws as prior_draws
 from .priors import prior_residual as prior_residual
 from .priors import prior_slopes as prior_slopes
+from .priors import stepped as stepped
 from .wheel_symmetry import by_prior as by_prior
 from .wheel_symmetry import change_from as change_from
 from .wheel_symmetry import nearest as nearest

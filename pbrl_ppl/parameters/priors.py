@@ -307,6 +307,17 @@ def inside(priors: Sequence[Prior], phi: Floats) -> Floats:
     return np.clip(phi, lower, upper)
 
 
+def stepped(priors: Sequence[Prior], phi: Floats, step: Floats, *, most: float = 10.0) -> Floats:
+    """Return values a step on, just inside their supports, shape (p,).
+
+    A log-normal one, such as a mass, changes by the factor ``most`` at most: at the end of its
+    support, where a long step would lead, motion is too fast to simulate.
+    """
+    positive = np.array([prior.family == "log_normal" for prior in priors], dtype=bool)
+    end = np.where(positive, np.clip(phi + step, phi / most, phi * most), phi + step)
+    return inside(priors, end)
+
+
 def box(priors: Sequence[Prior], *, margin: float = 1e-6) -> tuple[Floats, Floats]:
     """Return the bounds of a search: the supports less a margin, which discrete priors lack.
 
