@@ -103,7 +103,7 @@ def close_loop(
 
     Parameters
     ----------
-    train : TRAIN...
+    train : TRAIN
         Measured history (.csv, .parquet, .nc), several, or a folder of them.
     test : TEST
         Held-out history; without it, a quarter of TRAIN's trajectories.
