@@ -62,13 +62,9 @@ from .posterior import loo_pit as loo_pit
 from .posterior import save_posterior as save_posterior
 from .posterior import uninformed as uninformed
 from .posterior import updated_scene as updated_scene
-from .reporting import ManyLoops as ManyLoops
-from .reporting import close_loop_many as close_loop_many
 from .reporting import report as report
-from .sampling import Pooled as Pooled
 from .sampling import fit as fit
 from .sampling import physics_model as physics_model
-from .sampling import pool as pool
 from .sampling import update as update
 from .scene import Actuator as Actuator
 from .scene import Body as Body

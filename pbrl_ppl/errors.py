@@ -130,7 +130,3 @@ class FitError(PbrlError, ValueError):
 
 class GoalError(PbrlError, ValueError):
     """An invalid goal, start or set of actions."""
-
-
-class ManifestError(PbrlError, ValueError):
-    """A manifest of logs that cannot be read, or that names one of them twice."""

@@ -1,19 +1,18 @@
-"""Work in parallel: threads, BLAS in one of them, processes that end, and an executor's tasks."""
+"""Work in parallel: threads, BLAS in one of them, and processes that end."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
 import signal
-from collections.abc import Callable, Generator, Iterable, Mapping
-from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache, wraps
 from threading import Thread
 from typing import ParamSpec, TypeVar
 
 from threadpoolctl import ThreadpoolController
 
-K = TypeVar("K")
 P = ParamSpec("P")
 R = TypeVar("R")
 T = TypeVar("T")
@@ -66,34 +65,3 @@ def _end_with_parent() -> None:
     if parent is not None:
         parent.join()
         os._exit(1)
-
-
-def as_ended(
-    tasks: Mapping[K, Callable[[], R]], executor: Executor | None
-) -> Generator[tuple[K, Callable[[], R]]]:
-    """Yield each task's key, and a call that returns its result or raises its error.
-
-    In the order in which they end; tasks that have not begun are cancelled with the iteration.
-
-    Parameters
-    ----------
-    tasks : mapping of callable
-        Each takes nothing; with an executor of processes they can be pickled.
-    executor : Executor, optional
-        Runs them; without one, the caller's call does.
-
-    Examples
-    --------
-    >>> {key: result() for key, result in as_ended({"a": int, "b": str}, None)}
-    {'a': 0, 'b': ''}
-    """
-    if executor is None:
-        yield from tasks.items()
-        return
-    futures = {executor.submit(task): key for key, task in tasks.items()}
-    try:
-        for future in as_completed(futures):
-            yield futures[future], future.result
-    finally:
-        for future in futures:
-            future.cancel()

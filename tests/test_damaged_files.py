@@ -14,7 +14,6 @@ from pbrl_ppl.history import History
 from pbrl_ppl.planning import Goal
 from pbrl_ppl.posterior import load_posterior, save_posterior
 from pbrl_ppl.posterior.store import from_groups
-from pbrl_ppl.reporting import read_manifest
 from pbrl_ppl.scene import Scene
 from tests.helpers.puck import SCENE
 
@@ -110,7 +109,7 @@ def test_what_is_no_file_is_refused_at_once(tmp_path, kind) -> None:
     }  # fmt: skip
     read_log = partial(History.load, scene=Scene.from_toml(SCENE))
     for suffix, read in {
-        ".toml": Scene.load, ".csv": read_manifest, ".nc": load_posterior, ".goal": Goal.load,
+        ".toml": Scene.load, ".csv": read_log, ".nc": load_posterior, ".goal": Goal.load,
         ".parquet": read_log, ".txt": read_log, ".mcap": read_log,
     }.items():  # fmt: skip
         path = tmp_path / f"a{suffix}"

@@ -1,16 +1,20 @@
-"""Spawned processes to run episodes in; an interrupt or an error ends them at once."""
+"""Spawned processes to run episodes in, ended at once by an interrupt or error; their tasks."""
 
 from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor
+from collections.abc import Callable, Generator, Iterator, Mapping
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import active_children, get_context
+from typing import TypeVar
 
 from episodes.world import EpisodeError
+
+K = TypeVar("K")
+R = TypeVar("R")
 
 
 @contextmanager
@@ -64,3 +68,34 @@ def processors() -> int:
     if hasattr(os, "sched_getaffinity"):  # on Linux
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+def as_ended(
+    tasks: Mapping[K, Callable[[], R]], executor: Executor | None
+) -> Generator[tuple[K, Callable[[], R]]]:
+    """Yield each task's key, and a call that returns its result or raises its error.
+
+    In the order in which they end; tasks that have not begun are cancelled with the iteration.
+
+    Parameters
+    ----------
+    tasks : mapping of callable
+        Each takes nothing; with an executor of processes they can be pickled.
+    executor : Executor, optional
+        Runs them; without one, the caller's call does.
+
+    Examples
+    --------
+    >>> {key: result() for key, result in as_ended({"a": int, "b": str}, None)}
+    {'a': 0, 'b': ''}
+    """
+    if executor is None:
+        yield from tasks.items()
+        return
+    futures = {executor.submit(task): key for key, task in tasks.items()}
+    try:
+        for future in as_completed(futures):
+            yield futures[future], future.result
+    finally:
+        for future in futures:
+            future.cancel()

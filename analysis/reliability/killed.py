@@ -38,7 +38,7 @@ COMMANDS = {
     "importance": (8, f"{FIT} --method importance"),
     "metropolis": (8, f"{FIT} --method metropolis --tune 100 --chains 2"),
     "close-loop": (16, "close-loop scene.toml train.csv -o out --test test.csv --method laplace"),
-    "close-logs": (8, "close-logs logs.csv -o out --jobs 2 --method laplace"),
+    "many": (8, "close-loop scene.toml train.csv again.csv -o out --jobs 2 --method laplace"),
     "report": (20, "report posterior.nc -o out.html"),
     "update": (8, "update posterior.nc test.csv -o out.nc"),
     "simulate": (20, "simulate posterior.nc test.csv -o out.csv"),
@@ -71,12 +71,9 @@ def prepare(base: Path) -> None:
             change = force / (2.0, 2.0, 0.04) - np.array([0.4, 0.4, 0.0]) * speed
             pose, speed = pose + 0.1 * speed + 0.005 * change, speed + 0.1 * change
     table = pd.DataFrame(rows, columns=[*COLUMNS])
-    table[table["trajectory"] < 5].to_csv(base / "train.csv", index=False)
+    for name in ("train", "again"):
+        table[table["trajectory"] < 5].to_csv(base / f"{name}.csv", index=False)
     table[table["trajectory"] == 5].to_csv(base / "test.csv", index=False)
-    (base / "logs.csv").write_text(
-        "name,scene,train,test\none,scene.toml,train.csv,test.csv\n"
-        "two,scene.toml,train.csv,test.csv\n"
-    )
     ran = run(command("laplace", False), base)
     if ran.code not in (0, 3):
         raise SystemExit(ran.err)

@@ -1,8 +1,7 @@
-"""Load: long recordings, many logs on a cluster with a killed worker, many fits, slopes of cost.
+"""Load: long recordings, many fits, slopes of cost.
 
     python -m reliability.load loop --most 10000   # 10,000 to 100,000 transitions, close-loop
     python -m reliability.load criticise           # 100,000 and a million transitions
-    python -m reliability.load logs                # 1,000 logs, a worker killed half way
     python -m reliability.load fits                # 2,000 fits in one process
     python -m reliability.load slope               # seconds against rows, bodies, laws, candidates
 
@@ -17,11 +16,8 @@ import argparse
 import json
 import os
 import resource
-import signal
-import subprocess
 import sys
 import tempfile
-import threading
 import time
 import traceback
 import warnings
@@ -219,68 +215,6 @@ def objects() -> Mapping[str, int]:
     return {"all": counts.total(), **dict(counts.most_common(4))}
 
 
-def logs(count: int, *, real: bool) -> Iterator[Case]:
-    """Close the loop on many logs by two workers of a Dask cluster, of which one is killed."""
-    yield {
-        "case": f"logs-{count}-{'loops' if real else 'stand-ins'}",
-        "run": partial(_logs, count, real),
-    }
-
-
-def _logs(count: int, real: bool) -> Case:
-    from tests.helpers.fleet import BEGUN, cluster, lines, made_logs, pretend
-
-    folder = (OUT / f"logs-{count}-{real}").absolute()
-    folder.mkdir(parents=True, exist_ok=True)
-    names = [f"log{i:04d}" for i in range(count)]
-    if real:
-        scene, _ = pucks(8, 1, 0, seed=0)
-        (folder / "scene.toml").write_text(scene.to_toml())
-        for i, name in enumerate(names):
-            pucks(48, 1, 0, seed=i)[1].to_dataframe().to_csv(folder / f"{name}.csv", index=False)
-        many: Any = None
-    else:
-        many = made_logs(folder, **dict.fromkeys(names, "wait"))
-    rows = [f"{name},scene.toml,{name}.csv\n" for name in names]
-    (folder / "logs.csv").write_text("name,scene,train\n" + "".join(rows))
-    killed: list[int] = []
-
-    def done() -> int:
-        return len(list(folder.glob("out/*/report.json")))
-
-    with cluster(folder / "dask") as client:
-        before = set(client.run(os.getpid).values())
-
-        def kill() -> None:
-            # where both workers are in the middle of a log
-            while done() < count // 2 or not (real or len(lines(folder, BEGUN)) == done() + 2):
-                time.sleep(0.02)
-            killed.append(min(before))
-            os.kill(killed[0], signal.SIGKILL)
-
-        threading.Thread(target=kill, daemon=True).start()
-        begin, first = time.monotonic(), done()
-        if real:
-            address = client.scheduler.address
-            code = "import sys; from pbrl_ppl.cli import main; sys.exit(main(sys.argv[1:]))"
-            argv = [sys.executable, "-c", code, "close-logs", "logs.csv", "-o", "out"]
-            argv += ["--method", "laplace", "--scheduler", address]
-            subprocess.run(argv, cwd=folder, capture_output=True, check=True, timeout=1700)
-        else:
-            pp.close_loop_many(
-                many, folder / "out", executor=client.get_executor(pure=False), run=pretend
-            )
-        wall = time.monotonic() - begin
-    summary = json.loads((folder / "out" / "summary.json").read_text())["logs"]
-    found = Counter(row["name"] for row in summary if row["status"] == "done")
-    again = [name for name, times in Counter(lines(folder, BEGUN)).items() if times > 1]
-    lost = [name for name in names if found[name] != 1]
-    left = [str(path) for path in folder.glob("out/*/.making-*")]
-    fault = f"lost {lost[:5]}, left {left[:5]}" if lost or left or not killed else ""
-    return {"wall": wall, "rows": len(summary), "done_before": first, "killed": killed,
-            "again": again, "fault": fault}  # fmt: skip
-
-
 # -- all -------------------------------------------------------------------------------------------
 
 
@@ -306,10 +240,9 @@ def exponents(results: list[Case]) -> Iterator[str]:
 def main() -> None:
     """Run what is missing, and print all results."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("part", choices=["loop", "criticise", "logs", "fits", "slope", "show"])
+    parser.add_argument("part", choices=["loop", "criticise", "fits", "slope", "show"])
     parser.add_argument("--most", type=int, default=10**6, help="transitions, at most")
-    parser.add_argument("--count", type=int, help="logs or fits")
-    parser.add_argument("--real", action="store_true", help="logs: loops, not stand-ins of 0.4 s")
+    parser.add_argument("--count", type=int, help="fits")
     given = parser.parse_args()
     OUT.mkdir(parents=True, exist_ok=True)
     path = OUT / "load.jsonl"
@@ -318,7 +251,6 @@ def main() -> None:
     cases = {
         "loop": lambda: by_command("close-loop", sizes, given.most),
         "criticise": lambda: by_command("criticise", (*sizes[:5], (10**6, 100)), given.most),
-        "logs": lambda: logs(given.count or 1000, real=given.real),
         "fits": lambda: fits(given.count or 2000),
         "slope": lambda: slopes(given.most),
         "show": lambda: iter(()),

@@ -56,7 +56,6 @@ KINDS: Mapping[str, tuple[str, int, tuple[str, ...]]] = {
     "actions": ("actions.toml", 4, (
         "plan posterior.nc --start 0,0,0 --goal 1,0,- --actions {} --nodes 50 -o new.csv",
     )),
-    "manifest": ("logs.csv", 4, ("manifest {}",)),
     "json": ("log.json", 5, (CHECK,)),
     "mat": ("log.mat", 3, (f"{CHECK} --columns time=time",)),
     "bag1": ("log.bag", 4, ("check bag.toml {} --no-prior",)),
@@ -78,13 +77,11 @@ LAUGHS = '<!DOCTYPE m [<!ENTITY a0 "ha">' + "".join(
 
 
 def library(argv: list[str]) -> int:
-    """Read a manifest, or a MuJoCo model, in place of a command."""
+    """Read a MuJoCo model in place of a command."""
     from pbrl_ppl.mjcf import scene_from_mjcf
-    from pbrl_ppl.reporting import read_manifest
 
-    readers = {"manifest": read_manifest, "mjcf": scene_from_mjcf}
     try:
-        readers[argv[0]](argv[1])
+        scene_from_mjcf(argv[1])
     except PbrlError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -411,7 +408,7 @@ def main() -> None:
         shutil.copytree(base, place, ignore=shutil.ignore_patterns(".std*"))
         way = mutate(kind, place / name, draw, base)
         argv = draw.choice(commands).format(name).split()
-        program = library if argv[0] in ("manifest", "mjcf") else None
+        program = library if argv[0] == "mjcf" else None
         ran = run(argv, place, limit=SECONDS, memory=MEGABYTES, program=program)
         fault = fault_of(ran)
         if not fault and kind == "posterior" and way == "damaged" and ran.code != 2:

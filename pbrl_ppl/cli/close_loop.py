@@ -1,36 +1,31 @@
-"""The loop: ``pbrl-ppl close-loop``; ``demo`` on the package's recording; ``close-logs``."""
+"""The loop: ``pbrl-ppl close-loop``, on one log or many; ``demo`` on the package's recording."""
 
 from __future__ import annotations
 
-import pickle
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any
 
-import cloudpickle
 import typer
 
 from pbrl_ppl.cli import options, terminal
 from pbrl_ppl.cli.app import command
 from pbrl_ppl.cli.new import models_folder
 from pbrl_ppl.cli.terminal import Progress, Result
-from pbrl_ppl.errors import OutputError
-from pbrl_ppl.files import check_folder
+from pbrl_ppl.errors import HistoryError, PbrlError
+from pbrl_ppl.files import check_folder, write_text
 from pbrl_ppl.threads import obey_parent
 
 if TYPE_CHECKING:
     from pbrl_ppl.criticism import Loop
     from pbrl_ppl.effects import Effect
-
-P = ParamSpec("P")
-T = TypeVar("T")
 
 #: How a sentence on laws that were found begins.
 _FOUND = "simulations name"
@@ -84,31 +79,50 @@ class Sampler:
         return vars(self) | {"method": self.method.value, "catalogue": tuple(effects)}
 
 
-@command("close-loop", 5, "pbrl-ppl close-loop scene.toml train.csv -o report/")
+@command(
+    "close-loop", 5, "pbrl-ppl close-loop scene.toml train.csv -o report/",
+    kept="nothing was written but reports of finished logs of many, into {to.output}",
+)  # fmt: skip
 def close_loop(
     context: typer.Context,
     scene: Path,
-    train: Path,
+    train: list[Path],
     to: options.FolderOutput,
     reading: options.SceneReading,
     sampler: Sampler,
     progress: Progress,
     interrupts: terminal.Interrupts,
     test: Path | None = None,
+    jobs: options.Count = 1,
 ) -> Result:
     """Find what the declared model lacks, add it, refit, and report before and after.
 
-    Exits with 3 if the chains have not converged: then there is no verdict.
+    Of several logs, or a folder of them, each has a report of its own, and index.html lists all.
+    Exits with 3 if the chains have not converged: then there is no verdict. Of several logs it
+    exits with 1 if at least one failed, which does not stop the others.
 
     Parameters
     ----------
     train : TRAIN
-        Measured history (.csv, .parquet, .nc).
+        Measured history (.csv, .parquet, .nc), several, or a folder of them.
     test : TEST
         Held-out history; without it, a quarter of TRAIN's trajectories.
+    jobs
+        Of several logs so many at a time, each in a process of its own.
     """
     progress("reading the scene and the histories")
-    paths = [train] if test is None else [train, test]
+    from pbrl_ppl.history import logs_in
+
+    logs = [log for path in train for log in logs_in(path)]
+    if logs != train or len(logs) > 1:
+        if test is not None:
+            raise HistoryError(
+                f"history {test}: --test is given with {len(logs)} logs, expected one; leave it"
+                " out, and a quarter of each log's trajectories is held out"
+            )
+        each = Each(scene, reading, sampler, to, options.command_line(context))
+        return _closed(each, _named(logs), jobs, progress)
+    paths = logs if test is None else [*logs, test]
     declared, histories = reading.read(scene, paths)
     progress("loading the sampler")
     import pbrl_ppl.reporting as report
@@ -120,13 +134,104 @@ def close_loop(
     run = partial(criticism.close_loop, declared, *histories, **settings)
     loop, stopped = _finished(run, progress, interrupts)
     progress("writing the report")
-    files = str(scene), str(train), str(test or "")
+    files = str(scene), str(logs[0]), str(test or "")
     source = report.Source(*files, options.command_line(context))
     loop.save(output, to.overwrite, page=report.render(loop, source))
     contents = loop.to_dict() | {"report": output / "report.html"}
     undecided = terminal.UNDECIDED if loop.verdict == criticism.NOT_CONVERGED else 0
     code = terminal.INTERRUPTED if stopped else undecided
     return Result(contents, report.in_brief(loop, output), code)
+
+
+@dataclass(frozen=True)
+class Each:
+    """What all of many logs have in common."""
+
+    scene: Path
+    reading: options.SceneReading
+    sampler: Sampler
+    to: options.FolderOutput
+    command: str
+
+    def close(self, name: str, log: Path) -> dict[str, Any]:
+        """Close the loop on one log, write its report, and return its row of the page."""
+        import pbrl_ppl.reporting as report
+        from pbrl_ppl import criticism
+
+        with terminal.warnings_in_a_line(), terminal.noted_warnings("") as noted:
+            try:
+                declared, histories = self.reading.read(self.scene, [log])
+                settings = self.sampler.settings(self.reading.catalogue())
+                loop = criticism.close_loop(declared, *histories, **settings)
+                source = report.Source(str(self.scene), str(log), "", self.command)
+                page = report.render(loop, source)
+                loop.save(self.to.output / name, self.to.overwrite, page=page)
+            except Exception as error:
+                return _failed(name, error)
+        return {
+            "log": name,
+            "verdict": loop.verdict,
+            "added": [f"{law.effect}[{law.body}]" for law in loop.added],
+            "error_before": loop.before.normalised_rmse,
+            "error_after": loop.after.normalised_rmse,
+            "warnings": list(dict.fromkeys(map(terminal.in_a_line, noted))),
+        }
+
+    def apart(self, name: str, log: Path) -> dict[str, Any]:
+        """Close the loop on one log in a process, whose end, short of memory say, is its alone."""
+        try:
+            # PyMC's threads do not survive a fork
+            with ProcessPoolExecutor(1, get_context("spawn"), obey_parent) as process:
+                return process.submit(self.close, name, log).result()
+        except BrokenProcessPool as error:
+            return _failed(name, error)
+
+
+def _failed(name: str, error: Exception) -> dict[str, Any]:
+    """Return the row of a log that failed."""
+    kind = "" if isinstance(error, PbrlError) else f"{type(error).__name__}: "
+    message = terminal.in_a_line(f"{kind}{error}")
+    return {"log": name, "verdict": "failed", "added": [], "warnings": [], "message": message}
+
+
+def _named(logs: Sequence[Path]) -> dict[str, Path]:
+    """Return logs by the names of their folders; some file systems ignore case."""
+    names = [log.name if log.is_dir() else log.stem for log in logs]
+    name, count = Counter(map(str.lower, names)).most_common(1)[0]
+    if count > 1:
+        raise HistoryError(
+            f'logs: {count} have the name "{name}", expected one each, for it names the folder of'
+            " the report; rename one"
+        )
+    return dict(zip(names, logs, strict=True))
+
+
+def _closed(each: Each, logs: Mapping[str, Path], jobs: int, progress: Progress) -> Result:
+    """Close the loop on many logs, and write the page of all."""
+    import pbrl_ppl.reporting as report
+    from pbrl_ppl.history import read_scene
+
+    page = each.to.output / "index.html"
+    check_folder(page.parent, True, [page.name])
+    # what would be wrong for all
+    read_scene(each.scene, **each.reading.scene_settings())
+    each.reading.catalogue()
+    page.parent.mkdir(parents=True, exist_ok=True)
+    rows: list[dict[str, Any]] = []
+    with ThreadPoolExecutor(jobs) as threads:
+        for row in threads.map(each.apart, logs, logs.values()):
+            rows.append(row)
+            said = row.get("message") or ", ".join([row["verdict"], *row["added"]])
+            progress(f"{len(rows)}/{len(logs)} {row['log']}: {said}")
+    write_text(page, report.render_logs(rows, each.command))
+    laws: dict[str, list[str]] = {}
+    for row in rows:
+        for law in row["added"]:
+            laws.setdefault(law, []).append(row["log"])
+    shown = [f"{law}: {', '.join(names)}" for law, names in laws.items()]
+    shown += [report.count_verdicts(rows), f"page: {page}"]
+    code = terminal.FAILED * any(row["verdict"] == report.FAILED for row in rows)
+    return Result({"page": page, "logs": rows}, shown, code)
 
 
 def _finished(
@@ -193,129 +298,10 @@ def demo(
         )
     train, test = (cart / "recorded" / f"{name}.csv" for name in ("train", "test"))
     result = close_loop(
-        context, cart / "scene.toml", train, to, options.SceneReading(), sampler, progress,
+        context, cart / "scene.toml", [train], to, options.SceneReading(), sampler, progress,
         interrupts, test,
     )  # fmt: skip
     if quiet or result.code:
         return result
     last = "With a recording of yours: pbrl-ppl new scene.toml --history train.csv"
     return replace(result, shown=[*result.shown, last])
-
-
-@command(
-    "close-logs", 6, "pbrl-ppl close-logs logs.csv -o results/ --jobs 4",
-    kept="finished logs are in {output}; the same command goes on",
-)  # fmt: skip
-def close_logs(
-    context: typer.Context,
-    manifest: Path,
-    output: options.OutputFolder,
-    reading: options.SceneReading,
-    sampler: Sampler,
-    progress: Progress,
-    overwrite: bool = False,
-    jobs: options.Count = 1,
-    scheduler: str | None = None,
-) -> Result:
-    """Close the loop on each log of a manifest, and report which effects are where.
-
-    The same command goes on after an interrupt. Exits with 1 if some logs failed.
-
-    Parameters
-    ----------
-    manifest : MANIFEST
-        A CSV file with the columns name, scene, train, test, kind.
-    output
-        Folder for the results.
-    overwrite
-        Run finished logs again.
-    jobs
-        Logs at a time.
-    scheduler : ADDRESS
-        A Dask scheduler that has the workers.
-    """
-    check_folder(output, overwrite=True)
-    progress("reading the manifest")
-    import pbrl_ppl.reporting as report
-
-    logs = report.read_manifest(manifest)  # its errors come before a cluster is sought
-    settings = sampler.settings(reading.catalogue())
-    if not (reading.effect_file or sampler.catalogue):
-        del settings["catalogue"]
-    with _executor(jobs, scheduler) as executor:
-        loops = report.close_loop_many(
-            logs, output, executor=executor, progress=progress, again=overwrite,
-            source=report.Source(command=options.command_line(context)),
-            **settings, **reading.scene_settings(), **reading.settings(),
-        )  # fmt: skip
-    effects = loops.effects().drop_duplicates(["name", "effect", "body"])
-    lines = [
-        f"{effect}[{body}]: {', '.join(rows['name'])}"
-        for (effect, body), rows in effects.groupby(["effect", "body"], sort=False)
-    ]
-    page = output / "index.html"
-    lines += [report.in_words(loops.rows), f"page: {page}"]
-    return Result({"page": page, "logs": loops.rows}, lines, terminal.FAILED if loops.failed else 0)
-
-
-def _executor(jobs: int, scheduler: str | None) -> AbstractContextManager[Executor | None]:
-    """Return the executor of a Dask cluster, processes of this machine, or None, as a context."""
-    if scheduler is not None:
-        return _cluster(scheduler)
-    # close_loop_many cancels what has not begun
-    return nullcontext() if jobs == 1 else OneProcessEach(jobs)
-
-
-@contextmanager
-def _cluster(scheduler: str) -> Iterator[Executor]:
-    """Yield the executor of a running Dask scheduler."""
-    try:
-        from distributed import Client
-    except ImportError:
-        raise OutputError(
-            "--scheduler needs Dask distributed, which is not installed: pip install"
-            " 'pbrl_ppl[many]', here and where the workers run"
-        ) from None
-    try:
-        client = Client(scheduler, timeout=10)
-    except (OSError, ValueError) as error:
-        raise OutputError(
-            f"--scheduler {scheduler}: no Dask scheduler answers there ({error}); expected an"
-            " address such as tcp://host:8786"
-        ) from None
-    with client:
-        if not client.scheduler_info()["workers"]:
-            typer.echo(f"no worker at {scheduler} yet; waiting for one", err=True)
-        yield client.get_executor(pure=False)
-
-
-class OneProcessEach(ThreadPoolExecutor):
-    """Executor that runs each call in a fresh process.
-
-    A process that dies, out of memory for instance, does not take others with it, as in a pool; its
-    call is tried once more. PyMC's threads do not survive a fork, so processes are spawned.
-    """
-
-    def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-        """Schedule a call."""
-        return super().submit(_in_a_process, partial(fn, *args, **kwargs))
-
-
-def _in_a_process(function: partial[T]) -> T:
-    # the laws of an effect file are functions of no module that another process could import
-    call = cloudpickle.dumps(function)
-    made: T
-    try:
-        made = _in_a_new_one(call)
-    except BrokenProcessPool:
-        made = _in_a_new_one(call)
-    return made
-
-
-def _in_a_new_one(call: bytes) -> Any:
-    with ProcessPoolExecutor(1, get_context("spawn"), obey_parent) as pool:
-        return pool.submit(_called, call).result()
-
-
-def _called(call: bytes) -> object:
-    return pickle.loads(call)()

@@ -32,6 +32,7 @@ import shlex
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar
 
@@ -233,13 +234,13 @@ def command_line(context: typer.Context) -> str:
         value = context.params.get(str(parameter.name))
         if value is None or value is False:
             continue
+        items = list(map(str, value if isinstance(value, (list, tuple)) else (value,)))
         if parameter.param_type_name == "argument":
-            words.append(str(value))
+            words += items
         elif value is True:
             options.append(parameter.opts[0])
         else:
-            for item in value if isinstance(value, (list, tuple)) else (value,):
-                options += [parameter.opts[0], str(item)]
+            options += chain.from_iterable((parameter.opts[0], item) for item in items)
     return shlex.join([*words, *options])
 
 

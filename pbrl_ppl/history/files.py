@@ -101,6 +101,34 @@ def read_table(path: Path, layout: Recording) -> pd.DataFrame:
         raise HistoryError(f"history {path}: cannot be read: {reason(error)}") from None
 
 
+def logs_in(path: Path) -> list[Path]:
+    """Return a log itself, or of a folder of logs each: its bags and files that can be read.
+
+    Raises
+    ------
+    HistoryError
+        If there is no such file, or the folder has no log.
+    """
+    if not path.exists():
+        raise HistoryError(f"history {path}: there is no such file; check the path")
+    if not path.is_dir() or _is_bag(path):
+        return [path]
+    endings = [suffix for suffix in _readers() if suffix != FOLDER]
+    logs = [
+        each for each in sorted(path.iterdir()) if each.suffix.lower() in endings or _is_bag(each)
+    ]
+    if not logs:
+        raise HistoryError(
+            f"history {path}: the folder has no log; expected files that end in"
+            f" {', '.join(endings)}, or ROS 2 bags (folders with metadata.yaml)"
+        )
+    return logs
+
+
+def _is_bag(path: Path) -> bool:
+    return (path / "metadata.yaml").exists()
+
+
 def read_commands(path: Path, layout: Recording | None) -> pd.DataFrame | None:
     """Return the table of a layout's ``commands``, beside a recording; None without any."""
     if layout is None or not layout.commands:

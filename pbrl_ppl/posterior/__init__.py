@@ -59,6 +59,4 @@ from .store import smoothed as smoothed
 from .updated_prior import joint_probabilities as joint_probabilities
 from .updated_prior import learned_library as learned_library
 from .updated_prior import library_probabilities as library_probabilities
-from .updated_prior import moment_matched as moment_matched
 from .updated_prior import updated_scene as updated_scene
-from .updated_prior import with_priors as with_priors

@@ -3,11 +3,9 @@
 from pbrl_ppl.reporting.effect_plots import plot_candidates as plot_candidates
 from pbrl_ppl.reporting.error_plots import plot_errors as plot_errors
 from pbrl_ppl.reporting.error_plots import plot_rollout as plot_rollout
-from pbrl_ppl.reporting.logs import Log as Log
-from pbrl_ppl.reporting.logs import read_manifest as read_manifest
-from pbrl_ppl.reporting.many import ManyLoops as ManyLoops
-from pbrl_ppl.reporting.many import close_loop_many as close_loop_many
-from pbrl_ppl.reporting.many_page import in_words as in_words
+from pbrl_ppl.reporting.logs_page import FAILED as FAILED
+from pbrl_ppl.reporting.logs_page import count_verdicts as count_verdicts
+from pbrl_ppl.reporting.logs_page import render_logs as render_logs
 from pbrl_ppl.reporting.page import Source as Source
 from pbrl_ppl.reporting.posterior_plots import plot_prior_check as plot_prior_check
 from pbrl_ppl.reporting.posterior_plots import plot_rank as plot_rank

@@ -5,6 +5,4 @@ from .declaration import try_own_effects as try_own_effects
 from .fitting import DEFAULT as DEFAULT
 from .fitting import fit as fit
 from .fitting import sample as sample
-from .pooling import Pooled as Pooled
-from .pooling import pool as pool
 from .updating import update as update

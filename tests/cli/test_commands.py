@@ -106,7 +106,6 @@ def test_options_are_alike() -> None:
         "check",
         "fit",
         "close-loop",
-        "close-logs",
         "plan",
         "suggest",
         "simulate",
@@ -125,7 +124,7 @@ def test_commands_read_recordings_alike() -> None:
         for name in NAMES
     }
     reading = {"--columns", "--units", "--estimate-velocities", "--trim", "--effect-file"}
-    for name in ("check", "criticise", "fit", "close-loop", "close-logs"):
+    for name in ("check", "criticise", "fit", "close-loop"):
         assert reading | {"--noise", "--substeps", "--time-step"} <= options[name], name
     for name in ("update", "simulate"):
         assert reading | {"--resample"} <= options[name], name
@@ -601,12 +600,8 @@ def test_a_folder_that_cannot_be_made_is_refused_at_once(
     name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(criticism, "close_loop", lambda *args, **options: pytest.fail("too late"))
-    Path("logs.csv").write_text("name,scene,train\na,scene.toml,train.csv\n")
-    for argv in (
-        ["close-loop", "scene.toml", "train.csv"],
-        ["close-logs", "logs.csv"],
-    ):
-        assert "cannot be made" in message(capsys, *argv, "-o", name)
+    for logs in (["train.csv"], ["train.csv", "test.csv"]):
+        assert "cannot be made" in message(capsys, "close-loop", "scene.toml", *logs, "-o", name)
 
 
 @pytest.mark.usefixtures("puck")

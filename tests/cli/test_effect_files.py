@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 import pbrl_ppl as pp
-from pbrl_ppl import criticism, planning, posterior, reporting
+from pbrl_ppl import criticism, planning, posterior
 from pbrl_ppl.cli import main
-from pbrl_ppl.cli.close_loop import OneProcessEach
 from pbrl_ppl.cli.options import added_effects, own_effects
 from pbrl_ppl.posterior import load_posterior, scene_of
 from tests.helpers.histories import simulated_history
@@ -106,18 +105,15 @@ def test_commands_look_effects_up_in_the_file(files, monkeypatch, capsys) -> Non
         (criticism, "criticise"),
         (criticism, "attribute"),
         (planning, "suggest_actions"),
-        (reporting, "close_loop_many"),
     ):
         monkeypatch.setattr(module, name, take)
     monkeypatch.setattr(posterior, "load_posterior", lambda path: None)
     monkeypatch.setattr(posterior, "scene_of", lambda idata: pp.Scene.load("scene.toml"))
-    Path("logs.csv").write_text("name,scene,train\na,scene.toml,train.csv\n")
     names = ["--effect", "tether", "--effect", "spring"]
     for command in (
         ["criticise", "scene.toml", "train.csv"],
         ["criticise", "scene.toml", "train.csv", "--simulate"],
         ["suggest", "puck.nc", "-o", "next.csv", *names],
-        ["close-logs", "logs.csv", "-o", "out"],
     ):
         given.clear()
         assert "enough" in refused(capsys, *command, "--effect-file", "laws.py")
@@ -134,10 +130,14 @@ def test_commands_look_effects_up_in_the_file(files, monkeypatch, capsys) -> Non
     assert float(abs(off).max()) < 0.05
 
 
-def test_a_law_of_an_effect_file_goes_to_another_process(files) -> None:
-    (tether,) = own_effects([Path("laws.py")])
-    with OneProcessEach(1) as executor:
-        assert executor.submit(getattr, tether, "name").result() == "tether"
+@pytest.mark.slow
+def test_a_law_of_an_effect_file_is_found_in_two_logs(files, capsys) -> None:
+    """Each in a process of its own, which reads the file again."""
+    argv = ["close-loop", "scene.toml", "train.csv", "since.csv", "-o", "out", "--jobs", "2"]
+    options = ["--effect-file", "laws.py", "--method", "laplace", "--quiet"]
+    assert main([*argv, *options]) == 0
+    assert "tether[puck]: train, since" in capsys.readouterr().out
+    assert all(Path("out", name, "report.html").is_file() for name in ("train", "since"))
 
 
 def test_an_own_effect_that_the_scene_declares_acts_there_alone(files) -> None:

@@ -11,8 +11,7 @@ from pbrl_ppl.cli import main
 from pbrl_ppl.cli.terminal import Result, in_a_line, stages, table
 from pbrl_ppl.errors import printable
 from pbrl_ppl.history.files import COLUMNS
-from pbrl_ppl.reporting import Source
-from pbrl_ppl.reporting.many_page import page
+from pbrl_ppl.reporting import render_logs
 from pbrl_ppl.scene import Scene
 from tests.helpers.html import Page
 
@@ -117,15 +116,11 @@ def test_pages_show_a_name_as_text(tmp_path) -> None:
 
 
 def test_the_page_of_many_logs_shows_names_as_text(tmp_path) -> None:
-    """A log's name cannot be hostile; its message, warnings, effects and bodies can."""
-    failed = {"name": "a", "kind": "", "status": "failed", "message": PRINTABLE}
-    done = {
-        "name": "b", "kind": "", "status": "done", "verdict": "effects-added",
-        "effects": [{"effect": "spring", "body": PRINTABLE, "parameters": {}, "p_value": 1e-9,
-                     "main": True}],
-        "detectable": {}, "error_before": 2.0, "error_after": 1.0, "seconds": 1.0,
-        "warnings": [PRINTABLE],
-    }  # fmt: skip
-    text = page([failed, done], {}, {}, Source(command=PRINTABLE))
+    """A log's name, its message, warnings and bodies."""
+    failed = {"log": PRINTABLE, "verdict": "failed", "added": [], "warnings": [],
+              "message": PRINTABLE}  # fmt: skip
+    done = failed | {"verdict": "effects-added", "added": [f"spring[{PRINTABLE}]"],
+                     "message": "", "warnings": [PRINTABLE]}  # fmt: skip
+    text = render_logs([failed, done], PRINTABLE)
     assert "<script>alert" not in text
     assert Page(text).text.count(PRINTABLE) >= 3

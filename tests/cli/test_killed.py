@@ -13,11 +13,16 @@ pytestmark = pytest.mark.one_stack
 
 SCRIPT = """
 import multiprocessing, time
-from pbrl_ppl.cli.close_loop import OneProcessEach
+from concurrent.futures import ThreadPoolExecutor
+from pbrl_ppl.cli.close_loop import Each
+
+class Sleeps(Each):
+    def close(self, name, log):
+        time.sleep(60.0)
 
 if __name__ == "__main__":
-    with OneProcessEach(1) as pool:
-        pool.submit(time.sleep, 60.0)
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(Sleeps(*[None] * 5).apart, "log", None)
         while not multiprocessing.active_children():
             time.sleep(0.1)
         time.sleep({wait})
@@ -28,7 +33,7 @@ if __name__ == "__main__":
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="processes are listed there")
 def test_a_worker_ends_with_its_parent(tmp_path) -> None:
-    """A log's process went on for minutes, and then waited for ever, once close-logs was killed."""
+    """A log's process went on for minutes, and then waited for ever, after a kill."""
     script = tmp_path / "script.py"
     script.write_text(SCRIPT.format(wait=4.0))  # its initializer has begun by then
     with subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, text=True) as parent:

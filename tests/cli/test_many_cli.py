@@ -1,7 +1,7 @@
-"""``close-logs`` and the options of tables that have names and units of their own."""
+"""``close-loop`` on many logs, and the options of tables that have names and units of their own."""
 
-import os
-from concurrent.futures.process import BrokenProcessPool
+import json
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +10,11 @@ import pytest
 
 from pbrl_ppl import criticism
 from pbrl_ppl.cli import main
-from pbrl_ppl.cli.close_loop import OneProcessEach
-from pbrl_ppl.reporting import many
-from pbrl_ppl.reporting.logs import Settings, close_log, settle
-from tests.helpers.fleet import made_logs, pretend
-from tests.helpers.processes import dies
+from pbrl_ppl.cli.close_loop import Each, Sampler
+from pbrl_ppl.cli.options import FolderOutput, SceneReading
+from pbrl_ppl.criticism import FILES, Loop
+from tests.helpers.made_up import made_up
+from tests.helpers.processes import Dies
 
 SCENE = """
 [world]
@@ -24,100 +24,117 @@ time_step = 0.1
 name = "puck"
 shape = { kind = "circle", radius = 0.1 }
 """
+HEADER = "trajectory,time,body,x,y,theta,vx,vy,omega,force_x,force_y,torque\n"
 
 
 @pytest.fixture
-def logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Settings]:
-    """A folder with a manifest of logs that take no time; the settings they were run with."""
-    made = made_logs(tmp_path, red="linear_drag", blue="")
-    rows = [f"{log.name},{log.scene.name},{log.train.name}\n" for log in made]
-    (tmp_path / "logs.csv").write_text("name,scene,train\n" + "".join(rows))
+def seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """A folder of logs whose loops take no time, here; the transitions of those that were closed.
+
+    That of two transitions is adequate, of three has a drag, of four makes the loop crash.
+    """
     monkeypatch.chdir(tmp_path)
-    seen: list[Settings] = []
+    Path("scene.toml").write_text(SCENE)
+    Path("logs").mkdir()
+    for name, count in {"blue": 2, "red": 3, "Red 2": 3, "wild": 4}.items():
+        rows = (f"1,{0.1 * i:g},puck,{i},0,0,1,0,0,0,0,0\n" for i in range(count + 1))
+        Path(f"logs/{name}.csv").write_text(HEADER + "".join(rows))
+    Path("logs/bad.csv").write_text("time,x\n1,2\n")
+    Path("logs/notes.md").write_text("no log")
+    closed: list[int] = []
 
-    def settled(log: Any, folder: Any, settings: Settings, inputs: str, run: Any) -> Any:
-        assert run is close_log
-        seen.append(settings)
-        return settle(log, folder, settings, inputs, pretend)
+    def close_loop(scene: Any, train: Any, **options: Any) -> Loop:
+        closed.append(train.n_transitions)
+        assert options["seed"] == 7 and options["method"] == "laplace"
+        if train.n_transitions == 4:
+            raise ZeroDivisionError("by zero")
+        if train.n_transitions == 2:
+            warnings.warn("rows were\nresampled", UserWarning, stacklevel=2)
+        return made_up("adequate" if train.n_transitions == 2 else "effects-added")
 
-    monkeypatch.setattr(many, "settle", settled)
-    return seen
+    monkeypatch.setattr(criticism, "close_loop", close_loop)
+    monkeypatch.setattr("pbrl_ppl.reporting.render", lambda *args, **options: "a page")
+    monkeypatch.setattr(Each, "apart", Each.close)
+    return closed
 
 
-def test_many(logs: list[Settings], capsys: pytest.CaptureFixture[str]) -> None:
-    options = (
-        "--seed 7 --draws 300 --substeps 5 --noise x=0.1 --columns x=px,force_y=0 --columns time=t"
-        " --units x=mm,theta=deg --time-step 0.2 --estimate-velocities --method laplace"
-    )
-    argv = ["close-logs", "logs.csv", "-o", "out"]
-    assert main([*argv, *options.split()]) == 0
+OPTIONS = ("-o", "out", "--seed", "7", "--method", "laplace")
+
+
+def test_a_folder_of_logs(seen: list[int], capsys: pytest.CaptureFixture[str]) -> None:
+    """Each has a report, one page lists all, and those that fail do not stop the others."""
+    assert main(["close-loop", "scene.toml", "logs", *OPTIONS]) == 1
     captured = capsys.readouterr()
     assert captured.out.splitlines() == [
-        "linear_drag[cart]: red",
-        "1 adequate, 1 effects-added",
+        "linear_drag[cart]: Red 2, red",
+        "1 adequate, 2 effects-added, 2 failed",
         "page: out/index.html",
     ]
-    assert "2/2 blue: adequate" in captured.err
-    # the page says what makes it again
+    assert "3/5 blue: adequate" in captured.err and "warning" not in captured.err
+    assert "5/5 wild: ZeroDivisionError: by zero" in captured.err
+    for name in ("Red 2", "blue", "red"):
+        assert sorted(path.name for path in Path("out", name).iterdir()) == sorted(FILES)
+    assert sorted(path.name for path in Path("out").iterdir()) == [
+        "Red 2", "blue", "index.html", "red",
+    ]  # fmt: skip
     page = Path("out/index.html").read_text()
-    assert "pbrl-ppl close-logs" in page and "logs.csv" in page and "--units x=mm" in page
-    assert (
-        logs
-        == [
-            Settings(
-                scene={"noise": {"x": 0.1}, "substeps": 5, "time_step": 0.2},
-                recording={
-                    "estimate_velocities": True,
-                    "columns": {"x": "px", "force_y": 0.0, "time": "t"},
-                    "units": {"x": "mm", "theta": "deg"},
-                    "trim": False,
-                },
-                loop={"seed": 7, "draws": 300, "method": "laplace", "most_transitions": 3000},
-            )
-        ]
-        * 2
-    )
-    Path("blue.csv").write_text("fail")
-    assert main([*argv, "-q"]) == 1
-    captured = capsys.readouterr()
-    assert "1 effects-added, 1 failed" in captured.out and captured.err == ""
-    Path("blue.csv").write_text("interrupt")
-    assert main([*argv, "-q"]) == 130
-    message = "interrupted; finished logs are in out; the same command goes on\n"
-    assert capsys.readouterr().err == message
-    assert main(argv) == 130
-    assert capsys.readouterr().err.count("interrupted") == 1
-    assert Path("out/red/report.html").is_file() and not Path("out/blue/report.json").exists()
+    for words in ('href="Red%202/report.html"', "linear drag[cart]", "missing column(s)",
+                  "rows were resampled", "pbrl-ppl close-loop scene.toml logs -o out"):  # fmt: skip
+        assert words in page
+    assert 'href="bad' not in page
+
+
+def test_several_logs_are_run_again(seen: list[int], capsys: pytest.CaptureFixture[str]) -> None:
+    argv = ["close-loop", "scene.toml", "logs/blue.csv", "logs/red.csv", *OPTIONS, "-q"]
+    assert main(argv) == 0
+    assert capsys.readouterr().err == ""
+    assert main(argv) == 2
+    assert "it is not empty" in capsys.readouterr().err
+    assert main([*argv, "--overwrite", "--json"]) == 0
+    assert sorted(seen) == [2, 2, 3, 3]
+    told = json.loads(capsys.readouterr().out)
+    assert told["page"] == "out/index.html"
+    assert [(row["log"], row["verdict"]) for row in told["logs"]] == [
+        ("blue", "adequate"),
+        ("red", "effects-added"),
+    ]
+    assert told["logs"][0]["warnings"] == ["rows were resampled"]
+    assert told["logs"][1]["error_before"] > told["logs"][1]["error_after"]
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("given", "message"),
     [
-        ("nope.csv", "nope.csv: there is no such file"),
-        ("scene.toml", 'unknown column "a scene"'),
-        ("scene.toml red.csv", "unexpected extra argument"),
-        ("", "Missing argument 'MANIFEST'"),
-        ("logs.csv --columns x", "is not NAME=VALUE, such as x=pos_x"),
-        ("logs.csv --units x=", "is not NAME=VALUE, such as x=mm"),
-        ("logs.csv --scheduler tcp://127.0.0.1:9", "no Dask scheduler answers there"),
+        ("logs/blue.csv nope.csv", "nope.csv: there is no such file"),
+        ("logs/blue.csv logs/red.csv logs/blue.csv", '2 have the name "blue"'),
+        ("logs --test logs/blue.csv", "--test is given with 5 logs"),
+        ("empty", "the folder has no log; expected files that end in .csv"),
+        ("logs --columns x", "is not NAME=VALUE, such as x=pos_x"),
+        ("logs --units x=", "is not NAME=VALUE, such as x=mm"),
+        ("logs --noise speed=1", "speed"),
+        ("logs --effect-file nope.py", "nope.py"),
+        ("logs --jobs 0", "--jobs"),
     ],
 )
 def test_bad_usage(
-    options: str, message: str, logs: list[Settings], capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
-    distributed = pytest.importorskip("distributed")
-
-    def nobody(address: str, timeout: float) -> None:
-        raise OSError("timed out")
-
-    monkeypatch.setattr(distributed, "Client", nobody)
-    assert main(["close-logs", "-o", "out", *options.split()]) == 2
+    given: str, message: str, seen: list[int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What is wrong for all logs is said before any of them."""
+    Path("empty").mkdir()
+    assert main(["close-loop", "scene.toml", *given.split(), *OPTIONS]) == 2
     captured = capsys.readouterr()
     assert captured.out == "" and "Traceback" not in captured.err
     # typer puts usage errors into a box
     assert message in " ".join(captured.err.replace("│", " ").split())
-    assert not logs and not Path("out").exists()
+    assert not seen and not Path("out").exists()
+
+
+def test_a_process_that_dies_takes_no_other_with_it(tmp_path: Path) -> None:
+    scene, to = tmp_path / "scene.toml", FolderOutput(tmp_path / "out")
+    each = Dies(scene, SceneReading(), Sampler(), to, "pbrl-ppl close-loop")
+    assert each.apart("lives", tmp_path)["verdict"] == "adequate"
+    row = each.apart("dies", tmp_path)
+    assert row["verdict"] == "failed" and "BrokenProcessPool" in row["message"]
 
 
 @pytest.mark.filterwarnings("default::pbrl_ppl.errors.ResamplingWarning")
@@ -170,17 +187,3 @@ def test_every_command_that_reads_a_recording_takes_own_tables(
     simulated = ["simulate", *files, *own, "--resample", "-o", "new.csv", "--set", "mass=1"]
     assert main([*simulated, "--set", "r=0.1", "--set", "mu_c=0.1"]) == 0
     assert Path("new.csv").is_file()
-
-
-def test_a_process_that_dies_takes_no_other_with_it(tmp_path: Path) -> None:
-    folders = [tmp_path / f"{times}" for times in range(3)]
-    for folder in folders:
-        folder.mkdir()
-    with OneProcessEach(2) as executor:
-        never, once, twice = (
-            executor.submit(dies, str(folder), times) for times, folder in enumerate(folders)
-        )
-        assert never.result() != os.getpid() != once.result()
-        with pytest.raises(BrokenProcessPool):
-            twice.result()
-    assert [len(list(folder.iterdir())) for folder in folders] == [1, 2, 2]

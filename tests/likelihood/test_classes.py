@@ -174,14 +174,3 @@ def test_one_choice_a_class() -> None:
     table = library_probabilities(idata)
     assert table.index.tolist() == ["chair"] and table.loc["chair", "heavy"] == 1.0
     assert Dynamics.of(idata).mass("chair2") == MASS
-
-
-def test_pooled() -> None:
-    """Each chair gets the class's prior."""
-    own = scene().with_effects("chair2", "linear_drag")
-    idata = [quick(physics_model(own, recorded(seed=s, intervals=15)), method="laplace")
-             for s in (5, 6)]  # fmt: skip
-    pooled = pp.pool({"a": idata[0], "b": idata[1]})
-    first, second = (dict(body.prior) for body in pooled.scene.bodies)
-    assert first["mass"] == second["mass"]
-    assert "linear_drag_coefficient" in second and "linear_drag_coefficient" not in first
