@@ -154,7 +154,7 @@ def _passed_by(history: History, step: int) -> Floats:
     motion = np.zeros(off.shape[1:])
     motion[off[1] > 0.0] = np.nanstd(observed[:, :, off[1] > 0.0], axis=(0, 1))
     size = np.sqrt(off[0] / np.maximum(off[1], 1.0))
-    return np.divide(size, motion, out=np.zeros_like(size), where=motion > 0.0)
+    return np.where(motion > 0.0, size / np.where(motion > 0.0, motion, 1.0), 0.0)
 
 
 def _each(data: xr.Dataset, step: int, dt: float) -> History:
