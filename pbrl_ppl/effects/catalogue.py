@@ -260,6 +260,8 @@ def _shown(scene: Scene, body: str, history: History | None) -> set[str]:
         shown.add("camera")
     poses = of_body["start"].to_numpy()
     turns = is_pivoted(scene, scene.body(body))
+    if not (turns and any(scene.gravity)):
+        shown.add("free")
     if _repeats(np.mod(poses[..., [THETA]], 2.0 * np.pi) if turns else poses[..., :2]):
         shown.add("places")
     return shown

@@ -477,7 +477,8 @@ class Effect:
         effects last, and adds them only where they explain what common ones leave.
     needs : tuple of str
         What a recording must have for it, besides commands for a law of the command: ``commands``;
-        ``places`` that repeat; a ``camera``; or measurements of a dimension, such as ``theta``.
+        ``places`` that repeat; a ``camera``; a body that is ``free`` to move, in no hinge under
+        gravity; or measurements of a dimension, such as ``theta``.
     force : callable, optional
         Short for ``stage=Force(force)``.
 

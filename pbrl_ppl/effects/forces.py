@@ -62,6 +62,7 @@ constant_force = Effect(
     "Newton's second law with a constant force",
     Force(_world_force),
     family="place and angle",
+    needs=("free",),  # in a hinge it is a tilt, or a weight
 )
 
 

@@ -48,6 +48,13 @@ def test_laws_of_commands_need_commands() -> None:
     assert {"torque_gain", "actuator_delay", "push_offset"} <= names(ARM, swinging(push=0.1))
 
 
+def test_a_steady_force_in_a_hinge_is_a_tilt_of_gravity() -> None:
+    under_gravity = names(ARM, swinging())
+    assert "gravity_tilt" in under_gravity and "constant_force" not in under_gravity
+    assert "constant_force" in names(ARM.replace(gravity=(0.0, 0.0)), swinging())
+    assert "constant_force" in names(PUCK, sliding(1.0, 1.1))
+
+
 def test_an_encoder_is_no_camera_unless_the_scene_says_so() -> None:
     assert not names(ARM, swinging()) & CAMERA
     seen = ARM.replace(recording=Recording(camera=True))
