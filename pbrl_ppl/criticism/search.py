@@ -471,12 +471,12 @@ class Search:
             gain = table.value(mode) - here
             if len(key) < len(laws):
                 gain -= sum(climb.earlier.get(law, 0.0) for law in laws - key)
-            elif (
-                share(now, mode, weight)
-                < max(least_share, self.criteria.negligible * (len(mode.phi) > len(now.phi)))
-                or far_out(mode, key) >= most
-            ):
-                continue  # a law of more parameters follows the grain of friction, too
+            else:
+                # in a law's place one of more parameters follows the grain of friction, too
+                flexible = len(key) == len(laws) and len(mode.phi) > len(now.phi)
+                needed_share = max(least_share, self.criteria.negligible * flexible)
+                if share(now, mode, weight) < needed_share or far_out(mode, key) >= most:
+                    continue
             top = max(top, gain)
             needed = least if len(key) >= len(laws) else 0.0
             if len(key) == len(laws) and len(mode.phi) < len(now.phi):
