@@ -304,7 +304,7 @@ def _tested(
     if frames:  # the data change, not the laws
         task.say("; ".join(map(str, frames)))
         cleaned = replace(cleaned, train=train, bad_frames=(*cleaned.bad_frames, *map(str, frames)))
-        declared = task.mode(train)
+        declared = task.mode(train, declared)
         found = found.on(declared)
         innovations = filtered_mode(declared, found.after) if found.laws else declared
     tested = HeldOut.of(innovations, cleaned.test)

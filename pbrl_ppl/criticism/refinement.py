@@ -26,7 +26,14 @@ from pbrl_ppl.history import (
     without_bad_frames,
 )
 from pbrl_ppl.likelihood import Problem, check_moves, observed_coordinates, single_transitions
-from pbrl_ppl.modes import FilteredMode, Mode, find_mode, nearby_mode, trajectory_mode
+from pbrl_ppl.modes import (
+    FilteredMode,
+    Mode,
+    find_mode,
+    mode_of_more,
+    nearby_mode,
+    trajectory_mode,
+)
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Scene, check_substeps
 from pbrl_ppl.state import STATE, Floats, Ints
@@ -220,9 +227,11 @@ class Declared:
         problem = mode.problem
         return candidates(self.scene, problem.physics.effects, self.catalogue, problem.data.history)
 
-    def mode(self, train: History) -> FilteredMode:
-        """Return the model's mode on whole trajectories."""
+    def mode(self, train: History, of_part: FilteredMode | None = None) -> FilteredMode:
+        """Return the model's mode on whole trajectories, begun at that of a part of them, if any."""
         self.say(Stage.FIT)
+        if of_part is not None:
+            return mode_of_more(Problem.of(of_part.problem.physics, train), of_part)
         return declared_mode(
             self.scene, train, self.effects, self.seed, self.substeps, self.say, self.criteria
         )

@@ -280,7 +280,10 @@ class Search:
         return found, {law: alone[law] for law in leading if alone[law] >= limits.main_share}
 
     def of(
-        self, train: History, fit: Callable[[History], FilteredMode], seed: int
+        self,
+        train: History,
+        fit: Callable[[History, FilteredMode | None], FilteredMode],
+        seed: int,
     ) -> tuple[FilteredMode, SearchResult]:
         """Return the declared model's mode, and the laws that it lacks.
 
@@ -291,18 +294,19 @@ class Search:
         train : History
             Measured trajectories.
         fit : callable
-            Returns the declared model's mode of whole trajectories.
+            Returns the declared model's mode of whole trajectories, begun at that of a part of
+            them, if any.
         seed : int
             Draws the pieces.
         """
         limits = self.criteria.search
         part, _ = drawn_pieces(train, limits.rows, seed, pieces=limits.pieces)
-        mode = fit(part)
+        mode = fit(part, None)
         self.say(Stage.SIMULATE)
         found = self(mode)
         if part is train:
             return mode, found
-        mode = fit(train)
+        mode = fit(train, mode)
         return mode, found.on(mode)
 
     def _candidates(self, mode: Mode, unusual: bool) -> list[Attached]:
@@ -327,6 +331,7 @@ class Search:
         ``beside``: models at each length, of which a complete explanation leaves less: the climb
         ends where it does not.
         """
+        limits = self.criteria.search
         for i, length in enumerate(lengths):
             if i:
                 longer = _carried(climb.mode, length)
@@ -342,12 +347,14 @@ class Search:
                     climb.table, modes={frozenset(climb.table.laws(longer)): longer}
                 )
                 climb.mode = longer
-            self._improve(climb)
+            # on the longest pieces a law of less than a main share is not named
+            last = i and length == lengths[-1]
+            self._improve(climb, limits.main_share if last else limits.least_share)
             if not climb.noise.size:
                 climb.noise = climb.mode.sigma
             if i < len(beside):
                 better = share(beside[i], climb.mode, weights(climb.mode))
-                if better < self.criteria.search.least_share:
+                if better < limits.least_share:
                     break
 
     def _linearised(self, climb: _Climb) -> tuple[Library, list[Attached]]:
@@ -368,15 +375,18 @@ class Search:
             mode = replace(mode, problem=mode.problem.with_likelihood(tau=white), sigma=sigma)
         return Library(mode, laws, self.criteria)
 
-    def _improve(self, climb: _Climb, rounds: int = 8) -> None:
-        """Improve a model on pieces of one length by moves from model to model."""
+    def _improve(self, climb: _Climb, least_share: float, rounds: int = 8) -> None:
+        """Improve a model on pieces of one length by moves from model to model.
+
+        ``least_share``: of the error, which added laws take off.
+        """
         table, before, begin = climb.table, climb.laws, climb.mode
         for i in range(rounds):
             library, candidates = self._linearised(climb)
             regression = best_subsets(library, candidates)
             if i == 0:
                 climb.regressions.append(regression)
-            better = self._enlarged(climb, regression, self.criteria.search.least_share)
+            better = self._enlarged(climb, regression, least_share)
             if better is climb.mode:
                 better = self._exchanged(climb, library, candidates)
             if better is climb.mode:

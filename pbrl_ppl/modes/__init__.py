@@ -38,6 +38,7 @@ from .trajectories import carried_mode as carried_mode
 from .trajectories import filtered_mode as filtered_mode
 from .trajectories import find_simulation_mode as find_simulation_mode
 from .trajectories import find_trajectory_mode as find_trajectory_mode
+from .trajectories import mode_of_more as mode_of_more
 from .trajectories import nearby_mode as nearby_mode
 from .trajectories import simulation_mode as simulation_mode
 from .trajectories import tempered_mode as tempered_mode

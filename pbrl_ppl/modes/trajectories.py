@@ -104,6 +104,11 @@ def trajectory_mode(
     return mode
 
 
+def mode_of_more(problem: Problem, mode: FilteredMode) -> FilteredMode:
+    """Return the mode of whole trajectories, begun at that of a part of them."""
+    return nearby_mode(_smoothed_cheaply(problem, mode.phi), mode.phi, mode.sigma)
+
+
 def _with_small_process_noise(problem: FilteredProblem, sigma: Floats, share: float) -> Floats:
     """Return sigma with unexplained accelerations of at most a share of their prior median."""
     steps, sigma = problem.likelihood.noise.coordinates.accelerations, sigma.copy()
