@@ -88,7 +88,7 @@ from pbrl_ppl.scene import Scene
 from pbrl_ppl.threads import one_blas_thread
 
 #: Draws of each chain by method, then those where that is not enough.
-_DRAWS = {"importance": (180, 600), "laplace": (125,)}
+_DRAWS = {"importance": (180, 600), "laplace": (60,)}
 #: The same of all other methods.
 _CHAIN_DRAWS = (300, 1000)
 
