@@ -253,7 +253,7 @@ def test_a_seed_draws_the_same_cases_and_another_one_others(attribution) -> None
 def test_every_effect_of_the_tables_can_be_made_and_known(attribution) -> None:
     """The generator takes its value, and the oracle has as many parameters."""
     sizes, bodies = attribution.sizes, attribution.bodies
-    known = {effect.name for effect in pp.catalogue} | {"force_cutoff"}
+    known = {effect.name for effect in pp.catalogue} | {"force_cutoff", "point_attractor"}
     rng = np.random.default_rng(0)
     for sort, effects in sizes.EFFECTS.items():
         assert set(effects) <= known

@@ -55,9 +55,9 @@ INDISTINGUISHABLE = {
     CART: (_TURNED, _SCALED), PUCK: _FREE, SLED: _FREE, PAIR: _FREE, ARM: _HUNG, LEVER: _HUNG,
     CHAIN: _HUNG[:2],
 }  # fmt: skip
-#: A richer effect, and one that it contains: the richer one is left out with it. A source deep
-#: below the plane pulls like a spring; a centre of gravity beside the arm lets it hang askew.
-_RICHER = (("anisotropic_gain", "torque_gain"), ("point_attractor", "spring"))
+#: A richer effect, and one that it contains: the richer one is left out with it. A centre of
+#: gravity beside the arm lets it hang askew.
+_RICHER = (("anisotropic_gain", "torque_gain"),)
 _ASKEW = (("com_offset", "gravity_tilt"), ("com_offset", "sensor_bias"))
 CONTAIN = {CART: _RICHER, ARM: _ASKEW, LEVER: _ASKEW, CHAIN: ()}
 CONTAIN |= {sort: (*_RICHER, ("anisotropic_gain", "inertia_scale")) for sort in (PUCK, SLED, PAIR)}

@@ -101,10 +101,8 @@ _EFFECTS = (
 #: Laws of the catalogue that contain one of these, and are left out of the loop's beside it.
 CONTAINING = {
     "cubic_drag": "power_drag",
-    "corrugation": "ripple",
     "actuator_lag": "first_order_lag",
     "stribeck": "sliding_stribeck",
-    "stiction_patch": "friction_by_place",
 }
 OUTSIDE_EFFECTS = {effect.name: effect for effect in _EFFECTS}
 

@@ -9,7 +9,8 @@ from collections.abc import Callable
 from attribution.bodies import ARM, CART, CHAIN, HINGED, LEVER, PAIR, PUCK, SLED, Body, Hidden, mh
 
 #: Effects of the catalogue that make sense on a body. `heavy_tails` is on none: the loop scores the
-#: noise's shape and never adds it. An asterisk: where a motor turns it.
+#: noise's shape and never adds it. An asterisk: where a motor turns it. The attractor has left the
+#: catalogue: it is drawn, so that all else is drawn as it was, and its cases are left out.
 _FORCES = (
     "linear_drag", "quadratic_drag", "angular_drag", "constant_force", "body_force",
     "constant_torque", "push_offset", "magnus_force", "spring", "torsion_spring",

@@ -94,9 +94,7 @@ SHAPE = (
     "torque_saturation",
     "saturation",
     "force_cutoff",
-    "power_limit",
     "gain_by_speed",
-    "gain_by_place",
 )
 DRY = (
     "pivot_friction",
@@ -114,7 +112,7 @@ ANGLE = (
     "askew_angle",
     "encoder_eccentricity",
 )
-PLACE = ("spring", "cubic_spring", "cable", "ripple", "point_attractor")
+PLACE = ("spring", "cubic_spring")
 DRAG = (
     "linear_drag",
     "quadratic_drag",
@@ -163,9 +161,6 @@ CASES = {
         also=("pivot_friction",),
         family=DRY,
     ),
-    "pivot_one_way_damping": Case(
-        torque=lambda z, u, t: -0.006 * np.abs(z[:, 1:]), family=("pivot_one_way_damping",)
-    ),
     "quadratic_drag": Case(
         torque=lambda z, u, t: -0.004 * np.abs(z[:, 1:]) * z[:, 1:],
         family=(*DRAG, "quadratic_angular_drag", "power_angular_drag"),
@@ -174,10 +169,6 @@ CASES = {
     "upper_stop": Case(torque=lambda z, u, t: -2.0 * np.maximum(z[:, :1] - 0.5, 0.0), family=ANGLE),
     "lower_stop": Case(torque=lambda z, u, t: 2.0 * np.maximum(-0.5 - z[:, :1], 0.0), family=ANGLE),
     "cogging": Case(torque=lambda z, u, t: 0.05 * np.sin(8 * z[:, :1]), family=ANGLE),
-    "periodic_torque": Case(
-        torque=lambda z, u, t: 0.05 * np.sin(2 * np.pi * t / 1.3) + 0 * z[:, :1],
-        family=("periodic_torque",),
-    ),
     "torque_saturation": Case(torque=lambda z, u, t: np.clip(u, -0.25, 0.25) - u, family=SHAPE),
     "torque_dead_zone": Case(torque=lambda z, u, t: -np.clip(u, -0.1, 0.1), family=SHAPE),
     "command_power": Case(
@@ -185,9 +176,6 @@ CASES = {
     ),
     "gain_by_sign": Case(torque=lambda z, u, t: 0.15 * np.abs(u), family=SHAPE),
     "gain_by_speed": Case(torque=lambda z, u, t: -0.06 * np.abs(u) * z[:, 1:], family=SHAPE),
-    "fading_gain": Case(
-        torque=lambda z, u, t: (np.exp(-0.1 * t) - 1.0) * u, family=("fading_gain",)
-    ),
     "encoder_eccentricity": Case(measure=lambda z, t: z + 0.05 * np.sin(z), family=ANGLE),
     "sensor_drift": Case(measure=lambda z, t: z + 0.02 * t, family=("sensor_drift",)),
     "drag_by_axis": Case("puck", lambda z, u, t: polar(z, 0.1, 0.6, 1), family=DRAG),
@@ -208,16 +196,6 @@ CASES = {
         lambda z, u, t: -0.8 * (z[:, :3] * (1, 1, 0)) * (z[:, :2] ** 2).sum(1)[:, None],
         family=PLACE,
     ),
-    "ripple": Case(
-        "puck", lambda z, u, t: pushes(0.5 * np.sin(2 * np.pi * z[:, 0] / 0.8), 0.0), family=PLACE
-    ),
-    "periodic_force": Case(
-        "puck",
-        lambda z, u, t: pushes(0.3 * np.sin(2 * np.pi * t / 1.3) + 0 * z[:, 0], 0.0),
-        family=("periodic_force",),
-    ),
-    "gain_by_place": Case("puck", lambda z, u, t: 0.25 * u * z[:, :1], family=SHAPE),
-    "power_limit": Case("puck", lambda z, u, t: _weaker(z, u), family=SHAPE),
     "turning_friction": Case(
         "puck",
         lambda z, u, t: pushes(0 * z[:, 0], 0 * z[:, 0], -0.004 * sign(z[:, 5])),
@@ -242,11 +220,6 @@ def _weight(z: Floats) -> Floats:
 def _blown(z: Floats) -> Floats:
     v = z[:, 3:5] - (1.0, -0.5)
     return pushes(*(-0.25 * np.linalg.norm(v, axis=1)[:, None] * v).T)
-
-
-def _weaker(z: Floats, u: Floats) -> Floats:
-    power = (u * z[:, 3:]).sum(1, keepdims=True)
-    return u * (np.minimum(1.0, 0.4 / np.maximum(power, 1e-12)) - 1.0) * (power > 0)
 
 
 def _askew(z: Floats) -> Floats:

@@ -29,13 +29,9 @@ SHOWN = {
     "cogging": {"count": 6.0},
     "upper_stop": {"angle": 0.2},
     "lower_stop": {"angle": -0.2},
-    "cable": {"anchor_x": -0.5, "anchor_y": 0.0, "length": 0.7},
 }
 #: Laws that change the friction of another.
-BESIDE = {
-    "sliding_stribeck": "sliding_friction", "friction_by_place": "sliding_friction",
-    "pivot_angle_friction": "pivot_friction",
-}  # fmt: skip
+BESIDE = {"sliding_stribeck": "sliding_friction", "pivot_angle_friction": "pivot_friction"}
 
 
 @cache

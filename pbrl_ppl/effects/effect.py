@@ -255,7 +255,7 @@ class Force:
     timed : bool
         Whether the law depends on the time.
     memory : int
-        How many numbers of its own the law has, such as the place of a mass that sloshes.
+        How many numbers of its own the law has, such as how far a bearing bends.
     rate : callable, optional
         ``rate(state, command, parameters, change)`` sets their rates of change (1/s).
     begin : callable, optional

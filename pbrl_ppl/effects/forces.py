@@ -5,7 +5,6 @@ import math
 import numpy as np
 
 from pbrl_ppl.effects.effect import (
-    ANY_ANGLE,
     SIGNED,
     SIZE,
     Clock,
@@ -13,10 +12,8 @@ from pbrl_ppl.effects.effect import (
     EffectParameter,
     Force,
     Properties,
-    ScanWith,
     Values,
     adding,
-    is_unpivoted,
 )
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
@@ -132,14 +129,13 @@ def _scan_counts(scene: Scene, history: History, body: Body) -> Floats:
     return np.array([(np.nan, np.nan, n) for n in counts]).reshape(-1, 3)
 
 
-_TORQUES = (
-    EffectParameter("cosine", "N m", SIGNED, scale="torque"),
-    EffectParameter("sine", "N m", SIGNED, scale="torque"),
-)
-
 cogging = Effect(
     "cogging",
-    (*_TORQUES, EffectParameter("count", "1", Prior("log_normal", mu=1.5, sigma=1.0), null=2.0)),
+    (
+        EffectParameter("cosine", "N m", SIGNED, scale="torque"),
+        EffectParameter("sine", "N m", SIGNED, scale="torque"),
+        EffectParameter("count", "1", Prior("log_normal", mu=1.5, sigma=1.0), null=2.0),
+    ),
     "a torque that repeats several times in a turn: a motor's magnets, a bearing with flat spots",
     "cogging torque, a cos(n theta) + b sin(n theta)",
     Force(_cogging),
@@ -148,110 +144,6 @@ cogging = Effect(
     family="place and angle",
     unusual="few drives have magnets or teeth that are felt beside their friction",
     needs=("places",),
-)
-
-
-def _ripple(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
-    c, s = math.cos(parameters[3]), math.sin(parameters[3])
-    phase = 2.0 * math.pi * (c * state[0] + s * state[1]) / parameters[2]
-    force = parameters[0] * math.cos(phase) + parameters[1] * math.sin(phase)
-    wrench[0] += c * force
-    wrench[1] += s * force
-
-
-def _scan_waves(scene: Scene, history: History, body: Body) -> Floats:
-    """Return wavelengths along each axis of motion; the derivative is taken by the forces."""
-    places = history.dataset["start"].sel(body=body.name, state=["x", "y"]).to_numpy()
-    high = np.nanmax(places, axis=(0, 1), initial=-np.inf)
-    reach = high - np.nanmin(places, axis=(0, 1), initial=np.inf)
-    rows = [
-        (np.nan, np.nan, reach[axis] / n, 0.5 * np.pi * axis)
-        for axis in (0, 1) for n in 1.5 * 1.35 ** np.arange(8)
-        if 0.2 * reach.max() < reach[axis] < np.inf
-    ]  # fmt: skip
-    return np.array(rows).reshape(-1, 4)
-
-
-ripple = Effect(
-    "ripple",
-    (
-        EffectParameter("cosine", "N", SIGNED, scale="force"),
-        EffectParameter("sine", "N", SIGNED, scale="force"),
-        EffectParameter(
-            "wavelength", "m", Prior("log_normal", mu=-1.0, sigma=1.0), null=0.4, scale="range"
-        ),
-        EffectParameter("direction", "rad", ANY_ANGLE),
-    ),
-    "a force along a line that repeats with the place: a linear motor's magnets, a belt's teeth",
-    "force ripple, a cos(2 pi x / l) + b sin(2 pi x / l)",
-    Force(_ripple),
-    applies=is_unpivoted,
-    scan=_scan_waves,
-    log_odds=-5.0,
-    family="place and angle",
-    unusual="floors with waves are rare; it takes any misfit of a place",
-    needs=("places",),
-)
-
-
-def _periodic(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
-    if command[9] < math.inf:  # after the recording nobody knows its phase
-        phase = 2.0 * math.pi * command[9] / parameters[2]
-        force = parameters[0] * math.cos(phase) + parameters[1] * math.sin(phase)
-        wrench[0] += math.cos(parameters[3]) * force
-        wrench[1] += math.sin(parameters[3]) * force
-
-
-def _scan_periods(
-    scene: Scene, history: History, body: Body, directions: tuple[tuple[float, ...], ...]
-) -> Floats:
-    """Return periods with each direction, of whole trajectories to four intervals (s).
-
-    The derivative is taken by the forces or torques, which come first.
-    """
-    longest = float(np.nanmax(history.elapsed, initial=0.0))
-    periods = [longest / n for n in (1, 2, 4, 8, 16) if longest / n > 4.0 * scene.time_step]
-    grid = [(np.nan, np.nan, period, *turn) for period in periods for turn in directions]
-    return np.array(grid).reshape(-1, 3 + len(directions[0]))
-
-
-_PERIOD = EffectParameter(
-    "period", "s", Prior("log_normal", mu=-1.5, sigma=1.0), null=0.2, scale="time"
-)
-
-periodic_force = Effect(
-    "periodic_force",
-    (
-        EffectParameter("cosine", "N", SIGNED, scale="force"),
-        EffectParameter("sine", "N", SIGNED, scale="force"),
-        _PERIOD,
-        EffectParameter("direction", "rad", ANY_ANGLE),
-    ),
-    "a force along a line that repeats with the time since a trajectory began: a shaken table",
-    "harmonic force, a cos(2 pi t / T) + b sin(2 pi t / T)",
-    Force(_periodic, timed=True),
-    applies=is_unpivoted,
-    scan=ScanWith(_scan_periods, ((0.0,), (0.5 * np.pi,))),
-    log_odds=-6.0,
-    unusual="it takes any oscillation, and few rigs are shaken",
-)
-
-
-def _periodic_torque(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
-    if command[9] < math.inf:
-        phase = 2.0 * math.pi * command[9] / parameters[2]
-        wrench[2] += parameters[0] * math.cos(phase) + parameters[1] * math.sin(phase)
-
-
-periodic_torque = Effect(
-    "periodic_torque",
-    (*_TORQUES, _PERIOD),
-    "a torque that repeats with the time since a trajectory began",
-    "harmonic torque, a cos(2 pi t / T) + b sin(2 pi t / T)",
-    Force(_periodic_torque, timed=True),
-    scan=ScanWith(_scan_periods, ((),)),
-    log_odds=-6.0,
-    unusual="it takes any oscillation, and few rigs are shaken",
 )
 
 
@@ -322,49 +214,4 @@ mass_change = Effect(
     scan=_scan_begins,
     log_odds=-8.0,
     unusual="few rigs lose or take up a load within a recording",
-)
-
-
-def _slosh(state: Floats, command: Floats, parameters: Floats, change: Floats) -> None:
-    rate = 2.0 * math.pi * parameters[1]
-    for i in range(2):
-        off, speed = command[12 + i] - state[i], command[14 + i]
-        change[i] = speed
-        change[2 + i] = -rate * rate * off - 2.0 * parameters[2] * rate * (speed - state[3 + i])
-
-
-def _press(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
-    rate = 2.0 * math.pi * parameters[1]
-    for i in range(2):
-        off, speed = command[12 + i] - state[i], command[14 + i] - state[3 + i]
-        wrench[i] += parameters[0] * (rate * rate * off + 2.0 * parameters[2] * rate * speed)
-
-
-def _begin_at_rest(state: Floats, command: Floats, parameters: Floats, memory: Floats) -> None:
-    for i in range(2):
-        memory[i], memory[2 + i] = state[i], state[3 + i]
-
-
-def _scan_frequencies(scene: Scene, history: History, body: Body) -> Floats:
-    """Return frequencies of some intervals; the derivative is taken by the mass."""
-    return np.array([(np.nan, 1.0 / (n * scene.time_step), 0.05) for n in (6, 12, 25)])
-
-
-sloshing = Effect(
-    "sloshing",
-    (
-        EffectParameter("mass", "kg", Prior("half_normal", sigma=0.5), scale="mass"),
-        EffectParameter(
-            "frequency", "Hz", Prior("log_normal", mu=-2.0, sigma=1.0), null=0.1, scale="/interval"
-        ),
-        EffectParameter("damping", "1", Prior("half_normal", sigma=0.2), null=0.05),
-    ),
-    "a mass that swings within the body, beside the body's own: a liquid, a loose load, a flexible"
-    " mast",
-    "a mass on a spring and a damper, at rest in the body when a transition begins",
-    Force(_press, memory=4, rate=_slosh, begin=_begin_at_rest),
-    applies=is_unpivoted,
-    scan=_scan_frequencies,
-    log_odds=-4.0,
-    unusual="few rigs carry a liquid or a loose part",
 )

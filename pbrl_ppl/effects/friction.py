@@ -149,22 +149,6 @@ pivot_angle_friction = Effect(
 )
 
 
-def _damp_one_way(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
-    wrench[2] -= parameters[0] * abs(state[5])
-
-
-pivot_one_way_damping = Effect(
-    "pivot_one_way_damping",
-    (EffectParameter("coefficient", "N m s", SIGNED, scale="torque/turn_rate"),),
-    "viscous friction in the hinge that is stronger one way than the other",
-    "viscous torque by direction, tau = -c |omega| beside -c omega",
-    Force(_damp_one_way),
-    applies=is_pivoted,
-    log_odds=-3.0,
-    unusual="few hinges have a one-way clutch or a damper with a valve",
-)
-
-
 def _bend(state: Floats, command: Floats, parameters: Floats, change: Floats) -> None:
     most = parameters[1] * (1.0 + parameters[2] * math.exp(-((state[5] / parameters[3]) ** 2)))
     bend = min(max(command[12], -most), most)  # steps that are too long go beyond
@@ -290,50 +274,6 @@ slider_stribeck = Effect(
     log_odds=-2.0,
     family="dry friction",
     unusual="few recordings are slow and clean enough to show it beside dry friction",
-)
-
-
-def _vary_along(state: Floats, load: Floats, parameters: Floats, most: Floats) -> None:
-    off = parameters[0] * (state[0] - parameters[2]) + parameters[1] * (state[1] - parameters[3])
-    most[0] += off / parameters[4]
-
-
-slider_place_friction = Effect(
-    "slider_place_friction",
-    (
-        EffectParameter("along_x", "N", _DIFFERENCE, scale="force"),
-        EffectParameter("along_y", "N", _DIFFERENCE, scale="force"),
-    ),
-    "dry friction in the slider that is stronger at one end of the rail, by this force at the"
-    " typical distance from the middle",
-    "Coulomb's law, F + a . (x - x0) / r0, with the mean place x0 and a typical range r0",
-    Friction(_vary_along),
-    applies=is_sliding,
-    constants=("x", "y", "range"),
-    log_odds=-3.0,
-    family="dry friction",
-    unusual="few rails rub at one end; it takes any misfit of a place",
-    needs=("places",),
-)
-
-
-def _vary_with_place(state: Floats, load: Floats, parameters: Floats, most: Floats) -> None:
-    share = parameters[0] * (state[0] - parameters[2]) + parameters[1] * (state[1] - parameters[3])
-    most[0] *= 1.0 + share / parameters[4]
-
-
-friction_by_place = Effect(
-    "friction_by_place",
-    (EffectParameter("along_x", "1", _DIFFERENCE), EffectParameter("along_y", "1", _DIFFERENCE)),
-    "dry friction on the floor that is stronger at one end of the room, by this share at the"
-    " typical distance from the middle",
-    "Coulomb's law, mu (1 + a . (x - x0) / r0), with the mean place x0 and a typical range r0",
-    Friction(_vary_with_place, under=True),
-    applies=_is_pressed,
-    constants=("x", "y", "range"),
-    log_odds=-3.0,
-    unusual="few floors are rough at one end; it takes any misfit of a place",
-    needs=("places",),
 )
 
 

@@ -1,4 +1,4 @@
-"""Springs, attraction to a place, and rods that the scene does not show."""
+"""Springs, springy stops, and rods that the scene does not show."""
 
 from itertools import product
 from math import floor, pi
@@ -216,103 +216,6 @@ lower_stop = Effect(
     log_odds=-4.0,
     family="place and angle",
     unusual="stops are seen, and seldom reached",
-    needs=("places",),
-)
-
-
-def _cable(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
-    x, y = state[0] - parameters[1], state[1] - parameters[2]
-    distance = (x * x + y * y) ** 0.5
-    if distance > parameters[3]:
-        pull = parameters[0] * (1.0 - parameters[3] / distance)
-        wrench[0] -= pull * x
-        wrench[1] -= pull * y
-
-
-def _scan_cables(scene: Scene, history: History, body: Body) -> Floats:
-    """Return cables from beyond each side, taut in a third of the poses; only stiffness is free."""
-    places = _poses(history, body, 2)
-    if not len(places):
-        return np.empty((0, 4))
-    middle, reach = places.mean(axis=0), places.max(axis=0) - places.min(axis=0)
-    rows = []
-    for side in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-        if reach @ np.abs(side) > 0.0:
-            anchor = middle + reach * side
-            length = np.quantile(np.linalg.norm(places - anchor, axis=1), 0.67)
-            rows.append((np.nan, *anchor, length))
-    return np.array(rows).reshape(-1, 4)
-
-
-cable = Effect(
-    "cable",
-    (
-        EffectParameter("stiffness", "N/m", Prior("half_normal", sigma=3.0), scale="force/length"),
-        *_ANCHOR,
-        EffectParameter("length", "m", SIZE, scale="range"),
-    ),
-    "a pull towards a place that begins beyond a distance: a springy cable that gets taut",
-    "one-sided spring, F = -k max(0, r - l)",
-    Force(_cable),
-    applies=is_unpivoted,
-    scan=_scan_cables,
-    log_odds=-5.0,
-    family="place and angle",
-    unusual="cables are seen, and mostly slack",
-    needs=("places",),
-)
-
-
-def _attraction(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
-    x, y = parameters[1] - state[0], parameters[2] - state[1]
-    strength = parameters[0] * (x * x + y * y + parameters[3] * parameters[3]) ** -1.5
-    wrench[0] += strength * x
-    wrench[1] += strength * y
-
-
-def _scan_places(
-    scene: Scene,
-    history: History,
-    body: Body,
-    *,
-    n_places: int = 9,
-    beyond: float = 0.15,
-    shares: tuple[float, ...] = (0.15, 0.45),
-) -> Floats:
-    """Return places about the measured positions; the derivative is taken by the strength.
-
-    ``n_places``: attractors along each axis.
-    ``beyond``: how far beyond the measured positions they are, as a share of their range.
-    ``shares``: their depths in radii of the body.
-    """
-    places = _poses(history, body, 2)
-    if not len(places):
-        return np.empty((0, 4))
-    low, high = places.min(axis=0), places.max(axis=0)
-    wider = beyond * (high - low)
-    x, y = np.linspace(low - wider, high + wider, n_places).T
-    depths = [share * body.shape.bounding_radius for share in shares]
-    return np.array([(np.nan, *at) for at in product(np.unique(x), np.unique(y), depths)])
-
-
-point_attractor = Effect(
-    "point_attractor",
-    (
-        EffectParameter("strength", "N m^2", SIGNED, scale="force length^2"),
-        EffectParameter("x", "m", SIGNED, scale="range", origin="x"),
-        EffectParameter("y", "m", SIGNED, scale="range", origin="y"),
-        EffectParameter(
-            "depth", "m", Prior("log_normal", mu=-1.0, sigma=0.7), null=0.4, scale="length"
-        ),
-    ),
-    "a pull towards a place, or a push away, that is strong near it and weak far off: a magnet",
-    "inverse-square law, of a source below or above the plane",
-    Force(_attraction),
-    applies=is_unpivoted,
-    scan=_scan_places,
-    log_odds=-8.0,
-    family="place and angle",
-    unusual="few rigs have magnets",
     needs=("places",),
 )
 

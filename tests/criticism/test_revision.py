@@ -168,11 +168,10 @@ def test_what_comes_by_chance_takes_no_name_away() -> None:
     ("name", "size", "richer"),
     [
         ("saturation", 2.7, ()),
-        # an attractor that is deep down and a cable of no length pull like a spring, and forces
-        # of the place that are not linear make one together
-        ("spring", (0.5, 1.0, -0.5), ("point_attractor", "cable", "cubic_spring", "ripple")),
+        # cubic forces of the place make one together
+        ("spring", (0.5, 1.0, -0.5), ("cubic_spring",)),
         ("actuator_delay", 0.4, ("first_order_lag", "rate_limit", "actuator_backlash")),
-        ("corrugation", (0.3, 0.3), ("ripple",)),
+        ("corrugation", (0.3, 0.3), ()),
     ],
 )
 def test_the_search_has_no_name_for_what_is_outside(name, size, richer, make_history) -> None:

@@ -139,28 +139,6 @@ def test_friction_that_bends() -> None:
     np.testing.assert_allclose(states[:, 2], expected.y[0], atol=2e-6)
 
 
-@pytest.mark.parametrize("engine", ["auto", "chipmunk"])
-def test_a_mass_that_sloshes(engine: str) -> None:
-    """Two masses on a spring, against SciPy; momentum is conserved without a push."""
-    mass, rate, ratio = 0.6, 2.0 * np.pi * 1.2, 0.05
-    values = {"mass": mass, "frequency": 1.2, "damping": ratio}
-    found, phi = physics(puck(400), "sloshing", values, engine=engine)
-
-    def slope(t: float, z: Floats) -> list[float]:
-        x, v, p, w = z
-        pull = rate**2 * (p - x) + 2.0 * ratio * rate * (w - v)
-        return [v, (1.5 + mass * pull) / MASS, w, -pull]
-
-    times = STEP * np.arange(1, N + 1)
-    expected = solve_ivp(slope, (0, times[-1]), [0.0, 0.3, 0.0, 0.3], "DOP853", times, rtol=1e-10)
-    wrench = np.zeros((1, N, 1, 3))
-    wrench[..., 0] = 1.5
-    start = np.zeros((1, 1, 6))
-    start[..., 3] = 0.3
-    states = found.predict(phi, start, wrench)[0, :, 0]
-    np.testing.assert_allclose(states[:, 0], expected.y[0], atol=3e-3)
-
-
 def test_a_law_of_a_users_own_remembers() -> None:
     """The valve of the guide to own effects: 2 N more in each interval."""
     guide = (ROOT / "analysis/docs/pages/guides/own_effect.md").read_text()

@@ -8,14 +8,15 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.special import ellipk
 
-from pbrl_ppl.effects import Effect, EffectParameter, Force, catalogue
+from pbrl_ppl.effects import Effect, EffectParameter, Force
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.physics import Physics, Simulator, compiled
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.chains import LINK, cart_with_trailers, case, chain
 from tests.helpers.engines import BOX
+from tests.helpers.examples import EXAMPLES
 from tests.helpers.plain import PlainSimulator
-from tests.helpers.worlds import G
+from tests.helpers.worlds import BY_NAME, G
 
 pytestmark = pytest.mark.one_stack
 
@@ -278,13 +279,13 @@ def test_a_ring_holds_up_to_its_friction() -> None:
 
 
 @pytest.mark.parametrize(
-    ("count", "names"), [(8, ("sliding_friction",)), (6, ("sliding_friction", "sloshing"))]
+    ("count", "more"), [(8, ()), (6, (EXAMPLES["sloshing"],))], ids=["bare", "sloshing"]
 )
-def test_bodies_far_apart_move_alike_up_to_the_largest_tree(count, names) -> None:
+def test_bodies_far_apart_move_alike_up_to_the_largest_tree(count, more) -> None:
     """All coordinates that a tree may have, and force laws whose numbers find no place there."""
     bodies = tuple(Body(f"b{i}", Shape.circle(0.1), pose=(3.0 * i, 0, 0)) for i in range(count))
     scene = Scene(time_step=0.1, substeps=6, normal_gravity=G, bodies=bodies)
-    physics = Physics.declare(scene, [effect for effect in catalogue if effect.name in names])
+    physics = Physics.declare(scene, [BY_NAME["sliding_friction"], *more])
     phi = np.array([prior.centre for prior in physics.layout.priors])
     start = np.zeros((1, count, 6))
     start[:, :, 0] = 3.0 * np.arange(count)
