@@ -63,7 +63,7 @@ class SearchCriteria:
     pieces: int = 4
     refits: int = 4
     singles: int = 2
-    promise: float = 0.4
+    promise: float = 0.3
     complete: float = 1.15
     incomplete: float = 1 / 3
 

@@ -228,7 +228,7 @@ class Declared:
         return candidates(self.scene, problem.physics.effects, self.catalogue, problem.data.history)
 
     def mode(self, train: History, of_part: FilteredMode | None = None) -> FilteredMode:
-        """Return the model's mode on whole trajectories, begun at that of a part of them, if any."""
+        """Return the model's mode on whole trajectories, from that of a part of them, if any."""
         self.say(Stage.FIT)
         if of_part is not None:
             return mode_of_more(Problem.of(of_part.problem.physics, train), of_part)

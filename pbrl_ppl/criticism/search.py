@@ -46,7 +46,7 @@ from pbrl_ppl.modes import (
     simulated_states,
     with_robust_covariance,
 )
-from pbrl_ppl.state import Floats
+from pbrl_ppl.state import Bools, Floats
 from pbrl_ppl.threads import in_parallel
 
 #: Least ratio of the predicted to the required fall of the error for a refit.
@@ -165,16 +165,16 @@ class _Climb:
         """Laws of the model."""
         return self.table.laws(self.mode)
 
-    def excess_of(self, mode: Mode) -> float:
-        """Return an error over that on the shortest pieces and its sampling error, at most."""
+    def excesses(self, mode: Mode) -> Floats:
+        """Return errors over those on the shortest pieces and their sampling error, (state,)."""
         weight = weights(mode)
         sampling = 1.0 + 2.0 / np.sqrt(2.0 * np.maximum(weight, 1.0))
-        return float((mode.sigma / self.noise / sampling)[weight > 0].max(initial=0.0))
+        return np.where(weight > 0, mode.sigma / self.noise / sampling, 0.0)
 
     @property
     def excess(self) -> float:
-        """The same of the model."""
-        return self.excess_of(self.mode)
+        """The largest of the model's."""
+        return float(self.excesses(self.mode).max(initial=0.0))
 
 
 @dataclass(eq=False)
@@ -231,8 +231,9 @@ class Search:
         self._leave_out(common)
         hypotheses: Mapping[Attached, float] = {}
         several = mode.problem.data.history.n_trajectories > 1 and not single
-        if several and common.excess > limits.complete:
-            i, hypotheses = self._promised(common)
+        lost = len(common.modes) < len(lengths)
+        if several and (lost or common.excess > limits.complete):
+            i, hypotheses = self._promised(common, lost)
             if i is not None:
                 self.say("common laws leave more than the noise: trying unusual ones")
                 tried = len(self._candidates(short, True))
@@ -248,21 +249,24 @@ class Search:
         found = self._result(best, common.regressions, hypotheses)
         return found if single else _with_contacts(found, mode, lengths[0])
 
-    def _promised(self, common: _Climb) -> tuple[int | None, dict[Attached, float]]:
+    def _promised(self, common: _Climb, lost: bool) -> tuple[int | None, dict[Attached, float]]:
         """Return at which length an unusual law may take most of the error beyond the noise off.
 
         To first order, beside the common laws, with one more, or in the place of one. The longest
         pieces are asked first, and shorter ones where these are too far off to tell. Also the
-        leading ones alone, with their shares of the error on the longest pieces.
+        leading ones alone, with their shares of the error on the longest pieces. Of a climb that
+        was ``lost`` before these all error is beyond the noise.
         """
         limits, alone = self.criteria.search, dict[Attached, float]()
         found: int | None = None
         for i, mode in reversed([*enumerate(common.modes)]):
-            beyond = 1.0 - 1.0 / max(common.excess_of(mode), 1.0)
-            if beyond < 1.0 - 1.0 / limits.complete or found is not None:
+            excesses = common.excesses(mode)
+            large = excesses > (0.0 if lost else limits.complete)
+            if not large.any() or found is not None:
                 break
+            beyond = 1.0 if lost else 1.0 - float(np.exp(-np.log(excesses[large]).mean()))
             laws = common.table.laws(mode)
-            library, now = self._library(mode, laws), 0.0
+            library, now = self._library(mode, laws, large), 0.0
             every = [one for one in self._candidates(mode, True) if one not in laws]
             for without in ((), *((law,) for law in laws)):
                 total = float((library.test(without).residual ** 2).sum())
@@ -322,8 +326,9 @@ class Search:
         plain, rows = common.mode, more.mode.problem.data.horizon
         if is_simulated_mode(plain) and plain.problem.data.horizon < rows:
             plain = _carried(plain, rows)
-        left = 1.0 - share(plain, more.mode, more.table.weight)
-        return more.excess < limits.complete or left < limits.incomplete
+        large = common.excesses(plain) > limits.complete
+        left = np.log(more.mode.sigma / plain.sigma)[large].mean() if large.any() else 0.0
+        return more.excess < limits.complete or float(np.exp(left)) < limits.incomplete
 
     def _climb(self, climb: _Climb, lengths: Sequence[int], beside: Sequence[Mode] = ()) -> None:
         """Find the laws that pieces of growing length show, from a model at the first.
@@ -362,8 +367,10 @@ class Search:
         more = climb.unusual and not any(law.effect.unusual for law in climb.laws)
         return self._library(climb.mode, climb.laws), self._candidates(climb.mode, more)
 
-    def _library(self, mode: Mode, laws: tuple[Attached, ...]) -> Library:
-        """Return derivatives at a mode, errors as if they were white.
+    def _library(
+        self, mode: Mode, laws: tuple[Attached, ...], dimensions: Bools | bool = True
+    ) -> Library:
+        """Return derivatives at a mode, of some dimensions, errors as if they were white.
 
         A lacking model's errors are correlated because of what it lacks.
         """
@@ -371,7 +378,7 @@ class Search:
             mode = corrected(mode)
             white = (1.0,) * len(mode.problem.likelihood.tau)
             # rounding of what does not move is no error of a law
-            sigma = np.where(moving(mode), mode.sigma, np.inf)
+            sigma = np.where(moving(mode) & dimensions, mode.sigma, np.inf)
             mode = replace(mode, problem=mode.problem.with_likelihood(tau=white), sigma=sigma)
         return Library(mode, laws, self.criteria)
 

@@ -41,12 +41,12 @@ def log_error(mode: Mode) -> Floats:
 
 
 def share(before: Mode, after: Mode, weight: Floats) -> float:
-    """Return the share of the error that a model takes off, over dimensions of some weights.
+    """Return the share of the error that a model takes off, of the dimension that shows it most.
 
-    Of the root mean square; ``weight`` has shape (state,).
+    Of the root mean square; ``weight`` has shape (state,), zero where nothing is told.
     """
-    fall = float((weight * (log_error(before) - log_error(after))).sum())
-    return 1.0 - float(np.exp(-fall / max(weight.sum(), 1.0)))
+    fall = (log_error(before) - log_error(after))[weight > 0.0]
+    return 1.0 - float(np.exp(-fall.max())) if len(fall) else 0.0
 
 
 def informed(mode: Mode, *, most: float = 0.7) -> Bools:

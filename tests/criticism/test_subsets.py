@@ -84,8 +84,8 @@ def table(dragged_and_pulled) -> Table:
     table = Table((), tried=6, modes={frozenset(): dragged_and_pulled})
     laws = {law.effect.name: law for law in candidates(DISC, (), OFFERED)}
     drag, force = laws["linear_drag"], laws["constant_force"]
-    sizes = {drag: np.array([0.8]), force: np.array([1.5, -0.6])}
-    table.fitted(dragged_and_pulled, (drag, force), sizes)
+    begin = dict(zip((*drag.labels, *force.labels), (0.8, 1.5, -0.6), strict=True))
+    table.fitted(dragged_and_pulled, (drag, force), begin)
     return table
 
 
@@ -116,11 +116,11 @@ def test_the_value_is_the_log_evidence_with_the_odds_of_the_laws(table) -> None:
 def test_shares_of_laws_that_replace_each_other_add_up(table) -> None:
     """A drag and a force are apart: each share is that by which the error rises without it."""
     (mode,) = (table.modes[key] for key in table.modes if len(key) == 2)
-    for law, part in table.shares(mode, 0.2).items():
+    for law, part in table.shares(mode, 0.2):
         alone = share(table.without(mode, law), mode, table.weight)
         assert part == pytest.approx(alone, abs=1e-9)
-    parts = list(table.shares(mode, 0.2).values())
-    assert parts == sorted(parts, reverse=True)
+    parts = [part for _, part in table.shares(mode, 0.2)]
+    assert parts == sorted(parts)
 
 
 def test_two_laws_that_replace_each_other_share_what_both_take_off(table) -> None:
@@ -133,14 +133,15 @@ def test_two_laws_that_replace_each_other_share_what_both_take_off(table) -> Non
     copy.modes[frozenset({force})], copy.modes[frozenset({drag})] = small[drag], small[force]
     together = share(table.fitted(mode, ()), mode, copy.weight)
     half = 1.0 - np.sqrt(1.0 - together)  # of a fall in the logarithm
-    assert list(copy.shares(mode, 0.2).values()) == pytest.approx([half, half])
+    assert [part for _, part in copy.shares(mode, 0.2)] == pytest.approx([half, half])
 
 
 def test_rivals_are_models_within_some_nats_that_differ_by_one_law(table) -> None:
     (mode,) = (table.modes[key] for key in table.modes if len(key) == 2)
     laws = {law.effect.name: law for law in candidates(DISC, (), OFFERED)}
     drag, force, other = laws["linear_drag"], laws["constant_force"], laws["quadratic_drag"]
-    begin = {other: sizes_of(mode, drag), force: sizes_of(mode, force)}
+    at = [*sizes_of(mode, drag), *sizes_of(mode, force)]
+    begin = dict(zip((*other.labels, *force.labels), at, strict=True))
     worse = table.value(mode) - table.value(table.fitted(mode, (force, other), begin))
     assert table.rivals(mode, drag, worse + 1.0) == (other,)
     assert table.rivals(mode, drag, worse - 1.0) == ()
