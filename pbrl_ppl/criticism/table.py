@@ -40,13 +40,15 @@ def log_error(mode: Mode) -> Floats:
     return np.asarray(np.log(np.maximum(mode.sigma, 1e-300)))
 
 
-def share(before: Mode, after: Mode, weight: Floats) -> float:
-    """Return the share of the error that a model takes off, of the dimension that shows it most.
+def share(before: Mode, after: Mode, weight: Floats, *, least: float = 0.01) -> float:
+    """Return the share of the error that a model takes off, over dimensions of some weights.
 
-    Of the root mean square; ``weight`` has shape (state,), zero where nothing is told.
+    Of the root mean square; ``weight`` has shape (state,). An angle at its noise does not count
+    beside positions that a wind moves: of less than the share ``least`` a dimension shows nothing.
     """
-    fall = (log_error(before) - log_error(after))[weight > 0.0]
-    return 1.0 - float(np.exp(-fall.max())) if len(fall) else 0.0
+    fall = log_error(before) - log_error(after)
+    shown = np.where(np.abs(fall) > least, weight, 0.0)
+    return 1.0 - float(np.exp(-(shown * fall).sum() / max(shown.sum(), 1.0)))
 
 
 def informed(mode: Mode, *, most: float = 0.7) -> Bools:

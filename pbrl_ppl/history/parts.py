@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from math import comb
 
 import numpy as np
 import xarray as xr
@@ -19,9 +20,9 @@ _ENOUGH = 1000
 #: Transitions that a law is searched in. They show one of a hundredth of the motion, and a search's
 #: time grows faster than they do.
 MOST_TRANSITIONS = 3000
-#: A spline through the rows that are kept passes others by so many times what it does through every
-#: second row, or by such a share of the motion.
-_NOISY, _SMOOTH = 1.5, 1e-3
+#: A spline through the rows that are kept passes others by so many times their noise, or by such a
+#: share of the motion, at most.
+_NOISY, _SMOOTH = 2.0, 1e-3
 #: Transitions of a piece, at least.
 _SHORTEST = 100
 
@@ -85,7 +86,7 @@ def thinned(
 ) -> tuple[Scene, tuple[History, ...], tuple[str, ...]]:
     """Return a scene and histories with a longer time step, if the first is finer than it moves.
 
-    Every k-th row is kept, and commands are averaged between them, so that at least ``most``
+    Every k-th row is kept, and commands are averaged between them, so that about ``most``
     transitions remain and a spline through the rows that are kept passes the others by no more than
     measurement errors. Recordings in which bodies may touch stay: a collision is an instant.
 
@@ -96,7 +97,7 @@ def thinned(
     *histories : History
         Of its bodies, with its time step; the first one is judged.
     most : int
-        Transitions from which on a recording is thinned, to no fewer.
+        Transitions of a recording that is not thinned any more, about.
 
     Returns
     -------
@@ -112,15 +113,9 @@ def thinned(
     still = scene.walls or len(scene.moving) < len(scene.bodies)
     if still or not alone or any(body.kinematic for body in scene.moving):
         return scene, histories, ()
-    least = None
-    for step in range(2, train.n_transitions // most + 1):
-        passed = _passed_by(train, step)
-        least = passed if least is None else least
-        if (passed > np.maximum(_NOISY * least, _SMOOTH)).any():
-            step -= 1
-            break
-    else:
-        step = train.n_transitions // most
+    limit, step = np.maximum(_NOISY * _noise(train), _SMOOTH), 1
+    while step < train.n_transitions // most and (_passed_by(train, step + 1) <= limit).all():
+        step += 1
     if step < 2:
         return scene, histories, ()
     dt = float(train.dataset.attrs["time_step"]) * step
@@ -133,6 +128,24 @@ def thinned(
         tuple(_each(one.dataset, step, dt) for one in histories),
         (said,),
     )
+
+
+def _noise(history: History, *, order: int = 6) -> Floats:
+    """Return the noise of single rows as a share of the motion, by differences, (body, state)."""
+    observed = history.dataset["observed"].to_numpy()
+    rough = np.diff(observed, order, axis=1)
+    seen = np.isfinite(rough).any(axis=(0, 1))
+    noise = np.zeros(observed.shape[2:])
+    noise[seen] = np.sqrt(np.nanmean(rough[:, :, seen] ** 2, axis=(0, 1)) / comb(2 * order, order))
+    return noise / _spread(observed)
+
+
+def _spread(observed: Floats) -> Floats:
+    """Return the standard deviation of each column, 1 where nothing moves, (body, state)."""
+    seen = np.isfinite(observed).any(axis=(0, 1))
+    spread = np.ones(observed.shape[2:])
+    spread[seen] = np.nanstd(observed[:, :, seen], axis=(0, 1))
+    return np.where(spread > 0.0, spread, 1.0)
 
 
 def _passed_by(history: History, step: int) -> Floats:
@@ -151,10 +164,8 @@ def _passed_by(history: History, step: int) -> Floats:
             if len(kept) > 3 and len(rows):
                 error = values[rows] - CubicSpline(kept, values[kept])(rows)
                 off[(slice(None), *place)] += (error**2).sum(), len(rows)
-    motion = np.zeros(off.shape[1:])
-    motion[off[1] > 0.0] = np.nanstd(observed[:, :, off[1] > 0.0], axis=(0, 1))
-    size = np.sqrt(off[0] / np.maximum(off[1], 1.0))
-    return np.where(motion > 0.0, size / np.where(motion > 0.0, motion, 1.0), 0.0)
+    size: Floats = np.sqrt(off[0] / np.maximum(off[1], 1.0))
+    return size / _spread(observed)
 
 
 def _each(data: xr.Dataset, step: int, dt: float) -> History:

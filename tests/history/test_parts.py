@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from pbrl_ppl.cli import options
-from pbrl_ppl.history import MOST_TRANSITIONS, History, drawn_pieces
-from pbrl_ppl.scene import Body, Scene, Shape
+from pbrl_ppl.history import MOST_TRANSITIONS, History, drawn_pieces, thinned
+from pbrl_ppl.scene import Body, Scene, Shape, Wall
 
 PUCK = Scene(time_step=0.1, bodies=(Body("puck", Shape.circle(0.1)),))
 
@@ -74,3 +74,51 @@ def test_no_piece_begins_in_a_gap() -> None:
 
 def test_commands_use_as_many() -> None:
     assert options.MOST_TRANSITIONS == MOST_TRANSITIONS
+
+
+def swings(*rows: int, step: float = 0.001, period: float = 1.0, noise: float = 1e-4) -> History:
+    """Return a puck that goes to and fro, in a row a step, and is pushed by the row's number."""
+    rng, longest = np.random.default_rng(0), max(rows)
+    states = np.full((len(rows), longest, 1, 6), np.nan)
+    pushes = np.zeros((len(rows), longest - 1, 1, 3))
+    for states_of_one, n in zip(states, rows, strict=True):
+        places = np.cos(2.0 * np.pi * step * np.arange(n) / period)
+        states_of_one[:n, 0, 0] = places + rng.normal(scale=noise, size=n)
+    pushes[..., 0, 0] = np.arange(longest - 1)
+    times = np.where(np.isfinite(states[:, :, 0, 0]), step * np.arange(longest), np.nan)
+    return History.of_arrays(states, PUCK.replace(time_step=step), pushes, times)
+
+
+def test_a_recording_finer_than_its_motion_is_thinned() -> None:
+    """Rows are kept, commands averaged, and no trajectory's rows are mixed with another's."""
+    history = swings(6001, 3004)
+    scene, (thin, other), said = thinned(PUCK.replace(time_step=0.001), history, history)
+    step = round(scene.time_step / 0.001)
+    assert 2 <= step <= 9 and f"one row in {step}" in said[0]
+    assert thin.n_transitions > 990 and thin.dataset.attrs["time_step"] == scene.time_step
+    assert thin.data_sha256 == other.data_sha256 != history.data_sha256
+    np.testing.assert_array_equal(thin.dataset["n_rows"], [6000 // step + 1, 3003 // step + 1])
+    for i, n in enumerate(thin.dataset["n_rows"].to_numpy()):
+        for name in ("observed", "start", "clock"):
+            kept = history.dataset[name].to_numpy()[i, ::step][:n]
+            np.testing.assert_array_equal(thin.dataset[name].to_numpy()[i, :n], kept)
+            assert np.isnan(thin.dataset[name].to_numpy()[i, n:]).all()
+        pushes = thin.dataset["action"].to_numpy()[i, :, 0, 0]
+        np.testing.assert_allclose(pushes[: n - 1], step * np.arange(n - 1) + (step - 1) / 2)
+        assert np.isnan(pushes[n - 1 :]).all()
+
+
+@pytest.mark.parametrize(
+    "history",
+    [swings(1500), swings(6000, step=0.1), swings(6000, noise=0.0, step=0.1)],
+    ids=["short", "no finer than it moves", "exact"],
+)
+def test_a_recording_that_its_motion_needs_stays(history: History) -> None:
+    scene = PUCK.replace(time_step=float(history.dataset.attrs["time_step"]))
+    assert thinned(scene, history) == (scene, (history,), ())
+
+
+def test_a_recording_with_collisions_stays() -> None:
+    history = swings(6000)
+    walled = PUCK.replace(time_step=0.001, walls=(Wall((-1.0, -1.0), (1.0, -1.0)),))
+    assert thinned(walled, history)[2] == ()

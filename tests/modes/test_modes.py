@@ -11,7 +11,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, TransitionLikelihood
-from pbrl_ppl.modes import search, trajectory_mode
+from pbrl_ppl.modes import mode_of_more, search, trajectory_mode
 from pbrl_ppl.modes.laplace import climb, covariance_of, sandwich
 from pbrl_ppl.modes.search import find_mode, find_modes
 from pbrl_ppl.parameters import by_prior, covariance_factor, differentiate
@@ -226,6 +226,15 @@ def test_whole_trajectories_do_not_change_the_problem_otherwise(problem, modes) 
     assert isinstance(problem.likelihood, TransitionLikelihood)
     assert whole.physics is problem.physics
     assert whole.data.history is problem.data.history
+
+
+def test_the_mode_of_a_recording_is_found_from_that_of_its_part(history, problem, modes) -> None:
+    """As from prior draws, within half a nat; the part has half of the trajectories."""
+    part = history.select(range(history.n_trajectories // 2))
+    of_part = trajectory_mode(problem.with_data(history=part), modes[0].phi)
+    whole, found = trajectory_mode(problem, modes[0].phi), mode_of_more(problem, of_part)
+    assert found.problem.segments.n == whole.problem.segments.n > of_part.problem.segments.n
+    assert found.log_posterior > whole.log_posterior - 0.5
 
 
 def test_prior_alone_where_data_say_nothing() -> None:

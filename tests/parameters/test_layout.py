@@ -13,7 +13,14 @@ from hypothesis import strategies as st
 from pbrl_ppl.effects import attach
 from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.model.declaration import random_variable
-from pbrl_ppl.parameters import BODY_PARAMETERS, WHEEL_PARAMETERS, Block, Layout, Prior
+from pbrl_ppl.parameters import (
+    BODY_PARAMETERS,
+    WHEEL_PARAMETERS,
+    Block,
+    Layout,
+    Prior,
+    stepped,
+)
 from pbrl_ppl.physics import build_layout
 from pbrl_ppl.physics.table1 import table1
 from pbrl_ppl.scene import Body, Scene, Shape
@@ -33,6 +40,17 @@ def layouts(draw) -> Layout:
         on = tuple(draw(st.lists(st.sampled_from(BODIES), unique=True, min_size=1)))
         blocks.append(Block(name, on, "1", (NORMAL,) * len(on)))
     return Layout(tuple(blocks))
+
+
+def test_a_step_takes_a_mass_no_further_than_ten_times() -> None:
+    """A linear step beyond zero would end at the support's end, where drag is too stiff."""
+    priors = (Prior("log_normal", mu=0.0, sigma=1.5), Prior("normal"), Prior("half_normal"))
+    phi = np.array([2.0, 2.0, 2.0])
+    end = stepped(priors, phi, np.array([-100.0, -100.0, -100.0]))
+    assert end[0] == pytest.approx(0.2) and end[1] == -98.0 and 0.0 <= end[2] < 1e-5
+    far, near = (stepped(priors, phi, np.full(3, size)) for size in (100.0, 0.5))
+    np.testing.assert_allclose(far, (20.0, 102.0, 102.0))
+    np.testing.assert_allclose(near, 2.5)
 
 
 # -- layouts ---------------------------------------------------------------------------------------
