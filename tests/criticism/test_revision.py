@@ -397,7 +397,8 @@ def test_only_chains_are_said_not_to_converge(method, said, monkeypatch) -> None
 
     def unconverged(*args: Any, **options: Any) -> Any:
         warnings.warn("the chains have not converged", ConvergenceWarning, stacklevel=1)
-        held = {"interrupted": None, "pareto_k": None, "max_rhat": 1.02, "min_ess": 350.0}
+        held = {"method": method, "interrupted": None, "pareto_k": None}
+        held |= {"max_rhat": 1.02, "min_ess": 350.0}
         return SimpleNamespace(record=SimpleNamespace(**held))
 
     monkeypatch.setattr("pbrl_ppl.criticism.closing.sample", unconverged)
