@@ -271,14 +271,19 @@ class Search:
             for without in ((), *((law,) for law in laws)):
                 total = float((library.test(without).residual ** 2).sum())
                 now = now or total
-                for subset in best_subsets(
-                    library, every, without, largest=2 - len(without)
-                ).subsets:
-                    unusual = [law for law in subset.laws if law.effect.unusual]
-                    part = 1.0 - float(np.sqrt(total * (1.0 - subset.share) / now))
+                subsets = best_subsets(library, every, without, largest=2 - len(without)).subsets
+                left = dict[tuple[Attached, ...], float]()
+                for one in subsets:  # of several grid points the best
+                    rest = total * (1.0 - one.share)
+                    left[one.laws] = min(rest, left.get(one.laws, rest))
+                for laws_of, rest in left.items():
+                    unusual = [law for law in laws_of if law.effect.unusual]
+                    common_ones = tuple(law for law in laws_of if law not in unusual)
+                    before = min(now, left.get(common_ones, now))
+                    part = 1.0 - float(np.sqrt(rest / before))
                     if len(unusual) == 1 and part > limits.promise * beyond:
                         found = i
-                    if len(unusual) == len(subset.laws) == 1 and mode is common.modes[-1]:
+                    if len(unusual) == len(laws_of) == 1 and mode is common.modes[-1]:
                         alone[unusual[0]] = max(part, alone.get(unusual[0], 0.0))
         leading = sorted(alone, key=lambda law: -alone[law])[: limits.refits]
         return found, {law: alone[law] for law in leading if alone[law] >= limits.main_share}
@@ -349,7 +354,7 @@ class Search:
                         break
                     climb.mode = trial
                 climb.table = replace(
-                    climb.table, modes={frozenset(climb.table.laws(longer)): longer}
+                    climb.table, behind={}, modes={frozenset(climb.table.laws(longer)): longer}
                 )
                 climb.mode = longer
             # on the longest pieces a law of less than a main share is not named
@@ -481,9 +486,9 @@ class Search:
         table, now, laws = climb.table, climb.mode, frozenset(climb.laws)
         least, most = self.criteria.search.least_nats, self.criteria.far_out
         good = list[tuple[float, Mode, float]]()
-        in_parallel(lambda key: table.fitted(now, key, moves[key]), moves)
+        table.race(now, moves)
         weight, here, top = table.weight, table.value(now), 0.0
-        for key in moves:
+        for key in (one for one in moves if one in table.modes):
             mode = table.modes[key]
             gain = table.value(mode) - here
             if len(key) < len(laws):

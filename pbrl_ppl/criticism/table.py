@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from pbrl_ppl.effects import Attached
 from pbrl_ppl.likelihood import LikelihoodT, Problem, is_independent, is_simulated
-from pbrl_ppl.modes import Mode, find_mode, fit_pieces
+from pbrl_ppl.modes import Mode, find_mode, fit_pieces, is_simulated_mode
 from pbrl_ppl.parameters import inside, prior_residual, prior_slopes, stepped
 from pbrl_ppl.scene import state_sizes
 from pbrl_ppl.state import Bools, Floats
+from pbrl_ppl.threads import in_parallel
 
 
 def moving(mode: Mode, *, still: float = 1e-4) -> Bools:
@@ -102,8 +104,10 @@ def with_effects(
     return problem, inside(layout.priors, phi)
 
 
-def refit(mode: Mode, effects: tuple[Attached, ...], begin: Mapping[str, float]) -> Mode:
-    """Return the mode with other effects, under the same likelihood.
+def refit(
+    mode: Mode, effects: tuple[Attached, ...], begin: Mapping[str, float], rounds: int = 8
+) -> Mode:
+    """Return the mode with other effects, under the same likelihood, by so many ``rounds``.
 
     It is climbed from where parameters may ``begin``, by their labels, from there with new ones
     alone, or from a part of the way: the best of these.
@@ -112,11 +116,7 @@ def refit(mode: Mode, effects: tuple[Attached, ...], begin: Mapping[str, float])
     new = {label: value for label, value in begin.items() if label not in known}
     problem, phi = with_effects(mode, effects, new)
     if is_simulated(problem):
-        return fit_pieces(
-            problem,
-            _best_start(mode, effects, phi, begin),
-            rounds=8, tolerance=1.0, n_steps=1, dampings=(0.1, 10.0, 1e3),
-        )  # fmt: skip
+        return fit_pieces(problem, _best_start(mode, effects, phi, begin), rounds, **_CLIMB)
     # what a lacking model's parameters have made up for is far from where they are with the law
     centre = np.array([prior.centre for prior in problem.layout.priors])
     centre[problem.layout.places(new)] = [*new.values()]
@@ -149,6 +149,10 @@ def _best_start(
     return np.asarray(points[int(np.argmin(cost))])
 
 
+#: A climb of a refit: it ends at a gain of 1 nat.
+_CLIMB: dict[str, Any] = {"tolerance": 1.0, "n_steps": 1, "dampings": (0.1, 10.0, 1e3)}
+
+
 @dataclass(eq=False)
 class Table:
     """Models of one recording on pieces of one length, by their laws; each is fitted once.
@@ -163,12 +167,15 @@ class Table:
         Grid points that a law was chosen from, where it has a scan.
     modes : dict of frozenset to Mode
         The models by their laws.
+    behind : dict of frozenset to Mode
+        Models that were given up in a race.
     """
 
     declared: tuple[Attached, ...]
     tried: int
     points: dict[Attached, int] = field(default_factory=dict)
     modes: dict[frozenset[Attached], Mode] = field(default_factory=dict)
+    behind: dict[frozenset[Attached], Mode] = field(default_factory=dict)
 
     def laws(self, mode: Mode) -> tuple[Attached, ...]:
         """Return the laws of a model."""
@@ -186,10 +193,46 @@ class Table:
         """
         key = frozenset(laws)
         if key not in self.modes:
-            effects = tuple(one for one in near.problem.physics.effects if one in key)
-            new = tuple(one for one in laws if one not in effects)
-            self.modes[key] = refit(near, (*self.declared, *effects, *new), begin or {})
+            self.modes[key] = self._refitted(near, laws, begin or {})
         return self.modes[key]
+
+    def _refitted(
+        self, near: Mode, laws: Collection[Attached], begin: Mapping[str, float], rounds: int = 8
+    ) -> Mode:
+        """Return a model, climbed on where it was given up."""
+        behind = self.behind.pop(frozenset(laws), None)
+        if behind is not None and is_simulated_mode(behind):
+            return fit_pieces(behind.problem, behind.phi, rounds, **_CLIMB)
+        effects = tuple(one for one in near.problem.physics.effects if one in laws)
+        new = tuple(one for one in laws if one not in effects)
+        return refit(near, (*self.declared, *effects, *new), begin, rounds)
+
+    def race(
+        self,
+        near: Mode,
+        moves: Mapping[frozenset[Attached], Mapping[str, float]],
+        *,
+        rounds: int = 2,
+        far: float = 30.0,
+    ) -> None:
+        """Fit models at once, from where their parameters begin, by their labels.
+
+        Those that are ``far`` behind the best after a few ``rounds`` (nats) are given up.
+        """
+        new = [key for key in moves if key not in self.modes]
+        if not is_simulated_mode(near) or len(new) < 2:
+            in_parallel(lambda key: self.fitted(near, key, moves[key]), new)
+            return
+        rest = [key for key in new if key not in self.behind]
+        first = in_parallel(lambda key: self._refitted(near, key, moves[key], rounds), rest)
+        self.behind |= dict(zip(rest, first, strict=True))
+        self.modes |= (tried := {key: self.behind[key] for key in new})
+        values = {key: self.value(mode) for key, mode in tried.items()}
+        least = max(*values.values(), self.value(near)) - far
+        for key in new:
+            del self.modes[key]
+        ahead = [key for key in new if values[key] >= least]
+        in_parallel(lambda key: self.fitted(near, key, moves[key]), ahead)
 
     def without(self, mode: Mode, law: Attached) -> Mode:
         """Return a model without a law."""
