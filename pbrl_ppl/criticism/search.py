@@ -472,6 +472,11 @@ class Search:
                 if one.nats > 0.5 * max(own, 0.0) and not same & {*one.laws}
             ]  # fmt: skip
             alike = [one for one in instead.subsets if are_alike(law, *one.laws)]
+            for one in () if law.effect.unusual else alike:  # a simpler one that is nearly as good
+                simple = climb.table.fitted(climb.mode, rest | {*one.laws}, one.begin(labels))
+                more = share(simple, climb.mode, climb.table.weight)
+                if more < self.criteria.search.least_share:
+                    return simple
             for one in (*swaps[: self.criteria.search.singles], *alike):
                 moves.setdefault(rest | {*one.laws}, one.begin(labels))
         return self._best(climb, moves, 0.0)
@@ -494,9 +499,9 @@ class Search:
             if len(key) < len(laws):
                 gain -= sum(climb.earlier.get(law, 0.0) for law in laws - key)
             else:
-                # in a law's place one of more parameters follows the grain of friction, too
+                # in a law's place one of more parameters follows whatever else is missing
                 flexible = len(key) == len(laws) and len(mode.phi) > len(now.phi)
-                needed_share = max(least_share, self.criteria.negligible * flexible)
+                needed_share = max(least_share, self.criteria.search.least_share * flexible)
                 if share(now, mode, weight) < needed_share or far_out(mode, key) >= most:
                     continue
             top = max(top, gain)
