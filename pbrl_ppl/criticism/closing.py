@@ -412,12 +412,12 @@ def _fit(task: _Task, mode: Mode) -> tuple[Fit, list[Warning]]:
 def _converged(fit: Fit, criteria: Criteria) -> bool:
     """Return whether draws are good enough for a verdict; warnings begin earlier."""
     record = fit.record
-    if record.method == "laplace":  # independent draws
-        return True
     if record.max_rhat is None or record.min_ess is None:
         return False
     if record.pareto_k is not None and not record.pareto_k <= MAX_PARETO_K:
         return False
+    if record.method == "laplace":  # independent draws
+        return True
     return record.max_rhat <= criteria.worst_rhat and record.min_ess >= criteria.least_ess
 
 
