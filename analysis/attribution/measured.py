@@ -130,7 +130,7 @@ class Recording:
     @property
     def right(self) -> set[str]:
         """The names that are right, those too of what was in no catalogue and is now."""
-        since = (_SINCE.get(law, law) for law in self.outside)
+        since = {_SINCE.get(law, law) for law in self.outside} & {one.name for one in pp.catalogue}
         return {name for law in (*self.laws, *self.also, *since) for name in self.names_of(law)}
 
     @property
