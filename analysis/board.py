@@ -25,6 +25,7 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
+import signal
 import sys
 from collections import Counter
 from pathlib import Path
@@ -107,7 +108,10 @@ def run_apart(recording: Recording, path: Path, options: argparse.Namespace) -> 
             print(f"{recording.name}: no forecasts: {error}", file=sys.stderr, flush=True)
             return
         seconds = children() - before
-        is_late = isinstance(error, TimeoutError) or seconds > limit - 1
+        # the system counts some seconds that are not counted for ended children
+        spent = f"exit code {-signal.SIGXCPU}" in str(error)
+        is_late = isinstance(error, TimeoutError) or spent or seconds > limit - 1
+        seconds = max(seconds, limit) if spent else seconds
         why = f"no verdict in {limit} s" if is_late else f"{type(error).__name__}: {error}"
         verdict = "late" if is_late else "failed"
         Result.of(recording, method, verdict=verdict, error=why, seconds=seconds).save(path)

@@ -167,8 +167,9 @@ def _with(mode: Mode, added: Attached, values: dict[str, float]) -> Mode:
     problem = mode.problem.with_physics(effects=(*mode.problem.physics.effects, added))
     layout = problem.layout
     phi = layout.from_layout(mode.problem.layout, mode.phi)
-    for name, value in values.items():
-        phi[layout.index(f"{added.effect.name}_{name}", added.body)] = value
+    known = {parameter.name for parameter in added.effect.parameters}
+    for name in values.keys() & known:  # a sensor's of what the body's joint leaves it
+        phi[layout.index(f"{added.effect.name}_{name}", added.body)] = values[name]
     return trajectory_mode(problem, inside(layout.priors, phi), mode.sigma)
 
 
