@@ -125,7 +125,7 @@ RAW = (
         train="train.csv",
         test="test.csv",
         new=(
-            *("--columns", "time=millis,theta=count", "--units", "time=ms,theta=turn/8192"),
+            *("--columns", "time=millis,theta=count", "--units", "time=ms,theta=8192/turn"),
             *("--top", "--body", "wheel=circle:0.05"),
         ),
         edits=(
@@ -143,7 +143,7 @@ RAW = (
         test="test.csv",
         new=(
             *("--columns", "time=profileTime,x=position,vx=velocity"),
-            *("--units", "x=m/54324.89,vx=m/54324.89/s", "--top", "--body", "carriage=box:0.3x0.2"),
+            *("--units", "x=54324.89/m,vx=54324.89/m", "--top", "--body", "carriage=box:0.3x0.2"),
         ),
         edits=(_weighed(4.2),),
         more="""
@@ -184,7 +184,7 @@ anchor_b = [0.0, 0.0]
         laws=("quadratic_drag",),
         same_data={"quadratic_drag": ("power_drag",)},
         train="slow-motion",
-        new=("--units", "time=s/8", "--side", "--body", "ball=circle:0.02"),
+        new=("--units", "time=8/s", "--side", "--body", "ball=circle:0.02"),
         edits=(_weighed(0.0027),),
     ),
     Raw(

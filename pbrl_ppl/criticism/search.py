@@ -146,6 +146,8 @@ class _Climb:
         Candidates that are the same physics as a law.
     small : dict of Attached to float
         Laws that were left out as no main ones, and their shares of the error.
+    last : bool
+        Whether the pieces are the longest ones.
     """
 
     mode: Mode
@@ -159,6 +161,7 @@ class _Climb:
     first_order: dict[Attached, float] = field(default_factory=dict)
     same: dict[Attached, tuple[Attached, ...]] = field(default_factory=dict)
     small: dict[Attached, float] = field(default_factory=dict)
+    last: bool = False
 
     @property
     def laws(self) -> tuple[Attached, ...]:
@@ -357,9 +360,8 @@ class Search:
                     climb.table, behind={}, modes={frozenset(climb.table.laws(longer)): longer}
                 )
                 climb.mode = longer
-            # on the longest pieces a law of less than a main share is not named
-            last = i and length == lengths[-1]
-            self._improve(climb, limits.main_share if last else limits.least_share)
+            climb.last = bool(i) and length == lengths[-1]
+            self._improve(climb)
             if not climb.noise.size:
                 climb.noise = climb.mode.sigma
             if i < len(beside):
@@ -387,18 +389,15 @@ class Search:
             mode = replace(mode, problem=mode.problem.with_likelihood(tau=white), sigma=sigma)
         return Library(mode, laws, self.criteria)
 
-    def _improve(self, climb: _Climb, least_share: float, rounds: int = 8) -> None:
-        """Improve a model on pieces of one length by moves from model to model.
-
-        ``least_share``: of the error, which added laws take off.
-        """
+    def _improve(self, climb: _Climb, rounds: int = 8) -> None:
+        """Improve a model on pieces of one length by moves from model to model."""
         table, before, begin = climb.table, climb.laws, climb.mode
         for i in range(rounds):
             library, candidates = self._linearised(climb)
             regression = best_subsets(library, candidates)
             if i == 0:
                 climb.regressions.append(regression)
-            better = self._enlarged(climb, regression, least_share)
+            better = self._enlarged(climb, regression, self.criteria.search.least_share)
             if better is climb.mode:
                 better = self._exchanged(climb, library, candidates)
             if better is climb.mode:
@@ -427,6 +426,7 @@ class Search:
     def _enlarged(self, climb: _Climb, regression: Regression, least_share: float) -> Mode:
         """Return the model with the best of a few proposed subsets, or the climb's own."""
         limits, least = self.criteria.search, 1.0 - (1.0 - _PREDICTED * least_share) ** 2
+        least /= max(int(moving(climb.mode).sum()), 1)  # one dimension may show it alone
         for one in regression.signatures:
             climb.table.points[one.attached] = one.candidate.n_grid_points
         subsets = [
@@ -502,6 +502,8 @@ class Search:
                 # in a law's place one of more parameters follows whatever else is missing
                 flexible = len(key) == len(laws) and len(mode.phi) > len(now.phi)
                 needed_share = max(least_share, self.criteria.search.least_share * flexible)
+                if climb.last and len(key) > len(laws) + 1:  # no handful of small ones at the end
+                    needed_share = self.criteria.search.main_share
                 if share(now, mode, weight) < needed_share or far_out(mode, key) >= most:
                     continue
             top = max(top, gain)

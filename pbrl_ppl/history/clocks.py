@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from pbrl_ppl.errors import HistoryError, LayoutError
-from pbrl_ppl.history.measures import TIME, unit_in_name
+from pbrl_ppl.history.measures import TIME, unit_in_name, unit_size
 from pbrl_ppl.history.resampling import held_means
 from pbrl_ppl.scene import Recording, column_of
 from pbrl_ppl.state import STATE, WRENCH, Bools, Floats, Ints
@@ -142,9 +142,13 @@ def _seconds(frame: pd.DataFrame, name: str, layout: Recording, source: str) -> 
                 ' or units = { time = "s" }',
                 units={"time": unit},
             )
-    if unit not in TIME:
-        raise HistoryError(f'units: "{unit}" is none of time; expected one of {", ".join(TIME)}')
-    return np.array(stamps * TIME[unit])
+    size = unit_size("time", unit)
+    if size is None:
+        raise HistoryError(
+            f'units: "{unit}" is none of time; expected one of {", ".join(TIME)}, or a number to'
+            ' one, "240/s"'
+        )
+    return np.array(stamps * size)
 
 
 def _stated_unit(frame: pd.DataFrame, name: str) -> str:

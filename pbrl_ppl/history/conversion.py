@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TypedDict, Unpack
 
 import numpy as np
@@ -13,7 +14,13 @@ from pbrl_ppl.history.clocks import Say, in_order, on_one_clock
 from pbrl_ppl.history.cuts import cut, without_lost_rows
 from pbrl_ppl.history.files import COLUMNS
 from pbrl_ppl.history.guesses import with_derived
-from pbrl_ppl.history.measures import in_si, stated_units, unit_in_name, with_zeros
+from pbrl_ppl.history.measures import (
+    in_si,
+    stated_units,
+    unit_in_name,
+    with_whole_counts,
+    with_zeros,
+)
 from pbrl_ppl.history.rows import with_clean_names
 from pbrl_ppl.scene import Recording, Scene, nearest
 from pbrl_ppl.state import STATE, WRENCH
@@ -88,13 +95,14 @@ def as_history(
     say = said.append
     if is_history(frame):
         return _repaired(frame, scene, layout, source, said)
+    known = _numbered(frame, dict(layout.columns), source)
+    layout = replace(layout, columns=tuple(known.items()))
     frame = with_derived(frame, say)
     frame = on_one_clock(frame, layout, commands, source, say)
-    known = _numbered(frame, dict(layout.columns), source)
     if "time" in frame and "duration" not in known:
         known["time"] = "time"  # in s by now
     named = renamed(frame, scene, known, source)
-    named = _unseen_emptied(named, layout, source)
+    named = with_whole_counts(_unseen_emptied(named, layout, source), say)
     stated = stated_units(frame, known)
     units = stated | {name: unit for name, unit in layout.units if name != "time"}
     named = with_zeros(in_si(named, units), scene, layout, source)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import pandas as pd
@@ -11,7 +11,7 @@ import pandas as pd
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history.kinematics import joint_order
 from pbrl_ppl.scene import Recording, Scene, column_of, nearest
-from pbrl_ppl.state import wrapped
+from pbrl_ppl.state import STATE, VELOCITY, Floats, wrapped
 
 #: Units of time in s.
 TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
@@ -104,8 +104,33 @@ def _no_unit(key: str, name: str, unit: str) -> str:
     known = [known for known in _UNITS[name] if not {"*", ".", "\u00b7"} & {*known}]
     return (
         f'units: "{unit}" is none of {key}; expected one of'
-        f' {", ".join(known[:12])}: units = {{ {key} = "{known[0]}" }}'
+        f' {", ".join(known[:12])}, or a number of counts to one, "8192/{known[-1]}":'
+        f' units = {{ {key} = "{known[0]}" }}'
     )
+
+
+def unit_size(name: str, text: str) -> float | None:
+    """Return a unit of a history's column in SI units; None if it has no such unit.
+
+    Of counts ``"8192/turn"`` is 8,192 to a turn; of a rate ``"8192/turn"`` is the same in a second.
+
+    Examples
+    --------
+    >>> [unit_size("x", unit) for unit in ("mm", "2000/m", "N")], unit_size("vx", "2000/m")
+    ([0.001, 0.0005, None], 0.0005)
+    """
+    units = _UNITS[name]
+    if (unit := _SAME.get(text, text)) in units:
+        return units[unit]
+    number, _, rest = (part.strip() for part in unit.partition("/"))
+    try:
+        count = float(number)
+    except ValueError:
+        return None
+    rest = _SAME.get(rest, rest)
+    of_rate = name in STATE[VELOCITY:] and f"{rest}/s" in units
+    size = units.get(f"{rest}/s" if of_rate else rest)
+    return size / count if size is not None and np.isfinite(count) and count > 0 else None
 
 
 def in_si(frame: pd.DataFrame, units: Mapping[str, str]) -> pd.DataFrame:
@@ -133,18 +158,76 @@ def in_si(frame: pd.DataFrame, units: Mapping[str, str]) -> pd.DataFrame:
     frame = frame.copy()
     for key, text in units.items():
         body, _, name = key.rpartition(".")
-        unit = _SAME.get(text, text)
         if name not in _UNITS:
             raise HistoryError(f'units: "{key}" has none{nearest(name, _UNITS)}')
-        if unit not in _UNITS[name]:
+        size = unit_size(name, text)
+        if size is None:
             raise HistoryError(_no_unit(key, name, text))
         if name not in frame:
-            raise HistoryError(f'units: "{name}" is in {unit}, and the table has no such column')
+            raise HistoryError(f'units: "{name}" is in {text}, and the table has no such column')
         values = pd.to_numeric(frame[name], errors="coerce")
         scaled = values.notna() & (frame["body"] == body if body else True)
         # non-numbers are kept, for the message that names them
-        frame[name] = (values * _UNITS[name][unit]).where(scaled, frame[name])
+        frame[name] = (values * size).where(scaled, frame[name])
     return frame
+
+
+def with_whole_counts(frame: pd.DataFrame, say: Callable[[str], None]) -> pd.DataFrame:
+    """Return a table whose counters of 8, 16 or 32 bits go on where they overflow.
+
+    Parameters
+    ----------
+    frame : pandas.DataFrame
+        With a history's column names, in the file's units.
+    say : callable
+        Takes a sentence on each column that was mended.
+
+    Examples
+    --------
+    >>> turning = pd.DataFrame({"theta": [32700.0, 32760.0, -32716.0, -32656.0]})
+    >>> with_whole_counts(turning, print)["theta"].tolist()
+    theta is a counter of 16 bits that overflows 1 time, first in row 2: it goes on
+    [32700.0, 32760.0, 32820.0, 32880.0]
+    """
+    bodies = frame["body"].to_numpy() if "body" in frame else np.zeros(len(frame))
+    time = pd.to_numeric(frame["time"], errors="coerce") if "time" in frame else None
+    frame = frame.copy()
+    for name in (name for name in STATE if name in frame):
+        values = pd.to_numeric(frame[name], errors="coerce").to_numpy(float, copy=True)
+        found = list[tuple[int, int]]()
+        for body in pd.unique(bodies):
+            rows = np.flatnonzero((bodies == body) & np.isfinite(values))
+            every, clock = values[rows], np.zeros(len(rows))
+            clock = clock if time is None else time.to_numpy()[rows]
+            for run in np.split(rows, np.flatnonzero(np.diff(clock) < 0.0) + 1):
+                bits = _overflows(values[run], every)
+                if bits:
+                    jumps = np.abs(np.diff(values[run])) > 0.5 * 2.0**bits
+                    found += [(bits, int(row)) for row in run[1:][jumps]]
+                    values[run] = np.unwrap(values[run], period=2.0**bits)
+        if found:
+            times = f"{len(found)} time{'s' * (len(found) > 1)}"
+            say(
+                f"{name} is a counter of {found[0][0]} bits that overflows {times}, first in row"
+                f" {min(row for _, row in found)}: it goes on"
+            )
+            frame[name] = values
+    return frame
+
+
+def _overflows(run: Floats, every: Floats, *, full: float = 0.75) -> int:
+    """Return the bits of a counter that overflows in a run of a column; 0 if it does not.
+
+    ``full``: a jump is at least this share of what it counts to.
+    """
+    if len(run) < 2 or (every != np.round(every)).any():
+        return 0
+    for bits in (8, 16, 32):
+        size = 2.0**bits
+        fits = any(low <= every.min() and every.max() < low + size for low in (-size / 2, 0.0))
+        if fits:
+            return bits if (np.abs(np.diff(run)) > full * size).any() else 0
+    return 0
 
 
 def zero_angle(scene: Scene, body: str, zero: str) -> float:

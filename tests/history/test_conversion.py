@@ -7,9 +7,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pbrl_ppl.errors import HistoryError, ResamplingWarning
+from pbrl_ppl.errors import HistoryError, RecordingWarning, ResamplingWarning
 from pbrl_ppl.history import History, measured_alone
-from pbrl_ppl.scene import Body, Scene, Shape
+from pbrl_ppl.history.measures import in_si
+from pbrl_ppl.scene import Body, Joint, Scene, Shape
 from pbrl_ppl.state import STATE, WRENCH
 from tests.helpers.free_puck import DISC, Disc
 from tests.helpers.histories import NOISE
@@ -229,3 +230,79 @@ def test_bodies_with_clocks_of_their_own() -> None:
     assert data["trajectory"].values.tolist() == ["run", "2"]
     assert not data["observed"][:, :40].isnull().any()
     np.testing.assert_array_equal(data["observed"][0], data["observed"][1])
+
+
+# -- counts ----------------------------------------------------------------------------------------
+
+ARM = Scene(
+    time_step=0.01,
+    bodies=(Body("arm", Shape.box(0.04, 0.3)),),
+    joints=(Joint("hinge", ("arm", "world"), (0.0, 0.15), (0.0, 0.0)),),
+)
+
+
+def turning(bits: int, signed: bool, *, counts: int = 8192, runs: int = 2) -> pd.DataFrame:
+    """An arm that turns to and fro by some turns, its counter, and its counts in a second."""
+    low = -(2 ** (bits - 1)) if signed else 0
+    time = 0.01 * np.arange(400)
+    turns = 3.0 * 2**bits / counts * np.sin(0.8 * time)
+    rate = np.gradient(turns, time)
+
+    def counted(values: np.ndarray) -> np.ndarray:
+        return np.mod(np.round(counts * values) - low, 2**bits) + low
+
+    one = pd.DataFrame({"millis": 1000.0 * time, "count": counted(turns)})
+    one["rate"] = np.round(counts * rate)
+    one["turns"] = turns
+    return pd.concat([one] * runs, ignore_index=True)  # the clock starts again
+
+
+@pytest.mark.parametrize(("bits", "signed"), [(8, False), (16, True), (16, False), (32, True)])
+def test_a_counter_that_overflows_goes_on(tmp_path, bits, signed) -> None:
+    """Each run from its own beginning, and it is said which row is the first."""
+    counts = {8: 20, 16: 8192, 32: 2**28}[bits]
+    frame, path = turning(bits, signed, counts=counts), tmp_path / "log.csv"
+    frame.drop(columns=["turns", "rate"]).to_csv(path, index=False)
+    units = {"time": "ms", "theta": f"{counts}/turn"}
+    with pytest.warns(RecordingWarning, match=f"theta is a counter of {bits} bits that overflows"):
+        history = History.load(path, ARM, columns={"time": "millis", "theta": "count"}, units=units)
+    theta = history.dataset["observed"].sel(state="theta").to_numpy()
+    expected = 2.0 * np.pi * frame["turns"].to_numpy().reshape(2, -1)
+    assert theta.shape[0] == 2
+    np.testing.assert_allclose(theta[..., 0], expected, atol=2.0 * np.pi / counts)
+
+
+def test_numbers_that_jump_and_count_nothing_stay(tmp_path) -> None:
+    """A sensor's range of 16 bits with a jump in it, in fractions; and a jump of half the range."""
+    time = 0.01 * np.arange(40)
+    for place in (np.where(time < 0.2, 32767.5, -32768.5), np.where(time < 0.2, 16000.0, -16000.0)):
+        path = tmp_path / "log.csv"
+        pd.DataFrame({"t": time, "x": place}).to_csv(path, index=False)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            history = History.load(path, DISC.replace(time_step=0.01), columns={"time": "t"})
+        np.testing.assert_array_equal(history.dataset["observed"].to_numpy()[0, :, 0, 0], place)
+
+
+def test_a_rate_in_counts_is_by_the_second() -> None:
+    frame = pd.DataFrame({"vx": [5000.0], "omega": [8192.0], "x": [2500.0]})
+    read = in_si(frame, {"vx": "2000/m", "omega": "8192/turn", "x": "2000/m"})
+    np.testing.assert_allclose(read.to_numpy(), [[2.5, 2.0 * np.pi, 1.25]])
+
+
+@pytest.mark.parametrize("unit", ["0/turn", "-5/turn", "nan/turn", "many/turn", "5/apple", "/turn"])
+def test_counts_to_nothing_are_no_unit(unit) -> None:
+    with pytest.raises(HistoryError, match=r'none of theta.*or a number of counts to one, "8192/'):
+        in_si(pd.DataFrame({"theta": [1.0]}), {"theta": unit})
+
+
+def test_times_by_number_have_their_unit(tmp_path) -> None:
+    """A file without a head, in milliseconds; and frames of a camera, 240 a second."""
+    for unit, step in (("ms", 10.0), ("100/s", 1.0)):
+        path = tmp_path / "log.txt"
+        np.savetxt(path, np.column_stack([step * np.arange(30), np.sin(0.1 * np.arange(30))]))
+        history = History.load(
+            path, DISC.replace(time_step=0.01), columns={"time": 0, "x": 1}, units={"time": unit}
+        )
+        clock = history.dataset["clock"].to_numpy()[0]
+        np.testing.assert_allclose(clock, 0.01 * np.arange(30), atol=1e-12)
