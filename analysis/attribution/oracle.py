@@ -167,9 +167,10 @@ def _with(mode: Mode, added: Attached, values: dict[str, float]) -> Mode:
     problem = mode.problem.with_physics(effects=(*mode.problem.physics.effects, added))
     layout = problem.layout
     phi = layout.from_layout(mode.problem.layout, mode.phi)
-    known = {parameter.name for parameter in added.effect.parameters}
-    for name in values.keys() & known:  # a sensor's of what the body's joint leaves it
-        phi[layout.index(f"{added.effect.name}_{name}", added.body)] = values[name]
+    for name, value in values.items():
+        label = f"{added.effect.name}_{name}[{added.body}]"
+        if label in layout.labels:  # a sensor's of what is measured
+            phi[layout.labels.index(label)] = value
     return trajectory_mode(problem, inside(layout.priors, phi), mode.sigma)
 
 
