@@ -142,7 +142,9 @@ def _share(mode: Mode, case: Case) -> float:
     """Return the effect's change of velocities per step, relative to the bodies' acceleration."""
     problem, null = mode.problem, mode.phi.copy()
     added = true_effect(case).on(str(case.on))
-    null[[problem.layout.labels.index(label) for label in added.labels]] = added.effect.null
+    for label, value in zip(added.labels, added.effect.null, strict=True):
+        if label in problem.layout.labels:
+            null[problem.layout.labels.index(label)] = value
     coordinates = problem.likelihood.noise.coordinates
     change = coordinates.of((problem.predict(mode.phi) - problem.predict(null))[:, 0])
     velocity = coordinates.places % len(STATE)
