@@ -25,6 +25,8 @@ from pbrl_ppl.threads import in_parallel, one_blas_thread
 
 #: Names are compared at this many times the least size that is seen.
 _WELL_SEEN = 3.0
+#: A dimension shows a law from this fall of its error's logarithm on.
+_SHOWN = 0.01
 
 
 @dataclass(frozen=True)
@@ -234,16 +236,20 @@ class _Regression:
         """Return the least multiple of a change of the residual, shape (n,), that is seen."""
         initial, limits = self.mode.problem.likelihood.initial_states, self.criteria.search
         n, alone = float(self.counts.sum()), self.mode.problem.data.history.n_trajectories == 1
-        main = -n * float(np.log1p(-(limits.alone if alone else limits.main_share)))
+        main = -float(np.log1p(-(limits.alone if alone else limits.main_share)))
         paid = limits.least_nats + term.price - worth(0.0, len(term.columns), n)
-        gain, shape = max(main, paid), self.mode.whitened_residual.shape
+        shape = self.mode.whitened_residual.shape
         square = unit[: np.prod(shape)].reshape(shape) ** 2
         rows, begin = np.split(square, [initial.seen[0].size], axis=1)
         square = initial.totals(rows.reshape(initial.seen.shape), begin) / self.counts
-        # the first is enough if every dimension shows as much as the one that shows most
-        squares = np.geomspace(1.0, 1e6, 300) * np.expm1(2.0 * gain / n) / max(square.max(), 1e-300)
-        gains = 0.5 * np.log1p(squares[:, None] * square) @ self.counts
-        return float(np.sqrt(np.interp(gain, gains, squares)))
+        # from what is enough where one dimension shows it alone, or all of them as much
+        first = np.expm1(2.0 * min(main, paid / n)) / max(square.max(), 1e-300)
+        squares = first * np.geomspace(1.0, 1e6, 600)
+        falls = 0.5 * np.log1p(squares[:, None] * square)
+        shown = np.where(falls > _SHOWN, self.counts, 0.0)
+        share = (shown * falls).sum(axis=1) / np.maximum(shown.sum(axis=1), 1.0)
+        enough = (share >= main) & (falls @ self.counts >= paid)
+        return float(np.sqrt(squares[int(np.argmax(enough))])) if enough.any() else np.inf
 
     def named(self, law: Attached, added: Floats) -> tuple[str, tuple[str, ...]]:
         """Return which law is named where one adds to the residual, and others within some nats."""
