@@ -17,7 +17,7 @@ import numpy as np
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.results import Law, SearchLength, Stage
 from pbrl_ppl.criticism.score import Library, Signature, named_beside
-from pbrl_ppl.criticism.subsets import Regression, Subset, best_subsets
+from pbrl_ppl.criticism.subsets import Regression, Subset, best_subsets, by_label
 from pbrl_ppl.criticism.table import (
     Table,
     far_out,
@@ -224,12 +224,9 @@ class Search:
         table = Table(
             declared, max(len(self._candidates(short, single)), 1), {}, {frozenset(): short}
         )
-        begin = {
-            label: value
-            for law, sizes in (laws or {}).items()
-            for label, value in zip(law.labels, sizes.tolist(), strict=True)
-        }
-        common = best = _Climb(table.fitted(short, laws or {}, begin), table, unusual=single)
+        common = best = _Climb(
+            table.fitted(short, laws or {}, by_label(laws or {})), table, unusual=single
+        )
         self._climb(common, lengths)
         self._leave_out(common)
         hypotheses: Mapping[Attached, float] = {}
@@ -517,9 +514,7 @@ class Search:
             return now
         _, mode, needed = min(near, key=lambda one: (len(one[1].phi), -one[0]))
         # friction makes the top rough: the better model may only have been climbed from elsewhere
-        labels = [label for law in laws for label in law.labels]
-        at = now.phi[now.problem.layout.places(labels)].tolist()
-        kept = dict(zip(labels, at, strict=True))
+        kept = by_label({law: sizes_of(now, law) for law in laws})
         again = refit(mode, now.problem.physics.effects, kept)
         if table.value(again) > here:
             table.modes[laws] = climb.mode = again

@@ -62,10 +62,16 @@ class Subset:
 
     def begin(self, labels: Sequence[str]) -> dict[str, float]:
         """Return where a refit begins, by the labels of parameters; ``labels`` are those of phi."""
-        begin = dict(zip(labels, self.phi.tolist(), strict=True))
-        for law, sizes in self.sizes.items():
-            begin |= dict(zip(law.labels, sizes.tolist(), strict=True))
-        return begin
+        return dict(zip(labels, self.phi.tolist(), strict=True)) | by_label(self.sizes)
+
+
+def by_label(sizes: Mapping[Attached, Floats]) -> dict[str, float]:
+    """Return the parameters of laws by their labels."""
+    return {
+        label: float(size)
+        for law, each in sizes.items()
+        for label, size in zip(law.labels, each, strict=True)
+    }
 
 
 def worth(share: float, columns: int, n: float) -> float:

@@ -42,15 +42,24 @@ def log_error(mode: Mode) -> Floats:
     return np.asarray(np.log(np.maximum(mode.sigma, 1e-300)))
 
 
-def share(before: Mode, after: Mode, weight: Floats, *, least: float = 0.01) -> float:
+def shown_fall(falls: Floats, weight: Floats, *, least: float = 0.01) -> Floats:
+    """Return the mean fall of errors' logarithms over the dimensions that show one, shape (...).
+
+    An angle at its noise does not count beside positions that a wind moves: where an error changes
+    by less than the share ``least`` a dimension shows nothing. ``falls`` has shape (..., state),
+    ``weight`` (state,).
+    """
+    shown = np.where(np.abs(falls) > least, weight, 0.0)
+    mean: Floats = (shown * falls).sum(axis=-1) / np.maximum(shown.sum(axis=-1), 1.0)
+    return mean
+
+
+def share(before: Mode, after: Mode, weight: Floats) -> float:
     """Return the share of the error that a model takes off, over dimensions of some weights.
 
-    Of the root mean square; ``weight`` has shape (state,). An angle at its noise does not count
-    beside positions that a wind moves: of less than the share ``least`` a dimension shows nothing.
+    Of the root mean square, where it is shown; ``weight`` has shape (state,).
     """
-    fall = log_error(before) - log_error(after)
-    shown = np.where(np.abs(fall) > least, weight, 0.0)
-    return 1.0 - float(np.exp(-(shown * fall).sum() / max(shown.sum(), 1.0)))
+    return 1.0 - float(np.exp(-shown_fall(log_error(before) - log_error(after), weight)))
 
 
 def informed(mode: Mode, *, most: float = 0.7) -> Bools:

@@ -22,4 +22,5 @@ from .effect import at_stage as at_stage
 from .effect import hanging_body as hanging_body
 from .effect import holder as holder
 from .effect import is_pivoted as is_pivoted
+from .effect import is_unpivoted as is_unpivoted
 from .effect import needs_inputs as needs_inputs

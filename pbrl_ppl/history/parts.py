@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from math import comb
@@ -113,8 +114,9 @@ def thinned(
     still = scene.walls or len(scene.moving) < len(scene.bodies)
     if still or not alone or any(body.kinematic for body in scene.moving):
         return scene, histories, ()
-    limit, step = np.maximum(_NOISY * _noise(train), _SMOOTH), 1
-    while step < train.n_transitions // most and (_passed_by(train, step + 1) <= limit).all():
+    observed, step = train.dataset["observed"].to_numpy(), 1
+    limit = np.maximum(_NOISY * _noise(observed), _SMOOTH * _over_rows(np.nanstd, observed))
+    while step < train.n_transitions // most and (_passed_by(observed, step + 1) <= limit).all():
         step += 1
     if step < 2:
         return scene, histories, ()
@@ -130,30 +132,22 @@ def thinned(
     )
 
 
-def _noise(history: History, *, order: int = 6) -> Floats:
-    """Return the noise of single rows as a share of the motion, by differences, (body, state)."""
-    observed = history.dataset["observed"].to_numpy()
-    rough = np.diff(observed, order, axis=1)
-    seen = np.isfinite(rough).any(axis=(0, 1))
-    noise = np.zeros(observed.shape[2:])
-    noise[seen] = np.sqrt(np.nanmean(rough[:, :, seen] ** 2, axis=(0, 1)) / comb(2 * order, order))
-    return noise / _spread(observed)
+def _noise(observed: Floats, *, order: int = 6) -> Floats:
+    """Return the noise of single rows by their differences, (body, state)."""
+    rough = np.diff(observed, order, axis=1) ** 2 / comb(2 * order, order)
+    return np.sqrt(_over_rows(np.nanmean, rough))
 
 
-def _spread(observed: Floats) -> Floats:
-    """Return the standard deviation of each column, 1 where nothing moves, (body, state)."""
-    seen = np.isfinite(observed).any(axis=(0, 1))
-    spread = np.ones(observed.shape[2:])
-    spread[seen] = np.nanstd(observed[:, :, seen], axis=(0, 1))
-    return np.where(spread > 0.0, spread, 1.0)
+def _over_rows(statistic: Callable[..., Floats], values: Floats) -> Floats:
+    """Return a statistic over all rows of each column, 0 where none is seen, (body, state)."""
+    seen = np.isfinite(values).any(axis=(0, 1))
+    result = np.zeros(values.shape[2:])
+    result[seen] = statistic(values[:, :, seen], axis=(0, 1))
+    return result
 
 
-def _passed_by(history: History, step: int) -> Floats:
-    """Return how far splines through one row in ``step`` pass the others by, (body, state).
-
-    As a share of the motion, root mean square.
-    """
-    observed = history.dataset["observed"].to_numpy()
+def _passed_by(observed: Floats, step: int) -> Floats:
+    """Return how far splines through one row in ``step`` pass the others by, rms, (body, state)."""
     off = np.zeros((2, *observed.shape[2:]))
     for one in observed:
         for place in np.ndindex(one.shape[1:]):
@@ -165,7 +159,7 @@ def _passed_by(history: History, step: int) -> Floats:
                 error = values[rows] - CubicSpline(kept, values[kept])(rows)
                 off[(slice(None), *place)] += (error**2).sum(), len(rows)
     size: Floats = np.sqrt(off[0] / np.maximum(off[1], 1.0))
-    return size / _spread(observed)
+    return size
 
 
 def _each(data: xr.Dataset, step: int, dt: float) -> History:

@@ -11,7 +11,7 @@ from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.scan import each_grid_point
 from pbrl_ppl.criticism.score import Library, named_beside, null_sides
 from pbrl_ppl.criticism.subsets import Term, worth
-from pbrl_ppl.criticism.table import weights
+from pbrl_ppl.criticism.table import shown_fall, weights
 from pbrl_ppl.effects import Attached, Effect, attach, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.history import History, with_units
@@ -25,8 +25,6 @@ from pbrl_ppl.threads import in_parallel, one_blas_thread
 
 #: Names are compared at this many times the least size that is seen.
 _WELL_SEEN = 3.0
-#: A dimension shows a law from this fall of its error's logarithm on.
-_SHOWN = 0.01
 
 
 @dataclass(frozen=True)
@@ -246,9 +244,7 @@ class _Regression:
         first = np.expm1(2.0 * min(main, paid / n)) / max(square.max(), 1e-300)
         squares = first * np.geomspace(1.0, 1e6, 600)
         falls = 0.5 * np.log1p(squares[:, None] * square)
-        shown = np.where(falls > _SHOWN, self.counts, 0.0)
-        share = (shown * falls).sum(axis=1) / np.maximum(shown.sum(axis=1), 1.0)
-        enough = (share >= main) & (falls @ self.counts >= paid)
+        enough = (shown_fall(falls, self.counts) >= main) & (falls @ self.counts >= paid)
         return float(np.sqrt(squares[int(np.argmax(enough))])) if enough.any() else np.inf
 
     def named(self, law: Attached, added: Floats) -> tuple[str, tuple[str, ...]]:

@@ -6,7 +6,7 @@ F = -stiffness max(0, r - length), r the distance from the anchor.
 import numpy as np
 
 import pbrl_ppl as pp
-from pbrl_ppl.effects import is_pivoted
+from pbrl_ppl.effects import is_unpivoted
 
 
 def law(state, command, parameters, wrench):
@@ -17,11 +17,6 @@ def law(state, command, parameters, wrench):
         pull = parameters[0] * (1.0 - parameters[3] / distance)
         wrench[0] -= pull * x
         wrench[1] -= pull * y
-
-
-def applies(scene, body):
-    """Return whether a body hangs in no hinge."""
-    return not is_pivoted(scene, body)
 
 
 def scan(scene, history, body):
@@ -55,7 +50,7 @@ cable = pp.Effect(
     "a pull towards a place that begins beyond a distance: a springy cable that gets taut",
     "one-sided spring, F = -k max(0, r - l)",
     pp.Force(law),
-    applies=applies,
+    applies=is_unpivoted,
     scan=scan,
     log_odds=-5.0,
     family="place and angle",

@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 import pbrl_ppl as pp
-from pbrl_ppl.effects import is_pivoted
+from pbrl_ppl.effects import is_unpivoted
 
 
 def force(state, command, parameters, wrench):
@@ -26,11 +26,6 @@ def torque(state, command, parameters, wrench):
     if command[9] < math.inf:
         phase = 2.0 * math.pi * command[9] / parameters[2]
         wrench[2] += parameters[0] * math.cos(phase) + parameters[1] * math.sin(phase)
-
-
-def applies(scene, body):
-    """Return whether a body hangs in no hinge."""
-    return not is_pivoted(scene, body)
 
 
 def scan_torque(scene, history, body):
@@ -64,7 +59,7 @@ periodic_force = pp.Effect(
     "a force along a line that repeats with the time since a trajectory began: a shaken table",
     "harmonic force, a cos(2 pi t / T) + b sin(2 pi t / T)",
     pp.Force(force, timed=True),
-    applies=applies,
+    applies=is_unpivoted,
     scan=scan_force,
     log_odds=-6.0,
     unusual="it takes any oscillation, and few rigs are shaken",

@@ -8,7 +8,7 @@ from itertools import product
 import numpy as np
 
 import pbrl_ppl as pp
-from pbrl_ppl.effects import is_pivoted
+from pbrl_ppl.effects import is_unpivoted
 
 
 def law(state, command, parameters, wrench):
@@ -17,11 +17,6 @@ def law(state, command, parameters, wrench):
     strength = parameters[0] * (x * x + y * y + parameters[3] * parameters[3]) ** -1.5
     wrench[0] += strength * x
     wrench[1] += strength * y
-
-
-def applies(scene, body):
-    """Return whether a body hangs in no hinge."""
-    return not is_pivoted(scene, body)
 
 
 def scan(scene, history, body):
@@ -52,7 +47,7 @@ point_attractor = pp.Effect(
     "a pull towards a place, or a push away, that is strong near it and weak far off: a magnet",
     "inverse-square law, of a source below or above the plane",
     pp.Force(law),
-    applies=applies,
+    applies=is_unpivoted,
     scan=scan,
     log_odds=-8.0,
     family="place and angle",

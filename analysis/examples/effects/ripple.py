@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 import pbrl_ppl as pp
-from pbrl_ppl.effects import is_pivoted
+from pbrl_ppl.effects import is_unpivoted
 
 
 def law(state, command, parameters, wrench):
@@ -18,11 +18,6 @@ def law(state, command, parameters, wrench):
     force = parameters[0] * math.cos(phase) + parameters[1] * math.sin(phase)
     wrench[0] += c * force
     wrench[1] += s * force
-
-
-def applies(scene, body):
-    """Return whether a body hangs in no hinge."""
-    return not is_pivoted(scene, body)
 
 
 def scan(scene, history, body):
@@ -54,7 +49,7 @@ ripple = pp.Effect(
     "a force along a line that repeats with the place: a linear motor's magnets, a belt's teeth",
     "force ripple, a cos(2 pi x / l) + b sin(2 pi x / l)",
     pp.Force(law),
-    applies=applies,
+    applies=is_unpivoted,
     scan=scan,
     log_odds=-5.0,
     family="place and angle",

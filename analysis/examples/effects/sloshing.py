@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 import pbrl_ppl as pp
-from pbrl_ppl.effects import is_pivoted
+from pbrl_ppl.effects import is_unpivoted
 
 
 def law(state, command, parameters, wrench):
@@ -35,11 +35,6 @@ def at_rest(state, command, parameters, memory):
         memory[i], memory[2 + i] = state[i], state[3 + i]
 
 
-def applies(scene, body):
-    """Return whether a body hangs in no hinge."""
-    return not is_pivoted(scene, body)
-
-
 def scan(scene, history, body):
     """Return frequencies of some intervals; the derivative is taken by the mass."""
     return np.array([(np.nan, 1.0 / (n * scene.time_step), 0.05) for n in (6, 12, 25)])
@@ -62,7 +57,7 @@ sloshing = pp.Effect(
     " mast",
     "a mass on a spring and a damper, at rest in the body when a transition begins",
     pp.Force(law, memory=4, rate=swing, begin=at_rest),
-    applies=applies,
+    applies=is_unpivoted,
     scan=scan,
     log_odds=-4.0,
     unusual="few rigs carry a liquid or a loose part",
