@@ -27,7 +27,7 @@ from tests.helpers.variants import (
 TIMED = [one for one in catalogue if getattr(one.stage, "timed", False)]
 #: Standard deviations by which posteriors may differ: a millionth but where digits are lost, or the
 #: noise of x and y is another.
-BOUNDS = {"far": 1e-3, "turned": 0.3, "turns": 1e-5}
+BOUNDS = {"far": 1e-3, "turned": 0.3}
 DISC = Disc(trajectories=4, intervals=15, drag=1.0)
 
 
