@@ -22,7 +22,7 @@ from pbrl_ppl.criticism import close_loop
 #: Parameters of which more than one value is the truth: any number between two trajectories.
 _AMBIGUOUS = {("mass_change", "trajectory")}
 #: Changes of what a row means make cached ones useless.
-_FORMAT = 3
+_FORMAT = 4
 
 
 @dataclass(frozen=True)
@@ -92,6 +92,11 @@ class Row:
     def matters(self) -> bool:
         """Return whether the effect improves the oracle's forecasts."""
         return self.oracle is not None and self.oracle.matters
+
+    @property
+    def is_main(self) -> bool:
+        """Return whether the effect takes off what the loop asks of a law that it names."""
+        return self.oracle is not None and self.oracle.is_main
 
     @property
     def worse(self) -> bool:

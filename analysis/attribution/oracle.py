@@ -12,11 +12,13 @@ from attribution.bodies import mh
 from attribution.cases import OUTSIDE, Case
 from attribution.outside import OUTSIDE_EFFECTS, parameters_of
 from attribution.sizes import STRONGEST
+from pbrl_ppl.criticism.criteria import DEFAULT
 from pbrl_ppl.criticism.held_out import HeldOut, forecast, longest_rollout, rollout_horizon
 from pbrl_ppl.criticism.refinement import with_enough_substeps
+from pbrl_ppl.criticism.table import share, weights
 from pbrl_ppl.effects import Attached
-from pbrl_ppl.likelihood import Problem, bodies_acceleration
-from pbrl_ppl.modes import Mode, find_mode, trajectory_mode
+from pbrl_ppl.likelihood import Problem, bodies_acceleration, in_pieces
+from pbrl_ppl.modes import Mode, find_mode, fit_pieces, piece_lengths, trajectory_mode
 from pbrl_ppl.parameters import inside
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.state import STATE
@@ -52,6 +54,9 @@ class Oracle:
     share : float
         What the effect changes of a step's velocities, over the bodies' acceleration; the largest
         of the velocities'.
+    main : float
+        Share of the error of simulated trajectories, the longest pieces of the loop's search, that
+        it takes off.
     """
 
     statistic: float
@@ -59,6 +64,7 @@ class Oracle:
     rollout_rmse: dict[str, float] = field(default_factory=dict)
     gain: float = 1.0
     share: float = 1.0
+    main: float = 1.0
 
     @property
     def detects(self) -> bool:
@@ -69,6 +75,11 @@ class Oracle:
     def matters(self) -> bool:
         """Return whether the effect is not negligible and improves forecasts."""
         return min(self.gain, self.share) >= MATTERS
+
+    @property
+    def is_main(self) -> bool:
+        """Return whether the effect takes off what the loop asks of a law that it names."""
+        return self.main >= DEFAULT.search.main_share
 
 
 def true_effect(case: Case) -> pp.Effect:
@@ -135,7 +146,18 @@ def ask(case: Case, declared: Mode, test: pp.History, seed: int) -> Oracle:
     noise = case.body.noise
     before, after = (np.hypot.reduce([e[d] / noise[d] for d in e]) for e in (plain, errors))
     p_value = float(chi2.sf(statistic, len(true_effect(case).parameters)))
-    return Oracle(statistic, p_value, errors, float(1 - after / before), _share(best, case))
+    gain = float(1 - after / before)
+    return Oracle(statistic, p_value, errors, gain, _share(best, case), _main(without, best))
+
+
+def _main(without: Mode, best: Mode) -> float:
+    """Return the share of the simulation error on the longest pieces that an effect takes off."""
+    length = piece_lengths(without)[-1]
+    simulated = [
+        fit_pieces(in_pieces(mode.problem, length, mode.problem.data.smoothed_states), mode.phi)
+        for mode in (without, best)
+    ]
+    return share(*simulated, weights(simulated[1]))
 
 
 def _share(mode: Mode, case: Case) -> float:

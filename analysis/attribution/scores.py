@@ -15,7 +15,7 @@ from attribution.oracle import MATTERS
 
 #: What may come of a case in which something is hidden; each has one.
 NAMED, EXTRA, ABSTAINED, MISNAMED = "named", "extra name", "abstained", "misnamed"
-MISSED, NEGLIGIBLE, EQUIVALENT = "missed", "negligible", "equivalent"
+MISSED, NEGLIGIBLE, EQUIVALENT, SMALL = "missed", "negligible", "equivalent", "small"
 #: What may come of the others.
 RIGHT, FALSE_ALARM, REFUSED, ACCEPTED = "right", "false alarm", "refused", "accepted"
 _NO_VERDICT = ("not-converged", "failed")
@@ -36,7 +36,7 @@ def outcome(row: Row) -> str:
     if row.kind == CATALOGUED and any(right):
         return NAMED if all(right) else EXTRA
     if row.open or verdict == "unexplained":
-        return ABSTAINED
+        return SMALL if row.kind == CATALOGUED and not (row.added or row.is_main) else ABSTAINED
     return EQUIVALENT if row.kind != CATALOGUED and _is_as_good(row) else MISNAMED
 
 
@@ -59,8 +59,9 @@ def score(rows: Sequence[Row]) -> dict[str, float | int | None]:
     -------
     dict
         Over the cases that the oracle detects, but for those that do not matter and are called
-        adequate (``negligible``, their number), and those of an effect that is not to be had in
-        which what was added forecasts as the oracle's model does (``equivalent``): ``naming``,
+        adequate (``negligible``, their number), those of no main law of which the loop says that
+        something remains (``small``), and those of an effect that is not to be had in which what
+        was added forecasts as the oracle's model does (``equivalent``): ``naming``,
         share of catalogued ones with the right effect's name and no other; ``overcautious``, share
         of these ones with the right name alone and the verdict ``unexplained``; ``extra_names``,
         number with a wrong name beside the right one; ``abstention``, share of left-out and outside
@@ -77,7 +78,7 @@ def score(rows: Sequence[Row]) -> dict[str, float | int | None]:
         ``method_laplace``, ``method_metropolis``: numbers. ``seconds``: sum.
     """
     detected = [row for row in rows if row.kind in (CATALOGUED, LEFT_OUT, OUTSIDE) and row.detected]
-    hidden = [row for row in detected if outcome(row) not in (NEGLIGIBLE, EQUIVALENT)]
+    hidden = [row for row in detected if outcome(row) not in (NEGLIGIBLE, EQUIVALENT, SMALL)]
     catalogued = [row for row in hidden if row.kind == CATALOGUED]
     nameless = [row for row in hidden if row.kind != CATALOGUED]
     named = [row for row in catalogued if outcome(row) == NAMED]
@@ -101,6 +102,7 @@ def score(rows: Sequence[Row]) -> dict[str, float | int | None]:
         "detected": len(detected),
         "negligible": sum(outcome(row) == NEGLIGIBLE for row in detected),
         "equivalent": sum(outcome(row) == EQUIVALENT for row in detected),
+        "small": sum(outcome(row) == SMALL for row in detected),
         "failed": sum(row.verdict == "failed" for row in rows),
         "not_converged": sum(row.verdict == "not-converged" for row in rows),
         **{f"method_{method}": sum(row.method == method for row in rows) for method in METHODS},

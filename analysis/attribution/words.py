@@ -39,9 +39,9 @@ def table(rows: list[Row]) -> Table:
 def _oracle(row: Row) -> str:
     if row.oracle is None:
         return ""
-    return f"{row.oracle.p_value:.0e}" + (
-        " not detected" if not row.oracle.detects else " negligible" * (not row.oracle.matters)
-    )
+    if not row.oracle.detects:
+        return f"{row.oracle.p_value:.0e} not detected"
+    return f"{row.oracle.p_value:.0e}, {100 * row.oracle.main:.0f} %"
 
 
 def _name(added: dict[str, Any]) -> str:

@@ -445,6 +445,13 @@ class Search:
             frozenset((*climb.laws, *one.laws)): one.begin(climb.mode.problem.layout.labels)
             for one in proposals
         }
+        for one in proposals:  # a spring has the constant torque of its anchor
+            kin = [law for law in climb.laws if any(_are_kin(law, new) for new in one.laws)]
+            if kin and any(law.effect.unusual for law in one.laws):
+                begin = one.begin(climb.mode.problem.layout.labels)
+                for label in (label for law in kin for label in law.labels):
+                    begin.pop(label, None)
+                moves[frozenset((*climb.laws, *one.laws)) - {*kin}] = begin
         return self._best(climb, moves, least_share)
 
     def _exchanged(self, climb: _Climb, library: Library, candidates: Sequence[Attached]) -> Mode:
@@ -489,8 +496,17 @@ class Search:
         least, most = self.criteria.search.least_nats, self.criteria.far_out
         good = list[tuple[float, Mode, float]]()
         table.race(now, moves)
+        fair = {  # a law of an impossible size takes no others with it
+            key - {law}: {
+                label: value for label, value in begin.items() if label not in law.labels
+            }
+            for key, begin in moves.items() if key in table.modes
+            for law in key - laws if far_out(table.modes[key], [law]) >= most
+        }  # fmt: skip
+        moves = {**moves, **fair}
+        table.race(now, {key: begin for key, begin in fair.items() if len(key) > len(laws)})
         weight, here, top = table.weight, table.value(now), 0.0
-        for key in (one for one in moves if one in table.modes):
+        for key in (one for one in moves if one in table.modes and one != laws):
             mode = table.modes[key]
             gain = table.value(mode) - here
             if len(key) < len(laws):
@@ -742,10 +758,15 @@ def are_alike(law: Attached, other: Attached) -> bool:
 
     What an unusual law's grid points promise says little.
     """
-    of, kin = law.effect, other.effect
-    if other == law or not of.family or (of.family, law.body) != (kin.family, other.body):
+    if other == law or not _are_kin(law, other):
         return False
-    return bool(of.unusual) or len(other.labels) < len(law.labels)
+    return bool(law.effect.unusual) or len(other.labels) < len(law.labels)
+
+
+def _are_kin(law: Attached, other: Attached) -> bool:
+    """Return whether two laws of a body are of one family."""
+    family = law.effect.family
+    return bool(family) and (family, law.body) == (other.effect.family, other.body)
 
 
 def _structures(subset: Subset) -> set[Attached]:

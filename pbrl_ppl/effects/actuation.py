@@ -107,11 +107,13 @@ def _numbers(actuator: Actuator) -> list[EffectParameter]:
             parameters.append(_given(value))
             continue
         family, scale = _PRIORS[actuator.kind][name]
+        per_unit = 1.0 / actuator.full if name == "gain" else 1.0
+        family = family.scaled(per_unit)
         stated: dict[str, Any] = dict(prior.get(name, ()))
         if stated:  # in SI units
             family, scale = replace(family, **stated), ""
         unit = NUMBERS[actuator.kind][name][0]
-        null = 1.0 if family.family == "log_normal" else 0.0
+        null = per_unit if family.family == "log_normal" else 0.0
         parameters.append(
             EffectParameter(f"{actuator.name}_{name}", unit, family, null, scale=scale)
         )
@@ -189,8 +191,8 @@ def laws_of_actuators(scene: Scene, body: str) -> tuple[tuple[str, Effect], ...]
             laws.append(("", wrong_gain))
         gain = actuator.numbers.get("gain", 1.0 if actuator.kind == "wrench" else None)
         natural = "torque" if _kind(actuator) == _TORQUE else "force"
-        if not gain or actuator.kind == "servo":  # natural is what the gain's prior or a goal has
-            gain, natural = 1.0, ""
+        if not gain or actuator.kind == "servo":  # natural is a full command
+            gain, natural = 1.0 / actuator.full, ""
         for suffix, (law, _, sentence) in OF_COMPONENTS.items():
             known = f"{name}_{suffix}", f"{name} {sentence}", WRENCH[slot], "1", natural, abs(gain)
             laws.append((law.name, replace(of_component(law, *known), applies=always)))

@@ -199,6 +199,8 @@ _ACTUATORS = {
     "servo": r"goal|target|setpoint|servo|desired",
     "motor": r"motor|duty|pwm|volt|throttle|current",
 }
+#: A command that exceeds this is no share of a full one.
+_COUNTS = 2.0
 
 
 def guessed_actuators(
@@ -232,11 +234,15 @@ def guessed_actuators(
         place = (0.0, round(side * 0.4 * (high - low), 6))
         name = re.sub(r"\W+", "_", column).strip("_") or "command"
         kind = "thruster" if kind == "motor" and not hung else kind
+        if not pd.api.types.is_numeric_dtype(frame[column]):
+            continue
+        most = float(f"{frame[column].abs().max():.3g}")
         found.append(
             Actuator(
                 name=name if name.isidentifier() else f"command_{name}",
                 kind=kind, body="body", column="" if name == column else column,
                 at=place if kind == "thruster" else (0.0, 0.0),
+                full=most if kind != "servo" and most > _COUNTS else 1.0,
             )
         )  # fmt: skip
     return tuple(found) if len(found) <= len(WRENCH) else ()

@@ -194,6 +194,9 @@ class Actuator:
         ``force_x``, ``force_y`` or ``torque``.
     frame : str
         Whether directions are the ``body``'s, and turn with it, or the ``world``'s.
+    full : float
+        Size of a full command in its column's unit, such as 255 of a PWM register: priors of what
+        is inferred for each unit, and of thresholds of the command, are relative to it.
     known : tuple of (str, float)
         Numbers that are given, not inferred: force or torque for each unit of the command
         (``gain``), and what the speed takes off it (``loss``), a thruster's ``direction`` (rad);
@@ -223,6 +226,7 @@ class Actuator:
     at: Point = (0.0, 0.0)
     of: str = ""
     frame: str = "body"
+    full: float = 1.0
     known: Named = ()
     prior: tuple[tuple[str, Named], ...] = ()
 
@@ -232,7 +236,7 @@ class Actuator:
         if not self.name.isidentifier():
             raise SceneError(f"{where}: the name is part of parameters' names; use letters and _")
         checks.choice(self.kind, f"{where}: kind", NUMBERS, ", ".join(NUMBERS))
-        checks.settle(self, where, at=checks.vector)
+        checks.settle(self, where, at=checks.vector, full=checks.positive)
         choices = {"servo": ("angle", "speed"), "wrench": WRENCH}.get(self.kind, ("",))
         object.__setattr__(self, "of", self.of or choices[0])
         checks.choice(self.of, f"{where}: of", choices, " or ".join(choices))
