@@ -76,7 +76,8 @@ def sizes_of(mode: Mode, law: Attached) -> Floats:
 def far_out(mode: Mode, laws: Iterable[Attached]) -> float:
     """Return how many prior scales the sizes of laws lie from their priors' centres, at most.
 
-    Of an angle that may be any, how many turns.
+    Of an angle that may be any, how many turns. A factor of nearly nothing is not far: what acts no
+    more is a plain fault.
     """
     layout = mode.problem.layout
     places = [place for law in laws for place in layout.places(law.labels)]
@@ -85,8 +86,9 @@ def far_out(mode: Mode, laws: Iterable[Attached]) -> float:
         for place in places
         if layout.priors[place].family == "von_mises"
     ]
-    off = np.abs(prior_residual(layout.priors, mode.phi)[places])
-    return float(max(off.max(initial=0.0), *turns, 0.0))
+    off = prior_residual(layout.priors, mode.phi)[places]
+    factor = np.array([layout.priors[place].family == "log_normal" for place in places], bool)
+    return float(max(np.where(factor, off, np.abs(off)).max(initial=0.0), *turns, 0.0))
 
 
 def with_effects(
