@@ -324,16 +324,23 @@ class Search:
 
     def _is_complete(self, more: _Climb, common: _Climb) -> bool:
         """Return whether unusual laws explain all that common ones leave, or most of it."""
-        limits = self.criteria.search
         unusual = any(law.effect.unusual for law in more.laws)
         if not unusual or more.mode.problem.data.horizon < common.mode.problem.data.horizon:
             return False
         plain, rows = common.mode, more.mode.problem.data.horizon
         if is_simulated_mode(plain) and plain.problem.data.horizon < rows:
             plain = _carried(plain, rows)
-        large = common.excesses(plain) > limits.complete
-        left = np.log(more.mode.sigma / plain.sigma)[large].mean() if large.any() else 0.0
-        return more.excess < limits.complete or float(np.exp(left)) < limits.incomplete
+        return self._explains(more, plain)
+
+    def _explains(self, climb: _Climb, plain: Mode, further: float = 0.0) -> bool:
+        """Return whether a model explains all that a plain one leaves, or most of it.
+
+        With a ``further`` share of its errors taken off.
+        """
+        limits, large = self.criteria.search, climb.excesses(plain) > self.criteria.search.complete
+        falls = np.log(climb.mode.sigma / plain.sigma)[large]
+        left = (1.0 - further) * float(np.exp(falls.mean() if large.any() else 0.0))
+        return (1.0 - further) * climb.excess < limits.complete or left < limits.incomplete
 
     def _climb(self, climb: _Climb, lengths: Sequence[int], beside: Sequence[Mode] = ()) -> None:
         """Find the laws that pieces of growing length show, from a model at the first.
@@ -358,7 +365,7 @@ class Search:
                 )
                 climb.mode = longer
             climb.last = bool(i) and length == lengths[-1]
-            self._improve(climb)
+            self._improve(climb, beside[i] if i < len(beside) else None)
             if not climb.noise.size:
                 climb.noise = climb.mode.sigma
             if i < len(beside):
@@ -386,14 +393,20 @@ class Search:
             mode = replace(mode, problem=mode.problem.with_likelihood(tau=white), sigma=sigma)
         return Library(mode, laws, self.criteria)
 
-    def _improve(self, climb: _Climb, rounds: int = 8) -> None:
-        """Improve a model on pieces of one length by moves from model to model."""
+    def _improve(self, climb: _Climb, plain: Mode | None = None, rounds: int = 8) -> None:
+        """Improve a model on pieces of one length by moves from model to model.
+
+        These end where no proposal explains most of what a ``plain`` one leaves.
+        """
         table, before, begin = climb.table, climb.laws, climb.mode
         for i in range(rounds):
             library, candidates = self._linearised(climb)
             regression = best_subsets(library, candidates)
             if i == 0:
                 climb.regressions.append(regression)
+            most = max((one.share for one in regression.subsets if one.nats > 0), default=0.0)
+            if i and plain and not self._explains(climb, plain, 1.0 - float(np.sqrt(1.0 - most))):
+                break
             better = self._enlarged(climb, regression, self.criteria.search.least_share)
             if better is climb.mode:
                 better = self._exchanged(climb, library, candidates)
