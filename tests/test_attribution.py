@@ -46,7 +46,7 @@ def row(attribution):
 
     def make(
         kind, verdict, *added, effect="linear_drag", seen=True, gain=0.5, remains=False,
-        hdi=(0.0, 2.0), after=1.0, method="laplace", excess=None,
+        hdi=(0.0, 2.0), after=1.0, method="laplace", excess=None, main=1.0,
     ):  # fmt: skip
         names = [name.partition("@") for name in added]
         findings = {
@@ -68,7 +68,7 @@ def row(attribution):
         p_value = 1e-9 if seen else 0.3
         known = {} if excess is None else {"x": 1.0}
         findings["error"]["after"]["rollout_rmse"] = {name: 1.0 + excess for name in known}
-        oracle = attribution.oracle.Oracle(99.0, p_value, known, gain) if hidden else None
+        oracle = attribution.oracle.Oracle(99.0, p_value, known, gain, main=main)
         return attribution.one_case.Row(
             name="made up",
             kind=kind,
@@ -77,7 +77,7 @@ def row(attribution):
             effect=effect if hidden else None,
             on="cart" if hidden else None,
             truth={"coefficient": 1.5} if hidden else {},
-            oracle=oracle,
+            oracle=oracle if hidden else None,
             findings=None if verdict == "failed" else findings,
             error="why" if verdict == "failed" else None,
             seconds=10.0,
@@ -98,6 +98,8 @@ def test_scores_by_hand(attribution, row) -> None:
         row("catalogued", "adequate"),  # missed
         row("catalogued", "adequate", gain=0.005),  # detected, and does not matter
         row("catalogued", "effects-added", "spring", gain=0.005),  # misnamed all the same
+        row("catalogued", "unexplained", main=0.19),  # no main law, and something is said to remain
+        row("catalogued", "unexplained", "spring", main=0.19),  # a wrong name all the same
         row("catalogued", "not-converged", "linear_drag"),
         row("catalogued", "failed"),
         row("catalogued", "adequate", seen=False),  # nobody could have seen it
@@ -115,33 +117,34 @@ def test_scores_by_hand(attribution, row) -> None:
         row("nonsense", "not-converged"),
     ]
     assert attribution.scores.score(rows) == {
-        "naming": 3 / 11,
-        "overcautious": 1 / 11,
+        "naming": 3 / 12,
+        "overcautious": 1 / 12,
         "extra_names": 2,
         "abstention": 2 / 4,
-        "misnamed": 3 / 15,
-        "missed": 2 / 15,
-        "wrong_names_open": 2,
+        "misnamed": 3 / 16,
+        "missed": 2 / 16,
+        "wrong_names_open": 3,
         "false_alarms": 2 / 4,
         "worse_after": 2,
         "coverage": 1 / 2,  # the second named another effect of its group
         "excess": None,  # of catalogued ones nobody asked the oracle for forecasts
         "baseline_naming": None,
         "nonsense_adequate": 1,
-        "cases": 25,
-        "detected": 17,
+        "cases": 27,
+        "detected": 19,
         "negligible": 1,
         "equivalent": 1,
+        "small": 1,
         "failed": 1,
         "not_converged": 2,
         "method_metropolis": 1,
-        "method_laplace": 24,
-        "seconds": 250.0,
+        "method_laplace": 26,
+        "seconds": 270.0,
     }
-    assert attribution.words.table(rows).row_count == 25
-    assert {attribution.words.plain(each)["outcome"] for each in rows[:12]} == {
+    assert attribution.words.table(rows).row_count == 27
+    assert {attribution.words.plain(each)["outcome"] for each in rows[:14]} == {
         "named", "extra name", "misnamed", "abstained", "missed", "negligible", "not-converged",
-        "failed",
+        "failed", "small",
     }  # fmt: skip
 
 

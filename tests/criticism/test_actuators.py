@@ -48,3 +48,17 @@ def test_the_dead_zone_of_a_motor_s_duty() -> None:
     assert set(named) == {"duty_dead_zone", "pivot_friction"}
     assert named["duty_dead_zone"]["threshold"] == pytest.approx(DEAD, rel=0.02)
     assert named["pivot_friction"]["torque"] == pytest.approx(FRICTION, rel=0.05)
+
+
+def test_a_dead_zone_in_counts_of_a_register() -> None:
+    """The gain is inferred, and a full command of 255 counts says of what size both are."""
+    counts = recording(1)
+    counts["duty"] *= 255.0
+    prior = {"loss": {"sigma": 0.01}}
+    motor = pp.Actuator(name="duty", kind="motor", body="wheel", full=255.0, prior=prior)
+    scene = SCENE.replace(actuators=(motor,))
+    found = pp.attribute(scene, pp.History.from_dataframe(counts, scene), seed=1)
+    named = {law.effect: law.estimate for law in found.laws}
+    assert set(named) == {"duty_dead_zone", "pivot_friction"}
+    assert named["duty_dead_zone"]["threshold"] == pytest.approx(255.0 * DEAD, rel=0.05)
+    assert found.after["theta"] == pytest.approx(2e-3, rel=0.1)

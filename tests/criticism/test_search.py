@@ -10,7 +10,7 @@ from pbrl_ppl.effects import catalogue
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History
 from pbrl_ppl.physics import Physics
-from pbrl_ppl.scene import Body, Scene, Shape, Wall
+from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.falls import BALL, GRAVITY, MASS, fall
 
 pytestmark = [pytest.mark.one_stack, pytest.mark.slow]
@@ -223,3 +223,32 @@ def test_a_puck_that_touches_all_the_time_is_simulated_through_its_contacts() ->
     history = History.of_arrays(states, scene, push)
     found = attribute(scene, history, catalogue=some("linear_drag"))
     assert not found.laws
+
+
+def test_a_spring_stands_for_the_torque_of_its_anchor() -> None:
+    """An arm of 0.4 kg and 0.5 m by SciPy, a spring of 0.13 N m/rad with its rest at 0.15 rad.
+
+    A constant torque is found first, and leaves a part; the spring has it in it.
+    """
+    rng, dt, rows, moment = np.random.default_rng(4), 0.12, 19, 0.4 * 0.5**2 / 3
+    arm = Body("arm", Shape.box(0.02, 0.5), known={"mass": 0.4}, effects=("inertia_scale",))
+    hinge = Joint("hinge", ("arm", "world"), (0.0, 0.25), (0.0, 0.0))
+    scene = Scene(time_step=dt, gravity=(0.0, -9.81), bodies=(arm,), joints=(hinge,))
+    states = np.full((9, rows, 1, 6), np.nan)
+    for one, start in zip(states, np.linspace(-1.4, 1.2, 9), strict=True):
+
+        def slope(_: float, s: np.ndarray) -> list[float]:
+            torque = -0.4 * 9.81 * 0.25 * np.sin(s[0]) - 0.13 * (s[0] - 0.15)
+            return [s[1], torque / moment]
+
+        times = dt * np.arange(rows)
+        path = solve_ivp(slope, (0, times[-1]), [start, 0.0], t_eval=times, rtol=1e-9, atol=1e-9)
+        one[:, 0, [2, 5]] = path.y.T + rng.normal(0.0, [6e-3, 1.2e-2], (rows, 2))
+    history = History.of_arrays(states, scene, np.zeros((9, rows - 1, 1, 3)))
+    offered = some(
+        "constant_torque", "torsion_spring", "sensor_scale", "gravity_tilt", "inertia_scale"
+    )
+    (law,) = attribute(scene, history, catalogue=offered, seed=1).laws
+    assert law.effect == "torsion_spring"
+    assert law.estimate["stiffness"] == pytest.approx(0.13, rel=0.03)
+    assert law.estimate["angle"] == pytest.approx(0.15, abs=0.02)

@@ -79,7 +79,8 @@ def test_a_missing_column_is_named() -> None:
 def test_new_proposes_actuators(tmp_path: Path, column: str, shape: str, kind: str) -> None:
     """From a log of a free body, or of an angle alone; the log is read with what it proposes."""
     hung = shape.startswith("arm")
-    table = log().drop(columns=["left_fan", "right_fan"]).assign(**{column: np.arange(12) % 3})
+    commands_sent = 100.0 * (np.arange(12) % 3)
+    table = log().drop(columns=["left_fan", "right_fan"]).assign(**{column: commands_sent})
     if hung:
         table = table.drop(columns=["x", "y"])
     path, scene_path = tmp_path / "log.csv", tmp_path / "scene.toml"
@@ -89,9 +90,10 @@ def test_new_proposes_actuators(tmp_path: Path, column: str, shape: str, kind: s
     scene = Scene.load(scene_path)
     (actuator,) = scene.actuators
     assert actuator.kind == kind
+    assert actuator.full == (1.0 if kind == "servo" else 200.0)  # a goal is in rad
     if kind == "thruster":
         assert actuator.at[1] > 0.0
-    np.testing.assert_array_equal(commands(History.load(path, scene))[:, 0], np.arange(11) % 3)
+    np.testing.assert_array_equal(commands(History.load(path, scene))[:, 0], commands_sent[:-1])
 
 
 def test_a_fit_is_planned_with(tmp_path: Path) -> None:
