@@ -184,7 +184,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
     except KeyboardInterrupt:
-        return terminal.interrupted()
+        return terminal.Interrupts().ended("nothing was written")
     except PbrlError as error:
         print(f"error: {in_a_line(error)}", file=sys.stderr)  # noqa: T201
         return terminal.BAD_INPUT

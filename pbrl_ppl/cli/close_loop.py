@@ -26,6 +26,7 @@ from pbrl_ppl.threads import obey_parent
 if TYPE_CHECKING:
     from pbrl_ppl.criticism import Loop
     from pbrl_ppl.effects import Effect
+    from pbrl_ppl.reporting import Source
 
 #: How a sentence on laws that were found begins.
 _FOUND = "simulations name"
@@ -132,10 +133,12 @@ def close_loop(
     check_folder(output, True, criticism.FILES)
     settings = sampler.settings(reading.catalogue())
     run = partial(criticism.close_loop, declared, *histories, **settings)
-    loop, stopped = _finished(run, progress, interrupts)
-    progress("writing the report")
-    files = str(scene), str(logs[0]), str(test or "")
+    files, said = (str(scene), str(logs[0]), str(test or "")), list[str]()
     source = report.Source(*files, options.command_line(context))
+    interrupts.rescue = partial(_without_verdict, said, sampler, output, source)
+    loop, stopped = _finished(run, progress, interrupts, said)
+    interrupts.rescue = None
+    progress("writing the report")
     loop.save(output, to.overwrite, page=report.render(loop, source))
     contents = loop.to_dict() | {"report": output / "report.html"}
     undecided = terminal.UNDECIDED if loop.verdict == criticism.NOT_CONVERGED else 0
@@ -235,21 +238,18 @@ def _closed(each: Each, logs: Mapping[str, Path], jobs: int, progress: Progress)
 
 
 def _finished(
-    run: Callable[..., Loop], progress: Progress, interrupts: terminal.Interrupts
+    run: Callable[..., Loop], progress: Progress, interrupts: terminal.Interrupts, said: list[str]
 ) -> tuple[Loop, bool]:
     """Return the loop, with Gaussians at the modes if it is interrupted while it samples.
 
-    The second value is whether it was. An earlier interrupt ends the command, and says what was
-    found.
+    The second value is whether it was. What is found goes into ``said``.
     """
     from pbrl_ppl import criticism
 
-    names: list[str] = []
-
     def noted(stage: str) -> None:
         progress(stage)
-        if stage.startswith(_FOUND):
-            names.append(stage)
+        if not isinstance(stage, (criticism.Stage, criticism.Work)):
+            said.append(stage)
         if stage == criticism.Stage.SAMPLE:
             interrupts.keep()
 
@@ -258,10 +258,23 @@ def _finished(
     except criticism.LoopInterrupted as interrupt:
         progress("interrupted: Gaussians at the modes instead; once more ends without a report")
         return interrupt.finish(), True
-    except KeyboardInterrupt:
-        so_far = f"so far: {'; '.join(names)}; " if names else ""
-        advice = "--method laplace, fewer rows or a coarser log take less time"
-        raise typer.Exit(terminal.interrupted(f"nothing was written; {so_far}{advice}")) from None
+
+
+def _without_verdict(said: Sequence[str], sampler: Sampler, output: Path, source: Source) -> str:
+    """Write what was found before an interrupt, unless a report is there; return what is kept."""
+    import pbrl_ppl.reporting as report
+
+    faster = {
+        "--method laplace": sampler.method is not Method.LAPLACE,
+        "--catalogue common": sampler.catalogue is not Catalogue.COMMON,
+        f"--most-transitions {sampler.most_transitions // 4}": True,
+    }
+    advice = f"{', '.join(one for one, new in faster.items() if new)} take less time"
+    if not any(line.startswith(_FOUND) for line in said) or (output / "report.html").exists():
+        return f"nothing was written; {advice}"
+    output.mkdir(parents=True, exist_ok=True)
+    write_text(output / "report.html", report.render_without_verdict(said, advice, source))
+    return f"{output / 'report.html'} has what was found: {said[-1]}; {advice}"
 
 
 @command("demo", 0, "pbrl-ppl demo")

@@ -29,6 +29,8 @@ from pbrl_ppl.files import json_values
 #: input or usage; chains that have not converged, so no verdict; an interrupt, as shells report it.
 FAILED, BAD_INPUT, UNDECIDED, INTERRUPTED = 1, 2, 3, 130
 
+#: Signals that end a command: Ctrl-C, and that of `timeout` and of job schedulers.
+_ENDING = signal.SIGINT, signal.SIGTERM
 #: Seconds in which an interrupted command ends by itself.
 _PATIENCE = 1.5
 
@@ -58,7 +60,8 @@ def stages(quiet: bool, every: float = 60.0) -> Iterator[Progress]:
     with console.status(running), still_running(running, quiet, every):
 
         def progress(stage: str) -> None:
-            console.print(f"[{running.elapsed:5.1f} s] {in_a_line(stage)}", soft_wrap=True)
+            if not getattr(stage, "passing", False):
+                console.print(f"[{running.elapsed:5.1f} s] {in_a_line(stage)}", soft_wrap=True)
             running.name, running.share = stage, getattr(stage, "share", None)
 
         yield progress
@@ -110,6 +113,7 @@ class Interrupts:
 
     def __init__(self) -> None:
         self.seen = False  # a sampler may catch one and return as if it had finished
+        self.rescue: Callable[[], str] | None = None  # writes what was found, and says so
         self._going_on = threading.Event()
 
     def keep(self) -> None:
@@ -123,6 +127,14 @@ class Interrupts:
             sys.unraisablehook = lambda _: None  # of what is half made
         signal.default_int_handler(number, frame)
 
+    def ended(self, state: str) -> int:
+        """Print which results are kept after an interrupt, and return the exit code."""
+        if self.rescue is not None:
+            with suppress(OSError, OutputError):
+                state = self.rescue()
+        print(f"interrupted; {in_a_line(state)}", file=sys.stderr)  # noqa: T201
+        return INTERRUPTED
+
     @contextmanager
     def enforced(self, state: str) -> Iterator[None]:
         """End the process if an interrupt has not ended the context after `_PATIENCE`.
@@ -135,11 +147,11 @@ class Interrupts:
         before = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
 
         def watch() -> None:
-            while (number := os.read(reader, 1)) and number[0] != signal.SIGINT:
+            while (number := os.read(reader, 1)) and number[0] not in _ENDING:
                 pass
             if number and not self._going_on.wait(_PATIENCE):
                 Console(stderr=True).show_cursor()
-                os._exit(interrupted(state))
+                os._exit(self.ended(state))
 
         watcher = threading.Thread(target=watch, daemon=True)
         watcher.start()
@@ -161,7 +173,8 @@ def interruptible(state: str = "nothing was written") -> Iterator[Interrupts]:
     handled = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     handled = handled and threading.current_thread() is threading.main_thread()
     if handled:
-        signal.signal(signal.SIGINT, interrupts.note)
+        for number in _ENDING:
+            signal.signal(number, interrupts.note)
     try:
         with interrupts.enforced(state) if handled else nullcontext():
             yield interrupts
@@ -170,17 +183,12 @@ def interruptible(state: str = "nothing was written") -> Iterator[Interrupts]:
     except BaseException as error:
         # what an interrupt broke off may have raised an error of its own
         if interrupts.seen or isinstance(error, KeyboardInterrupt):
-            raise typer.Exit(interrupted(state)) from None
+            raise typer.Exit(interrupts.ended(state)) from None
         raise
     finally:
         if handled:
             signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-def interrupted(state: str = "nothing was written") -> int:
-    """Print which results are kept after an interrupt, and return the exit code."""
-    print(f"interrupted; {in_a_line(state)}", file=sys.stderr)  # noqa: T201
-    return INTERRUPTED
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def in_a_line(message: object) -> str:

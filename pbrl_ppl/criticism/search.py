@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
-from pbrl_ppl.criticism.results import Law, SearchLength, Stage
+from pbrl_ppl.criticism.results import Law, SearchLength, Stage, Work
 from pbrl_ppl.criticism.score import Library, Signature, named_beside
 from pbrl_ppl.criticism.subsets import Regression, Subset, best_subsets, by_label
 from pbrl_ppl.criticism.table import (
@@ -458,13 +458,13 @@ class Search:
             frozenset((*climb.laws, *one.laws)): one.begin(climb.mode.problem.layout.labels)
             for one in proposals
         }
-        for one in proposals:  # a spring has the constant torque of its anchor
-            kin = [law for law in climb.laws if any(_are_kin(law, new) for new in one.laws)]
-            if kin and any(law.effect.unusual for law in one.laws):
-                begin = one.begin(climb.mode.problem.layout.labels)
+        for subset in proposals:  # a spring has the constant torque of its anchor
+            kin = [law for law in climb.laws if any(_are_kin(law, new) for new in subset.laws)]
+            if kin and any(law.effect.unusual for law in subset.laws):
+                begin = subset.begin(climb.mode.problem.layout.labels)
                 for label in (label for law in kin for label in law.labels):
                     begin.pop(label, None)
-                moves[frozenset((*climb.laws, *one.laws)) - {*kin}] = begin
+                moves[frozenset((*climb.laws, *subset.laws)) - {*kin}] = begin
         return self._best(climb, moves, least_share)
 
     def _exchanged(self, climb: _Climb, library: Library, candidates: Sequence[Attached]) -> Mode:
@@ -508,6 +508,8 @@ class Search:
         table, now, laws = climb.table, climb.mode, frozenset(climb.laws)
         least, most = self.criteria.search.least_nats, self.criteria.far_out
         good = list[tuple[float, Mode, float]]()
+        rows, of = now.problem.data.horizon, len(table.modes)
+        self.say(Work(f"refitting {len(moves)} models on pieces of {rows} rows, {of} are done"))
         table.race(now, moves)
         fair = {  # a law of an impossible size takes no others with it
             key - {law}: {

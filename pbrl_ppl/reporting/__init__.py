@@ -14,6 +14,7 @@ from pbrl_ppl.reporting.posterior_summary import summary as summary
 from pbrl_ppl.reporting.reports import in_brief as in_brief
 from pbrl_ppl.reporting.reports import render as render
 from pbrl_ppl.reporting.reports import render_posterior as render_posterior
+from pbrl_ppl.reporting.reports import render_without_verdict as render_without_verdict
 from pbrl_ppl.reporting.reports import report as report
 from pbrl_ppl.reporting.scene_plots import animate_plan as animate_plan
 from pbrl_ppl.reporting.scene_plots import draw_goal as draw_goal

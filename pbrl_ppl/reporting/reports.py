@@ -54,6 +54,23 @@ POSTERIOR_SECTIONS = (
 )
 
 
+def render_without_verdict(said: Iterable[str], advice: str, source: Source) -> str:
+    """Return the page of a loop that was interrupted: what was ``said`` so far, and no verdict.
+
+    Parameters
+    ----------
+    said : iterable of str
+        Sentences on what was found, in order.
+    advice : str
+        What takes less time.
+    source : Source
+        Names of the files, and the command that makes the page again.
+    """
+    sections = [Section("interrupted", "What was found so far")]
+    known = {"said": list(said), "advice": advice, "source": source}
+    return render_page("interrupted: no verdict", "interrupted_header", sections, **known)
+
+
 def report(found: Loop | Idata, path: str | Path, *, source: Source | None = None) -> Path:
     """Write the report of a closed loop or of a posterior as one self-contained page.
 

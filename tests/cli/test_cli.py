@@ -274,7 +274,29 @@ def test_an_interrupt_of_the_search_says_what_was_found(
     monkeypatch.setattr(criticism, "close_loop", close_loop)
     assert main(["close-loop", "scene.toml", "train.csv", "-o", "out", "-q"]) == 130
     said = capsys.readouterr().err
-    assert "so far: simulations name linear_drag on cart; --method laplace" in said
+    assert "report.html has what was found: simulations name linear_drag on cart; " in said
+    page = Path("out/report.html").read_text()
+    assert "interrupted: no verdict" in page and "simulations name linear_drag on cart" in page
+    assert "--method laplace, --catalogue common, --most-transitions" in page
+
+
+@pytest.mark.usefixtures("files")
+def test_advice_is_not_what_was_in_use(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """And a report that is there is kept."""
+
+    def close_loop(*args: Any, progress: Any, **options: Any) -> Loop:
+        progress("simulations name linear_drag on cart")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(criticism, "close_loop", close_loop)
+    Path("out").mkdir()
+    Path("out/report.html").write_text("an older one")
+    argv = ["close-loop", "scene.toml", "train.csv", "-o", "out", "--overwrite", "-q"]
+    assert main([*argv, "--method", "laplace", "--catalogue", "common"]) == 130
+    assert "nothing was written; --most-transitions" in capsys.readouterr().err
+    assert Path("out/report.html").read_text() == "an older one"
 
 
 @pytest.mark.usefixtures("files")
