@@ -252,7 +252,8 @@ class Search:
     def _promised(self, common: _Climb, lost: bool) -> tuple[int | None, dict[Attached, float]]:
         """Return at which length an unusual law may take most of the error beyond the noise off.
 
-        To first order, beside the common laws, with one more, or in the place of one. The longest
+        To first order, beside the common laws, with one more, or in the place of one or all. The
+        longest
         pieces are asked first, and shorter ones where these are too far off to tell. Also the
         leading ones alone, with their shares of the error on the longest pieces. Of a climb that
         was ``lost`` before these all error is beyond the noise.
@@ -268,10 +269,10 @@ class Search:
             laws = common.table.laws(mode)
             library, now = self._library(mode, laws, large), 0.0
             every = [one for one in self._candidates(mode, True) if one not in laws]
-            for without in ((), *((law,) for law in laws)):
+            for without in dict.fromkeys(((), *((law,) for law in laws), laws)):
                 total = float((library.test(without).residual ** 2).sum())
                 now = now or total
-                subsets = best_subsets(library, every, without, largest=2 - len(without)).subsets
+                subsets = best_subsets(library, every, without, largest=1 if without else 2).subsets
                 left = dict[tuple[Attached, ...], float]()
                 for one in subsets:  # of several grid points the best
                     rest = total * (1.0 - one.share)
@@ -399,6 +400,7 @@ class Search:
         These end where no proposal explains most of what a ``plain`` one leaves.
         """
         table, before, begin = climb.table, climb.laws, climb.mode
+        limits = self.criteria.search
         for i in range(rounds):
             library, candidates = self._linearised(climb)
             regression = best_subsets(library, candidates)
@@ -407,7 +409,8 @@ class Search:
             most = max((one.share for one in regression.subsets if one.nats > 0), default=0.0)
             if i and plain and not self._explains(climb, plain, 1.0 - float(np.sqrt(1.0 - most))):
                 break
-            better = self._enlarged(climb, regression, self.criteria.search.least_share)
+            instead = best_subsets(library, candidates, climb.laws, largest=1) if plain else None
+            better = self._enlarged(climb, regression, limits.least_share, instead)
             if better is climb.mode:
                 better = self._exchanged(climb, library, candidates)
             if better is climb.mode:
@@ -433,8 +436,17 @@ class Search:
             )
         )
 
-    def _enlarged(self, climb: _Climb, regression: Regression, least_share: float) -> Mode:
-        """Return the model with the best of a few proposed subsets, or the climb's own."""
+    def _enlarged(
+        self,
+        climb: _Climb,
+        regression: Regression,
+        least_share: float,
+        instead: Regression | None = None,
+    ) -> Mode:
+        """Return the model with the best of a few proposed subsets, or the climb's own.
+
+        ``instead``: laws in the place of all that the climb has, which may stand in for one.
+        """
         limits, least = self.criteria.search, 1.0 - (1.0 - _PREDICTED * least_share) ** 2
         least /= max(int(moving(climb.mode).sum()), 1)  # one dimension may show it alone
         for one in regression.signatures:
@@ -465,6 +477,10 @@ class Search:
                 for label in (label for law in kin for label in law.labels):
                     begin.pop(label, None)
                 moves[frozenset((*climb.laws, *subset.laws)) - {*kin}] = begin
+        for one in instead.subsets[: limits.singles] if instead and climb.laws else ():
+            rest = [label for law in climb.laws for label in law.labels]
+            labels = [each for each in climb.mode.problem.layout.labels if each not in rest]
+            moves.setdefault(frozenset(one.laws), one.begin(labels))
         return self._best(climb, moves, least_share)
 
     def _exchanged(self, climb: _Climb, library: Library, candidates: Sequence[Attached]) -> Mode:
@@ -524,19 +540,19 @@ class Search:
         for key in (one for one in moves if one in table.modes and one != laws):
             mode = table.modes[key]
             gain = table.value(mode) - here
-            if len(key) < len(laws):
+            if key < laws:
                 gain -= sum(climb.earlier.get(law, 0.0) for law in laws - key)
             else:
                 # in a law's place one of more parameters follows whatever else is missing
-                flexible = len(key) == len(laws) and len(mode.phi) > len(now.phi)
+                flexible = len(key) <= len(laws) and len(mode.phi) > len(now.phi)
                 needed_share = max(least_share, self.criteria.search.least_share * flexible)
                 if climb.last and len(key) > len(laws) + 1:  # no handful of small ones at the end
                     needed_share = self.criteria.search.main_share
                 if share(now, mode, weight) < needed_share or far_out(mode, key) >= most:
                     continue
             top = max(top, gain)
-            needed = least if len(key) >= len(laws) else 0.0
-            if len(key) == len(laws) and len(mode.phi) < len(now.phi):
+            needed = 0.0 if key < laws else least
+            if not key < laws and len(key) <= len(laws) and len(mode.phi) < len(now.phi):
                 needed = -least  # of two that are nearly as good the simpler one
             if gain >= needed:
                 good.append((gain, mode, needed))

@@ -183,11 +183,12 @@ def _wind(state: Floats, command: Floats, parameters: Floats, wrench: Floats) ->
 
 
 def _scan_winds(scene: Scene, history: History, body: Body) -> Floats:
-    """Return winds along the axes at the body's usual speed; the derivative is by the drag."""
+    """Return winds in eight directions about the body's usual speed; the derivative is by drag."""
     velocity = history.dataset["start"].sel(body=body.name, state=["vx", "vy"]).to_numpy()
     speed = np.sqrt(np.nanmean((velocity**2).sum(axis=-1))) if np.isfinite(velocity).any() else 0.0
-    winds = [(x * speed, y * speed) for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1))]
-    return np.array([(np.nan, *wind) for wind in winds if speed > 0.0]).reshape(-1, 3)
+    turns = np.arange(8) * (np.pi / 4.0)
+    winds = speed * np.outer((0.5, 1.5), np.exp(1j * turns)).ravel()
+    return np.array([(np.nan, w.real, w.imag) for w in winds if speed > 0.0]).reshape(-1, 3)
 
 
 wind = Effect(
