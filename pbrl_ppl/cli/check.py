@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 @command("check", 2, "pbrl-ppl check scene.toml train.csv")
 def check(
     scene: Path,
-    history: Path,
+    history: list[Path],
     reading: options.SceneReading,
     progress: Progress,
     as_json: bool,
@@ -166,7 +166,7 @@ def _priors_table(priors: dict[str, dict[str, str]]) -> Table:
 @command("criticise", 4, "pbrl-ppl criticise scene.toml train.csv")
 def criticise(
     scene: Path,
-    history: Path,
+    history: list[Path],
     reading: options.SceneReading,
     progress: Progress,
     seed: options.Seed = 1,

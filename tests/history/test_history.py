@@ -539,7 +539,7 @@ def test_files_that_are_not_there(tmp_path: Path, suffix: str) -> None:
     with pytest.raises(HistoryError, match="no such file"):
         History.load(tmp_path / f"none{suffix}", CART)
     (tmp_path / f"folder{suffix}").mkdir()
-    with pytest.raises(HistoryError, match="cannot be read"):
+    with pytest.raises(HistoryError, match="the folder has no log"):
         History.load(tmp_path / f"folder{suffix}", CART)
 
 
