@@ -12,6 +12,7 @@ import pkgutil
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -123,7 +124,27 @@ def read_text(path: Path, layout: Recording) -> pd.DataFrame:
     HistoryError
         If it is empty or no table.
     """
-    text = _decoded(path.read_bytes())
+    return _table_of(_decoded(path.read_bytes()), path, layout)
+
+
+@reads(".xlsx")
+def read_excel(path: Path, layout: Recording) -> pd.DataFrame:
+    """Return the rows of the first sheet of a workbook, read as a text table is."""
+    with path.open("rb") as file:
+        try:
+            sheet = pd.read_excel(file, header=None, dtype=object, engine="openpyxl")
+        except ImportError:
+            raise HistoryError(
+                f"history {path}: reading it needs openpyxl: pip install 'pbrl_ppl[excel]'"
+            ) from None
+        except Exception as error:  # damaged files raise errors of many kinds
+            raise HistoryError(f"history {path}: not a workbook: {reason(error)}") from None
+    text = sheet.to_csv(sep="\t", header=False, index=False, lineterminator="\n")
+    return _table_of(text, path, replace(layout, separator="tab"))
+
+
+def _table_of(text: str, path: Path, layout: Recording) -> pd.DataFrame:
+    """Return the rows of a text table; arguments and attributes as of :func:`read_text`."""
     lines = re.split(r"\r\n|\r|\n", text)
     filled = [line for line in lines if line.strip()]
     if not filled:

@@ -10,6 +10,7 @@ import pandas as pd
 
 from pbrl_ppl.errors import HistoryError, printable
 from pbrl_ppl.history.files import FOLDER, read_table, readers
+from pbrl_ppl.history.rows import with_clean_names
 from pbrl_ppl.scene import Recording
 
 #: A log, a folder of logs, or several.
@@ -107,6 +108,28 @@ def labels_in(logs: Sequence[Path], labels: Sequence[Sequence[int | str]]) -> li
         for name, its in zip(names, labels, strict=True)
         for label in its
     ]
+
+
+def read_tables(logs: Sequence[Path], layout: Recording) -> list[pd.DataFrame]:
+    """Return the table of each log, as it is, with clean names of columns."""
+    return [with_clean_names(read_table(log, layout), f"history {log}") for log in logs]
+
+
+def joined(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    """Return the rows of all tables; trajectories of several are different ones."""
+    if len(tables) == 1:
+        return tables[0]
+    frame: pd.DataFrame = pd.concat(
+        [
+            table.assign(trajectory=f"{i}." + table["trajectory"].astype(str))
+            if "trajectory" in table
+            else table
+            for i, table in enumerate(tables)
+        ],
+        ignore_index=True,
+    )
+    frame.attrs = tables[0].attrs
+    return frame
 
 
 def read_commands(path: Path, layout: Recording | None) -> pd.DataFrame | None:

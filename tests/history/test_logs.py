@@ -1,8 +1,10 @@
 """Several files as trajectories of one history."""
 
+import sys
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from pbrl_ppl.errors import HistoryError
@@ -72,3 +74,23 @@ def test_commands_beside_each_log_are_no_logs(tmp_path: Path) -> None:
         history = History.load(tmp_path, scene)
     assert history.dataset["action"].to_numpy()[:, 0, 0, 0].tolist() == [1.0, 2.0]
     assert [path.name for path in logs_in(tmp_path, layout)] == ["a.csv", "b.csv"]
+
+
+def test_a_workbook_is_read_as_a_text_table_is(tmp_path: Path) -> None:
+    pytest.importorskip("openpyxl", reason="openpyxl reads workbooks; install the extra `excel`")
+    rows = [["taken on a rail", None], ["t", "x"], ["s", "mm"]]
+    rows += [[0.1 * i, 1000 / 3 * i if i != 1 else None] for i in range(4)]
+    pd.DataFrame(rows).to_excel(tmp_path / "a.xlsx", header=False, index=False)
+    history = History.load(tmp_path / "a.xlsx", PUCK)
+    x = history.dataset["observed"].to_numpy()[0, :, 0, 0]
+    np.testing.assert_allclose(x, [0.0, np.nan, 2 / 3, 1.0], rtol=1e-15)
+    (tmp_path / "b.xlsx").write_bytes(b"PK damaged")
+    with pytest.raises(HistoryError, match=r"b.xlsx: not a workbook"):
+        History.load(tmp_path / "b.xlsx", PUCK)
+
+
+def test_a_workbook_needs_openpyxl(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.xlsx").write_bytes(b"PK")
+    monkeypatch.setitem(sys.modules, "openpyxl", None)
+    with pytest.raises(HistoryError, match=r"needs openpyxl: pip install 'pbrl_ppl\[excel\]'"):
+        History.load(tmp_path / "a.xlsx", PUCK)
