@@ -23,8 +23,8 @@ def logs_in(paths: Paths, layout: Recording | None = None) -> list[Path]:
     Parameters
     ----------
     paths : str, Path or sequence of them
-        Logs, and folders of logs: files with a suffix that is read, and ROS 2 bags, which are
-        folders with metadata.yaml.
+        Logs, and folders of logs: files with a suffix that is read, but those that are hidden or
+        locks (``~$log.xlsx``), and ROS 2 bags, which are folders with metadata.yaml.
     layout : Recording, optional
         Its files of commands beside the logs of a folder are left out.
 
@@ -48,7 +48,8 @@ def _logs_of(folder: Path, layout: Recording | None) -> list[Path]:
     logs = [
         path
         for path in folder.iterdir()
-        if (path.suffix.lower() in endings and path.is_file()) or _is_bag(path)
+        if (path.suffix.lower() in endings and path.is_file() and path.name[0] not in ".~")
+        or _is_bag(path)
     ]
     if layout is not None and layout.commands:
         beside = {_commands_of(path, layout) for path in logs}

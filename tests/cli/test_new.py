@@ -13,7 +13,8 @@ from pbrl_ppl import criticism
 from pbrl_ppl.cli import main
 from pbrl_ppl.criticism import Loop
 from pbrl_ppl.effects import attach
-from pbrl_ppl.scene import Scene
+from pbrl_ppl.physics import Physics
+from pbrl_ppl.scene import Body, Joint, Scene, Shape
 from tests.helpers.made_up import made_up
 from tests.helpers.places import MODELS, ROOT
 
@@ -226,6 +227,25 @@ def test_what_a_new_scene_has_as_comments_is_valid() -> None:
     scene = Scene.from_toml(text.replace("known = { mass = 6.0 }", "known = { r = 0.5 }"))
     assert scene.walls and scene.noise and attach(scene)[0].effect.name == "linear_drag"
     assert scene.joints[0].bodies == ("arm", "world") and scene.joints[0].anchor_a == (0.0, 0.1)
+    assert run("new rail.toml --body cart=box:0.3x0.1 --time-step 0.02 -q") == 0
+    text = Path("rail.toml").read_text()
+    rail = Scene.from_toml(uncommented(text, "[[joint]]                # a cart"))
+    assert rail.joints[0].kind == "slider" and rail.joints[0].axis == (1.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("radius", "mass"), [(0.1, 2 * 0.0021 / 0.1**2), (np.sqrt(2 * 0.0021 / 0.42), 0.42)]
+)
+def test_known_moments_of_inertia(radius: float, mass: float) -> None:
+    """A wheel of 0.0021 kg m^2 on a hinge at its centre, as the scene's comments declare it."""
+    known = {"mass": mass, "r": 0.0, "mu_c": 0.0}
+    wheel = Body("wheel", Shape.circle(radius), known=known)
+    hinge = Joint("hinge", ("wheel", "world"), (0.0, 0.0), (0.0, 0.0))
+    scene = Scene(time_step=0.1, gravity=(0.0, -9.81), bodies=(wheel,), joints=(hinge,))
+    wrench = np.zeros((1, 1, 1, 3))
+    wrench[..., 2] = 0.03
+    omega = Physics(scene).predict(np.zeros(0), np.zeros((1, 1, 6)), wrench)[0, 0, 0, 5]
+    np.testing.assert_allclose(omega, 0.03 * 0.1 / 0.0021, rtol=1e-9)
 
 
 @pytest.mark.usefixtures("swing")
@@ -266,6 +286,9 @@ def test_the_page_on_own_logs_writes_scenes_that_load(
     Path("arm.csv").write_text(f"{angles}\n0,0,0,0,0,0,0,0\n0,0.01,0,0,0,0,0,0\n")
     rows = [f"0,{time},{body},0" for time in (0, 0.1) for body in ("block", "finger")]
     Path("push.csv").write_text("\n".join(["trajectory,time,object,x", *rows]))
+    Path("flights").mkdir()
+    for name in ("a", "b"):
+        Path(f"flights/{name}.txt").write_text("t\tx\ty\n0\t0\t0\n0.1\t1\t0\n")
     page = (ROOT / "analysis" / "docs" / "pages" / "guides" / "own_log.md").read_text()
     lines = page.replace("\\\n", " ").splitlines()
     commands = [line for line in lines if line.startswith("pbrl-ppl new")]
@@ -274,4 +297,4 @@ def test_the_page_on_own_logs_writes_scenes_that_load(
         assert run(f"{command.removeprefix('pbrl-ppl ')} --overwrite -q") == 0
         scene = Scene.load("scene.toml")
         kinds.append((len(scene.dynamic), len(scene.moving), len(scene.joints), len(scene.walls)))
-    assert kinds == [(1, 1, 1, 0), (1, 1, 1, 0), (2, 2, 2, 0), (2, 2, 0, 0)]
+    assert kinds == [(1, 1, 1, 0), (1, 1, 0, 0), (1, 1, 1, 0), (2, 2, 2, 0), (2, 2, 0, 0)]

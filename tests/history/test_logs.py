@@ -25,10 +25,11 @@ def write(path: Path, x: float, rows: int = 3) -> None:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Return a folder of three logs of different lengths, and a file that is none."""
+    """Return a folder of three logs of different lengths, and files that are none."""
     for number, rows in ((10, 4), (2, 3), (1, 5)):
         write(tmp_path / f"run_{number}.txt", 100.0 * number, rows)
-    (tmp_path / "notes.md").write_text("no log")
+    for name in ("notes.md", "._run_1.txt", "~$run.xlsx"):
+        (tmp_path / name).write_text("no log")
     return tmp_path
 
 
