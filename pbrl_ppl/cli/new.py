@@ -108,6 +108,8 @@ class Recorded:
         How it is laid out; None where it is a history's.
     said : list of str
         What was seen in it.
+    source : str
+        Its name in messages.
     hinges : Hinges
         Those that it shows.
     actuators : callable
@@ -118,6 +120,7 @@ class Recorded:
     time_step: float | None = None
     layout: Recording | None = None
     said: Sequence[str] = ()
+    source: str = ""
     hinges: Hinges = Hinges()
     actuators: Callable[[Shape], tuple[Actuator, ...]] = lambda shape: ()
 
@@ -147,7 +150,8 @@ def recorded(
 
     from pbrl_ppl import history as histories
 
-    source, said = f"history {histories.in_words(paths)}", list[str]()
+    name, said = histories.in_words(paths), list[str]()
+    source = f"history {name}"
     logs = histories.logs_in(paths, layout)
     frames = histories.read_tables(logs, layout)
     plain = layout == Recording() and all(map(histories.is_history, frames))
@@ -155,6 +159,7 @@ def recorded(
     frame = histories.joined(frames)
     if not plain:
         layout = histories.with_guesses(frame, commands[0], layout, said.append)
+        histories.check_states(frame, layout, source)
     columns = dict(layout.columns)
     names = _names(frame, columns) or list(given)
     if not names:
@@ -162,8 +167,6 @@ def recorded(
             f"{source}: no column has the bodies' names; give --body NAME=SHAPE for one body,"
             " --columns body=COLUMN, or --columns NAME.x=COLUMN,... for bodies side by side"
         )
-    if not plain:
-        histories.check_states(frame, layout, source)
     # later commands read it with the scene; any outline will do here
     bodies = tuple(Body(name, Shape.circle(1.0)) for name in names)
     stand_in = Scene(time_step=time_step or 1.0, bodies=bodies)
@@ -184,10 +187,10 @@ def recorded(
         )
 
     table, layout = _read_with_cures(read, layout, logs, said, plain=plain)
-    for name in ("trajectory", "body"):
-        if name not in table:
+    for key in ("trajectory", "body"):
+        if key not in table:
             raise HistoryError(
-                f"{source}: it has no column {name}; say which it is (--columns {name}=COLUMN)"
+                f"{source}: it has no column {key}; say which it is (--columns {key}=COLUMN)"
             )
     table["time"] = pd.to_numeric(table["time"], errors="coerce")
     # pandas 2 warns of a median of missing values alone
@@ -213,7 +216,7 @@ def recorded(
     if unused:
         shown.append(f"columns that are not used: {', '.join(unused)}")
     layout_found = None if plain and not shown else proposed
-    return Recorded(tuple(names), step, layout_found, [*said, *shown], hinges, acting)
+    return Recorded(tuple(names), step, layout_found, [*said, *shown], name, hinges, acting)
 
 
 def _read_with_cures(
@@ -377,7 +380,7 @@ def new(
         written = [scene]
     shown = [f"wrote {path}" for path in written]
     logs = history or ([written[-1]] if len(written) > 1 else [])
-    shown += [f"{', '.join(map(str, logs))}: {sentence}" for sentence in recording.said]
+    shown += [f"{recording.source}: {sentence}" for sentence in recording.said]
     if model is None:
         shown += [f"joints, walls, wheels, known masses: uncomment them in {scene}"]
     next_command = ["pbrl-ppl", "check", str(scene), *map(str, logs or [Path("history.csv")])]

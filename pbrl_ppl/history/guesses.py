@@ -206,9 +206,10 @@ def _found_by_unit(
     """Return columns that are a position or an angle, or their rate, as their unit says.
 
     Those without a unit are straight, unless an angle is known. Beside x and y a speed has no
-    direction.
+    direction. What a motion should be is not what it was.
     """
     found: dict[str, str] = {}
+    plain = {name: text for name, text in plain.items() if not re.search(_WANTED, text)}
     for keys, guesses in _BY_UNIT.items():
         name = _named(plain, guesses)
         taken = {"x", "y", "theta"} if "x" in keys else {"y", "vx", "vy", "omega"}
@@ -273,6 +274,8 @@ _ACTUATORS = {
     "servo": r"goal|target|setpoint|servo|desired",
     "motor": r"motor|duty|pwm|volt|throttle|current|cmd(?!_?vel)|command",
 }
+#: Words in names of a pose or a speed that is wanted, not measured.
+_WANTED = r"goal|target|setpoint|desired|cmd|command"
 #: A command that exceeds this is no share of a full one.
 _COUNTS = 2.0
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import pandas as pd
 
 from pbrl_ppl.errors import HistoryError, printable
+from pbrl_ppl.files import reason
 from pbrl_ppl.history.files import FOLDER, read_table, readers
 from pbrl_ppl.history.rows import with_clean_names
 from pbrl_ppl.scene import Recording
@@ -31,14 +32,17 @@ def logs_in(paths: Paths, layout: Recording | None = None) -> list[Path]:
     Raises
     ------
     HistoryError
-        If there is no such file, or a folder has no log.
+        If there is no such file, or a folder has no log or cannot be read.
     """
     logs: list[Path] = []
     for path in [paths] if isinstance(paths, str | Path) else paths:
         path = Path(path)
-        if not path.exists():
-            raise HistoryError(f"history {path}: there is no such file; check the path")
-        logs += _logs_of(path, layout) if path.is_dir() and not _is_bag(path) else [path]
+        try:
+            if not path.exists():
+                raise HistoryError(f"history {path}: there is no such file; check the path")
+            logs += _logs_of(path, layout) if path.is_dir() and not _is_bag(path) else [path]
+        except OSError as error:
+            raise HistoryError(f"history {path}: cannot be read: {reason(error)}") from None
     return sorted(dict.fromkeys(logs), key=_natural)
 
 

@@ -102,6 +102,8 @@ def test_three_commands_from_a_raw_table_to_a_verdict(
          {"theta": "position [deg]", "omega": "velocity [deg/s]"}),
         ("t,angle,speed", {"theta": "angle", "omega": "speed"}),
         ("t,x,y,speed", {}),  # which has no direction
+        ("t,position,target position,motor speed [rad/s]",
+         {"x": "position", "omega": "motor speed [rad/s]"}),
         ("t,qpos,qvel", {"theta": "qpos", "omega": "qvel"}),
         ("t,speed [rad/s],torque", {"omega": "speed [rad/s]"}),
     ],
@@ -148,7 +150,7 @@ def test_a_log_without_a_pose_or_a_speed_is_refused(
     note = ",up" if "note" in head else ""
     rows = "".join(f"{0.1 * i:g},{10 - i},{i % 5}{note}\n" for i in range(20))
     Path("log.csv").write_text(head + rows)
-    said = refused(capsys, "--history log.csv --body wheel=circle:0.1")
+    said = refused(capsys, "--history log.csv")
     assert "no column is known as a pose or a speed of a body" in said and guess in said
 
 

@@ -503,7 +503,7 @@ def test_the_first_broken_rule_is_reported_in_the_row_of_the_file(tmp_path: Path
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("a.xlsx", b"", "suffix is '.xlsx', expected one of .csv, .txt, .tsv, .dat, .parquet, .nc"),
+        ("a.xls", b"", "suffix is '.xls', expected one of .csv, .txt, .tsv, .dat, .xlsx"),
         ("a.csv", b"", "the file is empty"),
         ("a.csv", b"\n \n", "the file is empty"),
         ("a.csv", b"\xff\xfe,\n1,2\n", "not a CSV table|unknown column"),

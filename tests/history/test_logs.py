@@ -55,6 +55,8 @@ def test_a_message_names_the_file(folder: Path) -> None:
         History.load(folder / "empty", PUCK)
     with pytest.raises(HistoryError, match=r"none.csv: there is no such file"):
         History.load([folder, folder / "none.csv"], PUCK)
+    with pytest.raises(HistoryError, match="cannot be read: File name too long"):
+        History.load("x" * 300, PUCK)
 
 
 def test_trajectories_of_a_log_keep_their_labels(tmp_path: Path) -> None:
