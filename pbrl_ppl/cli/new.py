@@ -176,22 +176,8 @@ def recorded(
             f"{source}: it has no column time; say which it is (--columns time=COLUMN, or"
             " duration=COLUMN for times since the row before), or give --time-step"
         )
-
-    def read(layout: Recording | None) -> pd.DataFrame:
-        parts = zip(frames, logs, commands, strict=True)
-        return histories.joined(
-            [
-                histories.as_history(table, stand_in, f"history {log}", layout, commands=sent)
-                for table, log, sent in parts
-            ]
-        )
-
+    read = partial(_as_history, [*zip(frames, logs, commands, strict=True)], stand_in)
     table, layout = _read_with_cures(read, layout, logs, said, plain=plain)
-    for key in ("trajectory", "body"):
-        if key not in table:
-            raise HistoryError(
-                f"{source}: it has no column {key}; say which it is (--columns {key}=COLUMN)"
-            )
     table["time"] = pd.to_numeric(table["time"], errors="coerce")
     # pandas 2 warns of a median of missing values alone
     step = float(table.groupby(["trajectory", "body"])["time"].diff().dropna().median())
@@ -217,6 +203,27 @@ def recorded(
         shown.append(f"columns that are not used: {', '.join(unused)}")
     layout_found = None if plain and not shown else proposed
     return Recorded(tuple(names), step, layout_found, [*said, *shown], name, hinges, acting)
+
+
+def _as_history(
+    parts: Sequence[tuple[pd.DataFrame, Path, pd.DataFrame | None]],
+    scene: Scene,
+    layout: Recording | None,
+) -> pd.DataFrame:
+    """Return the tables of logs, each with its commands, as one with a history's columns."""
+    from pbrl_ppl import history as histories
+
+    tables = []
+    for frame, log, commands in parts:
+        source = f"history {log}"
+        table = histories.as_history(frame, scene, source, layout, commands=commands)
+        for name in ("trajectory", "body"):
+            if name not in table:
+                raise HistoryError(
+                    f"{source}: it has no column {name}; say which it is (--columns {name}=COLUMN)"
+                )
+        tables.append(table)
+    return histories.joined(tables)
 
 
 def _read_with_cures(
