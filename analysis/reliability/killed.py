@@ -38,7 +38,10 @@ COMMANDS = {
     "importance": (8, f"{FIT} --method importance"),
     "metropolis": (8, f"{FIT} --method metropolis --tune 100 --chains 2"),
     "close-loop": (16, "close-loop scene.toml train.csv -o out --test test.csv --method laplace"),
-    "many": (8, "close-loop scene.toml train.csv again.csv -o out --jobs 2 --method laplace"),
+    "many": (
+        8,
+        "close-loop scene.toml train.csv again.csv -o out --each --jobs 2 --method laplace",
+    ),
     "report": (20, "report posterior.nc -o out.html"),
     "update": (8, "update posterior.nc test.csv -o out.nc"),
     "simulate": (20, "simulate posterior.nc test.csv -o out.csv"),

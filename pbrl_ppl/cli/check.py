@@ -25,13 +25,14 @@ if TYPE_CHECKING:
 @command("check", 2, "pbrl-ppl check scene.toml train.csv")
 def check(
     scene: Path,
-    history: Path,
+    history: list[Path],
     reading: options.SceneReading,
     progress: Progress,
     as_json: bool,
     prior: Annotated[bool, typer.Option()] = True,
     draws: Annotated[int, typer.Option(min=50)] = 400,
     seed: options.Seed = 0,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v")] = False,
 ) -> Result:
     """Read a scene and a history: what is in them, what is missing, whether the prior fits.
 
@@ -43,6 +44,8 @@ def check(
         Whether to compare the data with draws from the prior.
     draws
         Draws from the prior.
+    verbose
+        List all default priors of effects, not three.
     """
     declared, (loaded,) = reading.read(scene, [history])
     catalogue = reading.catalogue()
@@ -77,7 +80,7 @@ def check(
         )
     sized = histories.with_units(declared, used)
     priors = _default_priors(sized, catalogue)
-    console.print(_priors_table(priors))
+    console.print(_priors_table(priors, None if verbose else 3))
     checked = None
     if prior:
         progress("comparing with draws from the prior")
@@ -154,11 +157,14 @@ def _default_priors(scene: Scene, catalogue: Sequence[Effect]) -> dict[str, dict
     return priors
 
 
-def _priors_table(priors: dict[str, dict[str, str]]) -> Table:
-    """Return a table of default priors, a column for each body."""
+def _priors_table(priors: dict[str, dict[str, str]], most: int | None) -> Table:
+    """Return a table of so many default priors, a column for each body; of all without a number."""
+    names = list(dict.fromkeys(chain(*priors.values())))
+    shown = names[:most]
     title = "default priors of effects, from the recording"
+    title += f" ({len(shown)} of {len(names)}: --verbose lists all)" * (len(shown) < len(names))
     listed = Table("parameter", *priors, title=title, title_justify="left")
-    for name in dict.fromkeys(chain(*priors.values())):
+    for name in shown:
         listed.add_row(name, *(those.get(name, "") for those in priors.values()))
     return listed
 
@@ -166,7 +172,7 @@ def _priors_table(priors: dict[str, dict[str, str]]) -> Table:
 @command("criticise", 4, "pbrl-ppl criticise scene.toml train.csv")
 def criticise(
     scene: Path,
-    history: Path,
+    history: list[Path],
     reading: options.SceneReading,
     progress: Progress,
     seed: options.Seed = 1,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
@@ -93,48 +93,53 @@ def close_loop(
     sampler: Sampler,
     progress: Progress,
     interrupts: terminal.Interrupts,
-    test: Path | None = None,
+    test: list[Path] | None = None,
+    each: Annotated[bool, typer.Option("--each")] = False,
     jobs: options.Count = 1,
 ) -> Result:
     """Find what the declared model lacks, add it, refit, and report before and after.
 
-    Of several logs, or a folder of them, each has a report of its own, and index.html lists all.
-    Exits with 3 if the chains have not converged: then there is no verdict. Of several logs it
-    exits with 1 if at least one failed, which does not stop the others.
+    Several logs, or a folder of them, are trajectories of one history. With --each every log has a
+    report of its own, and index.html lists all. Exits with 3 if the chains have not converged: then
+    there is no verdict; with --each it exits with 1 if at least one log failed, which does not stop
+    the others.
 
     Parameters
     ----------
     train : TRAIN
-        Measured history (.csv, .parquet, .nc), several, or a folder of them.
+        Measured history (.csv, .parquet, .nc, ...), several files of it, or a folder of them.
     test : TEST
-        Held-out history; without it, a quarter of TRAIN's trajectories.
+        Held-out history, a file or a folder; repeat for several. Without it, a quarter of TRAIN's
+        trajectories.
+    each
+        Close the loop on each log by itself.
     jobs
-        Of several logs so many at a time, each in a process of its own.
+        With --each so many logs at a time, each in a process of its own.
     """
     progress("reading the scene and the histories")
-    from pbrl_ppl.history import logs_in
-
-    logs = [log for path in train for log in logs_in(path)]
-    if logs != train or len(logs) > 1:
-        if test is not None:
+    if each:
+        if test:
             raise HistoryError(
-                f"history {test}: --test is given with {len(logs)} logs, expected one; leave it"
-                " out, and a quarter of each log's trajectories is held out"
+                f"history {test[0]}: --test is given with --each; leave it out, and a quarter of"
+                " each log's trajectories is held out"
             )
-        each = Each(scene, reading, sampler, to, options.command_line(context))
-        return _closed(each, _named(logs), jobs, progress)
-    paths = logs if test is None else [*logs, test]
-    declared, histories = reading.read(scene, paths)
+        settings = Each(scene, reading, sampler, to, options.command_line(context))
+        return _closed(settings, train, jobs, progress)
+    if jobs > 1:
+        raise typer.BadParameter(
+            "several logs are one history; add --each to run each by itself", param_hint="--jobs"
+        )
+    declared, histories = reading.read(scene, [train, test] if test else [train])
     progress("loading the sampler")
     import pbrl_ppl.reporting as report
     from pbrl_ppl import criticism
 
     output = to.output
     check_folder(output, True, criticism.FILES)
-    settings = sampler.settings(reading.catalogue())
+    settings, said = sampler.settings(reading.catalogue()), list[str]()
     run = partial(criticism.close_loop, declared, *histories, **settings)
-    files, said = (str(scene), str(logs[0]), str(test or "")), list[str]()
-    source = report.Source(*files, options.command_line(context))
+    recorded, held_out = (", ".join(map(str, paths)) for paths in (train, test or ()))
+    source = report.Source(str(scene), recorded, held_out, options.command_line(context))
     interrupts.rescue = partial(_without_verdict, said, sampler, output, source)
     loop, stopped = _finished(run, progress, interrupts, said)
     interrupts.rescue = None
@@ -163,7 +168,7 @@ class Each:
 
         with terminal.warnings_in_a_line(), terminal.noted_warnings("") as noted:
             try:
-                declared, histories = self.reading.read(self.scene, [log])
+                declared, histories = self.reading.read(self.scene, [[log]])
                 settings = self.sampler.settings(self.reading.catalogue())
                 loop = criticism.close_loop(declared, *histories, **settings)
                 source = report.Source(str(self.scene), str(log), "", self.command)
@@ -199,7 +204,9 @@ def _failed(name: str, error: Exception) -> dict[str, Any]:
 
 def _named(logs: Sequence[Path]) -> dict[str, Path]:
     """Return logs by the names of their folders; some file systems ignore case."""
-    names = [log.name if log.is_dir() else log.stem for log in logs]
+    from pbrl_ppl.history import log_name
+
+    names = list(map(log_name, logs))
     name, count = Counter(map(str.lower, names)).most_common(1)[0]
     if count > 1:
         raise HistoryError(
@@ -209,15 +216,16 @@ def _named(logs: Sequence[Path]) -> dict[str, Path]:
     return dict(zip(names, logs, strict=True))
 
 
-def _closed(each: Each, logs: Mapping[str, Path], jobs: int, progress: Progress) -> Result:
-    """Close the loop on many logs, and write the page of all."""
+def _closed(each: Each, paths: Sequence[Path], jobs: int, progress: Progress) -> Result:
+    """Close the loop on each log by itself, and write the page of all."""
     import pbrl_ppl.reporting as report
-    from pbrl_ppl.history import read_scene
+    from pbrl_ppl.history import logs_in, read_scene
 
     page = each.to.output / "index.html"
     check_folder(page.parent, True, [page.name])
     # what would be wrong for all
-    read_scene(each.scene, **each.reading.scene_settings())
+    declared = read_scene(each.scene, **each.reading.scene_settings())
+    logs = _named(logs_in(paths, declared.recording))
     each.reading.catalogue()
     page.parent.mkdir(parents=True, exist_ok=True)
     rows: list[dict[str, Any]] = []
@@ -312,7 +320,7 @@ def demo(
     train, test = (cart / "recorded" / f"{name}.csv" for name in ("train", "test"))
     result = close_loop(
         context, cart / "scene.toml", [train], to, options.SceneReading(), sampler, progress,
-        interrupts, test,
+        interrupts, [test],
     )  # fmt: skip
     if quiet or result.code:
         return result

@@ -87,7 +87,7 @@ class Sampler:
 @command("fit", 3, "pbrl-ppl fit scene.toml train.csv -o cart.nc")
 def fit(
     scene: Path,
-    history: Path,
+    history: list[Path],
     to: options.PosteriorOutput,
     reading: options.SceneReading,
     model: Model,
@@ -184,7 +184,7 @@ def _summary(idata: Idata) -> pd.DataFrame:
 @command("update", 9, "pbrl-ppl update cart.nc since.csv -o new.nc")
 def update(
     posterior: Path,
-    history: Path,
+    history: list[Path],
     to: options.PosteriorOutput,
     reading: options.PosteriorReading,
     progress: Progress,
@@ -199,7 +199,7 @@ def update(
     posterior : POSTERIOR
         Posterior file (.nc); it has the scene.
     history : HISTORY
-        What was recorded since (.csv, ...).
+        What was recorded since (.csv, ...); several files, or a folder, are one history.
     output
         The new posterior file.
     """

@@ -27,7 +27,7 @@ from pbrl_ppl.errors import (
 )
 from pbrl_ppl.files import write_atomically, write_text
 from pbrl_ppl.scene import WORLD, Actuator, Body, Joint, Recording, Scene, Shape, nearest, toml_of
-from pbrl_ppl.state import Floats
+from pbrl_ppl.state import STATE, Floats
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -43,7 +43,8 @@ class Hinges:
     Parameters
     ----------
     angles : tuple of str
-        Bodies of which angles alone were measured: a chain, each hung by its upper end.
+        Bodies of which angles alone were measured: a chain, each hung by its upper end, circles by
+        their centre.
     circles : dict of str to (float, float, float)
         Centre and radius (m) of bodies that swing on a circle, and whose angle was not measured.
     """
@@ -54,9 +55,10 @@ class Hinges:
     @classmethod
     def seen_in(cls, table: pd.DataFrame, names: Sequence[str]) -> Hinges:
         """Return the hinges that the measurements of bodies show."""
-        measured = table.reindex(columns=["x", "y", "theta"]).notna().groupby(table["body"]).any()
+        measured = table.reindex(columns=[*STATE]).notna().groupby(table["body"]).any()
         tracks = table.reindex(columns=["x", "y"]).groupby(table["body"])
-        angles = measured["theta"] & ~measured["x"] & ~measured["y"]
+        turns = measured[["theta", "omega"]].any(axis=1)
+        angles = turns & ~measured[["x", "y", "vx", "vy"]].any(axis=1)
         circles = {
             name: circle
             for name, track in tracks
@@ -73,8 +75,8 @@ class Hinges:
         if not self.angles:
             return said
         return [
-            f"only the angle of {' and '.join(self.angles)} was measured: hung by the upper end;"
-            " correct the places of [[joint]]",
+            f"only the angle of {' and '.join(self.angles)} was measured: hung by the upper end"
+            " (a circle, as a wheel, by its centre); correct the places of [[joint]]",
             *said,
         ]
 
@@ -84,7 +86,8 @@ class Hinges:
         above, end = WORLD, (0.0, 0.0)
         for name in self.angles:
             *_, low, high = shapes[name].bounds
-            joints.append(Joint("hinge", (name, above), (0.0, high), end))
+            top = 0.0 if shapes[name].kind == "circle" else high
+            joints.append(Joint("hinge", (name, above), (0.0, top), end))
             above, end = name, (0.0, low)
         for name, (x, y, radius) in self.circles.items():
             joints.append(Joint("hinge", (name, WORLD), (0.0, radius), (x, y)))
@@ -105,6 +108,8 @@ class Recorded:
         How it is laid out; None where it is a history's.
     said : list of str
         What was seen in it.
+    source : str
+        Its name in messages.
     hinges : Hinges
         Those that it shows.
     actuators : callable
@@ -115,19 +120,20 @@ class Recorded:
     time_step: float | None = None
     layout: Recording | None = None
     said: Sequence[str] = ()
+    source: str = ""
     hinges: Hinges = Hinges()
     actuators: Callable[[Shape], tuple[Actuator, ...]] = lambda shape: ()
 
 
 def recorded(
-    path: Path, layout: Recording, given: Sequence[str], time_step: float | None
+    paths: Sequence[Path], layout: Recording, given: Sequence[str], time_step: float | None
 ) -> Recorded:
     """Read bodies, time step and layout from a recording.
 
     Parameters
     ----------
-    path : Path
-        The recording.
+    paths : sequence of Path
+        The recording's files, or folders of them.
     layout : Recording
         What is known of its layout.
     given : sequence of str
@@ -138,18 +144,22 @@ def recorded(
     Raises
     ------
     HistoryError
-        If it cannot be read, names no body, or its times do not rise.
+        If it cannot be read, names no body and no pose or speed, or its times do not rise.
     """
     import pandas as pd
 
     from pbrl_ppl import history as histories
 
-    source, said = f"history {path}", list[str]()
-    frame = histories.read_table(path, layout)
-    plain = histories.is_history(frame) and layout == Recording()
-    commands = histories.read_commands(path, layout)
+    name, said = histories.in_words(paths), list[str]()
+    source = f"history {name}"
+    logs = histories.logs_in(paths, layout)
+    frames = histories.read_tables(logs, layout)
+    plain = layout == Recording() and all(map(histories.is_history, frames))
+    commands = [histories.read_commands(log, layout) for log in logs]
+    frame = histories.joined(frames)
     if not plain:
-        layout = histories.with_guesses(frame, commands, layout, said.append)
+        layout = histories.with_guesses(frame, commands[0], layout, said.append)
+        histories.check_states(frame, layout, source)
     columns = dict(layout.columns)
     names = _names(frame, columns) or list(given)
     if not names:
@@ -166,13 +176,8 @@ def recorded(
             f"{source}: it has no column time; say which it is (--columns time=COLUMN, or"
             " duration=COLUMN for times since the row before), or give --time-step"
         )
-    read = partial(histories.as_history, frame, stand_in, source, commands=commands)
-    table, layout = _read_with_cures(read, layout, f"{source}: ", said, plain=plain)
-    for name in ("trajectory", "body"):
-        if name not in table:
-            raise HistoryError(
-                f"{source}: it has no column {name}; say which it is (--columns {name}=COLUMN)"
-            )
+    read = partial(_as_history, [*zip(frames, logs, commands, strict=True)], stand_in)
+    table, layout = _read_with_cures(read, layout, logs, said, plain=plain)
     table["time"] = pd.to_numeric(table["time"], errors="coerce")
     # pandas 2 warns of a median of missing values alone
     step = float(table.groupby(["trajectory", "body"])["time"].diff().dropna().median())
@@ -181,7 +186,7 @@ def recorded(
             f"{source}: its times do not rise from row to row of a body and trajectory;"
             " correct them, or give --time-step; times since the row before are a column duration"
         )
-    step = time_step or _longer_step(float(f"{step:.4g}"), commands, layout, said)
+    step = time_step or _longer_step(float(f"{step:.4g}"), commands[0], layout, said)
     hinges = Hinges.seen_in(table, names)
     proposed, shown = histories.propose(table, layout, step, jumps=not hinges.circles)
     shown += hinges.in_words()
@@ -197,33 +202,63 @@ def recorded(
     if unused:
         shown.append(f"columns that are not used: {', '.join(unused)}")
     layout_found = None if plain and not shown else proposed
-    return Recorded(tuple(names), step, layout_found, [*said, *shown], hinges, acting)
+    return Recorded(tuple(names), step, layout_found, [*said, *shown], name, hinges, acting)
+
+
+def _as_history(
+    parts: Sequence[tuple[pd.DataFrame, Path, pd.DataFrame | None]],
+    scene: Scene,
+    layout: Recording | None,
+) -> pd.DataFrame:
+    """Return the tables of logs, each with its commands, as one with a history's columns."""
+    from pbrl_ppl import history as histories
+
+    tables = []
+    for frame, log, commands in parts:
+        source = f"history {log}"
+        table = histories.as_history(frame, scene, source, layout, commands=commands)
+        for name in ("trajectory", "body"):
+            if name not in table:
+                raise HistoryError(
+                    f"{source}: it has no column {name}; say which it is (--columns {name}=COLUMN)"
+                )
+        tables.append(table)
+    return histories.joined(tables)
 
 
 def _read_with_cures(
     read: Callable[..., pd.DataFrame],
     layout: Recording,
-    prefix: str,
+    logs: Sequence[Path],
     said: list[str],
     *,
     plain: bool,
 ) -> tuple[pd.DataFrame, Recording]:
     """Return a table as ``read`` returns it, and the layout with the entries that it needed.
 
-    What was proposed and repaired is added to ``said``, without the ``prefix``.
+    What was proposed and repaired is added to ``said``, each once, without the names of logs.
     """
+
+    def say(message: object) -> None:
+        text = str(message)
+        for log in logs:
+            text = text.removeprefix(f"history {log}: ")
+        if text not in said:
+            said.append(text)
+
     while True:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", RecordingWarning)
             try:
                 table = read(layout=None if plain else layout)
             except LayoutError as proposal:
-                said.append(str(proposal).removeprefix(prefix))
+                say(proposal)
                 before, layout = layout, layout.with_entries(**proposal.entries)
                 if layout == before:
                     raise
                 continue
-        said += [str(warning.message).removeprefix(prefix) for warning in caught]
+        for warning in caught:
+            say(warning.message)
         return table, layout
 
 
@@ -294,7 +329,7 @@ def new(
     bodies: Annotated[list[str] | None, typer.Option("--body")] = None,
     side: Annotated[bool | None, typer.Option("--side/--top")] = None,
     time_step: Annotated[float | None, typer.Option(min=0.0)] = None,
-    history: Path | None = None,
+    history: list[Path] | None = None,
     columns: options.Columns,
     commands: str = "",
     topics: Annotated[list[str] | None, typer.Option("--topic")] = None,
@@ -319,7 +354,8 @@ def new(
     time_step
         Time between rows of the history (s).
     history : HISTORY
-        A recording: has the bodies' names and the time step.
+        A recording: has the bodies' names and the time step. A folder of files, or several files
+        (repeat the option), are one.
     commands : FILE
         Commands with times of their own, beside the history.
     topics : NAME=TOPIC,...
@@ -333,7 +369,7 @@ def new(
     given = (bodies, time_step, history, columns.columns, columns.units)
     if model is not None and (side is not None or any(given)):
         raise SceneError("--from copies a model as it is: omit the other options, or omit --from")
-    if history is None and (columns.columns or columns.units or commands):
+    if not history and (columns.columns or columns.units or commands):
         raise SceneError(
             "--columns, --units and --commands say how a recording is read: add --history"
         )
@@ -342,20 +378,20 @@ def new(
         written = _copied(model, scene, overwrite)
     else:
         shapes = outlines(bodies or [])
-        if history is not None:
+        if history:
             recording = recorded(history, layout, [*shapes], time_step)
-        shapes, time_step = _complete(shapes, time_step, history, recording)
+        shapes, time_step = _complete(shapes, time_step, recording)
         text = scene_text(shapes, bool(side), time_step, recording)
         Scene.from_toml(text)  # written whole and valid, or not at all
         write_text(scene, text)
         written = [scene]
     shown = [f"wrote {path}" for path in written]
-    shown += [f"{history}: {sentence}" for sentence in recording.said]
+    logs = history or ([written[-1]] if len(written) > 1 else [])
+    shown += [f"{recording.source}: {sentence}" for sentence in recording.said]
     if model is None:
         shown += [f"joints, walls, wheels, known masses: uncomment them in {scene}"]
-    log = history or (written[-1] if len(written) > 1 else None)
-    next_command = ["pbrl-ppl", "check", str(scene), str(log or "history.csv")]
-    begin = "next" if log else "next, with your recording"
+    next_command = ["pbrl-ppl", "check", str(scene), *map(str, logs or [Path("history.csv")])]
+    begin = "next" if logs else "next, with your recording"
     shown += [f"{begin}: {shlex.join(next_command)}"]
     return Result({"scene": scene, "written": written}, () if quiet else shown)
 
@@ -404,7 +440,7 @@ def _copied(model: str, scene: Path, overwrite: bool) -> list[Path]:
 
 
 def _complete(
-    given: Mapping[str, Shape], time_step: float | None, history: Path | None, found: Recorded
+    given: Mapping[str, Shape], time_step: float | None, found: Recorded
 ) -> tuple[dict[str, Shape], float]:
     """Return shapes and time step, from options and a recording that give all of them."""
     names = [*(found.names or given)]
@@ -412,7 +448,7 @@ def _complete(
     for name in given:
         if name not in names:
             raise SceneError(
-                f"--body: {history} has no rows of {name!r}, only of {', '.join(names)}"
+                f"--body: the history has no rows of {name!r}, only of {', '.join(names)}"
             )
     lacking = [f"--body {name}={SHAPES}" for name in names or ["NAME"] if name not in given]
     lacking += ["--time-step"] if time_step is None else []

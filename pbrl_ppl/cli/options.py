@@ -5,7 +5,8 @@ Parameters
 scene : SCENE
     Scene file (.toml).
 history : HISTORY
-    Measured history (.csv, .parquet, .nc).
+    Measured history (.csv, .parquet, .nc, ...); several files, or a folder
+    of them, are one history.
 posterior : POSTERIOR
     Posterior file (.nc); all that is needed.
 columns : NAME=COLUMN,...
@@ -176,11 +177,11 @@ class Reading(EffectFiles, Columns):
         flags = {"estimate_velocities": self.estimate_velocities, "trim": self.trim}
         return self.layout() | flags
 
-    def recording(self, path: Path, scene: Scene, *, resample: bool) -> History:
-        """Return the history of a file."""
+    def recording(self, paths: Sequence[Path], scene: Scene, *, resample: bool) -> History:
+        """Return the history of files."""
         from pbrl_ppl.history import read_recording
 
-        return read_recording(path, scene, resample=resample, **self.settings())
+        return read_recording(paths, scene, resample=resample, **self.settings())
 
 
 @dataclass(frozen=True)
@@ -218,8 +219,8 @@ class SceneReading(Reading):
         noise = noise_of(self.noise)
         return {"noise": noise, "substeps": self.substeps, "time_step": self.time_step}
 
-    def read(self, scene: Path, histories: Sequence[Path]) -> tuple[Scene, list[History]]:
-        """Return the scene and its histories."""
+    def read(self, scene: Path, histories: Sequence[Sequence[Path]]) -> tuple[Scene, list[History]]:
+        """Return the scene and its histories, each of one file or more."""
         from pbrl_ppl.history import read_scene
 
         declared, resample = read_scene(scene, **self.scene_settings()), self.time_step is not None

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 @command("simulate", 11, "pbrl-ppl simulate cart.nc plan.csv -o predicted.csv --draws 20")
 def simulate(
     source: Path,
-    history: Path,
+    history: list[Path],
     to: options.RecordingOutput,
     reading: options.PosteriorReading,
     progress: Progress,
@@ -202,7 +202,7 @@ def rehearse(
     output = to.output
     values = options.pairs(given, "--set", "mass=8", float)
     progress("reading the scene and the commands")
-    declared, histories = reading.read(scene, [] if commands is None else [commands])
+    declared, histories = reading.read(scene, [] if commands is None else [[commands]])
     catalogue = reading.catalogue()
     progress("loading the model")
     from pbrl_ppl.planning import rehearsal

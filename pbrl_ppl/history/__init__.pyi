@@ -8,10 +8,8 @@ from .clocks import command_step as command_step
 from .conversion import as_history as as_history
 from .conversion import is_history as is_history
 from .cuts import propose as propose
-from .files import logs_in as logs_in
-from .files import read_commands as read_commands
-from .files import read_table as read_table
 from .files import table_of_arrays as table_of_arrays
+from .guesses import check_states as check_states
 from .guesses import guessed_actuators as guessed_actuators
 from .guesses import unused_columns as unused_columns
 from .guesses import with_guesses as with_guesses
@@ -27,6 +25,13 @@ from .kinematics import estimate_rates as estimate_rates
 from .kinematics import fill_joints as fill_joints
 from .kinematics import joint_coordinates as joint_coordinates
 from .kinematics import lever as lever
+from .logs import Paths as Paths
+from .logs import in_words as in_words
+from .logs import joined as joined
+from .logs import log_name as log_name
+from .logs import logs_in as logs_in
+from .logs import read_commands as read_commands
+from .logs import read_tables as read_tables
 from .parts import MOST_TRANSITIONS as MOST_TRANSITIONS
 from .parts import drawn_pieces as drawn_pieces
 from .parts import thinned as thinned

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from pbrl_ppl.errors import HistoryError, LayoutError
-from pbrl_ppl.history.measures import TIME, unit_in_name, unit_size
+from pbrl_ppl.history.measures import TIME, stated_unit, unit_in_name, unit_size
 from pbrl_ppl.history.resampling import held_means
 from pbrl_ppl.scene import Recording, column_of
 from pbrl_ppl.state import STATE, WRENCH, Bools, Floats, Ints
@@ -153,7 +153,7 @@ def _seconds(frame: pd.DataFrame, name: str, layout: Recording, source: str) -> 
 
 def _stated_unit(frame: pd.DataFrame, name: str) -> str:
     """Return the unit of time that a file states of a column, or an empty text."""
-    stated = frame.attrs.get("units", {}).get(name) or unit_in_name(name)[1]
+    stated = stated_unit(frame, name)
     return stated if stated in TIME else ""
 
 

@@ -12,6 +12,7 @@ import pkgutil
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +60,7 @@ def reads(*suffixes: str) -> Callable[[Reader], Reader]:
     return declare
 
 
-def _readers() -> Mapping[str, Reader]:
+def readers() -> Mapping[str, Reader]:
     """Return the readers of all modules of this room."""
     package = importlib.import_module("pbrl_ppl.history")
     for module in pkgutil.iter_modules(package.__path__):
@@ -73,7 +74,7 @@ def read_table(path: Path, layout: Recording) -> pd.DataFrame:
     Parameters
     ----------
     path : Path
-        The suffix is its format; a folder is a ROS 2 bag.
+        The suffix is its format; a folder is a ROS 2 bag. Of a folder of logs see :func:`logs_in`.
     layout : Recording
         What is known of the file: topics of a bag; separator, header and columns of a text table,
         which are otherwise found from its lines. The columns of one without header are called 0, 1,
@@ -84,12 +85,12 @@ def read_table(path: Path, layout: Recording) -> pd.DataFrame:
     HistoryError
         If the file is missing, of an unknown kind, or damaged.
     """
-    suffix, readers = path.suffix.lower(), _readers()
-    reader = readers[FOLDER] if path.is_dir() else readers.get(suffix)
+    suffix, known = path.suffix.lower(), readers()
+    reader = known[FOLDER] if path.is_dir() else known.get(suffix)
     if reader is None:
         raise HistoryError(
             f"history {path}: the suffix is {path.suffix!r}, expected one of "
-            f"{', '.join(readers)}; save it as one of these"
+            f"{', '.join(known)}; save it as one of these"
         )
     try:
         if not path.is_dir():
@@ -99,42 +100,6 @@ def read_table(path: Path, layout: Recording) -> pd.DataFrame:
         raise HistoryError(f"history {path}: there is no such file; check the path") from None
     except OSError as error:
         raise HistoryError(f"history {path}: cannot be read: {reason(error)}") from None
-
-
-def logs_in(path: Path) -> list[Path]:
-    """Return a log itself, or of a folder of logs each: its bags and files that can be read.
-
-    Raises
-    ------
-    HistoryError
-        If there is no such file, or the folder has no log.
-    """
-    if not path.exists():
-        raise HistoryError(f"history {path}: there is no such file; check the path")
-    if not path.is_dir() or _is_bag(path):
-        return [path]
-    endings = [suffix for suffix in _readers() if suffix != FOLDER]
-    logs = [
-        each for each in sorted(path.iterdir()) if each.suffix.lower() in endings or _is_bag(each)
-    ]
-    if not logs:
-        raise HistoryError(
-            f"history {path}: the folder has no log; expected files that end in"
-            f" {', '.join(endings)}, or ROS 2 bags (folders with metadata.yaml)"
-        )
-    return logs
-
-
-def _is_bag(path: Path) -> bool:
-    return (path / "metadata.yaml").exists()
-
-
-def read_commands(path: Path, layout: Recording | None) -> pd.DataFrame | None:
-    """Return the table of a layout's ``commands``, beside a recording; None without any."""
-    if layout is None or not layout.commands:
-        return None
-    beside = path.parent / layout.commands.replace("{stem}", path.stem)
-    return read_table(beside, Recording(columns=layout.columns))
 
 
 @reads(".csv", ".txt", ".tsv", ".dat")
@@ -159,7 +124,27 @@ def read_text(path: Path, layout: Recording) -> pd.DataFrame:
     HistoryError
         If it is empty or no table.
     """
-    text = _decoded(path.read_bytes())
+    return _table_of(_decoded(path.read_bytes()), path, layout)
+
+
+@reads(".xlsx")
+def read_excel(path: Path, layout: Recording) -> pd.DataFrame:
+    """Return the rows of the first sheet of a workbook, read as a text table is."""
+    with path.open("rb") as file:
+        try:
+            sheet = pd.read_excel(file, header=None, dtype=object, engine="openpyxl")
+        except ImportError:
+            raise HistoryError(
+                f"history {path}: reading it needs openpyxl: pip install 'pbrl_ppl[excel]'"
+            ) from None
+        except Exception as error:  # damaged files raise errors of many kinds
+            raise HistoryError(f"history {path}: not a workbook: {reason(error)}") from None
+    text = sheet.to_csv(sep="\t", header=False, index=False, lineterminator="\n")
+    return _table_of(text, path, replace(layout, separator="tab"))
+
+
+def _table_of(text: str, path: Path, layout: Recording) -> pd.DataFrame:
+    """Return the rows of a text table; arguments and attributes as of :func:`read_text`."""
     lines = re.split(r"\r\n|\r|\n", text)
     filled = [line for line in lines if line.strip()]
     if not filled:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+import shlex
+from collections.abc import Mapping, Sequence
+from itertools import islice
 
 import numpy as np
 import pandas as pd
 
+from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history.clocks import TIMES, Say
 from pbrl_ppl.history.files import COLUMNS
-from pbrl_ppl.history.measures import unit_in_name
+from pbrl_ppl.history.measures import stated_unit, unit_in_name, unit_size
 from pbrl_ppl.scene import Actuator, Recording, Shape, column_of
-from pbrl_ppl.state import WRENCH, Floats
+from pbrl_ppl.state import STATE, WRENCH, Floats
 
 Actuators = tuple[Actuator, ...]
 
@@ -26,9 +29,17 @@ _GUESSES = {
     "x": ("position.x", "pos_x", "px", "x"),
     "y": ("position.y", "pos_y", "py", "y"),
     "theta": ("yaw", "theta", "angle"),
+    "vx": ("velocity.x", "vel_x", "vx"),
+    "vy": ("velocity.y", "vel_y", "vy"),
+    "omega": ("angular_velocity.z", "angular_velocity", "angular_rate", "angular.rate", "omega"),
     "force_x": ("force.x", "force_x", "fx"),
     "force_y": ("force.y", "force_y", "fy"),
     "torque": ("torque.z", "torque", "tau"),
+}
+#: Names of a column that is one of two of a history's, by its unit.
+_BY_UNIT = {
+    ("x", "theta"): ("position", "pos", "qpos"),
+    ("vx", "omega"): ("velocity", "vel", "speed", "qvel"),
 }
 
 
@@ -166,10 +177,9 @@ def with_guesses(
     for key, guesses in _GUESSES.items():
         if key in known or key in plain or (key == "time" and "duration" in known):
             continue
-        hits = ([n for n, text in plain.items() if f".{text}".endswith(f".{g}")] for g in guesses)
-        hit = next((names for names in hits if names), [])
-        if len(hit) == 1:
-            found[key] = hit[0]
+        if hit := _named(plain, guesses):
+            found[key] = hit
+    found |= _found_by_unit(frame, plain, {*found, *known, *plain})
     columns = {**found, **known}
     own = {key: _stamps_of(plain, column) for key, column in columns.items() if key != "time"}
     clocks = {key: name for key, name in own.items() if name and name not in columns.values()}
@@ -181,6 +191,71 @@ def with_guesses(
         stamps = f"; stamps {', '.join(clocks.values())}" if clocks else ""
         say(f"columns by their names: {words}{stamps}; correct [recording] where that is wrong")
     return layout.with_entries(columns=columns)
+
+
+def _named(plain: Mapping[str, str], guesses: Sequence[str]) -> str:
+    """Return the one column that has the first of these names, or a path that ends in it."""
+    hits = ([n for n, text in plain.items() if f".{text}".endswith(f".{g}")] for g in guesses)
+    hit = next((names for names in hits if names), [])
+    return hit[0] if len(hit) == 1 else ""
+
+
+def _found_by_unit(
+    frame: pd.DataFrame, plain: Mapping[str, str], known: set[str]
+) -> dict[str, str]:
+    """Return columns that are a position or an angle, or their rate, as their unit says.
+
+    Those without a unit are straight, unless an angle is known. Beside x and y a speed has no
+    direction. What a motion should be is not what it was.
+    """
+    found: dict[str, str] = {}
+    plain = {name: text for name, text in plain.items() if not re.search(_WANTED, text)}
+    for keys, guesses in _BY_UNIT.items():
+        name = _named(plain, guesses)
+        taken = {"x", "y", "theta"} if "x" in keys else {"y", "vx", "vy", "omega"}
+        if not name or taken & known:
+            continue
+        unit = stated_unit(frame, name)
+        turns = plain[name].startswith("q") or "theta" in {*known, *found}
+        order = keys[::-1] if turns else keys
+        fits = (key for key in order if not unit or unit_size(key, unit) is not None)
+        found |= {key: name for key in islice(fits, 1)}
+    return found
+
+
+def check_states(frame: pd.DataFrame, layout: Recording, source: str) -> None:
+    """Refuse a table of which no column is a pose or a speed, with a proposal.
+
+    Raises
+    ------
+    HistoryError
+        Lists the columns with their ranges and units.
+    """
+    if {*STATE} & {*frame.columns, *(key.rpartition(".")[2] for key, _ in layout.columns)}:
+        return
+    numbers = frame.apply(pd.to_numeric, errors="coerce")
+    listed = []
+    for name, column in numbers.items():
+        unit = stated_unit(frame, str(name))
+        spread = f"{column.min():.6g}..{column.max():.6g}" if column.notna().any() else "text"
+        listed.append(f"{name} {spread} {unit}".strip())
+    guess = {key: str(column) for key, column in layout.columns}
+    rising = [str(name) for name, column in numbers.items() if (column.diff() > 0).mean() > 0.9]
+    if rising and not {"time", "duration"} & {*guess, *frame.columns}:
+        guess["time"] = rising[0]
+    used = {*guess.values(), *rising[:1]}
+    moving = [
+        name
+        for name in unused_columns(frame, layout)
+        if name not in used and numbers[name].notna().any() and not _actuator_kind(name)
+    ] or ["COLUMN"]
+    guess |= zip(("x", "y"), moving, strict=False) if len(moving) > 1 else {"theta": moving[0]}
+    words = ",".join(f"{key}={column}" for key, column in guess.items())
+    raise HistoryError(
+        f"{source}: no column is known as a pose or a speed of a body ({', '.join(STATE)}); it has"
+        f" {', '.join(listed)}; say which is which, such as --columns {shlex.quote(words)}, and"
+        " --units where they are not SI"
+    )
 
 
 def unused_columns(frame: pd.DataFrame, layout: Recording) -> list[str]:
@@ -197,8 +272,10 @@ def unused_columns(frame: pd.DataFrame, layout: Recording) -> list[str]:
 _ACTUATORS = {
     "thruster": r"fan|thrust|prop|rotor|jet|rocket|engine",
     "servo": r"goal|target|setpoint|servo|desired",
-    "motor": r"motor|duty|pwm|volt|throttle|current",
+    "motor": r"motor|duty|pwm|volt|throttle|current|cmd(?!_?vel)|command",
 }
+#: Words in names of a pose or a speed that is wanted, not measured.
+_WANTED = r"goal|target|setpoint|desired|cmd|command"
 #: A command that exceeds this is no share of a full one.
 _COUNTS = 2.0
 
@@ -225,8 +302,7 @@ def guessed_actuators(
         return ()
     found = []
     for column in unused_columns(frame, layout):
-        text = column.lower()
-        kind = next((k for k, words in _ACTUATORS.items() if re.search(words, text)), None)
+        text, kind = column.lower(), _actuator_kind(column)
         if kind is None or not (hung or kind != "servo"):
             continue
         side = float("left" in text) - float("right" in text)
@@ -246,6 +322,11 @@ def guessed_actuators(
             )
         )  # fmt: skip
     return tuple(found) if len(found) <= len(WRENCH) else ()
+
+
+def _actuator_kind(column: str) -> str | None:
+    """Return the kind of actuator whose commands a column has, by its name."""
+    return next((k for k, words in _ACTUATORS.items() if re.search(words, column.lower())), None)
 
 
 def _plain(name: str) -> str:

@@ -15,8 +15,9 @@ import pandas as pd
 import xarray as xr
 
 from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.history.files import read_commands, read_table, to_table, write_dataset
+from pbrl_ppl.history.files import read_table, to_table, write_dataset
 from pbrl_ppl.history.kinematics import complete_start, kinematic_bodies, path_velocities
+from pbrl_ppl.history.logs import Paths, labels_in, logs_in, read_commands
 from pbrl_ppl.history.resampling import resampled
 from pbrl_ppl.history.rows import Rows, padded, rows_of_arrays, rows_of_table, with_lines
 from pbrl_ppl.scene import Recording, Scene
@@ -107,18 +108,20 @@ class History:
     @classmethod
     def load(
         cls,
-        path: str | Path,
+        path: Paths,
         scene: Scene,
         *,
         estimate_velocities: bool = False,
         **reading: Unpack[Reading],
     ) -> History:
-        """Read a history from a CSV, Parquet or NetCDF file, by suffix.
+        """Read a history from a file, by suffix, or from several.
 
         Parameters
         ----------
-        path : str or pathlib.Path
-            File with one row for each (trajectory, step, body), or one that `save` wrote.
+        path : str or pathlib.Path, or sequence of them
+            File with one row for each (trajectory, step, body), or one that `save` wrote. A folder
+            of files, or several, are trajectories of one history, in natural order of names, which
+            are their labels.
         scene : Scene
             The bodies, hinges and time step that are expected; its ``recording`` says how a file of
             another program is laid out.
@@ -134,16 +137,22 @@ class History:
         HistoryError
             If the file cannot be used; the message says where and what to do.
         """
-        path, columns = Path(path), reading.get("columns") or {}
-        return cls.from_dataframe(
-            read_table(path, (scene.recording or Recording()).with_entries(columns=columns)),
-            scene,
-            estimate_velocities=estimate_velocities,
-            layout=scene.recording,
-            commands=read_commands(path, scene.recording),
-            source=f"history {path}",
-            **reading,
-        )
+        given = scene.recording or Recording()
+        layout = given.with_entries(columns=reading.get("columns") or {})
+        logs = logs_in(path, layout)
+        parts = [
+            _rows(
+                read_table(log, layout),
+                scene,
+                scene.recording,
+                read_commands(log, scene.recording),
+                f"history {log}",
+                **reading,
+            )
+            for log in logs
+        ]
+        estimated = estimate_velocities or given.velocities == "estimate"
+        return cls._of_rows(parts, scene, logs=logs, estimate_velocities=estimated)
 
     @classmethod
     def from_dataframe(
@@ -164,15 +173,9 @@ class History:
         """
         if not isinstance(frame, pd.DataFrame):
             raise HistoryError(f"{source}: got {type(frame).__name__}, expected a pandas.DataFrame")
-        from pbrl_ppl.history.conversion import as_history
-
-        frame = with_lines(frame, source)
-        table = as_history(frame, scene, source, layout, commands=commands, **reading)
-        rows = rows_of_table(table, scene, source, cut=layout is not None and bool(layout.cut))
-        if reading.get("resample") or (layout is not None and layout.resample):
-            rows = resampled(rows, scene, source)
+        rows = _rows(frame, scene, layout, commands, source, **reading)
         estimated = layout is not None and layout.velocities == "estimate"
-        return cls._of_rows(rows, scene, estimate_velocities=estimate_velocities or estimated)
+        return cls._of_rows([rows], scene, estimate_velocities=estimate_velocities or estimated)
 
     @classmethod
     def of_arrays(
@@ -229,12 +232,21 @@ class History:
         rows = rows_of_arrays(states, scene, actions, times, labels)
         if resample:
             rows = resampled(rows, scene, "history")
-        return cls._of_rows(rows, scene, estimate_velocities=estimate_velocities)
+        return cls._of_rows([rows], scene, estimate_velocities=estimate_velocities)
 
     @classmethod
-    def _of_rows(cls, rows: Rows, scene: Scene, *, estimate_velocities: bool) -> History:
-        """Return the history of rows at the scene's time step, after checks of all of them."""
-        n_rows, clock, state, action = padded(rows, scene)
+    def _of_rows(
+        cls,
+        parts: Sequence[Rows],
+        scene: Scene,
+        *,
+        logs: Sequence[Path] = (Path(),),
+        estimate_velocities: bool,
+    ) -> History:
+        """Return the history of each log's rows at the scene's time step, after checks of all."""
+        counts, *checked = zip(*(padded(rows, scene) for rows in parts), strict=True)
+        n_rows = np.concatenate(counts)
+        clock, state, action = (_stacked(arrays, int(n_rows.max())) for arrays in checked)
         start, assumed = complete_start(state, scene)
         if estimate_velocities:  # of positions that were measured, or that hinges give
             assumed[:, 3:] &= assumed[:, :3]
@@ -255,7 +267,7 @@ class History:
                 "before": (("trajectory", "body", "wrench"), before, wrenches),
             },
             coords={
-                "trajectory": rows.labels,
+                "trajectory": labels_in(logs, [rows.labels for rows in parts]),
                 "time": np.arange(clock.shape[1]),
                 "body": [body.name for body in scene.moving],
                 "kinematic": ("body", kinematic_bodies(scene)),
@@ -461,6 +473,35 @@ class History:
             f"History({self.n_trajectories} trajectories, {self.n_transitions} transitions, "
             f"bodies {', '.join(self.bodies)}, sha256 {self.data_sha256[:12]})"
         )
+
+
+def _rows(
+    frame: pd.DataFrame,
+    scene: Scene,
+    layout: Recording | None,
+    commands: pd.DataFrame | None,
+    source: str,
+    **reading: Unpack[Reading],
+) -> Rows:
+    """Return a table's rows as its layout says, resampled where that is declared."""
+    from pbrl_ppl.history.conversion import as_history
+
+    frame = with_lines(frame, source)
+    table = as_history(frame, scene, source, layout, commands=commands, **reading)
+    rows = rows_of_table(table, scene, source, cut=layout is not None and bool(layout.cut))
+    if reading.get("resample") or (layout is not None and layout.resample):
+        rows = resampled(rows, scene, source)
+    return rows
+
+
+def _stacked(arrays: Sequence[Floats], length: int) -> Floats:
+    """Return arrays of trajectories one after the other, with NaN up to this number of steps."""
+    stacked = np.full((sum(map(len, arrays)), length, *arrays[0].shape[2:]), np.nan)
+    begin = 0
+    for array in arrays:
+        stacked[begin : begin + len(array), : array.shape[1]] = array
+        begin += len(array)
+    return stacked
 
 
 def unseen(history: History) -> Bools:

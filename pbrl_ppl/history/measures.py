@@ -68,6 +68,11 @@ def unit_in_name(name: str) -> tuple[str, str]:
     return (stem, last) if stem and last in plain else (name, "")
 
 
+def stated_unit(frame: pd.DataFrame, column: str) -> str:
+    """Return the unit of a file's column as its row of units or its name states it, or ""."""
+    return frame.attrs.get("units", {}).get(column) or unit_in_name(column)[1]
+
+
 def stated_units(frame: pd.DataFrame, columns: Mapping[str, object]) -> dict[str, str]:
     """Return the unit of each history's column that the file states and that is not SI.
 
@@ -91,7 +96,7 @@ def stated_units(frame: pd.DataFrame, columns: Mapping[str, object]) -> dict[str
             continue
         column = column_of(column)
         whole = next((c for c in frame.columns if column in (c, unit_in_name(str(c))[0])), column)
-        text = row.get(whole) or unit_in_name(str(whole))[1]
+        text = stated_unit(frame, str(whole))
         unit = _SAME.get(text, text)
         if unit in _UNITS[name]:
             units[key] = unit

@@ -13,6 +13,7 @@ from pbrl_ppl.history.bad_frames import trimmed, unmodelled_ends
 from pbrl_ppl.history.conversion import Reading
 from pbrl_ppl.history.history import History
 from pbrl_ppl.history.kinematics import hung_bodies
+from pbrl_ppl.history.logs import Paths, in_words
 from pbrl_ppl.history.measures import zero_angle
 from pbrl_ppl.history.units import rate_factor, unit_mismatches
 from pbrl_ppl.scene import Scene
@@ -36,7 +37,7 @@ def read_scene(
 
 
 def read_recording(
-    path: Path,
+    path: Paths,
     scene: Scene,
     *,
     trim: bool = False,
@@ -44,13 +45,14 @@ def read_recording(
     most_ends: int = 4,
     **reading: Unpack[Reading],
 ) -> History:
-    """Return the history of a file as `History.load` does, and warn of what looks wrong.
+    """Return the history of files as `History.load` does, and warn of what looks wrong.
 
     Warns where velocities and changes of positions differ by the factor of a unit, and of rows at
     trajectory ends that belong to no model. With ``trim``, here or in the scene's ``[recording]``,
     these are left out. A warning names ``most_ends`` of them.
     """
     history = History.load(path, scene, estimate_velocities=estimate_velocities, **reading)
+    path = in_words(path)
     for sentence in (*unit_mismatches(history), *angle_warnings(history, scene)):
         warn(f"history {path}: {sentence}", UserWarning)
     ends = unmodelled_ends(history, scene)

@@ -133,10 +133,10 @@ def test_commands_look_effects_up_in_the_file(files, monkeypatch, capsys) -> Non
 @pytest.mark.slow
 def test_a_law_of_an_effect_file_is_found_in_two_logs(files, capsys) -> None:
     """Each in a process of its own, which reads the file again."""
-    argv = ["close-loop", "scene.toml", "train.csv", "since.csv", "-o", "out", "--jobs", "2"]
-    options = ["--effect-file", "laws.py", "--method", "laplace", "--quiet"]
+    argv = ["close-loop", "scene.toml", "train.csv", "since.csv", "-o", "out", "--each"]
+    options = ["--jobs", "2", "--effect-file", "laws.py", "--method", "laplace", "--quiet"]
     assert main([*argv, *options]) == 0
-    assert "tether[puck]: train, since" in capsys.readouterr().out
+    assert "tether[puck]: since, train" in capsys.readouterr().out
     assert all(Path("out", name, "report.html").is_file() for name in ("train", "since"))
 
 

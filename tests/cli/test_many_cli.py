@@ -43,7 +43,7 @@ def seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     Path("logs/notes.md").write_text("no log")
     closed: list[int] = []
 
-    def close_loop(scene: Any, train: Any, **options: Any) -> Loop:
+    def close_loop(scene: Any, train: Any, *test: Any, **options: Any) -> Loop:
         closed.append(train.n_transitions)
         assert options["seed"] == 7 and options["method"] == "laplace"
         if train.n_transitions == 4:
@@ -58,7 +58,7 @@ def seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return closed
 
 
-OPTIONS = ("-o", "out", "--seed", "7", "--method", "laplace")
+OPTIONS = ("--each", "-o", "out", "--seed", "7", "--method", "laplace")
 
 
 def test_a_folder_of_logs(seen: list[int], capsys: pytest.CaptureFixture[str]) -> None:
@@ -70,7 +70,7 @@ def test_a_folder_of_logs(seen: list[int], capsys: pytest.CaptureFixture[str]) -
         "1 adequate, 2 effects-added, 2 failed",
         "page: out/index.html",
     ]
-    assert "3/5 blue: adequate" in captured.err and "warning" not in captured.err
+    assert "2/5 blue: adequate" in captured.err and "warning" not in captured.err
     assert "5/5 wild: ZeroDivisionError: by zero" in captured.err
     for name in ("Red 2", "blue", "red"):
         assert sorted(path.name for path in Path("out", name).iterdir()) == sorted(FILES)
@@ -82,6 +82,25 @@ def test_a_folder_of_logs(seen: list[int], capsys: pytest.CaptureFixture[str]) -
                   "rows were resampled", "pbrl-ppl close-loop scene.toml logs -o out"):  # fmt: skip
         assert words in page
     assert 'href="bad' not in page
+
+
+def test_logs_are_one_history_without_each(
+    seen: list[int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A folder, or several files: as training and as test recordings."""
+    Path("logs/bad.csv").unlink()
+    alone = [*OPTIONS[1:], "-q", "--overwrite"]
+    assert main(["close-loop", "scene.toml", "logs", *alone]) == 0
+    files = ["logs/red.csv", "logs/wild.csv"]
+    assert main(["close-loop", "scene.toml", *files, "--test", "logs/blue.csv", *alone]) == 0
+    assert main(["close-loop", "scene.toml", *files, "--test", "logs", *alone]) == 0
+    assert seen == [2 + 3 + 3 + 4, 3 + 4, 3 + 4]
+    assert not Path("out/index.html").exists()
+    capsys.readouterr()
+    assert main(["check", "scene.toml", *files, "--no-prior", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["trajectories"] == 2
+    assert main(["close-loop", "scene.toml", "logs", "--jobs", "2", *alone]) == 2
+    assert "add --each" in capsys.readouterr().err
 
 
 def test_several_logs_are_run_again(seen: list[int], capsys: pytest.CaptureFixture[str]) -> None:
@@ -106,8 +125,8 @@ def test_several_logs_are_run_again(seen: list[int], capsys: pytest.CaptureFixtu
     ("given", "message"),
     [
         ("logs/blue.csv nope.csv", "nope.csv: there is no such file"),
-        ("logs/blue.csv logs/red.csv logs/blue.csv", '2 have the name "blue"'),
-        ("logs --test logs/blue.csv", "--test is given with 5 logs"),
+        ("logs Blue.txt", '2 have the name "blue"'),
+        ("logs --test logs/blue.csv", "--test is given with --each"),
         ("empty", "the folder has no log; expected files that end in .csv"),
         ("logs --columns x", "is not NAME=VALUE, such as x=pos_x"),
         ("logs --units x=", "is not NAME=VALUE, such as x=mm"),
@@ -121,6 +140,7 @@ def test_bad_usage(
 ) -> None:
     """What is wrong for all logs is said before any of them."""
     Path("empty").mkdir()
+    Path("Blue.txt").write_text("time x\n1 2\n")
     assert main(["close-loop", "scene.toml", *given.split(), *OPTIONS]) == 2
     captured = capsys.readouterr()
     assert captured.out == "" and "Traceback" not in captured.err

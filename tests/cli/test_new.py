@@ -13,7 +13,8 @@ from pbrl_ppl import criticism
 from pbrl_ppl.cli import main
 from pbrl_ppl.criticism import Loop
 from pbrl_ppl.effects import attach
-from pbrl_ppl.scene import Scene
+from pbrl_ppl.physics import Physics
+from pbrl_ppl.scene import Body, Joint, Scene, Shape
 from tests.helpers.made_up import made_up
 from tests.helpers.places import MODELS, ROOT
 
@@ -93,6 +94,86 @@ def test_three_commands_from_a_raw_table_to_a_verdict(
 
 
 @pytest.mark.usefixtures("swing")
+@pytest.mark.parametrize(
+    ("head", "found"),
+    [
+        ("t,position,velocity", {"x": "position", "vx": "velocity"}),
+        ("t,position [deg],velocity [deg/s]",
+         {"theta": "position [deg]", "omega": "velocity [deg/s]"}),
+        ("t,angle,speed", {"theta": "angle", "omega": "speed"}),
+        ("t,x,y,speed", {}),  # which has no direction
+        ("t,position,target position,motor speed [rad/s]",
+         {"x": "position", "omega": "motor speed [rad/s]"}),
+        ("t,qpos,qvel", {"theta": "qpos", "omega": "qvel"}),
+        ("t,speed [rad/s],torque", {"omega": "speed [rad/s]"}),
+    ],
+)  # fmt: skip
+def test_columns_by_name_and_unit(head: str, found: dict[str, str]) -> None:
+    width = len(head.split(","))
+    rows = "".join(f"{0.1 * i:g}{f',{i * i + 1}' * (width - 1)}\n" for i in range(20))
+    Path("log.csv").write_text(f"{head}\n{rows}")
+    assert run("new --history log.csv --body wheel=circle:0.1 -q --overwrite") == 0
+    scene = Scene.load("scene.toml")
+    assert scene.recording is not None
+    columns = dict(scene.recording.columns)
+    assert {key: columns[key] for key in columns if key not in ("time", "torque")} == found
+    assert run("check scene.toml log.csv --no-prior -q") == 0
+    # an angle alone: a wheel on a hinge at its centre
+    turns = {*found} <= {"theta", "omega"} and bool(found)
+    assert [joint.anchor_a for joint in scene.joints] == [(0.0, 0.0)] * turns
+
+
+@pytest.mark.usefixtures("swing")
+@pytest.mark.parametrize("command", ["cmd/left", "throttle", "duty", "current [A]"])
+def test_commands_by_their_names(command: str) -> None:
+    rows = "".join(f"{0.1 * i:g},{i},{i % 5}\n" for i in range(20))
+    Path("log.csv").write_text(f"t,x,{command}\n{rows}")
+    assert run("new --history log.csv --body car=circle:0.1 -q --overwrite") == 0
+    (actuator,) = Scene.load("scene.toml").actuators
+    assert (actuator.column or actuator.name) == command
+
+
+@pytest.mark.usefixtures("swing")
+@pytest.mark.parametrize(
+    ("head", "guess"),
+    [
+        ("time,ch1 [V],pwm,note\n", "it has time 0..1.9, ch1 [V] -9..10 V, pwm 0..4, note text;"),
+        ("millis,ch1,pwm,note\n", "such as --columns time=millis,theta=ch1,"),
+        ("t,ch1,ch2,note\n", "such as --columns time=t,x=ch1,y=ch2,"),
+        ("", "such as --columns time=0,x=1,y=2,"),
+    ],
+)
+def test_a_log_without_a_pose_or_a_speed_is_refused(
+    head: str, guess: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The message lists the columns with their ranges, and proposes which is which."""
+    note = ",up" if "note" in head else ""
+    rows = "".join(f"{0.1 * i:g},{10 - i},{i % 5}{note}\n" for i in range(20))
+    Path("log.csv").write_text(head + rows)
+    said = refused(capsys, "--history log.csv")
+    assert "no column is known as a pose or a speed of a body" in said and guess in said
+
+
+@pytest.mark.usefixtures("swing")
+def test_a_folder_of_logs(capsys: pytest.CaptureFixture[str]) -> None:
+    """With title lines and tabs: one history, which is not cut."""
+    Path("flights").mkdir()
+    for number in range(1, 6):
+        rows = "".join(f"{0.1 * i:.4f}\t{i}\t{i * i}\n" for i in range(90))
+        Path(f"flights/{number}.txt").write_text(f"\tball\t\nt\tx\ty\n{rows}")
+    assert run("new --history flights --body ball=circle:0.1") == 0
+    said = capsys.readouterr().out
+    assert said.count("columns by their names: time = t") == 1 and "cut" not in said
+    assert said.splitlines()[-1] == "next: pbrl-ppl check scene.toml flights"
+    assert run("check scene.toml flights --no-prior -q --json") == 0
+    assert '"trajectories": 5' in capsys.readouterr().out
+    files = "--history flights/1.txt --history flights/2.txt"
+    assert run(f"new two.toml {files} --body ball=circle:0.1") == 0
+    said = capsys.readouterr().out
+    assert "next: pbrl-ppl check two.toml flights/1.txt flights/2.txt" in said
+
+
+@pytest.mark.usefixtures("swing")
 def test_a_double_pendulum_side_by_side_in_a_row(capsys: pytest.CaptureFixture[str]) -> None:
     rows = ["t,q1,q2,tau", "0,0.1,0.2,0", "0.0101,0.1,0.2,0", "0.03,0.1,0.2,0", "0.04,0.1,0.2,0"]
     Path("arm.csv").write_text("\n".join(rows))
@@ -148,6 +229,25 @@ def test_what_a_new_scene_has_as_comments_is_valid() -> None:
     scene = Scene.from_toml(text.replace("known = { mass = 6.0 }", "known = { r = 0.5 }"))
     assert scene.walls and scene.noise and attach(scene)[0].effect.name == "linear_drag"
     assert scene.joints[0].bodies == ("arm", "world") and scene.joints[0].anchor_a == (0.0, 0.1)
+    assert run("new rail.toml --body cart=box:0.3x0.1 --time-step 0.02 -q") == 0
+    text = Path("rail.toml").read_text()
+    rail = Scene.from_toml(uncommented(text, "[[joint]]                # a cart"))
+    assert rail.joints[0].kind == "slider" and rail.joints[0].axis == (1.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("radius", "mass"), [(0.1, 2 * 0.0021 / 0.1**2), (np.sqrt(2 * 0.0021 / 0.42), 0.42)]
+)
+def test_known_moments_of_inertia(radius: float, mass: float) -> None:
+    """A wheel of 0.0021 kg m^2 on a hinge at its centre, as the scene's comments declare it."""
+    known = {"mass": mass, "r": 0.0, "mu_c": 0.0}
+    wheel = Body("wheel", Shape.circle(radius), known=known)
+    hinge = Joint("hinge", ("wheel", "world"), (0.0, 0.0), (0.0, 0.0))
+    scene = Scene(time_step=0.1, gravity=(0.0, -9.81), bodies=(wheel,), joints=(hinge,))
+    wrench = np.zeros((1, 1, 1, 3))
+    wrench[..., 2] = 0.03
+    omega = Physics(scene).predict(np.zeros(0), np.zeros((1, 1, 6)), wrench)[0, 0, 0, 5]
+    np.testing.assert_allclose(omega, 0.03 * 0.1 / 0.0021, rtol=1e-9)
 
 
 @pytest.mark.usefixtures("swing")
@@ -188,6 +288,9 @@ def test_the_page_on_own_logs_writes_scenes_that_load(
     Path("arm.csv").write_text(f"{angles}\n0,0,0,0,0,0,0,0\n0,0.01,0,0,0,0,0,0\n")
     rows = [f"0,{time},{body},0" for time in (0, 0.1) for body in ("block", "finger")]
     Path("push.csv").write_text("\n".join(["trajectory,time,object,x", *rows]))
+    Path("flights").mkdir()
+    for name in ("a", "b"):
+        Path(f"flights/{name}.txt").write_text("t\tx\ty\n0\t0\t0\n0.1\t1\t0\n")
     page = (ROOT / "analysis" / "docs" / "pages" / "guides" / "own_log.md").read_text()
     lines = page.replace("\\\n", " ").splitlines()
     commands = [line for line in lines if line.startswith("pbrl-ppl new")]
@@ -196,4 +299,4 @@ def test_the_page_on_own_logs_writes_scenes_that_load(
         assert run(f"{command.removeprefix('pbrl-ppl ')} --overwrite -q") == 0
         scene = Scene.load("scene.toml")
         kinds.append((len(scene.dynamic), len(scene.moving), len(scene.joints), len(scene.walls)))
-    assert kinds == [(1, 1, 1, 0), (1, 1, 1, 0), (2, 2, 2, 0), (2, 2, 0, 0)]
+    assert kinds == [(1, 1, 1, 0), (1, 1, 0, 0), (1, 1, 1, 0), (2, 2, 2, 0), (2, 2, 0, 0)]
