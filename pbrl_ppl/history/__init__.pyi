@@ -8,6 +8,8 @@ from .clocks import command_step as command_step
 from .conversion import as_history as as_history
 from .conversion import is_history as is_history
 from .cuts import propose as propose
+from .falls import WrongClock as WrongClock
+from .falls import wrong_clock as wrong_clock
 from .files import logs_in as logs_in
 from .files import read_commands as read_commands
 from .files import read_table as read_table

@@ -193,14 +193,15 @@ def unit_mismatches(history: History) -> tuple[str, ...]:
     tuple of str
         Empty where all agree.
     """
-    observed = history.dataset["observed"].to_numpy()
-    sentences = []
-    for i, body in enumerate(history.bodies):
-        for d in range(3):
-            factor = rate_factor(observed[:, :, i], d, float(history.dataset.attrs["time_step"]))
-            if factor is not None and (words := _unit_sentence(body, d, factor)):
-                sentences.append(words)
-    return tuple(sentences)
+    every = (unit_sentence(history, i, d) for i in range(len(history.bodies)) for d in range(3))
+    return tuple(sentence for sentence in every if sentence)
+
+
+def unit_sentence(history: History, body: int, d: int) -> str:
+    """Return a sentence where a velocity differs from its position's changes by a unit's factor."""
+    observed = history.dataset["observed"].to_numpy()[:, :, body]
+    factor = rate_factor(observed, d, float(history.dataset.attrs["time_step"]))
+    return "" if factor is None else _unit_sentence(history.bodies[body], d, factor)
 
 
 def rate_factor(
