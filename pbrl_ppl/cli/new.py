@@ -120,7 +120,11 @@ class Recorded:
 
 
 def recorded(
-    path: Path, layout: Recording, given: Sequence[str], time_step: float | None
+    path: Path,
+    layout: Recording,
+    given: Sequence[str],
+    time_step: float | None,
+    side: bool = False,
 ) -> Recorded:
     """Read bodies, time step and layout from a recording.
 
@@ -134,6 +138,8 @@ def recorded(
         Names of bodies from options, for a recording that names none.
     time_step : float, optional
         Time between rows (s), for a recording without times.
+    side : bool
+        Whether it was seen from the side: what falls tells whether the clock is right.
 
     Raises
     ------
@@ -144,7 +150,7 @@ def recorded(
 
     from pbrl_ppl import history as histories
 
-    source, said = f"history {path}", list[str]()
+    asked, source, said = layout, f"history {path}", list[str]()
     frame = histories.read_table(path, layout)
     plain = histories.is_history(frame) and layout == Recording()
     commands = histories.read_commands(path, layout)
@@ -192,12 +198,43 @@ def recorded(
     sent = [one.column or one.name for one in acting(Shape.circle(1.0))]
     if sent:
         shown.append(f"commands by their names: {', '.join(sent)}; correct [[actuator]]")
+    falls = side and hinges == Hinges() and not sent
+    tried = stand_in.replace(time_step=step, gravity=(0.0, -9.81 * falls))
+    tried = tried.replace(recording=None if plain else proposed)
+    found, units, computed = _cures(frame, tried, commands, source)
+    cured = replace(asked, velocities="computed") if computed else asked
+    if not plain and (time_step is None or "time" not in units):  # else the step is the user's
+        cured = cured.with_entries(units=units)
+    if cured != asked:
+        again = recorded(path, cured, given, time_step, side)
+        return replace(again, said=[*found, *again.said])
+    shown += found
     left = () if plain else histories.unused_columns(frame, proposed)
     unused = [name for name in left if name not in sent]
     if unused:
         shown.append(f"columns that are not used: {', '.join(unused)}")
     layout_found = None if plain and not shown else proposed
     return Recorded(tuple(names), step, layout_found, [*said, *shown], hinges, acting)
+
+
+def _cures(
+    frame: pd.DataFrame, scene: Scene, commands: pd.DataFrame | None, source: str
+) -> tuple[list[str], dict[str, str], bool]:
+    """Return what is wrong with the motion of a recording, with units and whether to leave out
+    velocities; nothing of a recording that cannot be read yet."""
+    from pbrl_ppl import history as histories
+
+    layout = scene.recording
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            history = histories.History.from_dataframe(
+                frame, scene, layout=layout, commands=commands, source=source
+            )
+        except HistoryError:  # later commands say it
+            return [], {}, False
+    present = histories.present_units(frame, layout or Recording())
+    return histories.layout_cures(history, scene, present)
 
 
 def _read_with_cures(
@@ -343,7 +380,7 @@ def new(
     else:
         shapes = outlines(bodies or [])
         if history is not None:
-            recording = recorded(history, layout, [*shapes], time_step)
+            recording = recorded(history, layout, [*shapes], time_step, bool(side))
         shapes, time_step = _complete(shapes, time_step, history, recording)
         text = scene_text(shapes, bool(side), time_step, recording)
         Scene.from_toml(text)  # written whole and valid, or not at all

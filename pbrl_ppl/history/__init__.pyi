@@ -7,6 +7,7 @@ from .bad_frames import without_measurements as without_measurements
 from .clocks import command_step as command_step
 from .conversion import as_history as as_history
 from .conversion import is_history as is_history
+from .conversion import present_units as present_units
 from .cuts import propose as propose
 from .falls import WrongClock as WrongClock
 from .falls import wrong_clock as wrong_clock
@@ -32,6 +33,7 @@ from .kinematics import lever as lever
 from .parts import MOST_TRANSITIONS as MOST_TRANSITIONS
 from .parts import drawn_pieces as drawn_pieces
 from .parts import thinned as thinned
+from .reading import layout_cures as layout_cures
 from .reading import read_recording as read_recording
 from .reading import read_scene as read_scene
 from .units import mass_contradictions as mass_contradictions

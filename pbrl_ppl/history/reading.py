@@ -11,12 +11,14 @@ import numpy as np
 from pbrl_ppl.errors import warn
 from pbrl_ppl.history.bad_frames import trimmed, unmodelled_ends
 from pbrl_ppl.history.conversion import Reading
+from pbrl_ppl.history.falls import wrong_clock
 from pbrl_ppl.history.history import History
 from pbrl_ppl.history.kinematics import hung_bodies
-from pbrl_ppl.history.measures import zero_angle
-from pbrl_ppl.history.units import rate_factor, unit_mismatches
+from pbrl_ppl.history.measures import unit_size, zero_angle
+from pbrl_ppl.history.units import rate_factor, unit_mismatch, unit_mismatches
+from pbrl_ppl.history.velocities import unused_velocities
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import THETA, Floats, wrapped
+from pbrl_ppl.state import THETA, VELOCITY, Floats, wrapped
 
 
 def read_scene(
@@ -62,6 +64,48 @@ def read_recording(
     cure = "left out" if trim else "no command or contact explains it: --trim leaves the rows out"
     warn(f"history {path}: {named}{more}: {cure}", UserWarning)
     return trimmed(history, ends) if trim else history
+
+
+def layout_cures(
+    history: History, scene: Scene, present: Mapping[str, str]
+) -> tuple[list[str], dict[str, str], bool]:
+    """Return what is wrong with a recording's units and velocities, and the entries that cure it.
+
+    Parameters
+    ----------
+    history, scene : History, Scene
+        What was measured; the scene's gravity and free bodies tell a wrong clock.
+    present : mapping of str to str
+        Units in which columns were read, if not SI units.
+
+    Returns
+    -------
+    said : list of str
+        A sentence on each finding.
+    units : dict of str to str
+        Those that cure it.
+    computed : bool
+        Whether velocities are best left out.
+    """
+    said, units, computed = [], dict[str, str](), False
+    if clock := wrong_clock(history, scene):
+        return [clock.sentence(scene)], {"time": clock.unit(present.get("time", "s"))}, False
+    alone = len(history.bodies) == 1
+    for i, body in enumerate(history.bodies):
+        for d in range(VELOCITY):
+            sentence, cures = unit_mismatch(history, i, d)
+            keys = {column: column if alone else f"{body}.{column}" for column in cures}
+            if sentence:
+                said.append(sentence)
+                units |= {keys[name]: cures[name] for name in cures if keys[name] not in present}
+    for velocity in unused_velocities(history):
+        if velocity.fault:
+            said.append(velocity.sentence)
+            key = velocity.state if alone else f"{velocity.body}.{velocity.state}"
+            size = unit_size(velocity.state, present[key]) if key in present else 1.0
+            computed |= not velocity.fault.factor
+            units |= {key: velocity.unit(size or 1.0)} if velocity.fault.factor else {}
+    return said, units, computed
 
 
 def angle_warnings(history: History, scene: Scene) -> list[str]:

@@ -415,7 +415,8 @@ def _check_complete(rows: Rows, scene: Scene, position: Ints, n_rows: Ints) -> N
     kinematic = kinematic_bodies(scene)[rows.body]
     pushed = (position < n_rows[rows.trajectory] - 1) & ~kinematic
     for values, required, columns, cure in (
-        (rows.action, pushed, WRENCH, "on every row but the last; write 0 where nothing pushed"),
+        (rows.action, pushed, WRENCH, "on every row but the last; write 0 where"
+         " nothing pushed, or declare [recording], by which an empty cell holds the command before"),
         (
             rows.state[:, :3],
             kinematic,

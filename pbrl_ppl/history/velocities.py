@@ -11,7 +11,7 @@ from scipy.stats import t as t_distribution
 from pbrl_ppl.history.contradictions import Contradiction, contradiction
 from pbrl_ppl.history.history import History
 from pbrl_ppl.history.kinematics import column_noise, finest_step, unwrapped
-from pbrl_ppl.history.units import unit_sentence
+from pbrl_ppl.history.units import unit_mismatch
 from pbrl_ppl.state import STATE, THETA, VELOCITY, Floats
 
 #: Positions and velocities of rows without gaps, m and m/s or rad and rad/s.
@@ -62,8 +62,7 @@ class UnusedVelocity:
         if self.fault:
             cure = 'velocities = "computed"'
             if self.fault.factor:
-                unit = "rad" if self.state == "omega" else "m"
-                cure = f'units = {{ {self.state} = "{1 / self.fault.factor:.4g}/{unit}" }}'
+                cure = f'units = {{ {self.state} = "{self.unit()}" }}'
             return (
                 f"{name} contradicts the changes of {self.position} in {self.fault.share:.0%} of"
                 f" the rows, first in row {self.fault.row} of trajectory {self.fault.trajectory}:"
@@ -78,6 +77,12 @@ class UnusedVelocity:
             return f"{name} {verb} {self.position} by {late} and is not used"
         lag = f", {late} {'late' if self.lag > 0 else 'early'}," if self.lag else ""
         return f"{name} was computed from {self.position}{lag} and is not used"
+
+
+    def unit(self, present: float = 1.0) -> str:
+        """Return the unit that cures another factor, from the size of the present one in SI."""
+        factor = self.fault.factor if self.fault else 1.0
+        return f"{1 / (present * factor or 1.0):.4g}/{'rad' if self.state == 'omega' else 'm'}"
 
 
 def unused_velocities(history: History) -> tuple[UnusedVelocity, ...]:
@@ -126,7 +131,7 @@ def unused_velocities(history: History) -> tuple[UnusedVelocity, ...]:
                 unused.append(UnusedVelocity(*names, True, late if abs(late) > 0.05 * dt else 0.0))
             elif lag := velocity_lag(runs, dt):
                 unused.append(UnusedVelocity(*names, False, lag))
-            elif fault and not unit_sentence(history, int(body), d):
+            elif fault and not unit_mismatch(history, int(body), d)[0]:
                 unused.append(UnusedVelocity(*names, False, 0.0, fault=fault))
     return tuple(unused)
 
