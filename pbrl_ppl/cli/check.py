@@ -63,7 +63,10 @@ def check(
     masses = histories.mass_contradictions(declared, used)
     fall = histories.wrong_clock(used, declared)
     clock = [fall.sentence(declared)] if fall else []
-    for sentence in (*drawn, *(velocity.sentence for velocity in unused), *masses, *clock):
+    moved = histories.command_shifts(used, declared)
+    shifts = [histories.shift_sentence(declared, body, rows) for body, rows in moved.items()]
+    velocities = (velocity.sentence for velocity in unused)
+    for sentence in (*drawn, *velocities, *masses, *clock, *shifts):
         console.print(sentence, soft_wrap=True)
     if loaded.n_trajectories < 2:
         console.print(
@@ -100,6 +103,7 @@ def check(
         "unit_mismatches": histories.unit_mismatches(used),
         "mass_contradictions": masses,
         "clock": clock,
+        "command_shifts": moved,
         "typical": {body.name: dict(body.typical) for body in sized.dynamic},
         "default_priors": priors,
         "prior": checked and {"passed": not checked.sentences, "sentences": checked.summary},

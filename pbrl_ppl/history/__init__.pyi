@@ -5,6 +5,8 @@ from .bad_frames import unmodelled_ends as unmodelled_ends
 from .bad_frames import without_bad_frames as without_bad_frames
 from .bad_frames import without_measurements as without_measurements
 from .clocks import command_step as command_step
+from .command_shift import command_shifts as command_shifts
+from .command_shift import shift_sentence as shift_sentence
 from .conversion import as_history as as_history
 from .conversion import is_history as is_history
 from .conversion import present_units as present_units

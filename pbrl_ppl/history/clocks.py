@@ -380,7 +380,9 @@ def _command_rows(frame: pd.DataFrame, columns: Mapping[str, object]) -> Bools:
     states = [name for key, name in named.items() if key.rpartition(".")[2] in STATE]
     states = [name for name in dict.fromkeys(states) if name in frame]
     posed = frame[states].notna().any(axis=1).to_numpy(dtype=bool)
-    others = frame[[name for name in frame if name not in states]].notna().to_numpy(dtype=bool)
+    sent = [name for key, name in named.items() if key.rpartition(".")[2] in WRENCH]
+    sent = [name for name in sent if name in frame] or [n for n in frame if n not in states]
+    others = frame[sent].notna().to_numpy(dtype=bool)
     if posed.all() or not posed.any():
         return np.zeros(len(frame), dtype=bool)
     rare = others[posed].mean(axis=0) < 0.1

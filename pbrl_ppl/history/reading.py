@@ -21,6 +21,10 @@ from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import THETA, VELOCITY, Floats, wrapped
 
 
+#: Whole numbers that range over more are no angles in rad or degrees, but counts.
+_COUNTS = 1440.0
+
+
 def read_scene(
     path: Path,
     *,
@@ -154,21 +158,51 @@ def angle_warnings(history: History, scene: Scene) -> list[str]:
 
 
 def _degrees(angles: list[Floats], *, hinged: bool) -> str:
-    """Return why angles in rad look like degrees; empty if they do not."""
+    """Return why angles in rad look like degrees or counts; empty if they do not."""
     steps = np.concatenate([np.abs(np.diff(run)) for run in angles])
+    every = np.concatenate(angles)
+    if (every == np.round(every)).all() and np.ptp(every) > _COUNTS:
+        return (
+            f"goes from {every.min():.6g} to {every.max():.6g} rad in whole numbers: looks like"
+            ' counts: say how many there are to a turn: units = { theta = "8192/turn" }'
+        )
     wraps = (steps > 340.0) & (steps < 360.5)
     if wraps.any() and np.median(steps) < 36.0:
         return 'jumps by 360 between rows: looks like deg: units = { theta = "deg" }'
-    every = np.concatenate(angles)
     middle = float(np.median(every))
     size = float(np.quantile(np.abs(every - middle), 0.9))
     turned = np.ptp(every) > 2.0 * np.pi  # not an angle in rad that wraps at 0 or half a turn
     crossings = sum(int((np.diff(np.sign(run - middle)) != 0).sum()) for run in angles)
-    if hinged and turned and size > np.pi and crossings >= 4:
+    if hinged and turned and np.pi < size <= 180.0 and crossings >= 4 and _hangs(angles):
         return (
             f'swings to both sides by {size:.2g} rad: looks like deg: units = {{ theta = "deg" }}'
         )
     return ""
+
+
+def _hangs(angles: list[Floats], better: float = 2.0) -> bool:
+    """Return whether angles accelerate as a pendulum's do in degrees, not as in radians.
+
+    Differences are over as many rows as either explains best: of few they are noise.
+
+    ``better``: by this factor of the squared residual.
+    """
+    left = [(np.inf, np.inf)]
+    for lag in (1, 2, 4, 8, 16):
+        long = [run for run in angles if len(run) > 2 * lag + 4]
+        parts = [(run[: -2 * lag], run[lag:-lag], run[2 * lag :]) for run in long]
+        if not parts:
+            break
+        before, place, after = (np.concatenate(part) for part in zip(*parts, strict=True))
+        y, ahead = before - 2.0 * place + after, after - before
+        rest = []
+        for turn in (place, np.radians(place)):
+            design = np.column_stack([np.sin(turn), np.cos(turn), ahead, np.ones(len(y))])
+            off = y - design @ np.linalg.lstsq(design, y, rcond=1e-9)[0]
+            rest.append(float(off @ off) / max(float(y @ y), 1e-300))
+        left.append((rest[0], rest[1]))
+    radians, degrees = min(left, key=min)
+    return radians > better * degrees
 
 
 def _rest(angles: list[Floats], steady: float = 0.05) -> float:
