@@ -68,7 +68,7 @@ def contradiction(
     >>> t = np.arange(0.0, 9.0, 0.02)
     >>> said = contradiction(np.sin(t)[None], np.clip(np.cos(t), -0.8, 0.8)[None], 0.02)
     >>> said.kind, round(said.share, 2), said.row
-    ('is clipped at 0.8', 0.35, 1)
+    ('is clipped at 0.8', 0.32, 1)
     """
     if position.shape[1] < 3:
         return None
@@ -106,7 +106,9 @@ def _wrong(
 ) -> tuple[Floats, Bools, float]:
     """Return mean quotients beside the inner rows, the rows that do not agree, and the tolerance.
 
-    The noise is what differences show in whichever order shows least: none is that of a motion.
+    The noise is what differences show in whichever order shows least, as none is that of a motion,
+    or the quarter of the rows that agree best, if that is less: of single rows that are wrong
+    differences have their share.
     """
     before, after, inner = quotient[:, :-1], quotient[:, 1:], rate[:, 1:-1]
     middle = np.where(np.isfinite(inner), (before + after) / 2, np.nan)
@@ -118,9 +120,11 @@ def _wrong(
         min(column_noise(column, order, robust=True) for order in (3, 5, 8))
         for column in (dt * np.cumsum(quotient, axis=1), rate)
     )
-    step, fast = finest_step(position) / dt, float(np.quantile(np.abs(middle[seen]), 0.9))
-    noise = np.hypot(rates, places / dt)
-    tolerance = 6.0 * float(noise) + (step if np.isfinite(step) else 0.0) + 0.05 * fast
+    step = finest_step(position) / dt
+    agree = float(np.quantile(np.abs(inner - middle)[seen], 0.25)) / 0.3186  # of a Gaussian
+    noise = min(float(np.hypot(rates, places / dt)), agree)
+    fast = float(np.quantile(np.abs(middle[seen]), 0.9))
+    tolerance = 6.0 * noise + (step if np.isfinite(step) else 0.0) + 0.05 * fast
     return middle, np.asarray(np.where(seen, outside, 0.0) > tolerance), tolerance
 
 

@@ -91,7 +91,7 @@ def layout_cures(
     computed : bool
         Whether velocities are best left out.
     """
-    said, units, computed = [], dict[str, str](), False
+    said, units, computed = angle_warnings(history, scene), dict[str, str](), False
     if clock := wrong_clock(history, scene):
         return [clock.sentence(scene)], {"time": clock.unit(present.get("time", "s"))}, False
     alone = len(history.bodies) == 1
