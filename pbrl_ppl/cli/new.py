@@ -220,8 +220,10 @@ def recorded(
 def _cures(
     frame: pd.DataFrame, scene: Scene, commands: pd.DataFrame | None, source: str
 ) -> tuple[list[str], dict[str, str], bool]:
-    """Return what is wrong with the motion of a recording, with units and whether to leave out
-    velocities; nothing of a recording that cannot be read yet."""
+    """Return what is wrong with units and velocities of a recording, and the entries that cure it.
+
+    Nothing is said of a recording that cannot be read yet.
+    """
     from pbrl_ppl import history as histories
 
     layout = scene.recording

@@ -381,7 +381,9 @@ def _command_rows(frame: pd.DataFrame, columns: Mapping[str, object]) -> Bools:
     states = [name for name in dict.fromkeys(states) if name in frame]
     posed = frame[states].notna().any(axis=1).to_numpy(dtype=bool)
     sent = [name for key, name in named.items() if key.rpartition(".")[2] in WRENCH]
-    sent = [name for name in sent if name in frame] or [n for n in frame if n not in states]
+    sent = [name for name in sent if name in frame] or [
+        str(name) for name in frame if name not in states
+    ]
     others = frame[sent].notna().to_numpy(dtype=bool)
     if posed.all() or not posed.any():
         return np.zeros(len(frame), dtype=bool)
@@ -419,14 +421,15 @@ def _of_two_streams(
 
 def with_later_commands(frame: pd.DataFrame, offset: float) -> pd.DataFrame:
     """Return a history's table whose commands are so many seconds later than their rows."""
-    frame = frame.copy()
     time = pd.to_numeric(frame["time"], errors="coerce").to_numpy(float)
+    moved: dict[str, Floats] = {}
     for rows in frame.groupby(["trajectory", "body"], sort=False).indices.values():
         for name in WRENCH:
             values = pd.to_numeric(frame[name].iloc[rows], errors="coerce").to_numpy(float)
-            at = frame.columns.get_loc(name)
-            frame.iloc[rows, at] = _at_times(time[rows], time[rows] + offset, values, hold=True)
-    return frame
+            moved.setdefault(name, np.full(len(frame), np.nan))[rows] = _at_times(
+                time[rows], time[rows] + offset, values, hold=True
+            )
+    return frame.assign(**moved)
 
 
 def in_order(frame: pd.DataFrame, say: Say, *, far: float = 5.0) -> pd.DataFrame:

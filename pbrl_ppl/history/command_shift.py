@@ -91,7 +91,11 @@ def _scores(
         return None
     rows = np.arange(_MOST + 1, n - _MOST - 2)
     y = (place[:, rows + 1] - 2 * place[:, rows] + place[:, rows - 1]).ravel()
-    rest = [np.ones_like(y), place[:, rows].ravel(), (place[:, rows + 1] - place[:, rows - 1]).ravel()]
+    rest = [
+        np.ones_like(y),
+        place[:, rows].ravel(),
+        (place[:, rows + 1] - place[:, rows - 1]).ravel(),
+    ]
     if turns:
         rest += [np.sin(place[:, rows]).ravel(), np.cos(place[:, rows]).ravel()]
     moved = {

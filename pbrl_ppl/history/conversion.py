@@ -100,7 +100,7 @@ def as_history(
     layout = (layout or Recording()).with_entries(columns=columns, units=units)
     said: list[str] = list(frame.attrs.get("said", ()))
     say = said.append
-    clocks = {key: value for key, value in layout.time if commands is None or key != "offset"}
+    clocks = tuple(entry for entry in layout.time if commands is None or entry[0] != "offset")
     if is_history(frame):
         return _repaired(frame, scene, replace(layout, time=clocks), source, said)
     known = _numbered(frame, dict(layout.columns), source)

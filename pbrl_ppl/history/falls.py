@@ -100,7 +100,9 @@ def wrong_clock(
 
 
 def _fall(places: Floats, down: Floats, dt: float, *, clear: float = 0.05) -> tuple[float, float]:
-    """Return the acceleration along ``down`` of places (trajectory, time, 2) and its standard error.
+    """Return the acceleration along ``down`` (m/s^2) and its standard error.
+
+    ``places`` has the shape (trajectory, time, 2).
 
     Differences are over as many rows as it takes for noise to be the share ``clear`` of them.
     """

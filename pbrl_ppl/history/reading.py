@@ -20,7 +20,6 @@ from pbrl_ppl.history.velocities import unused_velocities
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import THETA, VELOCITY, Floats, wrapped
 
-
 #: Whole numbers that range over more are no angles in rad or degrees, but counts.
 _COUNTS = 1440.0
 

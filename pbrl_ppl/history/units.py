@@ -258,9 +258,7 @@ def rate_factor(
     return best
 
 
-def _unit_words(
-    body: str, d: int, factor: float, near: float = 0.1
-) -> tuple[str, dict[str, str]]:
+def _unit_words(body: str, d: int, factor: float, near: float = 0.1) -> tuple[str, dict[str, str]]:
     """Return a sentence about a factor between a position and its rate that is near a unit's.
 
     A position in other units changes faster than its velocity says by that factor; where the

@@ -78,7 +78,6 @@ class UnusedVelocity:
         lag = f", {late} {'late' if self.lag > 0 else 'early'}," if self.lag else ""
         return f"{name} was computed from {self.position}{lag} and is not used"
 
-
     def unit(self, present: float = 1.0) -> str:
         """Return the unit that cures another factor, from the size of the present one in SI."""
         factor = self.fault.factor if self.fault else 1.0

@@ -148,7 +148,9 @@ def test_a_true_clock_is_not_doubted(drag: float, seed: int) -> None:
     scene = seen_from_the_side(1.0)
     assert wrong_clock(read(thrown(1.0, drag, seed, 1e-3), scene), scene) is None
     above = scene.replace(gravity=(0.0, 0.0))
-    assert wrong_clock(read(thrown(8.0, drag, seed), above.replace(time_step=1 / 30)), above) is None
+    assert (
+        wrong_clock(read(thrown(8.0, drag, seed), above.replace(time_step=1 / 30)), above) is None
+    )
 
 
 def test_a_held_body_tells_nothing_of_the_clock() -> None:
@@ -175,7 +177,7 @@ def test_the_prior_check_names_the_clock_first() -> None:
 def pushed(
     shift: int = 0, delay: float = 0.0, lag: float = 0.0, *, feedback: bool = False, seed: int = 0
 ) -> pd.DataFrame:
-    """A cart with drag; its commands are logged so many rows late, and act late by a part of one."""
+    """A cart with drag; its commands are logged rows late, or act late by a part of one."""
     rng, dt, parts = np.random.default_rng(seed), 0.02, 20
     sent = np.repeat(rng.normal(0.0, 3.0, 120), 5)
     place = speed = force = 0.0
@@ -197,7 +199,9 @@ def pushed(
 
 
 @pytest.mark.parametrize("shift", [1, -1, 2])
-def test_commands_rows_early_or_late_are_found_and_moved(shift: int, tmp_path: Path, capsys) -> None:
+def test_commands_rows_early_or_late_are_found_and_moved(
+    shift: int, tmp_path: Path, capsys
+) -> None:
     found = command_shifts(read(pushed(shift)), CART)
     assert found == {"cart": -shift}
     entry = f"time = {{ offset = {-0.02 * shift:g} }}"
