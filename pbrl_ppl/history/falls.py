@@ -131,7 +131,8 @@ def _fall(places: Floats, down: Floats, dt: float, *, clear: float = 0.05) -> tu
         rest = y[kept] - x @ best
         size = 1.4826 * float(np.median(np.abs(rest)))
         within = np.abs(rest) <= max(4.0 * size, 1e-9)
-        error = float(np.sqrt(np.mean(rest**2) * np.linalg.pinv(x.T @ x)[0, 0] * 2 * lag))
+        # white noise leaves differences of neighbouring rows independent
+        error = float(np.sqrt(2.0 * np.mean(rest**2) * np.linalg.pinv(x.T @ x)[0, 0]))
         kept[kept] = within
         if within.all():
             break
