@@ -27,7 +27,7 @@ from pbrl_ppl.errors import (
 )
 from pbrl_ppl.files import write_atomically, write_text
 from pbrl_ppl.scene import WORLD, Actuator, Body, Joint, Recording, Scene, Shape, nearest, toml_of
-from pbrl_ppl.state import Floats
+from pbrl_ppl.state import STATE, VELOCITY, Floats
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -202,6 +202,7 @@ def recorded(
     tried = stand_in.replace(time_step=step, gravity=(0.0, -9.81 * falls))
     tried = tried.replace(recording=None if plain else proposed)
     found, units, computed = _cures(frame, tried, commands, source)
+    computed |= plain and any(name in STATE[VELOCITY:] for name in units)  # whose units are SI's
     cured = replace(asked, velocities="computed") if computed else asked
     if not plain and (time_step is None or "time" not in units):  # else the step is the user's
         cured = cured.with_entries(units=units)

@@ -101,13 +101,17 @@ def layout_cures(
             if sentence:
                 said.append(sentence)
                 units |= {keys[name]: cures[name] for name in cures if keys[name] not in present}
-    for velocity in unused_velocities(history):
-        if velocity.fault:
-            said.append(velocity.sentence)
+    unused = unused_velocities(history)
+    rates = history.dataset["observed"].isel(state=slice(VELOCITY, None))
+    measured = int(rates.notnull().any(("trajectory", "time")).sum())
+    for velocity in unused:
+        said.append(velocity.sentence)
+        if velocity.fault and velocity.fault.factor:
             key = velocity.state if alone else f"{velocity.body}.{velocity.state}"
             size = unit_size(velocity.state, present[key]) if key in present else 1.0
-            computed |= not velocity.fault.factor
-            units |= {key: velocity.unit(size or 1.0)} if velocity.fault.factor else {}
+            units[key] = velocity.unit(size or 1.0)
+        else:  # of computed and late ones others may be good
+            computed |= velocity.fault is not None or len(unused) == measured
     return said, units, computed
 
 

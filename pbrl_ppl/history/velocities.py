@@ -62,7 +62,7 @@ class UnusedVelocity:
         if self.fault:
             cure = 'velocities = "computed"'
             if self.fault.factor:
-                cure = f'units = {{ {self.state} = "{self.unit()}" }}'
+                cure = f'units = {{ {self.state} = "{self.unit()}" }} or {cure}'
             return (
                 f"{name} contradicts the changes of {self.position} in {self.fault.share:.0%} of"
                 f" the rows, first in row {self.fault.row} of trajectory {self.fault.trajectory}:"
@@ -81,7 +81,7 @@ class UnusedVelocity:
     def unit(self, present: float = 1.0) -> str:
         """Return the unit that cures another factor, from the size of the present one in SI."""
         factor = self.fault.factor if self.fault else 1.0
-        return f"{1 / (present * factor or 1.0):.4g}/{'rad' if self.state == 'omega' else 'm'}"
+        return f"{1 / (present * factor or 1.0):.5g}/{'rad' if self.state == 'omega' else 'm'}"
 
 
 def unused_velocities(history: History) -> tuple[UnusedVelocity, ...]:

@@ -78,6 +78,21 @@ def test_a_velocity_that_contradicts_its_position_is_named(kind: str, tmp_path: 
     assert unused_velocities(History.load(log, written)) == ()
 
 
+@pytest.mark.parametrize("kind", ["wraps every 3,", "is 0.25 times the rate", "lags x by 60"])
+def test_new_leaves_velocities_of_a_whole_history_out(kind, tmp_path: Path, capsys) -> None:
+    """Its units are SI units, whatever [recording] says; a column that is late counts as well."""
+    late = 3.0 * np.cos(3.0 * (TIME - 0.06)) + 0.5 * np.cos(1.1 * (TIME - 0.06))
+    noise = 0.01 * np.random.default_rng(2).standard_normal(len(TIME))
+    frame = driven(FAULTS.get(kind, lambda v: late + noise))
+    frame = frame.assign(trajectory=0, body="cart", theta=np.nan, vy=np.nan, omega=np.nan)
+    frame.assign(force_x=0.0, force_y=0.0, torque=0.0).to_csv(tmp_path / "log.csv", index=False)
+    scene, log = tmp_path / "scene.toml", str(tmp_path / "log.csv")
+    assert main(["new", str(scene), "--history", log, "--body", "cart=box:0.2x0.1"]) == 0
+    assert kind in capsys.readouterr().out.replace("59.9", "60").replace("60.1", "60")
+    recording = Scene.load(scene).recording
+    assert recording is not None and recording.velocities == "computed"
+
+
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("noise", [0.0, 1e-4, 3e-3])
 def test_a_velocity_with_noise_a_bias_or_impacts_contradicts_nothing(seed, noise) -> None:
