@@ -387,7 +387,7 @@ def _command_rows(frame: pd.DataFrame, columns: Mapping[str, object]) -> Bools:
     others = frame[sent].notna().to_numpy(dtype=bool)
     if posed.all() or not posed.any():
         return np.zeros(len(frame), dtype=bool)
-    rare = others[posed].mean(axis=0) < 0.1
+    rare = others[posed].sum(axis=0) < 0.1 * others.sum(axis=0)
     return np.asarray(~posed & others[:, rare].any(axis=1))
 
 

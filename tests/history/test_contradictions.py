@@ -262,5 +262,6 @@ def test_two_topics_in_one_table_are_two_streams() -> None:
 def test_lost_poses_beside_commands_are_missing_measurements() -> None:
     frame = pushed()
     frame.loc[100:109, ["x", "y"]] = np.nan
-    history = read(frame)
-    assert int(history.dataset["observed"].sel(state="x").isnull().sum()) == 10
+    assert int(read(frame).dataset["observed"].sel(state="x").isnull().sum()) == 10
+    frame.loc[frame.index % 20 != 0, "force_x"] = np.nan  # sent at a twentieth of the rate
+    assert int(read(frame).dataset["observed"].sel(state="x").isnull().sum()) == 10
