@@ -64,7 +64,12 @@ def check(
     console.print(listed)
     console.print(_missing_table(missing, int(loaded.dataset["n_rows"].sum())))
     masses = histories.mass_contradictions(declared, used)
-    for sentence in (*drawn, *(velocity.sentence for velocity in unused), *masses):
+    fall = histories.wrong_clock(used, declared)
+    clock = [fall.sentence(declared)] if fall else []
+    moved = histories.command_shifts(used, declared)
+    shifts = [histories.shift_sentence(declared, body, rows) for body, rows in moved.items()]
+    velocities = (velocity.sentence for velocity in unused)
+    for sentence in (*drawn, *velocities, *masses, *clock, *shifts):
         console.print(sentence, soft_wrap=True)
     if loaded.n_trajectories < 2:
         console.print(
@@ -91,7 +96,7 @@ def check(
         physics = Physics(sized, attach(sized, (), catalogue))
         problem = Problem.of(physics, used, horizon=informative_horizon(used))
         checked = prior_predictive_check(problem, draws=draws, seed=seed)
-        for sentence in checked.summary:
+        for sentence in (one for one in checked.summary if one not in clock):
             console.print(f"prior: {sentence}", soft_wrap=True)
     facts = {
         "trajectories": loaded.n_trajectories,
@@ -100,6 +105,8 @@ def check(
         "velocities_not_used": [vars(column) for column in unused],
         "unit_mismatches": histories.unit_mismatches(used),
         "mass_contradictions": masses,
+        "clock": clock,
+        "command_shifts": moved,
         "typical": {body.name: dict(body.typical) for body in sized.dynamic},
         "default_priors": priors,
         "prior": checked and {"passed": not checked.sentences, "sentences": checked.summary},

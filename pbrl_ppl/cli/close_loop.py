@@ -136,8 +136,8 @@ def close_loop(
 
     output = to.output
     check_folder(output, True, criticism.FILES)
-    settings, said = sampler.settings(reading.catalogue()), list[str]()
-    run = partial(criticism.close_loop, declared, *histories, **settings)
+    known, said = sampler.settings(reading.catalogue()), list[str]()
+    run = partial(criticism.close_loop, declared, *histories, **known)
     recorded, held_out = (", ".join(map(str, paths)) for paths in (train, test or ()))
     source = report.Source(str(scene), recorded, held_out, options.command_line(context))
     interrupts.rescue = partial(_without_verdict, said, sampler, output, source)

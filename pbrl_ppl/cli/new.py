@@ -27,7 +27,7 @@ from pbrl_ppl.errors import (
 )
 from pbrl_ppl.files import write_atomically, write_text
 from pbrl_ppl.scene import WORLD, Actuator, Body, Joint, Recording, Scene, Shape, nearest, toml_of
-from pbrl_ppl.state import STATE, Floats
+from pbrl_ppl.state import STATE, VELOCITY, Floats
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -126,7 +126,11 @@ class Recorded:
 
 
 def recorded(
-    paths: Sequence[Path], layout: Recording, given: Sequence[str], time_step: float | None
+    paths: Sequence[Path],
+    layout: Recording,
+    given: Sequence[str],
+    time_step: float | None,
+    side: bool = False,
 ) -> Recorded:
     """Read bodies, time step and layout from a recording.
 
@@ -140,6 +144,8 @@ def recorded(
         Names of bodies from options, for a recording that names none.
     time_step : float, optional
         Time between rows (s), for a recording without times.
+    side : bool
+        Whether it was seen from the side: what falls tells whether the clock is right.
 
     Raises
     ------
@@ -150,7 +156,7 @@ def recorded(
 
     from pbrl_ppl import history as histories
 
-    name, said = histories.in_words(paths), list[str]()
+    asked, name, said = layout, histories.in_words(paths), list[str]()
     source = f"history {name}"
     logs = histories.logs_in(paths, layout)
     frames = histories.read_tables(logs, layout)
@@ -197,6 +203,18 @@ def recorded(
     sent = [one.column or one.name for one in acting(Shape.circle(1.0))]
     if sent:
         shown.append(f"commands by their names: {', '.join(sent)}; correct [[actuator]]")
+    falls = side and hinges == Hinges() and not sent
+    tried = stand_in.replace(time_step=step, gravity=(0.0, -9.81 * falls))
+    tried = tried.replace(recording=None if plain else proposed)
+    found, units, computed = _cures(paths, frame, tried)
+    computed |= plain and any(name in STATE[VELOCITY:] for name in units)  # whose units are SI's
+    cured = replace(asked, velocities="computed") if computed else asked
+    if not plain and (time_step is None or "time" not in units):  # else the step is the user's
+        cured = cured.with_entries(units=units)
+    if cured != asked:
+        again = recorded(paths, cured, given, time_step, side)
+        return replace(again, said=[*found, *again.said])
+    shown += found
     left = () if plain else histories.unused_columns(frame, proposed)
     unused = [name for name in left if name not in sent]
     if unused:
@@ -224,6 +242,25 @@ def _as_history(
                 )
         tables.append(table)
     return histories.joined(tables)
+
+
+def _cures(
+    paths: Sequence[Path], frame: pd.DataFrame, scene: Scene
+) -> tuple[list[str], dict[str, str], bool]:
+    """Return what is wrong with units and velocities of a recording, and the entries that cure it.
+
+    Nothing is said of a recording that cannot be read yet.
+    """
+    from pbrl_ppl import history as histories
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            history = histories.History.load(paths, scene)
+        except HistoryError:  # later commands say it
+            return [], {}, False
+    present = histories.present_units(frame, scene.recording or Recording())
+    return histories.layout_cures(history, scene, present)
 
 
 def _read_with_cures(
@@ -379,7 +416,7 @@ def new(
     else:
         shapes = outlines(bodies or [])
         if history:
-            recording = recorded(history, layout, [*shapes], time_step)
+            recording = recorded(history, layout, [*shapes], time_step, bool(side))
         shapes, time_step = _complete(shapes, time_step, recording)
         text = scene_text(shapes, bool(side), time_step, recording)
         Scene.from_toml(text)  # written whole and valid, or not at all

@@ -18,6 +18,7 @@ from pbrl_ppl.history import (
     measured_alone,
     measurement_noise,
     unused_velocities,
+    wrong_clock,
 )
 from pbrl_ppl.likelihood import Problem, draw_prior
 from pbrl_ppl.posterior import HDI_PROB
@@ -45,6 +46,7 @@ class PriorCheck:
         - ``share_inside`` (body, state): share of the measured cells inside the central 94 % of
           their own predictions;
         - ``share_beyond`` (body, state): share that lies beyond all of them;
+        - ``largest_beyond`` (body, state): how far the farthest lies beyond them;
         - ``factor`` (body, state, quantile): how many times as large measured changes are as
           predicted ones without noise, by least squares for each draw, over the draws;
         - ``cells`` (body, state): how many were measured.
@@ -54,6 +56,8 @@ class PriorCheck:
         Draws from the prior, and those on which the engine diverged, which were left out.
     criteria : PriorCriteria
         When the prior could not have made the data.
+    clock : tuple of str
+        What a free fall says of the recording's clock.
     """
 
     dataset: xr.Dataset
@@ -61,11 +65,12 @@ class PriorCheck:
     draws: int
     diverged: int
     criteria: PriorCriteria = DEFAULT.prior
+    clock: tuple[str, ...] = ()
 
     @property
     def sentences(self) -> tuple[str, ...]:
         """Return where the prior could not have made the data; empty where it could."""
-        limits, sentences = self.criteria, []
+        limits, sentences = self.criteria, [*self.clock]
         for body in self.dataset["body"].values:
             for state in self.dataset["state"].values:
                 changes = self.dataset.sel(body=body, state=state)
@@ -78,13 +83,14 @@ class PriorCheck:
                 if chance > limits.chance:
                     continue
                 # a position changes mostly by the velocity before, which is in the same units
-                factor = "" if str(state) in POSE else _unit(changes["factor"])
+                size, cause = ("", "") if str(state) in POSE else _unit(changes["factor"])
+                size = size or (
+                    f"otherwise, by up to {float(changes['largest_beyond']):.2g} {unit}, than"
+                )
                 sentences.append(
-                    f"{state} of {body} changes by up to {float(changes['measured_largest']):.3g}"
-                    f" {unit} in {self.seconds:g} s; under the prior 94 % of changes are within"
-                    f" {float(changes['predicted_extent']):.3g} {unit}, and {100 * share:.0f} % of"
-                    f" the measured ones lie beyond all of {self.draws} draws from it: check units,"
-                    f" of commands too, or the prior's hyper-parameters{factor}"
+                    f"{state} of {body} changes {size} draws from the prior in {self.seconds:g} s"
+                    f" ({100 * share:.0f} % of changes lie beyond all of {self.draws} draws): check"
+                    f" units, of commands too, or the prior's hyper-parameters{cause}"
                 )
         if self.diverged > 0.1 * self.draws:
             sentences.append(
@@ -155,7 +161,7 @@ def prior_predictive_check(
 
         check = pp.prior_predictive_check(pp.physics_model(scene, history))
         check.dataset["share_inside"]
-        check.sentences  # ('omega of cart changes by up to 12 rad/s in 0.1 s; under ...',)
+        check.sentences  # ('omega of cart changes 12 times as much as draws from the prior ...',)
     """
     if isinstance(model, Problem):
         problem = model
@@ -191,6 +197,7 @@ def prior_predictive_check(
         derived[:, i] = ~recorded[:, d if d >= len(POSE) else d + len(POSE)]
     dataset = _compare(observations.wrapped(predicted - first), measured, slack * derived)
     dataset = dataset.merge(_factors(exact, measured))
+    fall = wrong_clock(history, problem.scene)
     coords = {
         "body": [body.name for body in problem.scene.moving],
         "state": list(observations.names),
@@ -202,6 +209,7 @@ def prior_predictive_check(
         draws,
         draws - len(ends),
         criteria,
+        (fall.sentence(problem.scene),) if fall else (),
     )
 
 
@@ -257,26 +265,28 @@ def _factors(exact: Floats, measured: Floats) -> xr.Dataset:
     return xr.Dataset({"factor": (("quantile", "body", "state"), quantiles)})
 
 
-def _unit(factor: xr.DataArray, beyond: float = 1.5) -> str:
-    """Return a hint if measured changes are a factor of wrong units larger or smaller.
+def _unit(factor: xr.DataArray, beyond: float = 1.5) -> tuple[str, str]:
+    """Return how many times as large measured changes are, and a hint if a unit has that factor.
+
+    Both are empty where no size of predicted changes is that of the measured ones.
 
     ``beyond``: such a factor may lie this far beyond the range of the prior's.
     """
     low, middle, high = (float(factor[i]) for i in (0, len(QUANTILES) // 2, -1))
     if not low > 0:  # nothing was predicted, or motion the other way
-        return ""
+        return "", ""
     over, size = ("", middle) if middle > 1 else ("1/", 1 / middle)
     if middle <= 1:
         low, high = 1 / high, 1 / low
+    if low < 1:
+        return "", ""
+    words = f"{over}{size:.2g} times as much as"
     low, high = low / beyond, high * beyond
     near = [factor_of_units for factor_of_units in _UNITS if low < factor_of_units < high]
     if low < 1 or not near:
-        return ""
+        return words, ""
     best = min(near, key=lambda factor_of_units: abs(np.log(factor_of_units / size)))
-    return (
-        f" (the changes are about {middle:.2g} times those of the prior's middle, a factor near"
-        f" {over}{_UNITS[best]}: units?)"
-    )
+    return words, f" (a factor near {over}{_UNITS[best]}: units?)"
 
 
 def _at(states: Floats, step: Ints) -> Floats:
@@ -380,7 +390,8 @@ def _compare(predicted: Floats, measured: Floats, slack: Floats) -> xr.Dataset:
         warnings.simplefilter("ignore", RuntimeWarning)  # means of no measurements
         slack = slack * np.sqrt(np.nanmean(measured**2, axis=0))
     low_end, high_end = predicted.min(axis=0) - slack, predicted.max(axis=0) + slack
-    beyond = (measured < low_end) | (measured > high_end)
+    farther = np.maximum(measured - high_end, low_end - measured)
+    beyond = farther > 0.0
     total = np.maximum(seen.sum(axis=0), 1)
     # cells that were not measured count on neither side
     pooled = np.where(seen, predicted, np.nan).reshape(-1, *measured.shape[1:])
@@ -400,6 +411,7 @@ def _compare(predicted: Floats, measured: Floats, slack: Floats) -> xr.Dataset:
             "measured_largest": (dims, np.nanmax(np.abs(cells), axis=0) * safe),
             "share_inside": (dims, inside.sum(axis=0) / total * safe),
             "share_beyond": (dims, beyond.sum(axis=0) / total * safe),
+            "largest_beyond": (dims, np.nanmax(np.where(seen, farther, 0.0), axis=0).clip(0.0)),
             "cells": (dims, seen.sum(axis=0)),
         }
     ).transpose("body", "state", "quantile")

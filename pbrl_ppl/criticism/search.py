@@ -477,10 +477,10 @@ class Search:
                 for label in (label for law in kin for label in law.labels):
                     begin.pop(label, None)
                 moves[frozenset((*climb.laws, *subset.laws)) - {*kin}] = begin
-        for one in instead.subsets[: limits.singles] if instead and climb.laws else ():
+        for subset in instead.subsets[: limits.singles] if instead and climb.laws else ():
             rest = [label for law in climb.laws for label in law.labels]
             labels = [each for each in climb.mode.problem.layout.labels if each not in rest]
-            moves.setdefault(frozenset(one.laws), one.begin(labels))
+            moves.setdefault(frozenset(subset.laws), subset.begin(labels))
         return self._best(climb, moves, least_share)
 
     def _exchanged(self, climb: _Climb, library: Library, candidates: Sequence[Attached]) -> Mode:

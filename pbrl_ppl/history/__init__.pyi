@@ -5,9 +5,14 @@ from .bad_frames import unmodelled_ends as unmodelled_ends
 from .bad_frames import without_bad_frames as without_bad_frames
 from .bad_frames import without_measurements as without_measurements
 from .clocks import command_step as command_step
+from .command_shift import command_shifts as command_shifts
+from .command_shift import shift_sentence as shift_sentence
 from .conversion import as_history as as_history
 from .conversion import is_history as is_history
+from .conversion import present_units as present_units
 from .cuts import propose as propose
+from .falls import WrongClock as WrongClock
+from .falls import wrong_clock as wrong_clock
 from .files import table_of_arrays as table_of_arrays
 from .guesses import check_states as check_states
 from .guesses import guessed_actuators as guessed_actuators
@@ -35,6 +40,7 @@ from .logs import read_tables as read_tables
 from .parts import MOST_TRANSITIONS as MOST_TRANSITIONS
 from .parts import drawn_pieces as drawn_pieces
 from .parts import thinned as thinned
+from .reading import layout_cures as layout_cures
 from .reading import read_recording as read_recording
 from .reading import read_scene as read_scene
 from .units import mass_contradictions as mass_contradictions

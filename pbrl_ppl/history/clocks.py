@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from itertools import pairwise
 
 import numpy as np
@@ -92,6 +92,9 @@ def on_one_clock(
         if own:  # of a longer column with a clock of its own the rows below are no rows
             frame = frame[frame[name].notna()]
         time = _seconds(frame, name, layout, source)
+        if not own and (alone := _command_rows(frame, columns)).any():
+            frame = _of_two_streams(frame, columns, time, alone, layout, say)
+            time = time[~alone]
     elif "rate" in clocks:
         time = np.zeros(len(frame))
     else:
@@ -130,7 +133,7 @@ def _seconds(frame: pd.DataFrame, name: str, layout: Recording, source: str) -> 
             ) from None
         since = (dates - pd.Timestamp(0, tz="UTC")) / pd.Timedelta(seconds=1)
         return np.array(since, dtype=float)
-    unit = units.get("time", _stated_unit(frame, name))
+    unit = units.get("time", stated_time_unit(frame, name))
     stamps = np.array(numeric, dtype=np.float64)
     if not unit:
         unit = likely_unit(stamps)
@@ -151,7 +154,7 @@ def _seconds(frame: pd.DataFrame, name: str, layout: Recording, source: str) -> 
     return np.array(stamps * size)
 
 
-def _stated_unit(frame: pd.DataFrame, name: str) -> str:
+def stated_time_unit(frame: pd.DataFrame, name: str) -> str:
     """Return the unit of time that a file states of a column, or an empty text."""
     stated = stated_unit(frame, name)
     return stated if stated in TIME else ""
@@ -325,7 +328,7 @@ def command_stamps(commands: pd.DataFrame, layout: Recording, source: str = "his
             f' time = {{ commands = "..." }}; it has {", ".join(plain)}'
         )
     numeric = np.asarray(pd.to_numeric(commands[time], errors="coerce"), dtype=float)
-    unit = _stated_unit(commands, str(time)) or likely_unit(numeric)
+    unit = stated_time_unit(commands, str(time)) or likely_unit(numeric)
     return np.asarray(numeric * TIME[unit] + float(clocks.get("offset", 0.0)))
 
 
@@ -366,6 +369,67 @@ def _with_commands(
         hold = _holds(layout, stamps, values)
         frame = _brought(frame, str(name), stamps, values, say, hold=hold)
     return frame
+
+
+def _command_rows(frame: pd.DataFrame, columns: Mapping[str, object]) -> Bools:
+    """Return the rows of a table that hold commands alone, as of topics that were merged.
+
+    They have no state, but something that next to no row with a state has.
+    """
+    named = {key: column_of(columns.get(key, key)) for key in (*columns, *STATE)}
+    states = [name for key, name in named.items() if key.rpartition(".")[2] in STATE]
+    states = [name for name in dict.fromkeys(states) if name in frame]
+    posed = frame[states].notna().any(axis=1).to_numpy(dtype=bool)
+    sent = [name for key, name in named.items() if key.rpartition(".")[2] in WRENCH]
+    sent = [name for name in sent if name in frame] or [
+        str(name) for name in frame if name not in states
+    ]
+    others = frame[sent].notna().to_numpy(dtype=bool)
+    if posed.all() or not posed.any():
+        return np.zeros(len(frame), dtype=bool)
+    rare = others[posed].sum(axis=0) < 0.1 * others.sum(axis=0)
+    return np.asarray(~posed & others[:, rare].any(axis=1))
+
+
+def _of_two_streams(
+    frame: pd.DataFrame,
+    columns: Mapping[str, object],
+    time: Floats,
+    alone: Bools,
+    layout: Recording,
+    say: Say,
+) -> pd.DataFrame:
+    """Return the rows that have a state, with the commands of the other rows at their times."""
+    steps = np.diff(time)
+    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    run = np.append(0, np.cumsum(steps < -50.0 * usual))  # where the clock starts again
+    named = {key: column_of(columns.get(key, key)) for key in (*columns, *WRENCH)}
+    sent = [name for key, name in named.items() if key.rpartition(".")[2] in WRENCH]
+    brought = {}
+    for name in (name for name in dict.fromkeys(sent) if name in frame):
+        values = pd.to_numeric(frame[name], errors="coerce").to_numpy(float, copy=True)
+        hold, at_rows = _holds(layout, time, values), np.full(len(frame), np.nan)
+        for number in np.unique(run[~alone]):
+            here = run == number
+            at_rows[here & ~alone] = _at_times(
+                time[here & ~alone], time[here], values[here], hold=hold
+            )
+        brought[name] = at_rows[~alone]
+    say(f"{int(alone.sum())} rows hold commands and no state: read as a stream of their own")
+    return frame[~alone].assign(**brought)
+
+
+def with_later_commands(frame: pd.DataFrame, offset: float) -> pd.DataFrame:
+    """Return a history's table whose commands are so many seconds later than their rows."""
+    time = pd.to_numeric(frame["time"], errors="coerce").to_numpy(float)
+    moved: dict[str, Floats] = {}
+    for rows in frame.groupby(["trajectory", "body"], sort=False).indices.values():
+        for name in WRENCH:
+            values = pd.to_numeric(frame[name].iloc[rows], errors="coerce").to_numpy(float)
+            moved.setdefault(name, np.full(len(frame), np.nan))[rows] = _at_times(
+                time[rows], time[rows] + offset, values, hold=True
+            )
+    return frame.assign(**moved)
 
 
 def in_order(frame: pd.DataFrame, say: Say, *, far: float = 5.0) -> pd.DataFrame:

@@ -10,7 +10,13 @@ import numpy as np
 import pandas as pd
 
 from pbrl_ppl.errors import HistoryError, RecordingWarning, warn
-from pbrl_ppl.history.clocks import Say, in_order, on_one_clock
+from pbrl_ppl.history.clocks import (
+    Say,
+    in_order,
+    on_one_clock,
+    stated_time_unit,
+    with_later_commands,
+)
 from pbrl_ppl.history.cuts import cut, without_lost_rows
 from pbrl_ppl.history.files import COLUMNS
 from pbrl_ppl.history.guesses import with_derived
@@ -22,7 +28,7 @@ from pbrl_ppl.history.measures import (
     with_zeros,
 )
 from pbrl_ppl.history.rows import with_clean_names
-from pbrl_ppl.scene import Recording, Scene, nearest
+from pbrl_ppl.scene import Recording, Scene, column_of, nearest
 from pbrl_ppl.state import STATE, WRENCH
 
 
@@ -88,13 +94,15 @@ def as_history(
     frame = with_clean_names(frame, source)
     frame, sent = with_commands(frame, scene)
     if layout is None and not (columns or sent):
-        return in_si(frame, units) if units else frame
+        frame = in_si(frame, units) if units else frame
+        return _held_commands(frame, scene, source) if scene.actuators else frame
     columns = {**sent, **columns}
     layout = (layout or Recording()).with_entries(columns=columns, units=units)
     said: list[str] = list(frame.attrs.get("said", ()))
     say = said.append
+    clocks = tuple(entry for entry in layout.time if commands is None or entry[0] != "offset")
     if is_history(frame):
-        return _repaired(frame, scene, layout, source, said)
+        return _repaired(frame, scene, replace(layout, time=clocks), source, said)
     known = _numbered(frame, dict(layout.columns), source)
     layout = replace(layout, columns=tuple(known.items()))
     frame = with_derived(frame, say)
@@ -106,7 +114,7 @@ def as_history(
     stated = stated_units(frame, known)
     units = stated | {name: unit for name, unit in layout.units if name != "time"}
     named = with_zeros(in_si(named, units), scene, layout, source)
-    return _repaired(named, scene, layout, source, said)
+    return _repaired(named, scene, replace(layout, time=clocks), source, said)
 
 
 def with_commands(frame: pd.DataFrame, scene: Scene) -> tuple[pd.DataFrame, dict[str, str]]:
@@ -229,6 +237,14 @@ def _picked(frame: pd.DataFrame, columns: Mapping[str, object]) -> pd.DataFrame:
     )
 
 
+def present_units(frame: pd.DataFrame, layout: Recording) -> dict[str, str]:
+    """Return the units in which columns of a table are read, if not SI units."""
+    columns = dict(layout.columns)
+    time = stated_time_unit(frame, column_of(columns.get("time", "time")))
+    stated = stated_units(frame, columns) | ({"time": time} if time else {})
+    return stated | dict(layout.units)
+
+
 def is_history(frame: pd.DataFrame) -> bool:
     """Return whether a table has all columns of a history."""
     return {*COLUMNS} - {"step"} <= {str(name).strip() for name in frame.columns}
@@ -317,6 +333,8 @@ def _repaired(
     frame = in_order(frame, said.append)
     frame = without_lost_rows(frame, scene, said.append)
     frame = _held(frame, scene, said.append)
+    if offset := float(dict(layout.time).get("offset", 0.0)):
+        frame = with_later_commands(frame, offset)
     if layout.cut:
         before = len(frame)
         frame = cut(frame, dict(layout.cut), source)
@@ -327,6 +345,16 @@ def _repaired(
         left = frame.loc[single, "trajectory"].nunique()
         said.append(f"{left} trajectories of one step are left out")
         frame = frame[~single]
+    if said:
+        warn(f"{source}: {'; '.join(said)}", RecordingWarning)
+    return frame
+
+
+def _held_commands(frame: pd.DataFrame, scene: Scene, source: str) -> pd.DataFrame:
+    """Return a history's table whose actuators' commands hold where their cells are empty."""
+    said: list[str] = []
+    if {"trajectory", "body"} <= {*frame}:
+        frame = _held(frame.copy(), scene, said.append)
     if said:
         warn(f"{source}: {'; '.join(said)}", RecordingWarning)
     return frame

@@ -106,7 +106,9 @@ def frozen_poses(poses: Floats, *, far: float = 2.5) -> Bools:
     if len(first) < 4:
         return frozen
     change, rows = np.abs(np.diff(poses[first], axis=0)), np.diff(first)
-    finest = np.array([finest_step(column) for column in poses.T])
+    finest = np.array(  # within the noise a pose may be as before, which changes nothing
+        [max(finest_step(one), 2.0 * column_noise([one], robust=True)) for one in poses[first].T]
+    )
     size, rate = np.linalg.norm(change, axis=1), np.linalg.norm(change, axis=1) / rows
     usual = np.fmax(np.append(rate[0], rate[:-1]), np.append(rate[1:], rate[-1]))
     jumps = (change > far * finest).any(axis=1) & (size > 0.5 * (rows + 1) * usual)
@@ -269,8 +271,8 @@ def propose(
     trajectories : int
         Fewer long ones are cut: criticism needs so many.
     shortest : int
-        Rows of a piece, at least; it is also as long as the slowest motion where so many such
-        pieces are there.
+        Rows of a piece, at least; it is also as long as the motion needs, see `telling`, where so
+        many such pieces are there.
     most : int
         Pieces that one trajectory is cut to.
     """
@@ -308,7 +310,7 @@ def propose(
         and not cuts
         and length >= 2 * shortest * time_step
     ):
-        slow = max(slowest(times[rows], poses[rows]) for rows in groups)
+        slow = max(telling(times[rows], poses[rows]) for rows in groups)
         parts = np.clip(length / max(slow, shortest * time_step), min(trajectories, most), most)
         cuts["every"] = float(f"{length / int(parts):.2g}")
         said.append(
@@ -327,6 +329,42 @@ def slowest(times: Floats, poses: Floats) -> float:
             crossed = int((np.diff(np.sign(seen - seen.mean())) != 0).sum())
             periods.append(2.0 * float(np.ptp(times)) / max(crossed, 1))
     return max(periods)
+
+
+def telling(times: Floats, poses: Floats, *, periods: float = 8.0, constants: float = 3.0) -> float:
+    """Return how long a piece must be for slow losses to show (s): eight periods of a swing.
+
+    Of a motion that does not swing it is three time constants: the times in which the correlation
+    of its coordinates falls to 1/e.
+
+    Parameters
+    ----------
+    times : ndarray
+        Shape (row,), s.
+    poses : ndarray
+        Shape (row, coordinate), NaN where missing.
+    periods, constants : float
+        How many.
+
+    Examples
+    --------
+    >>> t = np.arange(0.0, 40.0, 0.05)
+    >>> round(telling(t, np.cos(2.0 * np.pi * t / 1.25)[:, None]))
+    10
+    """
+    period = slowest(times, poses)
+    if 4.0 * period <= np.ptp(times):
+        return periods * period
+    longest = 0.0
+    for column in poses.T:
+        seen = column[np.isfinite(column)]
+        if len(seen) > 2 and np.ptp(seen) > 0:
+            off = seen - seen.mean()
+            power = np.abs(np.fft.rfft(off, 2 * len(off))) ** 2
+            near = np.fft.irfft(power)[: len(off)] > np.exp(-1.0) * float(off @ off)
+            fallen = int(near.argmin()) if not near.all() else len(off)
+            longest = max(longest, fallen / len(seen) * float(np.ptp(times)))
+    return constants * longest
 
 
 def _longest_gap(times: Floats, states: Floats) -> float:

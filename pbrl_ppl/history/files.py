@@ -170,13 +170,14 @@ def _table_of(text: str, path: Path, layout: Recording) -> pd.DataFrame:
     columns = [str(i) for i in range(width)] if names is None else names
     named = [column for _, column in layout.columns if isinstance(column, str)]
     numbers = ["step", "time", *STATE, *WRENCH, *named]
+    decimal = "," if separator != "," and _has_commas(lines[first:]) else "."
     try:
         frame: pd.DataFrame = pd.read_csv(
             io.StringIO("\n".join(lines[first:])),
             sep=separator,
             names=columns,
             header=None,
-            decimal="," if separator != "," and _has_commas(lines[first:]) else ".",
+            decimal=decimal,
             dtype={"trajectory": "str", "body": "str"},
             keep_default_na=False,
             na_values=dict.fromkeys((*numbers, *(columns if names is None else ())), _MISSING),
@@ -190,7 +191,24 @@ def _table_of(text: str, path: Path, layout: Recording) -> pd.DataFrame:
     if not isinstance(frame.index, pd.RangeIndex):
         raise HistoryError(f"history {path}: rows have more cells than the header; repair them")
     frame.index = pd.RangeIndex(first + 1, first + 1 + len(frame))
+    frame = _with_numbers(frame, decimal)
     frame.attrs.update(lines=True, headerless=names is None, units=units, said=said)
+    return frame
+
+
+def _with_numbers(frame: pd.DataFrame, decimal: str) -> pd.DataFrame:
+    """Return a table whose columns of numbers and missing cells are numbers, whatever their names.
+
+    Such are commands of actuators, which are empty where they hold.
+    """
+    for name in frame.columns.difference(["trajectory", "body"], sort=False):
+        if pd.api.types.is_numeric_dtype(frame[name]):
+            continue
+        text = frame[name].astype(str).str.strip().str.replace(decimal, ".", regex=False)
+        given = text[~text.isin([*_MISSING, "", "nan"])]
+        numbers = pd.to_numeric(given, errors="coerce")
+        if len(given) and numbers.notna().all():
+            frame[name] = numbers.reindex(frame.index)
     return frame
 
 

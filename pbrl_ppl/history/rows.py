@@ -414,8 +414,12 @@ def _check_complete(rows: Rows, scene: Scene, position: Ints, n_rows: Ints) -> N
         )
     kinematic = kinematic_bodies(scene)[rows.body]
     pushed = (position < n_rows[rows.trajectory] - 1) & ~kinematic
+    empty = (
+        "on every row but the last; write 0 where nothing pushed, or declare [recording], by which"
+        " an empty cell holds the command before"
+    )
     for values, required, columns, cure in (
-        (rows.action, pushed, WRENCH, "on every row but the last; write 0 where nothing pushed"),
+        (rows.action, pushed, WRENCH, empty),
         (
             rows.state[:, :3],
             kinematic,

@@ -193,14 +193,18 @@ def unit_mismatches(history: History) -> tuple[str, ...]:
     tuple of str
         Empty where all agree.
     """
-    observed = history.dataset["observed"].to_numpy()
-    sentences = []
-    for i, body in enumerate(history.bodies):
-        for d in range(3):
-            factor = rate_factor(observed[:, :, i], d, float(history.dataset.attrs["time_step"]))
-            if factor is not None and (words := _unit_sentence(body, d, factor)):
-                sentences.append(words)
-    return tuple(sentences)
+    every = (unit_mismatch(history, i, d) for i in range(len(history.bodies)) for d in range(3))
+    return tuple(sentence for sentence, _ in every if sentence)
+
+
+def unit_mismatch(history: History, body: int, d: int) -> tuple[str, dict[str, str]]:
+    """Return why a position and its velocity are in units that differ, and the units that cure it.
+
+    Both are empty where no unit is near the factor between them.
+    """
+    observed = history.dataset["observed"].to_numpy()[:, :, body]
+    factor = rate_factor(observed, d, float(history.dataset.attrs["time_step"]))
+    return ("", {}) if factor is None else _unit_words(history.bodies[body], d, factor)
 
 
 def rate_factor(
@@ -254,7 +258,7 @@ def rate_factor(
     return best
 
 
-def _unit_sentence(body: str, d: int, factor: float, near: float = 0.1) -> str:
+def _unit_words(body: str, d: int, factor: float, near: float = 0.1) -> tuple[str, dict[str, str]]:
     """Return a sentence about a factor between a position and its rate that is near a unit's.
 
     A position in other units changes faster than its velocity says by that factor; where the
@@ -275,5 +279,5 @@ def _unit_sentence(body: str, d: int, factor: float, near: float = 0.1) -> str:
         for one, unit in known.items():
             if abs(size / one - 1) < near:
                 cure = f" {column} may be in {unit}; read it with --units {column}={unit}"
-                return f"{words}: units?{cure if unit else ''}"
-    return ""
+                return f"{words}: units?{cure if unit else ''}", {column: unit} if unit else {}
+    return "", {}

@@ -1,4 +1,4 @@
-"""Velocity columns that were computed from positions of the log, or lag them."""
+"""Velocity columns that were computed from positions of the log, lag or contradict them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,8 +8,10 @@ import numpy as np
 from scipy.stats import f as f_distribution
 from scipy.stats import t as t_distribution
 
+from pbrl_ppl.history.contradictions import Contradiction, contradiction
 from pbrl_ppl.history.history import History
 from pbrl_ppl.history.kinematics import column_noise, finest_step, unwrapped
+from pbrl_ppl.history.units import unit_mismatch
 from pbrl_ppl.state import STATE, THETA, VELOCITY, Floats
 
 #: Positions and velocities of rows without gaps, m and m/s or rad and rad/s.
@@ -34,6 +36,8 @@ class UnusedVelocity:
         By how much it is late (s); negative if early.
     zero : bool
         Whether it is 0 in all rows while the position moves: nobody measured it.
+    fault : Contradiction, optional
+        How it contradicts its position.
 
     Examples
     --------
@@ -49,11 +53,21 @@ class UnusedVelocity:
     computed: bool
     lag: float
     zero: bool = False
+    fault: Contradiction | None = None
 
     @property
     def sentence(self) -> str:
-        """Sentence: the column, how it was computed or by how much it lags."""
+        """Sentence: the column, how it was computed, what is wrong or by how much it lags."""
         name, late = f"{self.state} of {self.body}", f"{abs(self.lag):.3g} s"
+        if self.fault:
+            cure = 'velocities = "computed"'
+            if self.fault.factor:
+                cure = f'units = {{ {self.state} = "{self.unit()}" }} or {cure}'
+            return (
+                f"{name} contradicts the changes of {self.position} in {self.fault.share:.0%} of"
+                f" the rows, first in row {self.fault.row} of trajectory {self.fault.trajectory}:"
+                f" it {self.fault.kind}, and is not used: {cure} in [recording]"
+            )
         if self.zero:
             return f"{name} is 0 in all rows while {self.position} moves, and is not used"
         if 1e-3 <= abs(self.lag) < 1.0:
@@ -64,9 +78,14 @@ class UnusedVelocity:
         lag = f", {late} {'late' if self.lag > 0 else 'early'}," if self.lag else ""
         return f"{name} was computed from {self.position}{lag} and is not used"
 
+    def unit(self, present: float = 1.0) -> str:
+        """Return the unit that cures another factor, from the size of the present one in SI."""
+        factor = self.fault.factor if self.fault else 1.0
+        return f"{1 / (present * factor or 1.0):.5g}/{'rad' if self.state == 'omega' else 'm'}"
+
 
 def unused_velocities(history: History) -> tuple[UnusedVelocity, ...]:
-    """Return the velocity columns that were computed from positions of the log, or lag them.
+    """Return the velocity columns that were computed from positions, lag or contradict them.
 
     Tests are made so that fewer than one in a hundred logs with independently measured velocities
     loses one; it then costs information, as positions are enough for a fit.
@@ -95,18 +114,24 @@ def unused_velocities(history: History) -> tuple[UnusedVelocity, ...]:
     >>> print(unused_velocities(History.from_dataframe(table, scene))[0].sentence)
     vx of puck was computed from x and is not used
     """
-    dt = float(history.dataset.attrs["time_step"])
+    dt, observed = float(history.dataset.attrs["time_step"]), history.dataset["observed"].to_numpy()
     unused: list[UnusedVelocity] = []
     for body in np.flatnonzero(~history.dataset["kinematic"].to_numpy()):
         for d in range(3):
             runs = _runs(history, int(body), d)
             names = (history.bodies[body], STATE[d + VELOCITY], STATE[d])
+            pair = (observed[:, :, body, d], observed[:, :, body, d + VELOCITY])
+            fault = contradiction(*pair, dt, angle=d == THETA)
             if _is_zero(runs):
                 unused.append(UnusedVelocity(*names, False, 0.0, zero=True))
+            elif fault and fault.impossible:
+                unused.append(UnusedVelocity(*names, False, 0.0, fault=fault))
             elif (late := computed_lag(runs, dt)) is not None:
                 unused.append(UnusedVelocity(*names, True, late if abs(late) > 0.05 * dt else 0.0))
             elif lag := velocity_lag(runs, dt):
                 unused.append(UnusedVelocity(*names, False, lag))
+            elif fault and not unit_mismatch(history, int(body), d)[0]:
+                unused.append(UnusedVelocity(*names, False, 0.0, fault=fault))
     return tuple(unused)
 
 

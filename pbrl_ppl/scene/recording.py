@@ -39,7 +39,8 @@ class Recording:
     time : tuple of (str, str or float)
         Clocks: ``rate`` in Hz of rows that are even, whatever their stamps, with ``counter``, the
         column that counts them; ``{ theta = "angle_time" }`` where a column has stamps of its own;
-        ``commands``, the column of times in the file of commands.
+        ``commands``, the column of times in the file of commands; ``offset`` (s) is added to these,
+        or to the times of commands in the same file.
     commands : str
         File of the commands, beside the recording, with times of its own on the same clock.
     hold : bool, optional

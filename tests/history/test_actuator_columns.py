@@ -8,7 +8,7 @@ import pytest
 
 import pbrl_ppl as pp
 from pbrl_ppl.cli import main
-from pbrl_ppl.errors import HistoryError
+from pbrl_ppl.errors import HistoryError, RecordingWarning
 from pbrl_ppl.history import History
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.planning import Dynamics
@@ -49,6 +49,37 @@ def test_a_saved_history_is_read_again(tmp_path: Path) -> None:
     history.save(tmp_path / "saved.csv")
     again = History.load(tmp_path / "saved.csv", scene)
     assert again.data_sha256 == history.data_sha256
+
+
+@pytest.mark.parametrize("mark", [",", ";"])
+@pytest.mark.parametrize("recording", [None, Recording()], ids=["plain", "declared"])
+def test_an_empty_cell_of_a_file_holds_the_command(recording, mark: str, tmp_path: Path) -> None:
+    """Of a column that no history has, with decimal points or commas."""
+    given = np.arange(12) % 4 == 0
+    table = log().assign(left_fan=np.where(given, 0.5 + np.arange(12), np.nan))
+    decimal = "," if mark == ";" else "."
+    table.to_csv(tmp_path / "log.csv", index=False, sep=mark, decimal=decimal)
+    with pytest.warns(RecordingWarning, match="8 rows: the command before holds"):
+        history = History.load(tmp_path / "log.csv", craft().replace(recording=recording))
+    np.testing.assert_array_equal(commands(history)[:, 0], 0.5 + np.arange(11) // 4 * 4)
+
+
+def test_new_reads_topics_that_were_merged(tmp_path: Path) -> None:
+    """Rows of poses and rows of commands: the time step is the poses', the command an actuator."""
+    poses = log(40).drop(columns=["left_fan", "right_fan"])
+    sent = pd.DataFrame({"time": 0.05 + 0.5 * np.arange(8), "throttle": 0.1 * np.arange(8)})
+    merged = pd.concat([poses, sent]).sort_values("time", kind="stable")
+    merged.to_csv(tmp_path / "log.csv", index=False)
+    scene, path = tmp_path / "scene.toml", tmp_path / "log.csv"
+    asked = ["--history", str(path), "--columns", "body=craft", "--body", "craft=circle:0.1"]
+    assert main(["new", str(scene), *asked, "--quiet"]) == 0
+    written = Scene.load(scene)
+    assert written.time_step == 0.1
+    with pytest.warns(RecordingWarning, match="8 rows hold commands and no state"):
+        history = History.load(path, written.replace(recording=Recording()))
+    assert history.n_transitions == 39
+    expected = 0.1 * (np.arange(39) // 5 - 0.5 * (np.arange(39) % 5 == 0) * (np.arange(39) > 0))
+    np.testing.assert_allclose(commands(history)[:, 0], expected, atol=1e-9)
 
 
 def test_one_row_a_body() -> None:

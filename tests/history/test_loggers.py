@@ -21,10 +21,10 @@ from pbrl_ppl.errors import (
     SceneError,
 )
 from pbrl_ppl.history import History, read_recording
-from pbrl_ppl.history.cuts import frozen_poses, zero_poses
+from pbrl_ppl.history.cuts import frozen_poses, telling, zero_poses
 from pbrl_ppl.history.guesses import planar_yaw
 from pbrl_ppl.physics import Physics
-from pbrl_ppl.scene import Body, Joint, Recording, Scene, Shape
+from pbrl_ppl.scene import Actuator, Body, Joint, Recording, Scene, Shape
 from tests.helpers.places import ROOT
 from tests.helpers.plain import PlainSimulator
 
@@ -612,3 +612,94 @@ def test_new_reads_bursts_streams_and_circles(capsys) -> None:
     assert scene.time_step == 0.1 and scene.recording.commands == "cmd.csv"
     assert "time_step is the commands'" in capsys.readouterr().out
     assert main(["check", "c.toml", "pose.csv", "--no-prior", "-q"]) == 0
+
+
+# Cuts and angles ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("seconds", "every"), [(60.0, 10.0), (30.0, 7.5), (200.0, 17.0)])
+def test_pieces_of_a_long_take_hold_eight_periods(seconds, every, tmp_path: Path) -> None:
+    """Of a period of 1.26 s; four pieces at least, twelve at most."""
+    time = np.arange(0.0, seconds, 0.02)
+    swing = 0.3 * np.exp(-0.01 * time) * np.sin(2 * np.pi * time / 1.26)
+    pd.DataFrame({"t": time, "theta": swing}).to_csv(tmp_path / "log.csv", index=False)
+    scene = tmp_path / "scene.toml"
+    asked = ["--history", str(tmp_path / "log.csv"), "--columns", "time=t,theta=theta"]
+    assert main(["new", str(scene), *asked, "--side", "--body", "pole=box:0.02x0.3", "-q"]) == 0
+    recording = Scene.load(scene).recording
+    assert recording is not None
+    assert dict(recording.cut)["every"] == pytest.approx(every, rel=0.1)
+
+
+def test_pieces_of_a_motion_that_does_not_swing_hold_three_time_constants() -> None:
+    rng, steps = np.random.default_rng(1), 40_000
+    place = np.zeros(steps)
+    for i in range(1, steps):  # a correlation of 2 s
+        place[i] = (1 - 0.02 / 2.0) * place[i - 1] + rng.normal()
+    time = 0.02 * np.arange(steps)
+    slow = np.exp(-time[:2000] / 8.0)[:, None]
+    assert 1.0 < telling(time[:2000], slow) / 3.0 < 12.0
+    assert telling(time, place[:, None]) > 3.0 * 1.5
+
+
+def pendulum(speed: float, damping: float, seconds: float = 40.0) -> np.ndarray:
+    """Angles of a pendulum every 0.05 s that begins to hang, with this speed; also turns."""
+    angle, out = 0.0, []
+    for step in range(round(seconds / 0.001)):
+        if step % 50 == 0:
+            out.append(angle)
+        speed -= 0.001 * (25.0 * np.sin(angle) + damping * speed)
+        angle += 0.001 * speed
+    return np.array(out)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.002, 0.01])
+def test_turns_are_no_degrees_and_degrees_are(noise: float, tmp_path: Path) -> None:
+    """A pendulum that whirls, a few turns on and back: in rad it is no swing of 50 degrees."""
+    rng, names = np.random.default_rng(1), {"time": "t", "theta": "knee"}
+    on = pendulum(14.0, 0.0, 10.0)
+    whirled = np.concatenate([on, on[-2::-1], on[1:], on[-2::-1], on[1:]])
+    swung = np.degrees(pendulum(3.0, 0.02))
+    for angle, asked in ((whirled, False), (swung, True)):
+        off = noise * rng.standard_normal(len(angle)) * (1.0 if not asked else 57.3)
+        time = 0.05 * np.arange(len(angle))
+        said = warned(pd.DataFrame({"t": time, "knee": angle + off}), POLE, tmp_path, columns=names)
+        assert ("looks like deg" in said) == asked
+
+
+def test_whole_numbers_of_thousands_are_asked_about_as_counts(tmp_path: Path) -> None:
+    counts = np.round(pendulum(3.0, 0.02) * 8192 / (2 * np.pi) * 40)
+    time = 0.05 * np.arange(len(counts))
+    log = pd.DataFrame({"t": time, "knee": counts})
+    names = {"time": "t", "theta": "knee"}
+    assert 'units = { theta = "8192/turn" }' in warned(log, POLE, tmp_path, columns=names)
+    units = {"theta": "8192/turn"}
+    assert "counts" not in warned(log, POLE, tmp_path, columns=names, units=units)
+
+
+def test_a_pose_that_repeats_within_the_noise_is_a_measurement() -> None:
+    """Rounded to a tenth of the noise, a slow place is twice the same by chance."""
+    rng, time = np.random.default_rng(1), 0.02 * np.arange(4000)
+    place = np.round(0.05 * np.sin(time) + 2e-3 * rng.standard_normal(4000), 4)
+    place[1000] = place[999]
+    assert not frozen_poses(place[:, None].repeat(2, axis=1)).any()
+    moving_on = np.round(np.sin(time) + 1e-4 * rng.standard_normal(4000), 6)
+    moving_on[1000] = moving_on[999]
+    assert np.flatnonzero(frozen_poses(moving_on[:, None].repeat(2, axis=1))).tolist() == [1000]
+
+
+def test_an_empty_command_of_an_actuator_holds_in_a_history(tmp_path: Path) -> None:
+    """Also where no [recording] is declared."""
+    motor = Actuator(name="duty", kind="thruster", body="puck", known={"gain": 0.5})
+    scene = PUCK.replace(actuators=(motor,))
+    frame = moving().rename(columns={"t": "time"}).assign(trajectory=0, body="puck", theta=0.0)
+    frame = frame.assign(vx=np.nan, vy=np.nan, omega=np.nan)
+    frame["duty"] = np.where(np.arange(N) % 5 == 0, np.arange(N), np.nan)
+    for table in (frame, frame.rename(columns={"duty": "force_x"}).assign(force_y=0.0, torque=0.0)):
+        with pytest.warns(RecordingWarning, match="the command before holds"):
+            history = History.from_dataframe(table, scene)
+        np.testing.assert_array_equal(of(history, "force_x")[:-1], np.arange(N - 1) // 5 * 5)
+    with pytest.raises(HistoryError, match="an empty cell holds the command before"):
+        History.from_dataframe(
+            frame.rename(columns={"duty": "force_x"}).assign(force_y=0.0, torque=0.0), PUCK
+        )
