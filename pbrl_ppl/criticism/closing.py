@@ -137,7 +137,7 @@ def close_loop(
         Thresholds of the decisions.
     progress : callable, optional
         Called with each :class:`Stage`, a sentence with the share of the time at which it usually
-        begins, and with sentences on what was found.
+        begins, with sentences on what was found, and with :class:`Work`, what is done now.
 
     Returns
     -------

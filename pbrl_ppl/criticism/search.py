@@ -191,7 +191,7 @@ class Search:
     criteria : Criteria
         Thresholds.
     say : callable
-        Called with what was found.
+        Called with what was found, and with what is done now.
     """
 
     missing: Callable[[Mode], Sequence[Attached]]
@@ -377,7 +377,10 @@ class Search:
     def _linearised(self, climb: _Climb) -> tuple[Library, list[Attached]]:
         """Return derivatives at a climb's model, and candidates beside at most one unusual law."""
         more = climb.unusual and not any(law.effect.unusual for law in climb.laws)
-        return self._library(climb.mode, climb.laws), self._candidates(climb.mode, more)
+        candidates = self._candidates(climb.mode, more)
+        rows = climb.mode.problem.data.horizon
+        self.say(Work(f"deriving what {len(candidates)} laws change on pieces of {rows} rows"))
+        return self._library(climb.mode, climb.laws), candidates
 
     def _library(
         self, mode: Mode, laws: tuple[Attached, ...], dimensions: Bools | bool = True
