@@ -28,9 +28,6 @@ if TYPE_CHECKING:
     from pbrl_ppl.effects import Effect
     from pbrl_ppl.reporting import Source
 
-#: How a sentence on laws that were found begins.
-_FOUND = "simulations name"
-
 
 class Method(StrEnum):
     """Samplers of the loop's posteriors."""
@@ -278,7 +275,7 @@ def _without_verdict(said: Sequence[str], sampler: Sampler, output: Path, source
         f"--most-transitions {sampler.most_transitions // 4}": True,
     }
     advice = f"{', '.join(one for one, new in faster.items() if new)} take less time"
-    if not any(line.startswith(_FOUND) for line in said) or (output / "report.html").exists():
+    if not said or (output / "report.html").exists():
         return f"nothing was written; {advice}"
     output.mkdir(parents=True, exist_ok=True)
     write_text(output / "report.html", report.render_without_verdict(said, advice, source))

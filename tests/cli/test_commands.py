@@ -439,13 +439,16 @@ def test_an_error_that_an_interrupt_caused_is_an_interrupt(
 BUSY = """
 import hashlib
 from pbrl_ppl.cli import terminal
-with terminal.interruptible("two logs are kept"):
+with terminal.interruptible("nothing is kept") as interrupts:
+    interrupts.rescue = lambda: "two logs are kept"
     print("begun", flush=True)
     hashlib.pbkdf2_hmac("sha256", b"", b"", 10**9)
 """
 
 
-def test_an_interrupt_ends_machine_code() -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_ends_machine_code(number: signal.Signals) -> None:
+    """What was found is written before; a `timeout` sends the second."""
     with subprocess.Popen(
         [sys.executable, "-c", BUSY], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
@@ -453,7 +456,7 @@ def test_an_interrupt_ends_machine_code() -> None:
         assert process.stdout is not None and process.stderr is not None
         assert process.stdout.readline() == "begun\n"
         time.sleep(1.0)  # until it is in there
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         assert process.wait(60) == 130
         assert process.stderr.read() == "interrupted; two logs are kept\n"
 
