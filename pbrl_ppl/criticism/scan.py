@@ -49,11 +49,6 @@ class GridPoint:
         return point
 
 
-def grid_points(mode: Mode, candidate: Attached) -> list[GridPoint]:
-    """Return the grid points of a candidate's scan; see :func:`each_grid_point`."""
-    return list(each_grid_point(mode, candidate))
-
-
 def each_grid_point(
     mode: Mode, candidate: Attached, proposed: Floats | None = None, *, at_once: int = 8
 ) -> Iterator[GridPoint]:

@@ -13,7 +13,12 @@ from scipy.stats import binom, chi2, norm
 
 from pbrl_ppl.criticism import scan, score
 from pbrl_ppl.criticism.criteria import DEFAULT
-from pbrl_ppl.criticism.scan import GridPoint, detection_limits, grid_points, is_upper_limit
+from pbrl_ppl.criticism.scan import (
+    GridPoint,
+    detection_limits,
+    each_grid_point,
+    is_upper_limit,
+)
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.effects import candidates, catalogue
 from pbrl_ppl.state import STATE
@@ -42,19 +47,19 @@ def test_grid_points_are_paid_for(mode) -> None:
 
 
 def test_what_is_not_scanned_is_differentiated(mode) -> None:
-    tried = grid_points(mode, EFFECTS["mass_change"].on("puck"))
+    tried = list(each_grid_point(mode, EFFECTS["mass_change"].on("puck")))
     assert {look.columns for look in tried} == {(0,)}  # the factor
     assert {look.values[0] for look in tried} == {1.0}
     moments = {(look.values[1], look.values[2]) for look in tried}
     assert (0.5, 0.0) in moments  # from the second trajectory on
     assert any(time > 0 for _, time in moments)
-    whole = grid_points(mode, EFFECTS["force_cutoff"].on("puck"))
+    whole = list(each_grid_point(mode, EFFECTS["force_cutoff"].on("puck")))
     assert {look.columns for look in whole} == {()}
 
 
 def test_a_signature_is_what_the_effect_does(mode) -> None:
     """The change that a look at the truth predicts is what brings the residual down."""
-    thresholds = grid_points(mode, EFFECTS["force_cutoff"].on("puck"))
+    thresholds = list(each_grid_point(mode, EFFECTS["force_cutoff"].on("puck")))
     residual = mode.whitened_residual.ravel()
 
     def left(look) -> float:
@@ -119,7 +124,7 @@ def test_p_values_of_scans_are_no_smaller_than_chance_makes_them() -> None:
 
 
 def test_an_effect_without_a_scan_has_no_grid_points(mode) -> None:
-    assert grid_points(mode, EFFECTS["linear_drag"].on("puck")) == []
+    assert list(each_grid_point(mode, EFFECTS["linear_drag"].on("puck"))) == []
 
 
 def test_a_ranking_does_not_hold_every_signature(mode, monkeypatch) -> None:
@@ -146,7 +151,7 @@ def test_a_ranking_does_not_hold_every_signature(mode, monkeypatch) -> None:
 def test_grid_points_of_long_recordings_are_simulated_one_by_one(mode, monkeypatch) -> None:
     """To the last digit as eight at a time."""
     tried = EFFECTS["mass_change"].on("puck")
-    at_once = grid_points(mode, tried)
+    at_once = list(each_grid_point(mode, tried))
     monkeypatch.setattr(scan, "_VALUES", 1)
-    for one, other in zip(at_once, grid_points(mode, tried), strict=True):
+    for one, other in zip(at_once, list(each_grid_point(mode, tried)), strict=True):
         np.testing.assert_array_equal(one.signature, other.signature)
