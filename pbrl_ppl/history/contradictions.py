@@ -114,6 +114,9 @@ def _wrong(
     middle = np.where(np.isfinite(inner), (before + after) / 2, np.nan)
     seen = np.isfinite(middle)
     outside = np.maximum(inner - np.maximum(before, after), np.minimum(before, after) - inner)
+    # where a force turns round a speed leaves both, and its means with the next ones neither
+    off = np.abs((rate[:, 1:] + rate[:, :-1]) - 2.0 * quotient)
+    outside = np.fmin(outside, np.fmin(off[:, :-1], off[:, 1:]))
     if not seen.any():
         return middle, np.zeros(middle.shape, dtype=bool), 0.0
     places, rates = (

@@ -18,6 +18,7 @@ from pbrl_ppl.history import (
     unused_velocities,
     wrong_clock,
 )
+from pbrl_ppl.history.contradictions import contradiction
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Body, Joint, Recording, Scene, Shape
@@ -265,3 +266,13 @@ def test_lost_poses_beside_commands_are_missing_measurements() -> None:
     assert int(read(frame).dataset["observed"].sel(state="x").isnull().sum()) == 10
     frame.loc[frame.index % 20 != 0, "force_x"] = np.nan  # sent at a twentieth of the rate
     assert int(read(frame).dataset["observed"].sel(state="x").isnull().sum()) == 10
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_speeds_that_turn_round_within_rows_contradict_nothing(seed: int) -> None:
+    """Exact steps under a force of its own in each interval: speeds leave both quotients."""
+    pushes = np.random.default_rng(seed).normal(0.0, 3.0, (14, 5))
+    rate = np.pad(np.cumsum(0.1 * pushes, axis=1), ((0, 0), (1, 0)))
+    steps = 0.05 * (rate[:, 1:] + rate[:, :-1])
+    position = np.pad(np.cumsum(steps, axis=1), ((0, 0), (1, 0)))
+    assert contradiction(position, rate, 0.1) is None
