@@ -7,7 +7,7 @@ from scipy.integrate import solve_ivp
 
 from pbrl_ppl.criticism import attribute, close_loop
 from pbrl_ppl.effects import catalogue
-from pbrl_ppl.errors import HistoryError
+from pbrl_ppl.errors import HistoryError, PriorWarning
 from pbrl_ppl.history import History
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
@@ -65,7 +65,8 @@ def test_a_force_of_the_size_of_the_weight_is_no_law() -> None:
     found = attribute(BALL, slowed(4.0))
     assert not found.laws
     assert any("falls with 6.2 % of gravity" in why for why in found.rejected.values())
-    loop = close_loop(BALL, slowed(4.0), method="laplace", seed=1)
+    with pytest.warns(PriorWarning, match="the clock runs 4 times too fast"):
+        loop = close_loop(BALL, slowed(4.0), method="laplace", seed=1)
     assert loop.verdict == "unexplained" and not loop.added
     assert "a wrong unit of time or length" in loop.unexplained.sentence
 
