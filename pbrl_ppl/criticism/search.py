@@ -253,10 +253,9 @@ class Search:
         """Return at which length an unusual law may take most of the error beyond the noise off.
 
         To first order, beside the common laws, with one more, or in the place of one or all. The
-        longest
-        pieces are asked first, and shorter ones where these are too far off to tell. Also the
-        leading ones alone, with their shares of the error on the longest pieces. Of a climb that
-        was ``lost`` before these all error is beyond the noise.
+        longest pieces are asked first, and shorter ones where these are too far off to tell. Also
+        the leading ones alone, with their shares of the error on the longest pieces. Of a climb
+        that was ``lost`` before these all error is beyond the noise.
         """
         limits, alone = self.criteria.search, dict[Attached, float]()
         found: int | None = None
@@ -409,10 +408,12 @@ class Search:
             regression = best_subsets(library, candidates)
             if i == 0:
                 climb.regressions.append(regression)
-            most = max((one.share for one in regression.subsets if one.nats > 0), default=0.0)
-            if i and plain and not self._explains(climb, plain, 1.0 - float(np.sqrt(1.0 - most))):
-                break
-            instead = best_subsets(library, candidates, climb.laws, largest=1) if plain else None
+            instead = None
+            if plain:
+                most = max((one.share for one in regression.subsets if one.nats > 0), default=0.0)
+                if i and not self._explains(climb, plain, 1.0 - float(np.sqrt(1.0 - most))):
+                    break
+                instead = best_subsets(library, candidates, climb.laws, largest=1)
             better = self._enlarged(climb, regression, limits.least_share, instead)
             if better is climb.mode:
                 better = self._exchanged(climb, library, candidates)
@@ -477,13 +478,9 @@ class Search:
             kin = [law for law in climb.laws if any(_are_kin(law, new) for new in subset.laws)]
             if kin and any(law.effect.unusual for law in subset.laws):
                 begin = subset.begin(climb.mode.problem.layout.labels)
-                for label in (label for law in kin for label in law.labels):
-                    begin.pop(label, None)
-                moves[frozenset((*climb.laws, *subset.laws)) - {*kin}] = begin
+                moves[frozenset((*climb.laws, *subset.laws)) - {*kin}] = _without(begin, *kin)
         for subset in instead.subsets[: limits.singles] if instead and climb.laws else ():
-            rest = [label for law in climb.laws for label in law.labels]
-            labels = [each for each in climb.mode.problem.layout.labels if each not in rest]
-            moves.setdefault(frozenset(subset.laws), subset.begin(labels))
+            moves.setdefault(frozenset(subset.laws), subset.begin(_labels(climb.mode, *climb.laws)))
         return self._best(climb, moves, least_share)
 
     def _exchanged(self, climb: _Climb, library: Library, candidates: Sequence[Attached]) -> Mode:
@@ -499,7 +496,7 @@ class Search:
             climb.same[law] = tuple(one for one in others if one in same)
             own = max((one.nats for one in instead.subsets if same & {*one.laws}), default=0.0)
             climb.first_order[law] = own
-            labels = [one for one in library.mode.problem.layout.labels if one not in law.labels]
+            labels = _labels(library.mode, law)
             if own < _CLEAR:
                 others = library.test((law,)).phi.tolist()
                 moves[rest] = dict(zip(labels, others, strict=True))
@@ -531,9 +528,7 @@ class Search:
         self.say(Work(f"refitting {len(moves)} models on pieces of {rows} rows, {of} are done"))
         table.race(now, moves)
         fair = {  # a law of an impossible size takes no others with it
-            key - {law}: {
-                label: value for label, value in begin.items() if label not in law.labels
-            }
+            key - {law}: _without(begin, law)
             for key, begin in moves.items() if key in table.modes
             for law in key - laws if far_out(table.modes[key], [law]) >= most
         }  # fmt: skip
@@ -801,6 +796,18 @@ def _are_kin(law: Attached, other: Attached) -> bool:
     """Return whether two laws of a body are of one family."""
     family = law.effect.family
     return bool(family) and (family, law.body) == (other.effect.family, other.body)
+
+
+def _without(begin: Mapping[str, float], *laws: Attached) -> dict[str, float]:
+    """Return where parameters begin, by their labels, without those of some laws."""
+    gone = {label for law in laws for label in law.labels}
+    return {label: value for label, value in begin.items() if label not in gone}
+
+
+def _labels(mode: Mode, *laws: Attached) -> list[str]:
+    """Return the labels of a mode's parameters without those of some laws, in their order."""
+    gone = {label for law in laws for label in law.labels}
+    return [label for label in mode.problem.layout.labels if label not in gone]
 
 
 def _structures(subset: Subset) -> set[Attached]:

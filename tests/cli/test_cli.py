@@ -263,15 +263,21 @@ def test_trouble_in_the_long_work(
     assert not Path("out").exists()
 
 
-@pytest.mark.usefixtures("files")
-def test_an_interrupt_of_the_search_says_what_was_found(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.fixture
+def interrupted_search(monkeypatch: pytest.MonkeyPatch, files: Path) -> None:
+    """The loop is interrupted after it has named a law."""
+
     def close_loop(*args: Any, progress: Any, **options: Any) -> Loop:
         progress("simulations name linear_drag on cart")
         raise KeyboardInterrupt
 
     monkeypatch.setattr(criticism, "close_loop", close_loop)
+
+
+@pytest.mark.usefixtures("interrupted_search")
+def test_an_interrupt_of_the_search_says_what_was_found(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     assert main(["close-loop", "scene.toml", "train.csv", "-o", "out", "-q"]) == 130
     said = capsys.readouterr().err
     assert "report.html has what was found: simulations name linear_drag on cart; " in said
@@ -280,17 +286,9 @@ def test_an_interrupt_of_the_search_says_what_was_found(
     assert "--method laplace, --catalogue common, --most-transitions" in page
 
 
-@pytest.mark.usefixtures("files")
-def test_advice_is_not_what_was_in_use(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.usefixtures("interrupted_search")
+def test_advice_is_not_what_was_in_use(capsys: pytest.CaptureFixture[str]) -> None:
     """And a report that is there is kept."""
-
-    def close_loop(*args: Any, progress: Any, **options: Any) -> Loop:
-        progress("simulations name linear_drag on cart")
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(criticism, "close_loop", close_loop)
     Path("out").mkdir()
     Path("out/report.html").write_text("an older one")
     argv = ["close-loop", "scene.toml", "train.csv", "-o", "out", "--overwrite", "-q"]
