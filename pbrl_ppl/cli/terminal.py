@@ -173,8 +173,7 @@ def interruptible(state: str = "nothing was written") -> Iterator[Interrupts]:
     handled = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     handled = handled and threading.current_thread() is threading.main_thread()
     if handled:
-        for number in _ENDING:
-            signal.signal(number, interrupts.note)
+        before = {number: signal.signal(number, interrupts.note) for number in _ENDING}
     try:
         with interrupts.enforced(state) if handled else nullcontext():
             yield interrupts
@@ -187,8 +186,8 @@ def interruptible(state: str = "nothing was written") -> Iterator[Interrupts]:
         raise
     finally:
         if handled:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
-            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+            for number, handler in before.items():
+                signal.signal(number, handler or signal.SIG_DFL)
 
 
 def in_a_line(message: object) -> str:
