@@ -70,7 +70,7 @@ from pbrl_ppl.modes import (
     is_simulated_mode,
     tempered_mode,
 )
-from pbrl_ppl.physics import Physics, try_effect
+from pbrl_ppl.physics import Physics, compile_for_search, try_effect
 from pbrl_ppl.posterior import (
     MAX_PARETO_K,
     Comparison,
@@ -168,6 +168,7 @@ def close_loop(
         pp.report(loop, "report.html")
     """
     say = progress or (lambda stage: None)
+    compile_for_search(scene)
     if test is None:
         train, test = train.split(0.25, seed)
         numbered = test

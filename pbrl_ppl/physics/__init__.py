@@ -1,5 +1,7 @@
 """The physics engine: worlds, joints and batched rollouts; the only room that imports pymunk."""
 
+from .compilation import compile_for_search as compile_for_search
+from .compilation import compile_loops as compile_loops
 from .parts import Memory as Memory
 from .parts import OneWorld as OneWorld
 from .parts import Part as Part

@@ -7,7 +7,17 @@ import math
 import numba
 import numpy as np
 
-from pbrl_ppl.physics.calls import call1, call2, call_int, call_pointer, compiled, copy, get1, get2
+from pbrl_ppl.physics.calls import (
+    call1,
+    call2,
+    call_int,
+    call_pointer,
+    compiled,
+    copy,
+    get1,
+    get2,
+    inner,
+)
 from pbrl_ppl.physics.laws import (
     ACTED,
     COMMAND,
@@ -43,7 +53,7 @@ def iterations(fewest, chained, bodies, a_ratio=2, most=2000):  # type: ignore[n
     return max(fewest, int(enough))
 
 
-@compiled
+@inner
 def _apply(settings, rows, normal_gravity):  # type: ignore[no-untyped-def]
     """Set properties of constraints by their rows of numbers."""
     for j in range(len(settings)):
@@ -57,7 +67,7 @@ def _apply(settings, rows, normal_gravity):  # type: ignore[no-untyped-def]
             call1(setting.function, setting.constraint, row[column] * weight)
 
 
-@compiled
+@inner
 def set_properties(fn, world, bodies, joints):  # type: ignore[no-untyped-def]
     """Set masses, moments, surfaces and anchors, but no strengths of constraints."""
     for i in range(len(world.bodies)):
@@ -75,7 +85,7 @@ def set_properties(fn, world, bodies, joints):  # type: ignore[no-untyped-def]
     _apply(world.joint_settings, joints, world.still.normal_gravity)
 
 
-@compiled
+@inner
 def set_strengths(fn, world, bodies, on):  # type: ignore[no-untyped-def]
     """Set the constraints' greatest forces, or set them to zero; patches get theirs as placed."""
     for constraint in world.unlimited:
@@ -86,7 +96,7 @@ def set_strengths(fn, world, bodies, on):  # type: ignore[no-untyped-def]
         _apply(world.strengths, bodies, world.still.normal_gravity)
 
 
-@compiled
+@inner
 def arm(row, theta):  # type: ignore[no-untyped-def]
     """Return the arm from a body's origin to its centre of mass, in the world's frame."""
     x, y = row[COLUMN.com_x], row[COLUMN.com_y]
@@ -165,7 +175,7 @@ def patch_signal(row, state, normal_gravity):  # type: ignore[no-untyped-def]
     return row[COLUMN.patch_mu] * row[COLUMN.mass] * normal_gravity, speed
 
 
-@compiled
+@inner
 def place_bodies(fn, world, bodies, state):  # type: ignore[no-untyped-def]
     """Set the bodies' states; the engine's velocity is that of the centre of mass."""
     for i in range(len(world.bodies)):
@@ -177,7 +187,7 @@ def place_bodies(fn, world, bodies, state):  # type: ignore[no-untyped-def]
         call1(fn.cpBodySetAngularVelocity, body, turn)
 
 
-@compiled
+@inner
 def set_discs(fn, world, discs):  # type: ignore[no-untyped-def]
     """Place the hidden discs.
 
@@ -205,7 +215,7 @@ def set_discs(fn, world, discs):  # type: ignore[no-untyped-def]
         obstacle[4] = radius
 
 
-@compiled
+@inner
 def place_wheels(fn, world, bodies, state, axes, step):  # type: ignore[no-untyped-def]
     """Put the rods' ends on the wheels' axes as predicted for the end of the substep."""
     for j in range(len(world.wheel_body)):
@@ -215,7 +225,7 @@ def place_wheels(fn, world, bodies, state, axes, step):  # type: ignore[no-untyp
         call2(fn.cpPinJointSetAnchorB, world.wheels[1, j], x_2, y_2)
 
 
-@compiled
+@inner
 def place_patches(fn, world, laws, bodies, state, step, acted):  # type: ignore[no-untyped-def]
     """Put each point's rod along its velocity; split its friction with the pivot joint."""
     for j in range(len(world.patch_body)):
@@ -232,7 +242,7 @@ def place_patches(fn, world, laws, bodies, state, step, acted):  # type: ignore[
             call1(fn.cpConstraintSetMaxForce, world.patches[1, j, i], share * most)
 
 
-@compiled
+@inner
 def set_brakes(world, laws, bodies, joints, state, acted):  # type: ignore[no-untyped-def]
     """Set the greatest torque of friction in hinges where laws change it."""
     for j in range(len(world.strengths)):
@@ -247,7 +257,7 @@ def set_brakes(world, laws, bodies, joints, state, acted):  # type: ignore[no-un
             call1(setting.function, setting.constraint, most)
 
 
-@compiled
+@inner
 def drive(fn, world, state, action):  # type: ignore[no-untyped-def]
     """Set the velocities of kinematic bodies for the interval that begins."""
     for i in range(len(world.bodies)):
@@ -289,7 +299,7 @@ def _forget(fn, world, bodies, batch, touched):  # type: ignore[no-untyped-def]
     set_strengths(fn, world, bodies, True)
 
 
-@compiled
+@inner
 def intervals(bodies, p, t, horizon):  # type: ignore[no-untyped-def]
     """Return the properties in a transition's intervals; one row if they do not change."""
     if bodies.shape[1] > 1:
@@ -329,7 +339,7 @@ def _read(fn, world, bodies, state):  # type: ignore[no-untyped-def]
     return lost
 
 
-@compiled
+@inner
 def _scratch_of(world, batch):  # type: ignore[no-untyped-def]
     """Return the arrays of a transition.
 
@@ -364,7 +374,9 @@ def _transition(  # type: ignore[no-untyped-def]
         turn = bodies[world.wheel_body[j], COLUMN.w_theta]
         axes[j, 0], axes[j, 1] = math.cos(turn), math.sin(turn)
     touched, near = _FREE, False
-    driven = world.kinematic.any()
+    driven = False
+    for follows in world.kinematic:
+        driven |= follows
     acting = len(laws.commands) + len(laws.forces) > 0
     still = world.still
     watch = len(still.obstacles) > 0 or k > 1
@@ -389,7 +401,15 @@ def _transition(  # type: ignore[no-untyped-def]
             near = False
             if acting:
                 act(
-                    state, inputs[h], laws, s / substeps, (s + 1) / substeps, acted, memory[1], held
+                    state,
+                    inputs[h],
+                    laws,
+                    s / substeps,
+                    (s + 1) / substeps,
+                    acted,
+                    memory[1],
+                    held,
+                    False,
                 )
                 for slot in range(held.shape[1]):
                     held[0, slot] += step * held[1, slot]
@@ -446,8 +466,9 @@ def rollout(fn, world, batch, items, begins, whole, out):  # type: ignore[no-unt
             proposal = p
             set_properties(fn, world, first, joints[p])
             set_discs(fn, world, discs[p])
-            finer = FINER if (discs[p, :, 2] > 0.0).any() else 1
-        total[:] = 0.0
+            finer = 1
+            for disc in discs[p]:
+                finer = FINER if disc[2] > 0.0 else finer
         for level in range(len(batch.counts)):
             before, substeps = outcome, batch.counts[level]
             if not whole:  # near others: with the contacts in the order of a new world
@@ -475,7 +496,11 @@ def rollout(fn, world, batch, items, begins, whole, out):  # type: ignore[no-unt
                     copy(states[h], out[item, h])
             if outcome == _TOUCHED or not whole:
                 break
-            total += batch.weights[level] * states
+            for h in range(horizon):
+                for i in range(states.shape[1]):
+                    for d in range(6):
+                        sum_before = total[h, i, d] if level else 0.0
+                        total[h, i, d] = sum_before + batch.weights[level] * states[h, i, d]
         if whole and outcome == _FREE and len(batch.counts) > 1:
             for i in range(len(world.bodies)):
                 if world.kinematic[i]:  # the weights' sum is 1 but for rounding

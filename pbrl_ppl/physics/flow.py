@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pbrl_ppl.physics.calls import compiled, copy
+from pbrl_ppl.physics.calls import compiled, copy, inner
 from pbrl_ppl.physics.laws import (
     COMMAND,
     FIRST,
@@ -89,7 +89,7 @@ _WINDOW = 1e-7
 _COAST = 0.1
 
 
-@compiled
+@inner
 def _slope(work, laws, u, a, inputs, share, low, high):  # type: ignore[no-untyped-def]
     """Compute accelerations (row a) at places that are set and a time in a piece of the interval.
 
@@ -99,7 +99,7 @@ def _slope(work, laws, u, a, inputs, share, low, high):  # type: ignore[no-untyp
     solve(work, u, a, False)
 
 
-@compiled
+@inner
 def _load(work, flow, u, inputs, share, low, high):  # type: ignore[no-untyped-def]
     """Set what acts there: wrenches, forces, and rows of friction."""
     laws, motion, held = flow.laws, work.motion, work.n + 1
@@ -108,8 +108,9 @@ def _load(work, flow, u, inputs, share, low, high):  # type: ignore[no-untyped-d
     if len(laws.commands) + len(laws.forces) > 0:
         begin = min(max(low + _SHORTEST, share), high - _WINDOW)  # past a jump that is no switch
         act(
-            work.states, inputs, laws, begin, begin + _WINDOW, work.acted, flow.memory[1], work.held
-        )
+            work.states, inputs, laws, begin, begin + _WINDOW, work.acted, flow.memory[1],
+            work.held, False,
+        )  # fmt: skip
     for s in range(flow.held):
         motion[u, held + s] = work.held[1, s]
     set_forces(work, u)
@@ -117,7 +118,7 @@ def _load(work, flow, u, inputs, share, low, high):  # type: ignore[no-untyped-d
     set_bounds(work, laws, u)
 
 
-@compiled
+@inner
 def _switch(laws, low):  # type: ignore[no-untyped-def]
     """Return the first time after ``low`` at which a command jumps, as a share of the interval."""
     high = 1.0
@@ -131,7 +132,7 @@ def _switch(laws, low):  # type: ignore[no-untyped-def]
     return high
 
 
-@compiled
+@inner
 def _slowest(work, laws, r):  # type: ignore[no-untyped-def]
     """Return the square of a ring's speed from which friction lets it slide by next to nothing."""
     ring, points = r - work.n_rows, work.rings.shape[1] - POINTS
@@ -139,7 +140,7 @@ def _slowest(work, laws, r):  # type: ignore[no-untyped-def]
     return 2.0 * slowing * _COAST * laws.tolerance * laws.length
 
 
-@compiled
+@inner
 def _size(work, laws, r):  # type: ignore[no-untyped-def]
     """Return the natural size of a row's way: of a wheel's in m, or of its joint's coordinate."""
     if work.kinds[r, 0] >= ALONG:
@@ -147,7 +148,7 @@ def _size(work, laws, r):  # type: ignore[no-untyped-def]
     return work.motion[SIZE, work.tree[work.kinds[r, 1], LINK.first]]
 
 
-@compiled
+@inner
 def _set_wheel(work, r, mode):  # type: ignore[no-untyped-def]
     """Set the mode of rows of a wheel, or against turning, under the body of a ring at place r."""
     for row in range(work.n_rows):
@@ -156,7 +157,7 @@ def _set_wheel(work, r, mode):  # type: ignore[no-untyped-def]
             work.kinds[row, 2], work.kinds[row, 3] = mode, 2
 
 
-@compiled
+@inner
 def _decide(work, laws, inputs, share, low, high):  # type: ignore[no-untyped-def]
     """Set which rows and rings stick and which way the others slip; and the step's first slopes.
 
@@ -198,7 +199,7 @@ def _decide(work, laws, inputs, share, low, high):  # type: ignore[no-untyped-de
         set_twist(work, r - count, kinds[r, 1], U, TWIST)
 
 
-@compiled
+@inner
 def _begin_modes(work, laws):  # type: ignore[no-untyped-def]
     """Set modes by the speeds: rows and rings with a speed slip, and the others stick.
 
@@ -232,7 +233,7 @@ def _begin_modes(work, laws):  # type: ignore[no-untyped-def]
     return moves
 
 
-@compiled
+@inner
 def _slide(work, laws):  # type: ignore[no-untyped-def]
     """Let rings slide whose reaction exceeds what they can hold; return whether any does.
 
@@ -263,7 +264,7 @@ def _slide(work, laws):  # type: ignore[no-untyped-def]
     return True
 
 
-@compiled
+@inner
 def _margin(work, laws, u):  # type: ignore[no-untyped-def]
     """Return by how much no row switches, by speeds in a row of the motion and forces as solved."""
     least = 1.0
@@ -278,7 +279,7 @@ def _margin(work, laws, u):  # type: ignore[no-untyped-def]
     return least
 
 
-@compiled
+@inner
 def _first_margin(work, laws):  # type: ignore[no-untyped-def]
     """Return by how much nothing switches where a step begins."""
     least = _margin(work, laws, U)
@@ -288,7 +289,7 @@ def _first_margin(work, laws):  # type: ignore[no-untyped-def]
     return least
 
 
-@compiled
+@inner
 def _weighted(motion, stage, first, j):  # type: ignore[no-untyped-def]
     """Return the weighted sum of slopes of a coordinate before a stage, of rows from ``first``."""
     total = 0.0
@@ -297,7 +298,7 @@ def _weighted(motion, stage, first, j):  # type: ignore[no-untyped-def]
     return total
 
 
-@compiled
+@inner
 def _step(work, laws, inputs, share, low, high, width):  # type: ignore[no-untyped-def]
     """Try a step of a width (share of the interval) from its first slopes.
 
@@ -346,7 +347,7 @@ def _step(work, laws, inputs, share, low, high, width):  # type: ignore[no-untyp
     return error / laws.tolerance, end, way
 
 
-@compiled
+@inner
 def _advance(work, laws, still, inputs, low, high, budget, wanted):  # type: ignore[no-untyped-def]
     """Move through a piece of an interval in which no command jumps.
 
@@ -413,7 +414,7 @@ def _advance(work, laws, still, inputs, low, high, budget, wanted):  # type: ign
     return budget, wanted
 
 
-@compiled
+@inner
 def _accept(work, laws):  # type: ignore[no-untyped-def]
     """Begin the next step where one ends; return whether a ring that slides is to stop."""
     motion, n, stops = work.motion, work.n, False
@@ -431,7 +432,7 @@ def _accept(work, laws):  # type: ignore[no-untyped-def]
     return stops
 
 
-@compiled
+@inner
 def _follow_paths(work, seconds):  # type: ignore[no-untyped-def]
     """Move the bodies that follow a path."""
     for k in range(work.n_bodies):
@@ -439,7 +440,7 @@ def _follow_paths(work, seconds):  # type: ignore[no-untyped-def]
             work.states[k, d] += seconds * work.states[k, 3 + d]
 
 
-@compiled
+@inner
 def _way(work, laws, still):  # type: ignore[no-untyped-def]
     """Return the share of an interval in which no body moves by more than half the smallest."""
     fastest = 1e-300
@@ -460,7 +461,7 @@ class Flow(NamedTuple):
     length: float  # natural size of a way (m)
 
 
-@compiled
+@inner
 def _place_discs(still, discs):  # type: ignore[no-untyped-def]
     """Put the hidden discs (disc, 3) of a proposal among the obstacles."""
     for j in range(len(discs)):
@@ -469,7 +470,7 @@ def _place_discs(still, discs):  # type: ignore[no-untyped-def]
         one[1], one[3], one[4] = discs[j, 1], discs[j, 1], discs[j, 2]
 
 
-@compiled
+@inner
 def _set_states(work, states):  # type: ignore[no-untyped-def]
     """Begin at states (body, 6); nothing is known of the friction."""
     for r in range(work.n_kinds):
@@ -538,5 +539,8 @@ def rollout(works, still, batch, items, begins, out):  # type: ignore[no-untyped
                 for d in range(6):
                     out[item, h, k, d] = work.states[k, d]
             if lost:
-                out[item, h:] = np.nan
+                for later in range(h, horizon):
+                    for k in range(bodies):
+                        for d in range(6):
+                            out[item, later, k, d] = np.nan
                 break

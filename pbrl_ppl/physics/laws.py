@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pbrl_ppl.effects import Attached, Command, Force, Friction, at_stage, holder
-from pbrl_ppl.physics.calls import call_law, compiled, law_address
+from pbrl_ppl.physics.calls import call_law, inner, law_address
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import WRENCH, Floats, Ints
 
@@ -85,7 +85,7 @@ class Laws(NamedTuple):
     time_step: float  # s
 
 
-@compiled
+@inner
 def laws_of(batch, p):  # type: ignore[no-untyped-def]
     """Return the laws of a proposal."""
     given = batch.given
@@ -95,9 +95,9 @@ def laws_of(batch, p):  # type: ignore[no-untyped-def]
     )  # fmt: skip
 
 
-@compiled
+@inner
 def act(  # type: ignore[no-untyped-def]
-    state, interval, laws, begin, end, acted, memory, held, after=False
+    state, interval, laws, begin, end, acted, memory, held, after
 ):  # fmt: skip
     """Compute the wrench on each body in a substep: the command stage, then the force stage.
 
@@ -165,7 +165,7 @@ def act(  # type: ignore[no-untyped-def]
         call_law(law[LAW], state_at, seen, parameters_at, at + 8 * WRENCHES)
 
 
-@compiled
+@inner
 def begin_held(state, laws, acted, held):  # type: ignore[no-untyped-def]
     """Set the numbers of force laws where a transition begins."""
     k = len(acted) - MORE
@@ -181,7 +181,7 @@ def begin_held(state, laws, acted, held):  # type: ignore[no-untyped-def]
             )  # fmt: skip
 
 
-@compiled
+@inner
 def set_memory(batch, laws, p, t, begin, start, acted, memory, held, at):  # type: ignore[no-untyped-def]
     """Set what command laws remember before the interval ``begin`` of the transition ``t``.
 
@@ -206,7 +206,7 @@ def set_memory(batch, laws, p, t, begin, start, acted, memory, held, at):  # typ
         act(start, inputs[t, h], laws, LATE, 1.0, acted, memory[1], held, True)
 
 
-@compiled
+@inner
 def _begin_memory(laws, interval, start, acted, memory, held):  # type: ignore[no-untyped-def]
     """Set what laws remember where nothing but the inputs (body, 9 or more) is known.
 
@@ -233,7 +233,7 @@ def _begin_memory(laws, interval, start, acted, memory, held):  # type: ignore[n
         act(start, past, laws, LATE, 1.0, acted, memory, held, True)
 
 
-@compiled
+@inner
 def bound(base, laws, i, under, state, torque, rest, speed, acted):  # type: ignore[no-untyped-def]
     """Return the greatest force of dry friction in the hinge of body ``i``, or under it."""
     k, data = len(acted) - MORE, acted.ctypes.data
@@ -251,7 +251,7 @@ def bound(base, laws, i, under, state, torque, rest, speed, acted):  # type: ign
     return base
 
 
-@compiled
+@inner
 def states_before(batch, out, item, h):  # type: ignore[no-untyped-def]
     """Return the states (body, 6) before an interval of an item of ``out``."""
     p, t = item // len(batch.inputs), item % len(batch.inputs)

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pbrl_ppl.physics.calls import compiled
+from pbrl_ppl.physics.calls import compiled, inner
 from pbrl_ppl.physics.laws import ACTED, LATE, MORE, act, begin_held, laws_of, set_memory
 from pbrl_ppl.physics.properties import COLUMN
 from pbrl_ppl.physics.solids import reaches, segment
@@ -56,7 +56,7 @@ _C1, _C2, _C3, _C4, _C5, _C6, _C7 = ((-1) ** k / math.factorial(2 * k) for k in 
 _S1, _S2, _S3, _S4, _S5, _S6, _S7 = ((-1) ** k / math.factorial(2 * k + 1) for k in range(1, 8))
 
 
-@compiled
+@inner
 def set_body(body, i, row, wheel, normal_gravity, step):  # type: ignore[no-untyped-def]
     """Set a body's properties for an interval; keep stored impulses.
 
@@ -78,14 +78,14 @@ def set_body(body, i, row, wheel, normal_gravity, step):  # type: ignore[no-unty
     return com_x != 0.0 or com_y != 0.0
 
 
-@compiled
+@inner
 def align(body, i):  # type: ignore[no-untyped-def]
     """Set the heading from the angle, which removes accumulated rounding."""
     angle = body[BODY.angle + i]
     body[BODY.cos + i], body[BODY.sin + i] = math.cos(angle), math.sin(angle)
 
 
-@compiled
+@inner
 def _arm(body, i):  # type: ignore[no-untyped-def]
     """Return the arm from the origin to the centre of mass, in the world's frame."""
     x, y = body[BODY.com_x + i], body[BODY.com_y + i]
@@ -95,7 +95,7 @@ def _arm(body, i):  # type: ignore[no-untyped-def]
     return c * x - s * y, s * x + c * y
 
 
-@compiled
+@inner
 def set_state(body, i, states, k):  # type: ignore[no-untyped-def]
     """Set the state of the centre of mass from that of the origin, row ``k`` of the states."""
     omega = states[k, 5]
@@ -106,7 +106,7 @@ def set_state(body, i, states, k):  # type: ignore[no-untyped-def]
     body[BODY.vx + i], body[BODY.vy + i] = states[k, 3] - omega * y, states[k, 4] + omega * x
 
 
-@compiled
+@inner
 def get_state(body, i, states, k):  # type: ignore[no-untyped-def]
     """Write the state of the origin into row ``k`` of the states."""
     (x, y), omega = _arm(body, i), body[BODY.omega + i]
@@ -116,7 +116,7 @@ def get_state(body, i, states, k):  # type: ignore[no-untyped-def]
     states[k, 5] = omega
 
 
-@compiled
+@inner
 def set_wrench(body, i, force_x, force_y, torque):  # type: ignore[no-untyped-def]
     """Set the accelerations by a wrench and the additional weight."""
     body[BODY.force_x + i], body[BODY.force_y + i], body[BODY.torque + i] = force_x, force_y, torque
@@ -126,7 +126,7 @@ def set_wrench(body, i, force_x, force_y, torque):  # type: ignore[no-untyped-de
     body[BODY.spin_up + i] = torque * body[BODY.inverse_moment + i]
 
 
-@compiled
+@inner
 def lever(body):  # type: ignore[no-untyped-def]
     """Set the angular accelerations by forces on origins that are off the centres of mass."""
     for i in range(BLOCK):
@@ -137,7 +137,7 @@ def lever(body):  # type: ignore[no-untyped-def]
         body[BODY.spin_up + i] = (body[BODY.torque + i] - moment) * body[BODY.inverse_moment + i]
 
 
-@compiled
+@inner
 def turn(body, step):  # type: ignore[no-untyped-def]
     """Move a body and rotate its heading."""
     fast = False
@@ -160,7 +160,7 @@ def turn(body, step):  # type: ignore[no-untyped-def]
                 align(body, i)
 
 
-@compiled
+@inner
 def accelerate(body, gravity, step):  # type: ignore[no-untyped-def]
     """Add the velocity changes by gravity and the wrench."""
     g_x, g_y = gravity
@@ -170,7 +170,7 @@ def accelerate(body, gravity, step):  # type: ignore[no-untyped-def]
         body[BODY.omega + i] += body[BODY.spin_up + i] * step
 
 
-@compiled
+@inner
 def lose(body, still, touched):  # type: ignore[no-untyped-def]
     """Mark the transitions that have diverged."""
     for i in range(BLOCK):
@@ -179,7 +179,7 @@ def lose(body, still, touched):  # type: ignore[no-untyped-def]
         touched[i] |= not speed < still.fastest  # also true of NaN
 
 
-@compiled
+@inner
 def watch(bodies, still, discs, touched):  # type: ignore[no-untyped-def]
     """Mark the transitions in which a body is near an obstacle or another that it may touch."""
     for k in range(len(still.radii)):
@@ -209,14 +209,14 @@ def watch(bodies, still, discs, touched):  # type: ignore[no-untyped-def]
                     touched[i] |= reaches(x, y, 0.0, 0.0, 0.0, radius + still.radii[j])
 
 
-@compiled
+@inner
 def limited(impulse, most):  # type: ignore[no-untyped-def]
     """Return an impulse clipped to ``most`` in both directions."""
     impulse = most if impulse > most else impulse
     return -most if impulse < -most else impulse
 
 
-@compiled
+@inner
 def begin_wheel(body):  # type: ignore[no-untyped-def]
     """Place a wheel's two rods and apply their impulses of the substep before."""
     for i in range(BLOCK):
@@ -237,7 +237,7 @@ def begin_wheel(body):  # type: ignore[no-untyped-def]
         body[BODY.omega + i] -= moment * (along * j_x + across * j_y)
 
 
-@compiled
+@inner
 def solve_wheel(body):  # type: ignore[no-untyped-def]
     """Do one iteration of a wheel's rods, whose impulses friction limits."""
     for i in range(BLOCK):
@@ -278,7 +278,7 @@ def free_wheels(world: World) -> Wheels | None:
     return Wheels(np.isin(np.arange(len(world.bodies)), wheels), world.iterations)
 
 
-@compiled
+@inner
 def substep(bodies, wheels, gravity, step):  # type: ignore[no-untyped-def]
     """Do one step of the engine."""
     for k in range(len(wheels.under)):
@@ -302,10 +302,9 @@ def rollout(wheels, still, batch, items, begins, out):  # type: ignore[no-untype
     n, horizon, moving = len(inputs), inputs.shape[1], len(still.radii)
     timed = rows.shape[1] > 1
     acting = len(batch.commands) + len(batch.forces) > 0
-    bodies = np.zeros((moving, BLOCK * len(BODY)))
     own_discs = np.zeros((BLOCK, discs.shape[1], 3))
-    touched = np.zeros(BLOCK, dtype=np.bool_)
-    proposal, transition, first, until = np.zeros((4, BLOCK), dtype=np.int64)
+    proposal, transition = np.zeros(BLOCK, np.int64), np.zeros(BLOCK, np.int64)
+    first, until = np.zeros(BLOCK, np.int64), np.zeros(BLOCK, np.int64)
     states, acted = np.empty((moving, 6)), np.zeros((moving + MORE, ACTED))
     memory, at = np.zeros((2, batch.slots)), np.full(2, -1)
     remembered, held = np.zeros((BLOCK, batch.slots)), np.zeros((BLOCK, 2, batch.held))
@@ -323,8 +322,8 @@ def rollout(wheels, still, batch, items, begins, out):  # type: ignore[no-untype
         for level in range(len(batch.counts)):
             substeps, weight = batch.counts[level], batch.weights[level]
             step = batch.time_step / substeps
-            bodies[:] = 0.0
-            touched[:] = False
+            bodies = np.zeros((moving, BLOCK * len(BODY)))
+            touched = np.zeros(BLOCK, np.bool_)
             shifted = False
             for ahead in range(longest):
                 for k in range(moving):
@@ -353,7 +352,8 @@ def rollout(wheels, still, batch, items, begins, out):  # type: ignore[no-untype
                     laws = laws_of(batch, p)
                     set_memory(batch, laws, p, t, first[i], states, acted, memory, held[i], at)
                     begin_held(states, laws, acted, held[i])
-                    remembered[i] = memory[1]
+                    for slot in range(batch.slots):
+                        remembered[i, slot] = memory[1, slot]
                 for s in range(substeps):
                     if acting:
                         for i in range(width):
@@ -362,7 +362,7 @@ def rollout(wheels, still, batch, items, begins, out):  # type: ignore[no-untype
                                 get_state(bodies[k], i, states, k)
                             act(
                                 states, inputs[t, h], laws_of(batch, p), s / substeps,
-                                (s + 1) / substeps, acted, remembered[i], held[i],
+                                (s + 1) / substeps, acted, remembered[i], held[i], False,
                             )  # fmt: skip
                             for slot in range(batch.held):
                                 held[i, 0, slot] += step * held[i, 1, slot]

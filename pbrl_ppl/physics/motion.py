@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.physics.calls import compiled
+from pbrl_ppl.physics.calls import inner
 from pbrl_ppl.physics.joints import LENGTH
 from pbrl_ppl.physics.laws import ACTED, COMMAND, MORE, bound
 from pbrl_ppl.physics.properties import COLUMN
@@ -104,7 +104,7 @@ def work_of(tree: Tree, length: float) -> NDArray[np.void]:
     return work
 
 
-@compiled
+@inner
 def set_numbers(work, gravity, normal_gravity, ring, bodies, joints):  # type: ignore[no-untyped-def]
     """Set what depends on parameters alone: of ``bodies`` (body, column), ``joints`` (joint, 9)."""
     for i in range(work.n_links):
@@ -165,7 +165,7 @@ def set_numbers(work, gravity, normal_gravity, ring, bodies, joints):  # type: i
         numbers[BASE] = numbers[BOUND]
 
 
-@compiled
+@inner
 def set_coordinates(work, states):  # type: ignore[no-untyped-def]
     """Set coordinates and speeds from the states (body, 6) of bodies."""
     tree, motion = work.tree, work.motion
@@ -194,7 +194,7 @@ def set_coordinates(work, states):  # type: ignore[no-untyped-def]
             motion[Q, j], motion[U, j] = c * x + s * y, c * v_x + s * v_y
 
 
-@compiled
+@inner
 def _seen(state, x, y):  # type: ignore[no-untyped-def]
     """Return place and velocity of a point of a body, given in the body's frame."""
     c, s = math.cos(state[2]), math.sin(state[2])
@@ -205,7 +205,7 @@ def _seen(state, x, y):  # type: ignore[no-untyped-def]
 # From here on elements are addressed one by one: a view of an array costs as much as ten of them.
 
 
-@compiled
+@inner
 def set_places(work, q, u):  # type: ignore[no-untyped-def]
     """Set places, velocities and their derivatives, and states, from rows q and u of the motion."""
     tree, links, slope, motion, states = work.tree, work.links, work.slope, work.motion, work.states
@@ -255,7 +255,7 @@ def set_places(work, q, u):  # type: ignore[no-untyped-def]
             states[k, 3], states[k, 4], states[k, 5] = v_x + omega * o_y, v_y - omega * o_x, omega
 
 
-@compiled
+@inner
 def set_forces(work, u):  # type: ignore[no-untyped-def]
     """Set M and Q, and the rows of dry friction, where places and wrenches are set."""
     tree, links, slope, motion = work.tree, work.links, work.slope, work.motion
@@ -300,7 +300,7 @@ def set_forces(work, u):  # type: ignore[no-untyped-def]
             motion[M + k, j] = motion[M + j, k]
 
 
-@compiled
+@inner
 def set_rows(work, u):  # type: ignore[no-untyped-def]
     """Set the rows of dry friction, where places are set."""
     tree, links, slope, motion, rows = work.tree, work.links, work.slope, work.motion, work.rows
@@ -328,7 +328,7 @@ def set_rows(work, u):  # type: ignore[no-untyped-def]
         rows[r, BIAS] = omega * (n_x * v_y - n_y * v_x) + n_x * b_x + n_y * b_y
 
 
-@compiled
+@inner
 def set_bounds(work, laws, u):  # type: ignore[no-untyped-def]
     """Set the greatest forces of dry friction that laws change, where forces and rows are set."""
     if len(laws.frictions) == 0:
@@ -361,7 +361,7 @@ def set_bounds(work, laws, u):  # type: ignore[no-untyped-def]
             work.rings[ring, GRIP, 0] = most / points
 
 
-@compiled
+@inner
 def solve(work, u, a, impulse):  # type: ignore[no-untyped-def]
     """Compute accelerations (row a) and what holds, where forces and rows are set.
 
@@ -424,7 +424,7 @@ def solve(work, u, a, impulse):  # type: ignore[no-untyped-def]
             at += 3
 
 
-@compiled
+@inner
 def _eliminate(system, size):  # type: ignore[no-untyped-def]
     """Solve a linear system in place; its last column becomes the solution."""
     for k in range(size):
@@ -448,7 +448,7 @@ def _eliminate(system, size):  # type: ignore[no-untyped-def]
         system[k, size] = total / system[k, k]
 
 
-@compiled
+@inner
 def _sliding(work, ring, i, omega):  # type: ignore[no-untyped-def]
     """Return force and torque, at the place of its joint, on a body whose ring slides."""
     links, rings, f_x, f_y, torque = work.links, work.rings, 0.0, 0.0, 0.0
@@ -468,7 +468,7 @@ def _sliding(work, ring, i, omega):  # type: ignore[no-untyped-def]
     return f_x, f_y, torque
 
 
-@compiled
+@inner
 def _resist(work, r, u, column):  # type: ignore[no-untyped-def]
     """Add the friction of a row that slips, or of a ring that slides, to a column of the system."""
     system, slope = work.system, work.slope
@@ -484,7 +484,7 @@ def _resist(work, r, u, column):  # type: ignore[no-untyped-def]
     system[turn, column] += torque
 
 
-@compiled
+@inner
 def set_first_slide(work, u, a, tries=30):  # type: ignore[no-untyped-def]
     """Set the accelerations (row a) with which rings that hold begin to slide.
 
@@ -551,7 +551,7 @@ def set_first_slide(work, u, a, tries=30):  # type: ignore[no-untyped-def]
             break
 
 
-@compiled
+@inner
 def row_speed(work, r, u):  # type: ignore[no-untyped-def]
     """Return the speed of a row, or its acceleration without the bias, by a row of the motion."""
     speed = 0.0
@@ -560,7 +560,7 @@ def row_speed(work, r, u):  # type: ignore[no-untyped-def]
     return speed
 
 
-@compiled
+@inner
 def set_twist(work, ring, i, u, field):  # type: ignore[no-untyped-def]
     """Set a ring's twist, its third part times the ring's radius; return its square."""
     rings = work.rings
@@ -571,7 +571,7 @@ def set_twist(work, ring, i, u, field):  # type: ignore[no-untyped-def]
     return v_x * v_x + v_y * v_y + turned * turned
 
 
-@compiled
+@inner
 def strain(work, ring, i, tries=40):  # type: ignore[no-untyped-def]
     """Return by how much the reaction on a ring that holds exceeds what it can hold, as a share.
 

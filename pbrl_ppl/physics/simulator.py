@@ -109,7 +109,8 @@ class Engine:
             if self._wheels is not None:
                 lockstep.rollout(self._wheels, self._still, batch, items, begins, out)
             elif tree is not None:
-                flow.rollout(self._work, self._still, batch, items, begins, out)
+                rollout = calls.compiled_beside(flow.rollout)
+                rollout(self._work, self._still, batch, items, begins, out)
             left = begins < horizon
             items, begins = items[left], begins[left]
             if len(items) and self._name == "contact-free":

@@ -12,7 +12,7 @@ import pymunk
 
 from pbrl_ppl.errors import SimulationError
 from pbrl_ppl.history import History, Segments
-from pbrl_ppl.physics.calls import compiled
+from pbrl_ppl.physics.calls import compiled, inner
 from pbrl_ppl.physics.joints import JOINT_KINDS
 from pbrl_ppl.physics.world import engine_shapes
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene
@@ -422,7 +422,7 @@ def _overlaps(scene: Scene, poses: Floats) -> Iterator[tuple[int, str]]:
             )
 
 
-@compiled
+@inner
 def segment(obstacle):  # type: ignore[no-untyped-def]
     """Return an obstacle's begin, its way to the end, one over the way's square, and its radius."""
     a_x, a_y, b_x, b_y, radius = obstacle
@@ -431,7 +431,7 @@ def segment(obstacle):  # type: ignore[no-untyped-def]
     return a_x, a_y, d_x, d_y, 1.0 / square if square > 0.0 else 0.0, radius
 
 
-@compiled
+@inner
 def reaches(x, y, d_x, d_y, scale, reach):  # type: ignore[no-untyped-def]
     """Return whether a place relative to a segment's begin is within ``reach`` of the segment."""
     t = (x * d_x + y * d_y) * scale

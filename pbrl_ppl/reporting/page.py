@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import jinja2
 from markupsafe import Markup
+from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from pbrl_ppl.reporting import (
@@ -130,5 +131,6 @@ def render_page(title: str, header: str, sections: Sequence[Section], **context:
 def picture(draw: Callable[..., Figure]) -> Mapping[str, str]:
     """Return a picture in both widths, ``wide`` and ``narrow``, as data URLs."""
     sizes = {"wide": WIDE, "narrow": NARROW}
-    data = {name: base64.b64encode(png(draw(width=width))) for name, width in sizes.items()}
+    with rc_context({"text.parse_math": False}):  # a $ is part of a name
+        data = {name: base64.b64encode(png(draw(width=width))) for name, width in sizes.items()}
     return {name: f"data:image/png;base64,{code.decode('ascii')}" for name, code in data.items()}

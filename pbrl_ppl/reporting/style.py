@@ -11,8 +11,8 @@ import numpy as np
 from cycler import cycler
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.text import Text
 from PIL import Image
 from scipy.stats import gaussian_kde
 
@@ -200,15 +200,13 @@ def shares_below(axes: Axes, samples: Mapping[str, Floats], size: float) -> tupl
 
 def png(figure: Figure, colours: int = 96) -> bytes:
     """Render a figure as a PNG picture, which a palette makes a third as large."""
-    drawn, small = io.BytesIO(), io.BytesIO()
-    for text in figure.findobj(Text):
-        if "$" in text.get_text():  # of a name: no text here is a formula
-            text.set_parse_math(False)
+    figure.set_dpi(130 if figure.get_figwidth() > NARROW else 170)
+    canvas, small = FigureCanvasAgg(figure), io.BytesIO()
     with warnings.catch_warnings():
         # a name in letters that the font lacks is in the page's text all the same
         warnings.filterwarnings("ignore", message="Glyph .* missing from", category=UserWarning)
-        figure.savefig(drawn, format="png", dpi=130 if figure.get_figwidth() > NARROW else 170)
-    picture = Image.open(drawn).convert("RGB")
+        canvas.draw()  # once: saving a figure draws it twice
+    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
     picture = picture.quantize(colours, dither=Image.Dither.NONE)
     picture.save(small, format="png", optimize=True)
     return small.getvalue()
