@@ -46,7 +46,7 @@ from pbrl_ppl.progress import Progress
 from pbrl_ppl.sampling.methods import METHODS, OVER_LIBRARY, SamplerRun
 from pbrl_ppl.sampling.mixture import mix, most_frequent, most_probable, summed
 from pbrl_ppl.state import STATE, Floats
-from pbrl_ppl.threads import Say, one_blas_thread
+from pbrl_ppl.threads import Say, one_blas_thread, silent
 
 if TYPE_CHECKING:
     import pymc as pm
@@ -204,7 +204,8 @@ def sample(
     if method != "map":
         asked: dict[str, Any] = {key: n for key, n in schedule.items() if n is not None}
         chosen = replace(chosen, **asked)
-    with Progress(not progress) if isinstance(progress, bool) else nullcontext(progress) as say:
+    # quiet without a thread, which a fork by PyMC would copy
+    with Progress(False) if progress is True else nullcontext(progress or silent) as say:
         job = SamplerRun(
             problem=_as_in(problem, resume), method=chosen, mode=None, resume=resume, seed=seed,
             cores=os.cpu_count() or 1 if cores is None else cores, progress=say,
