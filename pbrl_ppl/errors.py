@@ -24,6 +24,11 @@ def printable(text: object, kept: str = "") -> str:
     return _OBEYED.sub(lambda one: one[0] if one[0] in kept else ascii(one[0])[1:-1], str(text))
 
 
+def in_a_line(message: object) -> str:
+    """Return a message in one line, whatever it quotes from a file, without control characters."""
+    return printable(" ".join(str(message).split()))
+
+
 def warn(message: str | Warning, category: type[Warning] | None = None) -> None:
     """Issue a warning that points at the first caller outside the package."""
     frame, level = inspect.currentframe(), 1

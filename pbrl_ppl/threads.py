@@ -1,21 +1,54 @@
-"""Work in parallel: threads, BLAS in one of them, and processes that end."""
+"""Work, counted and in parallel: threads, BLAS in one of them, and processes that end."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
 import signal
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, wraps
 from threading import Thread
-from typing import ParamSpec, TypeVar
+from typing import ParamSpec, Self, TypeVar
 
 from threadpoolctl import ThreadpoolController
 
 P = ParamSpec("P")
 R = TypeVar("R")
 T = TypeVar("T")
+
+#: Takes a stage that begins, what was found, or counted work.
+Say = Callable[[str], None]
+
+
+def silent(said: str) -> None:
+    """Show nothing."""
+
+
+class Work(str):
+    """A sentence on what is done now, and how much of it: a bar shows it, no log keeps it.
+
+    Attributes
+    ----------
+    done, total : int
+        Counted units. The work has ended once all are done.
+    """
+
+    done = total = 0
+
+    def __new__(cls, sentence: str, done: int, total: int) -> Self:
+        """Return the sentence with its counts."""
+        work = super().__new__(cls, sentence)
+        work.done, work.total = done, total
+        return work
+
+
+def counted(items: Iterable[T], total: int, sentence: str, say: Say) -> Iterator[T]:
+    """Yield items, and report how many of a total are done: those that the next was asked after."""
+    say(Work(sentence, 0, total))
+    for done, item in enumerate(items, 1):
+        yield item
+        say(Work(sentence, done, total))
 
 
 def one_blas_thread(function: Callable[P, R]) -> Callable[P, R]:
@@ -33,14 +66,17 @@ def one_blas_thread(function: Callable[P, R]) -> Callable[P, R]:
     return limited
 
 
-def in_parallel(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
+def in_parallel(
+    function: Callable[[T], R], items: Iterable[T], sentence: str = "", say: Say = silent
+) -> list[R]:
     """Return the function's values in the order of its arguments, a thread a processor.
 
-    Simulations and linear algebra release the interpreter's lock.
+    Simulations and linear algebra release the interpreter's lock. The ``sentence`` says what is
+    done, and how many items are.
     """
-    pool = ThreadPoolExecutor(processors())
+    pool, items = ThreadPoolExecutor(processors()), list(items)
     with pool, _pools().limit(limits=1, user_api="blas"):
-        return list(pool.map(function, items))
+        return list(counted(pool.map(function, items), len(items), sentence, say))
 
 
 def processors() -> int:

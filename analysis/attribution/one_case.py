@@ -18,6 +18,7 @@ from attribution.baselines import ask_baselines
 from attribution.cases import CATALOGUED, Case
 from attribution.oracle import Oracle, ask, declared_mode, sized, true_parameters
 from pbrl_ppl.criticism import close_loop
+from pbrl_ppl.threads import Work
 
 #: Parameters of which more than one value is the truth: any number between two trajectories.
 _AMBIGUOUS = {("mass_change", "trajectory")}
@@ -168,6 +169,11 @@ def _loop(
     """Return the loop's findings, and the start times of its stages (s)."""
     begin = time.perf_counter()
     stages: list[tuple[float, str]] = []
+
+    def begun(stage: str) -> None:
+        if not isinstance(stage, Work):
+            stages.append((time.perf_counter() - begin, stage))
+
     found = close_loop(
         case.body.scene,
         train,
@@ -176,7 +182,7 @@ def _loop(
         seed=seed,
         draws=draws if case.draws is None else case.draws,
         method=case.method,
-        progress=lambda stage: stages.append((time.perf_counter() - begin, stage)),
+        progress=begun,
     )
     return found.to_dict() | {"stages": stages, "loop_seconds": time.perf_counter() - begin}
 

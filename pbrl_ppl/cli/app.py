@@ -82,7 +82,7 @@ class Printing:
     def run(self, function: Callable[..., Result], kept: str, given: Mapping[str, object]) -> None:
         """Run a command with what it takes, and print its result."""
         taken = inspect.signature(function).parameters
-        staged = terminal.stages(self.quiet) if "progress" in taken else nullcontext()
+        staged = terminal.Progress(self.quiet) if "progress" in taken else nullcontext()
         output = given.get("output", getattr(given.get("to"), "output", None))
         with (
             terminal.interruptible(kept.format(**given)) as interrupts,

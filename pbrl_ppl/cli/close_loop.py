@@ -21,7 +21,7 @@ from pbrl_ppl.cli.new import models_folder
 from pbrl_ppl.cli.terminal import Progress, Result
 from pbrl_ppl.errors import HistoryError, PbrlError
 from pbrl_ppl.files import check_folder, write_text
-from pbrl_ppl.threads import obey_parent
+from pbrl_ppl.threads import Work, counted, obey_parent
 
 if TYPE_CHECKING:
     from pbrl_ppl.criticism import Loop
@@ -138,9 +138,10 @@ def close_loop(
     recorded, held_out = (", ".join(map(str, paths)) for paths in (train, test or ()))
     source = report.Source(str(scene), recorded, held_out, options.command_line(context))
     interrupts.rescue = partial(_without_verdict, said, sampler, output, source)
+    progress.stages = (*criticism.Stage, "writing the report")
     loop, stopped = _finished(run, progress, interrupts, said)
     interrupts.rescue = None
-    progress("writing the report")
+    progress(progress.stages[-1])
     loop.save(output, to.overwrite, page=report.render(loop, source))
     contents = loop.to_dict() | {"report": output / "report.html"}
     undecided = terminal.UNDECIDED if loop.verdict == criticism.NOT_CONVERGED else 0
@@ -226,8 +227,9 @@ def _closed(each: Each, paths: Sequence[Path], jobs: int, progress: Progress) ->
     each.reading.catalogue()
     page.parent.mkdir(parents=True, exist_ok=True)
     rows: list[dict[str, Any]] = []
+    progress.stages = (now := "closing the loop on each log",)
     with ThreadPoolExecutor(jobs) as threads:
-        for row in threads.map(each.apart, logs, logs.values()):
+        for row in counted(threads.map(each.apart, logs, logs.values()), len(logs), now, progress):
             rows.append(row)
             said = row.get("message") or ", ".join([row["verdict"], *row["added"]])
             progress(f"{len(rows)}/{len(logs)} {row['log']}: {said}")
@@ -253,7 +255,7 @@ def _finished(
 
     def noted(stage: str) -> None:
         progress(stage)
-        if not isinstance(stage, (criticism.Stage, criticism.Work)):
+        if not isinstance(stage, (criticism.Stage, Work)):
             said.append(stage)
         if stage == criticism.Stage.SAMPLE:
             interrupts.keep()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -22,8 +20,6 @@ if TYPE_CHECKING:
 
     from pbrl_ppl.posterior import Idata
 
-#: The stage of `fit` that takes longest.
-_SAMPLING = "looking for the mode, then sampling"
 #: Formats of a summary's columns; of others, four digits.
 _DIGITS = {"ess": ".0f", "r_hat": ".3f"}
 
@@ -92,7 +88,7 @@ def fit(
     reading: options.SceneReading,
     model: Model,
     sampler: Sampler,
-    quiet: bool,
+    progress: Progress,
     interrupts: terminal.Interrupts,
     resume: Path | None = None,
 ) -> Result:
@@ -106,34 +102,28 @@ def fit(
     resume : FILE
         Go on with this posterior: its chains, or more draws.
     """
-    with terminal.stages(quiet) as progress:
-        progress("reading the scene and the history")
-        declared, (loaded,) = reading.read(scene, [history])
-        declared, effects = reading.with_effects(declared)
-        progress("loading the sampler")
-        from pbrl_ppl import sampling
-        from pbrl_ppl.physics import check_history
-        from pbrl_ppl.posterior import load_posterior, save_posterior
+    progress("reading the scene and the history")
+    declared, (loaded,) = reading.read(scene, [history])
+    declared, effects = reading.with_effects(declared)
+    progress("loading the sampler")
+    from pbrl_ppl import sampling
+    from pbrl_ppl.physics import check_history
+    from pbrl_ppl.posterior import load_posterior, save_posterior
 
-        check_history(declared, loaded, loaded.segments(1))
-        earlier = None if resume is None else load_posterior(resume)
-        progress(_SAMPLING)
-        try:
-            made = sampling.physics_model(
-                declared, loaded, effects, likelihood=model.likelihood, horizon=model.horizon,
-                nu=model.nu, sigma="scalar" if model.scalar else "per_dimension",
-            )  # fmt: skip
-        except ValueError as error:  # an option that the model refuses
-            raise errors.FitError(f"fit: {error}") from None
+    check_history(declared, loaded, loaded.segments(1))
+    earlier = None if resume is None else load_posterior(resume)
+    try:
+        made = sampling.physics_model(
+            declared, loaded, effects, likelihood=model.likelihood, horizon=model.horizon,
+            nu=model.nu, sigma="scalar" if model.scalar else "per_dimension",
+        )  # fmt: skip
+    except ValueError as error:  # an option that the model refuses
+        raise errors.FitError(f"fit: {error}") from None
     if sampler.method not in ("importance", "laplace", "map"):
         interrupts.keep()  # the draws of chains so far
-    # the sampler shows its own progress
-    with (
-        terminal.noted_warnings("was interrupted") as caught,
-        redirect_stdout(sys.stderr),
-        terminal.still_running(terminal.Status(_SAMPLING), quiet),
-    ):
-        idata = sampling.fit(made, resume=earlier, progress=not quiet, **vars(sampler))
+    progress("looking for the mode, then sampling")
+    with terminal.noted_warnings("was interrupted") as caught:
+        idata = sampling.fit(made, resume=earlier, progress=progress, **vars(sampler))
         save_posterior(idata, to.output)
     return _fitted(idata, to.output, {type(warning) for warning in caught}, interrupts.seen)
 
@@ -214,7 +204,7 @@ def update(
     from pbrl_ppl.sampling import updating
 
     with terminal.noted_warnings() as caught:
-        idata = updating.update(idata, new, effects=catalogue, seed=seed, progress=False)
+        idata = updating.update(idata, new, effects=catalogue, seed=seed, progress=progress)
     record = posteriors.PosteriorRecord.of(idata)
     if record.interrupted is not None:  # half a posterior is no prior for the next update
         raise KeyboardInterrupt

@@ -1,4 +1,4 @@
-"""Terminal and files: progress, interrupts, warnings, output, checks of output paths."""
+"""Terminal and files: interrupts, warnings, output, checks of output paths."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import signal
 import sys
 import tempfile
 import threading
-import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
@@ -23,7 +22,9 @@ from rich.table import Table
 from rich.text import Text
 
 from pbrl_ppl.errors import OutputError, printable
+from pbrl_ppl.errors import in_a_line as in_a_line
 from pbrl_ppl.files import json_values
+from pbrl_ppl.progress import Progress as Progress
 
 #: Exit codes: a failed log, a goal that was not reached, or effects that stay inseparable; bad
 #: input or usage; chains that have not converged, so no verdict; an interrupt, as shells report it.
@@ -33,9 +34,6 @@ FAILED, BAD_INPUT, UNDECIDED, INTERRUPTED = 1, 2, 3, 130
 _ENDING = signal.SIGINT, signal.SIGTERM
 #: Seconds in which an interrupted command ends by itself.
 _PATIENCE = 1.5
-
-#: Takes the name of a stage that begins.
-Progress = Callable[[str], None]
 
 
 class PlainConsole(Console):
@@ -47,65 +45,6 @@ class PlainConsole(Console):
     def render_str(self, text: str, **options: Any) -> Text:
         """Return a text with what a terminal would obey as escapes."""
         return super().render_str(printable(text, kept="\n"), **options)
-
-
-@contextmanager
-def stages(quiet: bool, every: float = 60.0) -> Iterator[Progress]:
-    """Show stages on stderr with the time elapsed; a terminal also shows the running stage.
-
-    Elsewhere a line is written ``every`` so many seconds: a log is never silent for long.
-    """
-    console = PlainConsole(stderr=True, quiet=quiet)
-    running = Status()
-    with console.status(running), still_running(running, quiet, every):
-
-        def progress(stage: str) -> None:
-            if not getattr(stage, "passing", False):
-                console.print(f"[{running.elapsed:5.1f} s] {in_a_line(stage)}", soft_wrap=True)
-            running.name, running.share = stage, getattr(stage, "share", None)
-
-        yield progress
-
-
-@contextmanager
-def still_running(running: Status, quiet: bool, every: float = 60.0) -> Iterator[None]:
-    """Write to stderr ``every`` so many seconds that a stage goes on, unless that is a terminal."""
-    if quiet or sys.stderr.isatty():
-        yield
-        return
-    ended = threading.Event()
-
-    def write() -> None:
-        while not ended.wait(every):
-            # not by the console: it may be at work
-            line = f"[{running.elapsed:5.1f} s] {in_a_line(running.name)}: still running\n"
-            with suppress(OSError):
-                os.write(2, line.encode())
-
-    writer = threading.Thread(target=write, daemon=True)
-    writer.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        writer.join()
-
-
-class Status:
-    """Status line with the present stage, the time elapsed and, where known, the share done."""
-
-    def __init__(self, name: str = "starting") -> None:
-        self.name, self._begin = name, time.monotonic()
-        self.share: float | None = None
-
-    @property
-    def elapsed(self) -> float:
-        """Seconds since the start."""
-        return time.monotonic() - self._begin
-
-    def __rich__(self) -> Text:
-        done = "" if self.share is None else f", about {self.share:.0%} done"
-        return Text(f"{in_a_line(self.name)}, {self.elapsed:.0f} s{done}")
 
 
 class Interrupts:
@@ -188,11 +127,6 @@ def interruptible(state: str = "nothing was written") -> Iterator[Interrupts]:
         if handled:
             for number, handler in before.items():
                 signal.signal(number, handler or signal.SIG_DFL)
-
-
-def in_a_line(message: object) -> str:
-    """Return a message in one line, whatever it quotes from a file, without control characters."""
-    return printable(" ".join(str(message).split()))
 
 
 @contextmanager

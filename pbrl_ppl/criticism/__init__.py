@@ -32,7 +32,6 @@ from .results import Law as Law
 from .results import SearchLength as SearchLength
 from .results import Stage as Stage
 from .results import Unexplained as Unexplained
-from .results import Work as Work
 from .results import diverged_after as diverged_after
 from .score import Signature as Signature
 from .score import rank_candidates as rank_candidates

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.refinement import Declared
-from pbrl_ppl.criticism.results import ONE_TRAJECTORY, Candidate, Law, SearchLength, Stage
+from pbrl_ppl.criticism.results import ONE_TRAJECTORY, Candidate, Law, SearchLength
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.criticism.search import Search
 from pbrl_ppl.criticism.unexplained import unexplained_acceleration
@@ -215,8 +215,8 @@ def criticise(
     declared = Declared(scene, catalogue, seed, substeps, criteria, say)
     declared, history = declared.cleaned(history, most_transitions)
     mode = declared.mode(history)
-    say(Stage.SCORE)
-    ranked = rank_candidates(mode, declared.missing(mode), criteria)
+    say("scoring what the model might lack")
+    ranked = rank_candidates(mode, declared.missing(mode), criteria, say)
     excess = unexplained_acceleration(mode, criteria)
     return Ranking(
         tuple(signature.candidate for signature in ranked),

@@ -136,8 +136,8 @@ def close_loop(
     criteria : Criteria
         Thresholds of the decisions.
     progress : callable, optional
-        Called with each :class:`Stage`, a sentence with the share of the time at which it usually
-        begins, with sentences on what was found, and with :class:`Work`, what is done now.
+        Called with each :class:`Stage`, with sentences on what was found, and with
+        ``pbrl_ppl.threads.Work``, what is done now and how much of it.
 
     Returns
     -------
@@ -324,7 +324,7 @@ def _tested(
     seconds = (int(test.dataset["n_rows"].max()) - 1) * task.scene.time_step
     # unusual laws that no climb tried are not compiled for a test
     tried = [one for one in task.missing(innovations) if one in found.signatures]
-    ranked = rank_candidates(innovations, tried, criteria)
+    ranked = rank_candidates(innovations, tried, criteria, task.say)
     misfit = find_misfit(innovations, revised.excess, horizon=horizon, seed=task.seed)
     if not found.laws:  # a missing effect may be why the prior does not explain the data
         misfit = misfit.with_test(prior)
@@ -393,12 +393,12 @@ def _fit(task: _Task, mode: Mode) -> tuple[Fit, list[Warning]]:
         mode = tempered_mode(mode)
     method = task.method
     for n in _DRAWS.get(method, _CHAIN_DRAWS) if task.draws is None else (task.draws,):
-        tune = max(100, 5 * n // 8)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             fitted = sample(
-                mode.problem, method=method, seed=task.seed, draws=n, tune=tune, start=mode
-            )
+                mode.problem, method=method, seed=task.seed, draws=n, tune=max(100, 5 * n // 8),
+                start=mode, progress=task.say,
+            )  # fmt: skip
         if fitted.record.interrupted:  # half a posterior gives no verdict
             raise KeyboardInterrupt
         if _converged(fitted, task.criteria):

@@ -429,33 +429,11 @@ class Unexplained:
 
 
 class Stage(StrEnum):
-    """A stage of closing the loop: a name for programs, and a sentence for people.
+    """A stage of closing the loop, in their order: a name for programs, a sentence for people."""
 
-    Attributes
-    ----------
-    share : float or None
-        Share of the whole time at which the stage usually begins (measured on a cart); None for
-        stages that are not always there.
-    """
-
-    share: float | None
-
-    def __new__(cls, sentence: str, share: float | None = None) -> Stage:
-        """Return a stage that is its sentence, with its share."""
-        stage = str.__new__(cls, sentence)
-        stage._value_, stage.share = sentence, share
-        return stage
-
-    CHECK_PRIOR = "comparing the data with the prior", 0.02
-    FIT = "fitting the declared model", 0.03
-    SIMULATE = "simulating whole trajectories with what the model might lack", 0.2
-    SCORE = "scoring what the model might lack"
-    TEST = "testing the residual", 0.4
-    SAMPLE = "sampling the posteriors", 0.5
-    COMPARE = "comparing errors on held-out data", 0.99
-
-
-class Work(str):
-    """A sentence on what is being done now: a status line shows it, no log keeps it."""
-
-    passing = True
+    CHECK_PRIOR = "comparing the data with the prior"
+    FIT = "fitting the declared model"
+    SIMULATE = "simulating whole trajectories with what the model might lack"
+    TEST = "testing the residual"
+    SAMPLE = "sampling the posteriors"
+    COMPARE = "comparing errors on held-out data"

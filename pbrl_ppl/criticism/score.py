@@ -22,7 +22,7 @@ from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import Mode, posterior_slopes
 from pbrl_ppl.parameters import box, prior_residual, prior_slopes
 from pbrl_ppl.state import Floats, Ints
-from pbrl_ppl.threads import in_parallel
+from pbrl_ppl.threads import Say, in_parallel, silent
 
 #: Where the declared parameters leave less than this share of a signature they absorb it.
 ABSORBED = 1e-3
@@ -96,7 +96,7 @@ class Linearisation:
 
 
 def rank_candidates(
-    mode: Mode, candidates: Sequence[Attached], criteria: Criteria = DEFAULT
+    mode: Mode, candidates: Sequence[Attached], criteria: Criteria = DEFAULT, say: Say = silent
 ) -> list[Signature]:
     """Score every candidate effect at the mode of the model that lacks it, best first.
 
@@ -110,7 +110,8 @@ def rank_candidates(
         return signature
 
     # p-values of the same physics differ by rounding
-    return sorted(in_parallel(score, candidates), key=lambda one: round(one.log_p, 3))
+    scored = in_parallel(score, candidates, f"scoring {len(candidates)} laws", say)
+    return sorted(scored, key=lambda one: round(one.log_p, 3))
 
 
 class Library:

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
-from pbrl_ppl.criticism.results import Law, SearchLength, Stage, Work
+from pbrl_ppl.criticism.results import Law, SearchLength, Stage
 from pbrl_ppl.criticism.score import Library, Signature, named_beside
 from pbrl_ppl.criticism.subsets import Regression, Subset, best_subsets, by_label
 from pbrl_ppl.criticism.table import (
@@ -271,9 +271,9 @@ class Search:
             for without in dict.fromkeys(((), *((law,) for law in laws), laws)):
                 total = float((library.test(without).residual ** 2).sum())
                 now = now or total
-                subsets = best_subsets(library, every, without, largest=1 if without else 2).subsets
+                top = best_subsets(library, every, without, largest=2 - bool(without), say=self.say)
                 left = dict[tuple[Attached, ...], float]()
-                for one in subsets:  # of several grid points the best
+                for one in top.subsets:  # of several grid points the best
                     rest = total * (1.0 - one.share)
                     left[one.laws] = min(rest, left.get(one.laws, rest))
                 for laws_of, rest in left.items():
@@ -354,7 +354,7 @@ class Search:
                 longer = _carried(climb.mode, length)
                 if _is_lost(climb.mode, longer):
                     # out of phase: what is significant and takes little away is taken on trial
-                    regression = best_subsets(*self._linearised(climb))
+                    regression = best_subsets(*self._linearised(climb), say=self.say)
                     trial = self._enlarged(climb, regression, 0.0)
                     longer = _carried(trial, length)
                     if trial is climb.mode or _is_lost(trial, longer):
@@ -376,10 +376,7 @@ class Search:
     def _linearised(self, climb: _Climb) -> tuple[Library, list[Attached]]:
         """Return derivatives at a climb's model, and candidates beside at most one unusual law."""
         more = climb.unusual and not any(law.effect.unusual for law in climb.laws)
-        candidates = self._candidates(climb.mode, more)
-        rows = climb.mode.problem.data.horizon
-        self.say(Work(f"deriving what {len(candidates)} laws change on pieces of {rows} rows"))
-        return self._library(climb.mode, climb.laws), candidates
+        return self._library(climb.mode, climb.laws), self._candidates(climb.mode, more)
 
     def _library(
         self, mode: Mode, laws: tuple[Attached, ...], dimensions: Bools | bool = True
@@ -405,7 +402,7 @@ class Search:
         limits = self.criteria.search
         for i in range(rounds):
             library, candidates = self._linearised(climb)
-            regression = best_subsets(library, candidates)
+            regression = best_subsets(library, candidates, say=self.say)
             if i == 0:
                 climb.regressions.append(regression)
             instead = None
@@ -490,7 +487,7 @@ class Search:
             rest, others = frozenset(climb.laws) - {law}, candidates
             if law.effect.unusual:
                 others = self._candidates(library.mode, climb.unusual)
-            instead = best_subsets(library, [law, *others], (law,), largest=1)
+            instead = best_subsets(library, [law, *others], (law,), largest=1, say=self.say)
             groups = [{first, *more} for first, more in instead.same.items()]
             same = next((group for group in groups if law in group), {law})
             climb.same[law] = tuple(one for one in others if one in same)
@@ -524,9 +521,7 @@ class Search:
         table, now, laws = climb.table, climb.mode, frozenset(climb.laws)
         least, most = self.criteria.search.least_nats, self.criteria.far_out
         good = list[tuple[float, Mode, float]]()
-        rows, of = now.problem.data.horizon, len(table.modes)
-        self.say(Work(f"refitting {len(moves)} models on pieces of {rows} rows, {of} are done"))
-        table.race(now, moves)
+        table.race(now, moves, self.say)
         fair = {  # a law of an impossible size takes no others with it
             key - {law}: _without(begin, law)
             for key, begin in moves.items() if key in table.modes

@@ -22,7 +22,7 @@ from pbrl_ppl.criticism.score import (
 )
 from pbrl_ppl.effects import Attached
 from pbrl_ppl.state import Floats, Ints
-from pbrl_ppl.threads import in_parallel
+from pbrl_ppl.threads import Say, in_parallel, silent
 
 #: A whole change, as by an obstacle, is of size 1: it is at least this share of it in a subset.
 _LEAST_CHANGE = 0.5
@@ -136,6 +136,7 @@ def best_subsets(
     beam: int = 12,
     largest: int = 3,
     independent: float = 1e-5,
+    say: Say = silent,
 ) -> Regression:
     """Search the subsets of a few laws that explain the residual of a mode.
 
@@ -162,9 +163,12 @@ def best_subsets(
         Laws in a subset, at most.
     independent : float
         Least ratio of the eigenvalues of a subset's normal equations.
+    say : callable
+        Called with how many candidates are linearised.
     """
-    residual, problem = library.test(without).residual, library.mode.problem
-    signatures = in_parallel(lambda one: library.scored(one, len(candidates), without), candidates)
+    problem, residual, count = library.mode.problem, library.test(without).residual, len(candidates)
+    told = f"linearising {count} laws on pieces of {problem.data.horizon} rows", say
+    signatures = in_parallel(lambda one: library.scored(one, count, without), candidates, *told)
     signatures.sort(key=lambda one: round(one.log_p, 3))
     total = float(residual @ residual)
     n = max(float(problem.likelihood.counts(problem.observations).sum()), 2.0)

@@ -14,7 +14,7 @@ from pbrl_ppl.modes import Mode, find_mode, fit_pieces, is_simulated_mode
 from pbrl_ppl.parameters import inside, prior_residual, prior_slopes, stepped
 from pbrl_ppl.scene import state_sizes
 from pbrl_ppl.state import Bools, Floats
-from pbrl_ppl.threads import in_parallel
+from pbrl_ppl.threads import Say, in_parallel, silent
 
 
 def moving(mode: Mode, *, still: float = 1e-4) -> Bools:
@@ -222,6 +222,7 @@ class Table:
         self,
         near: Mode,
         moves: Mapping[frozenset[Attached], Mapping[str, float]],
+        say: Say = silent,
         *,
         rounds: int = 2,
         far: float = 30.0,
@@ -231,11 +232,12 @@ class Table:
         Those that are ``far`` behind the best after a few ``rounds`` (nats) are given up.
         """
         new = [key for key in moves if key not in self.modes]
+        told = f"refitting models on pieces of {near.problem.data.horizon} rows", say
         if not is_simulated_mode(near) or len(new) < 2:
-            in_parallel(lambda key: self.fitted(near, key, moves[key]), new)
+            in_parallel(lambda key: self.fitted(near, key, moves[key]), new, *told)
             return
         rest = [key for key in new if key not in self.behind]
-        first = in_parallel(lambda key: self._refitted(near, key, moves[key], rounds), rest)
+        first = in_parallel(lambda key: self._refitted(near, key, moves[key], rounds), rest, *told)
         self.behind |= dict(zip(rest, first, strict=True))
         self.modes |= (tried := {key: self.behind[key] for key in new})
         values = {key: self.value(mode) for key, mode in tried.items()}
@@ -243,7 +245,7 @@ class Table:
         for key in new:
             del self.modes[key]
         ahead = [key for key in new if values[key] >= least]
-        in_parallel(lambda key: self.fitted(near, key, moves[key]), ahead)
+        in_parallel(lambda key: self.fitted(near, key, moves[key]), ahead, *told)
 
     def without(self, mode: Mode, law: Attached) -> Mode:
         """Return a model without a law."""

@@ -22,6 +22,7 @@ from pbrl_ppl.modes.laplace import Mode
 from pbrl_ppl.modes.space import Space
 from pbrl_ppl.parameters import covariance_factor
 from pbrl_ppl.state import Floats
+from pbrl_ppl.threads import Say, Work, silent
 
 ProposalT = TypeVar("ProposalT", bound="Proposal")
 
@@ -85,6 +86,7 @@ def adaptive_importance(
     trial_batches: int = 6,
     hopeless_share: float = 0.3,
     max_pareto_k: float = 0.7,
+    say: Say = silent,
 ) -> tuple[WeightedPoints, ProposalT]:
     """Draw batches until their weights suffice, each from what all before it taught.
 
@@ -117,6 +119,8 @@ def adaptive_importance(
         See `trial_batches`.
     max_pareto_k : float
         Largest Pareto k that suffices.
+    say : callable
+        Called with the effective number of points, which may suffice before Pareto k does.
 
     Returns
     -------
@@ -127,7 +131,9 @@ def adaptive_importance(
     """
     proposals, q = [first], np.zeros((0, 0))
     log_densities, values, best = [], [], 0.0
+    told = f"weighing proposals until {enough:.0f} are effective"
     for turn in range(1, most_batches + 1):
+        say(Work(told, int(best), int(enough)))
         drawn = proposals[-1].draw(batch, rng)
         log_density, others = density(drawn)
         log_densities.append(log_density)
@@ -147,6 +153,7 @@ def adaptive_importance(
             break
         chosen = q[there][systematic(weight, len(q), rng)]
         proposals.append(first.learned(chosen, retained=dimension / (dimension + size)))
+    say(Work(told, int(enough), int(enough)))
     log_z = float(logsumexp(log_weight) - np.log(len(q)))
     points = WeightedPoints(q, log_weight, np.concatenate(values), log_z, size, good)
     return points, proposals[-1]

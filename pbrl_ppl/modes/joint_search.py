@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 import numpy as np
-from rich.console import Console
-from rich.progress import track
 from scipy.optimize import least_squares
 from scipy.special import logsumexp
 
@@ -28,6 +26,7 @@ from pbrl_ppl.modes.search import find_mode, find_modes
 from pbrl_ppl.parameters import JOINT_ANCHORS, inside, prior_draws
 from pbrl_ppl.scene import WORLD, Joint, Scene
 from pbrl_ppl.state import Floats
+from pbrl_ppl.threads import Say, counted, silent
 
 #: Configurations whose log-evidence is within this much of the best are sought from more starts.
 _CONTENDERS = 100.0
@@ -37,7 +36,7 @@ def weigh(
     problem: Problem,
     *,
     seed: int = 0,
-    progress: bool = False,
+    progress: Say = silent,
     margin: float = 25.0,
     at_least: int = 2,
 ) -> tuple[Weighed, ...]:
@@ -58,8 +57,8 @@ def weigh(
         Of a scene with such joints.
     seed : int
         The same seed gives the same answer.
-    progress : bool
-        Whether to show how far it is.
+    progress : callable
+        Called with how many configurations are done.
     margin : float
         A log-evidence this far below the best by the Laplace method is not looked at more closely:
         the approximation's error is a few units, and the same for all configurations in great part.
@@ -78,11 +77,10 @@ def weigh(
         If a single joint may join more pairs than can be tried.
     """
     problem.segments  # noqa: B018  # checks the initial states, once for all
-    console = Console(stderr=True)
-    modes, evidence = _tried(problem, seed, console, progress)
+    modes, evidence = _tried(problem, seed, progress)
     tried, worth = tuple(modes), _worth(modes)
     leading = _leading(evidence, _CONTENDERS, at_least=at_least)
-    for configuration in track(leading, "looking again", console=console, disable=not progress):
+    for configuration in counted(leading, len(leading), "looking again", progress):
         mode = modes[configuration]
         if configuration.empty:
             better = _apart(mode.problem, seed + 1)
@@ -93,7 +91,7 @@ def weigh(
     close = _leading(evidence, margin)
     if len(close) > 1:
         rng = np.random.default_rng(seed)
-        for configuration in track(close, "weighing joints", console=console, disable=not progress):
+        for configuration in counted(close, len(close), "weighing joints", progress):
             evidence[configuration] = importance(modes[configuration], rng)
     score = np.array([_score(configuration, evidence[configuration]) for configuration in tried])
     probability = np.exp(score - logsumexp(score))
@@ -104,7 +102,7 @@ def weigh(
 
 
 def _tried(
-    problem: Problem, seed: int, console: Console, progress: bool, *, breadth: int = 4
+    problem: Problem, seed: int, progress: Say, *, breadth: int = 4
 ) -> tuple[dict[Configuration, Mode], dict[Configuration, Marginal]]:
     """Return modes and Laplace evidence of the configurations that a search reaches.
 
@@ -116,9 +114,7 @@ def _tried(
     evidence = {apart: laplace(modes[apart])}
 
     def extend(parents: Mapping[Configuration, Configuration], what: str) -> None:
-        for configuration, parent in track(
-            list(parents.items()), what, console=console, disable=not progress
-        ):
+        for configuration, parent in counted(parents.items(), len(parents), what, progress):
             tied = configuration.problem(problem)
             modes[configuration] = _joint(tied, configuration, modes[parent], _worth(modes))
             evidence[configuration] = laplace(modes[configuration])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,7 +21,7 @@ from pbrl_ppl.physics import Physics, touching
 from pbrl_ppl.planning.trial_recording import measured, parameters_of, simulated
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats
-from pbrl_ppl.threads import in_parallel, one_blas_thread
+from pbrl_ppl.threads import Say, in_parallel, one_blas_thread, silent
 
 #: Names are compared at this many times the least size that is seen.
 _WELL_SEEN = 3.0
@@ -100,7 +100,7 @@ def rehearse(
     catalogue: Iterable[Effect] = full_catalogue,
     seed: int = 0,
     criteria: Criteria = DEFAULT,
-    progress: Callable[[str], None] | None = None,
+    progress: Say | None = None,
 ) -> Rehearsal:
     """Find out which laws a recording would show, and from which size on, before it is made.
 
@@ -131,7 +131,7 @@ def rehearse(
     criteria : Criteria
         Thresholds of the search.
     progress : callable, optional
-        Called with the name of each stage.
+        Called with the name of each stage and with counted work.
 
     Returns
     -------
@@ -155,7 +155,7 @@ def rehearse(
     >>> law.named, 0.0 < law.sizes["coefficient"] < 0.1  # kg/s
     ('linear_drag', True)
     """
-    say, catalogue = progress or (lambda stage: None), tuple(catalogue)
+    say, catalogue = progress or silent, tuple(catalogue)
     rng = np.random.default_rng(seed)
     say("simulating the declared model")
     physics = Physics(scene, attach(scene, (), catalogue), threads=2)
@@ -168,7 +168,7 @@ def rehearse(
     model = physics.scene, physics.effects, catalogue
     every, able = candidates(*model), candidates(*model, history)
     say(f"linearising {len(able)} laws on pieces of {seconds:.3g} s")
-    regression = _Regression(mode, able, criteria)
+    regression = _Regression(mode, able, criteria, say)
     laws = sorted(in_parallel(regression.rehearsed, every), key=lambda law: law.share)
     known = dict(zip(physics.layout.labels, phi.tolist(), strict=True))
     return Rehearsal(tuple(laws), history, known, noise, seconds)
@@ -215,9 +215,13 @@ class _Regression:
         Candidates, each of which is linearised at all its grid points.
     criteria : Criteria
         Thresholds.
+    say : callable
+        Called with how many laws are linearised.
     """
 
-    def __init__(self, mode: SimulatedMode, laws: Sequence[Attached], criteria: Criteria) -> None:
+    def __init__(
+        self, mode: SimulatedMode, laws: Sequence[Attached], criteria: Criteria, say: Say
+    ) -> None:
         library = Library(mode, criteria=criteria)
         self.mode, self.criteria, self.test = mode, criteria, library.test()
         self.counts = np.maximum(weights(mode), 1.0)
@@ -228,7 +232,8 @@ class _Regression:
             each = (self.test.at(point, law).about(point) for point in points)
             return [Term(law, a, np.arange(len(a.basis.T)), price) for a in each if a.basis.size]
 
-        self.terms = dict(zip(laws, in_parallel(linearised, laws), strict=True))
+        terms = in_parallel(linearised, laws, f"linearising {len(laws)} laws", say)
+        self.terms = dict(zip(laws, terms, strict=True))
 
     def least(self, term: Term, unit: Floats) -> float:
         """Return the least multiple of a change of the residual, shape (n,), that is seen."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -41,10 +42,11 @@ from pbrl_ppl.posterior import (
     parameter_draws,
     stored_mode,
 )
+from pbrl_ppl.progress import Progress
 from pbrl_ppl.sampling.methods import METHODS, OVER_LIBRARY, SamplerRun
 from pbrl_ppl.sampling.mixture import mix, most_frequent, most_probable, summed
 from pbrl_ppl.state import STATE, Floats
-from pbrl_ppl.threads import one_blas_thread
+from pbrl_ppl.threads import Say, one_blas_thread, silent
 
 if TYPE_CHECKING:
     import pymc as pm
@@ -71,7 +73,7 @@ def fit(
     cores: int | None = None,
     start: Mode | None = None,
     resume: Idata | None = None,
-    progress: bool = True,
+    progress: bool | Say = True,
 ) -> Idata:
     """Sample the posterior of a model of :func:`pbrl_ppl.physics_model`.
 
@@ -118,8 +120,9 @@ def fit(
         A posterior of the same model. Its chains go on as chains where they ended, and draws by
         importance sampling get more; the new draws stand after the old. Whole trajectories are
         linearised as they are in it.
-    progress : bool
-        Whether to show PyMC's progress bar.
+    progress : bool or callable
+        Whether to show a progress bar; or what is called with counted work
+        (``pbrl_ppl.threads.Work``).
 
     Returns
     -------
@@ -174,7 +177,7 @@ def sample(
     cores: int | None = None,
     start: Mode | None = None,
     resume: Idata | None = None,
-    progress: bool = False,
+    progress: bool | Say = False,
     **schedule: int | None,
 ) -> Fit:
     """Sample the posterior of a problem; see :func:`pbrl_ppl.fit`, which takes its pm.Model.
@@ -201,25 +204,23 @@ def sample(
     if method != "map":
         asked: dict[str, Any] = {key: n for key, n in schedule.items() if n is not None}
         chosen = replace(chosen, **asked)
-    job = SamplerRun(
-        problem=_as_in(problem, resume),
-        method=chosen,
-        mode=None,
-        resume=resume,
-        seed=seed,
-        cores=os.cpu_count() or 1 if cores is None else cores,
-        progress=progress,
-    )
-    while True:
-        job, trace, point = _drawn(job, start, walks)
-        # PyMC ends an interrupted run quietly, with fewer draws or with the chains that had most
-        sizes = group(trace, "posterior").sizes
-        cut = sizes["draw"] < chosen.draws or sizes["chain"] < job.chains
-        joined = job.problem if cut else _joined(job.problem, *parameter_draws(job.problem, trace))
-        if joined is job.problem:
-            break
-        start = start and carried_mode(job.at_mode, joined)
-        job, resume = replace(job, problem=joined, resume=None), None
+    # quiet without a thread, which a fork by PyMC would copy
+    with Progress(False) if progress is True else nullcontext(progress or silent) as say:
+        job = SamplerRun(
+            problem=_as_in(problem, resume), method=chosen, mode=None, resume=resume, seed=seed,
+            cores=os.cpu_count() or 1 if cores is None else cores, progress=say,
+        )  # fmt: skip
+        while True:
+            job, trace, point = _drawn(job, start, walks)
+            # PyMC ends an interrupted run quietly, with fewer draws or the chains that had most
+            sizes = group(trace, "posterior").sizes
+            cut = sizes["draw"] < chosen.draws or sizes["chain"] < job.chains
+            now = job.problem
+            joined = now if cut else _joined(now, *parameter_draws(now, trace))
+            if joined is now:
+                break
+            start = start and carried_mode(job.at_mode, joined)
+            job, resume = replace(job, problem=joined, resume=None), None
     if resume is not None:
         if sizes["chain"] < job.chains:
             raise KeyboardInterrupt  # some chains have nothing new, and resume= has all of them

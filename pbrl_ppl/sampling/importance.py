@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ def draw_proposals(
     effective_share: float = 0.5,
     most_batches: int = 40,
     numbers: int = 100_000_000,
+    say: Callable[[str], None] = lambda said: None,
 ) -> tuple[WeightedPoints, Reference]:
     """Draw weighted proposals for a posterior; return them, and what the last were drawn from.
 
@@ -42,12 +43,14 @@ def draw_proposals(
         Batches at most.
     numbers : int
         Log-likelihoods of transitions that proposals may hold.
+    say : callable
+        Called with how many proposals are effective.
     """
     rng, batch = np.random.default_rng(seed), -(-n // batches)
     space = reference.space
     most = int(np.clip(numbers // (batch * space.problem.segments.n), batches, most_batches))
     return adaptive_importance(
-        reference, space.log_densities, len(space.informed), rng, batch=batch,
+        reference, space.log_densities, len(space.informed), rng, batch=batch, say=say,
         enough=effective_share * n, smooth=smoothed, most_batches=most, max_pareto_k=MAX_PARETO_K,
     )  # fmt: skip
 

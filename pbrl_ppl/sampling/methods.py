@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from itertools import count
 
 import numpy as np
 import xarray as xr
-from rich.console import Console
-from rich.progress import track
 
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import (
@@ -34,6 +33,7 @@ from pbrl_ppl.posterior import (
 from pbrl_ppl.sampling.ensemble import Ensemble, Reference
 from pbrl_ppl.sampling.importance import draw_proposals, resample, stream
 from pbrl_ppl.state import Floats, Ints
+from pbrl_ppl.threads import Say, Work
 
 
 @dataclass(frozen=True)
@@ -71,8 +71,10 @@ class SamplerRun:
         Where draws begin, unless they go on from a posterior or walk over a library.
     resume : InferenceData or DataTree, optional
         Posterior to go on from.
-    seed, cores, progress
+    seed, cores
         As of :func:`pbrl_ppl.fit`, with defaults filled in.
+    progress : callable
+        Called with counted work.
     """
 
     problem: Problem
@@ -81,7 +83,7 @@ class SamplerRun:
     resume: Idata | None
     seed: int
     cores: int
-    progress: bool
+    progress: Say
 
     @property
     def chains(self) -> int:
@@ -134,7 +136,7 @@ def _importance(
     shape, seed = (job.chains, job.method.draws), stream(job.seed, job.starts())
     n = job.chains * job.method.draws
     reference = job.reference()
-    points, learned = draw_proposals(reference, int(proposals * n), seed)
+    points, learned = draw_proposals(reference, int(proposals * n), seed, say=job.progress)
     chosen, k, size = resample(points.log_weight, n, np.random.default_rng([*seed, 1]))
     if not np.isfinite(points.log_weight).any():
         raise FitError(
@@ -181,14 +183,13 @@ def _metropolis(
     ensemble = Ensemble(reference, q, rng)
     tune = -(-method.tune // walkers) * method.thin
     retained, rates = [], []
-    steps = track(
-        range(tune + per_walker), "sampling", console=Console(stderr=True),
-        disable=not job.progress,
-    )  # fmt: skip
+    done, total = 0, tune + per_walker * method.thin
     try:
-        for i in steps:
+        for i in range(tune + per_walker):
             sweeps = 1 if i < tune else method.thin
             rate = ensemble.move(reference.space, sweeps, adapt=i < tune)
+            done += sweeps
+            job.progress(Work(f"sampling chains of {total} sweeps", done, total))
             ensemble.q = reference.space.prior_draws(ensemble.q, rng)
             if i < tune:
                 ensemble.learn()
@@ -220,6 +221,7 @@ def _paper(job: SamplerRun) -> Idata:
     from pbrl_ppl.model import build_model
 
     model, starts, thin = build_model(job.problem), job.starts(), job.method.thin
+    total, done = len(starts) * (job.method.tune + job.method.draws * thin), count(1)
     steps = [
         pm.CategoricalGibbsMetropolis([variable], model=model)
         if model.rvs_to_values[variable] in model.discrete_value_vars
@@ -230,7 +232,8 @@ def _paper(job: SamplerRun) -> Idata:
         trace: Idata = pm.sample(
             draws=job.method.draws * thin, tune=job.method.tune, chains=len(starts),
             cores=min(job.cores, len(starts)), step=steps, initvals=starts,
-            random_seed=job.seed, progressbar=job.progress, quiet=not job.progress,
+            random_seed=job.seed, progressbar=False, quiet=True,
+            callback=lambda **_: job.progress(Work("sampling chains", next(done), total)),
             compute_convergence_checks=False, discard_tuned_samples=True, model=model,
         )  # fmt: skip
     except ValueError as error:

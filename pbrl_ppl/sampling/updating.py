@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,7 +35,7 @@ def update(
     *,
     effects: Iterable[Effect] = catalogue,
     seed: int = 0,
-    progress: bool = True,
+    progress: bool | Callable[[str], None] = True,
 ) -> Idata:
     """Return a posterior updated with new transitions.
 
@@ -58,8 +58,8 @@ def update(
         Where the names of the posterior's effects are looked up; add your own to the package's.
     seed : int
         Of the resampling or the refit; the same seed gives the same posterior.
-    progress : bool
-        Whether to show the progress of a refit.
+    progress : bool or callable
+        Whether to show the progress of a refit; or a callable, as of :func:`pbrl_ppl.fit`.
 
     Returns
     -------

@@ -5,15 +5,13 @@ import re
 import subprocess
 import sys
 import warnings
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import pytest
-from rich.console import Console
 
 from pbrl_ppl import criticism
-from pbrl_ppl.cli import main, terminal
+from pbrl_ppl.cli import main
 from pbrl_ppl.criticism.loop import FILES, Loop
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.errors import ConvergenceWarning, HistoryError
@@ -114,19 +112,6 @@ def test_close_loop_chooses_the_laws(files: Path, calls: list[Any], chosen, unus
     assert not any(effect.unusual for effect in given)
     names = [effect.name for effect in catalogue if unusual or not effect.unusual]
     assert [effect.name for effect in given] == names
-
-
-def test_a_status_line_has_the_stage_and_the_time_elapsed(monkeypatch: pytest.MonkeyPatch) -> None:
-    now = [100.0]
-    monkeypatch.setattr(terminal.time, "monotonic", lambda: now[0])
-    running = terminal.Status()
-    running.name = "sampling [all]"
-    now[0] = 281.4
-    shown = StringIO()
-    Console(file=shown, width=80).print(running)
-    running.share = 0.4
-    Console(file=shown, width=80).print(running)
-    assert shown.getvalue() == "sampling [all], 181 s\nsampling [all], 181 s, about 40% done\n"
 
 
 @pytest.mark.usefixtures("files")

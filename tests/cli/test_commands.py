@@ -22,8 +22,7 @@ import typer
 from pbrl_ppl import criticism, sampling
 from pbrl_ppl.cli import main
 from pbrl_ppl.cli.app import app
-from pbrl_ppl.cli.terminal import interruptible, stages
-from pbrl_ppl.criticism import Work
+from pbrl_ppl.cli.terminal import Progress, interruptible
 from pbrl_ppl.errors import ConvergenceWarning, FitError
 from pbrl_ppl.history import History
 from pbrl_ppl.model import problem_in
@@ -641,23 +640,10 @@ def test_of_two_commands_with_one_output_one_says_so(capsys: pytest.CaptureFixtu
 def test_a_long_stage_is_not_silent(capfd) -> None:
     """A log shows every minute that it goes on; nothing is written after it, or where quiet."""
     for quiet in (False, True):
-        with stages(quiet, every=0.05) as progress:
+        with Progress(quiet, every=0.05) as progress:
             progress("climbing")
             time.sleep(0.3)
         said = capfd.readouterr().err
         assert (said.count("s] climbing: still running\n") >= 2) is not quiet
         time.sleep(0.1)
         assert capfd.readouterr().err == ""
-
-
-def test_what_is_done_now_is_said_where_it_takes_long(capfd) -> None:
-    """Not as a line of its own: a search refits many models."""
-    with stages(False, every=0.05) as progress:
-        progress("searching")
-        progress(Work("refitting 7 models"))
-        time.sleep(0.3)
-    said = capfd.readouterr().err
-    assert said.count("s] searching\n") == 1
-    assert (
-        said.count("refitting 7 models") == said.count("refitting 7 models: still running\n") >= 2
-    )

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from pbrl_ppl.cli import main
-from pbrl_ppl.cli.terminal import Result, in_a_line, stages, table
+from pbrl_ppl.cli.terminal import Progress, Result, in_a_line, table
 from pbrl_ppl.errors import printable
 from pbrl_ppl.history.files import COLUMNS
 from pbrl_ppl.reporting import render_logs
@@ -53,7 +53,7 @@ def bare(text: str) -> bool:
 def test_what_a_terminal_obeys_is_shown_as_text(mark, capsys) -> None:
     """In messages, stages, lines and tables."""
     name = f"cart{mark}x"
-    with stages(quiet=False) as progress:
+    with Progress(quiet=False) as progress:
         progress(f"fitting {name}")
     rows = table(None, {"body": "<"}, [[name]])
     Result({"name": name}, [f"line {name}", rows], warning=f"warned {name}").show(as_json=False)

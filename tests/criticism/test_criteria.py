@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from pbrl_ppl.criticism import DEFAULT
-from pbrl_ppl.criticism.results import Stage
 
 PAGE = Path(__file__).parents[2] / "analysis/docs/pages/explanation/decisions.md"
 
@@ -38,9 +37,3 @@ def rows(criteria: Any, group: str = "") -> Iterator[str]:
 def test_the_page_has_all_thresholds() -> None:
     table = "\n".join(["| field | default | reason |", "|---|---|---|", *rows(DEFAULT)])
     assert table in PAGE.read_text(encoding="utf-8"), f"put this table on the page:\n{table}"
-
-
-def test_stages_are_sentences_with_rising_shares() -> None:
-    shares = [stage.share for stage in Stage if stage.share is not None]
-    assert shares == sorted(shares) and shares[0] > 0 and shares[-1] < 1
-    assert f"{Stage.FIT}" == "fitting the declared model" and Stage.SCORE.share is None

@@ -11,6 +11,7 @@ from pbrl_ppl.errors import HistoryError, PriorWarning
 from pbrl_ppl.history import History
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
+from tests.helpers.counted import of_work
 from tests.helpers.falls import BALL, GRAVITY, MASS, fall
 
 pytestmark = [pytest.mark.one_stack, pytest.mark.slow]
@@ -86,6 +87,10 @@ def test_unusual_laws_wait_for_common_ones_that_leave_something() -> None:
     found = attribute(BALL, falls, seed=1, progress=said.append)
     assert [law.effect for law in found.laws] == ["quadratic_drag"]
     assert not any("trying unusual ones" in one for one in said)
+    totals = of_work(said)
+    linearised = [one for one in totals if one.startswith("linearising")]
+    assert linearised and all(totals[one] == int(one.split()[1]) for one in linearised)
+    assert any(one.startswith("refitting models on pieces of") for one in totals)
 
 
 def test_gaps_longer_than_the_shortest_pieces() -> None:

@@ -113,9 +113,7 @@ def tried_of(free: Scene, monkeypatch, height):
         joint_search, "laplace", lambda mode: joint_search.Marginal(mode.log_posterior)
     )
     history = simulated_history(scene(), {}, seed=1, trajectories=1, intervals=2)
-    modes, _ = joint_search._tried(
-        Problem.of(Physics(free), history), 1, joint_search.Console(), False
-    )
+    modes, _ = joint_search._tried(Problem.of(Physics(free), history), 1, joint_search.silent)
     first, *others = modes
     assert first.empty
     assert set(others) == tried

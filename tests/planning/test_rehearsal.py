@@ -14,6 +14,7 @@ from pbrl_ppl.physics import Physics, simulated_recording
 from pbrl_ppl.planning.rehearsal import Rehearsal, RehearsedLaw, rehearse
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene, Shape
 from pbrl_ppl.state import STATE
+from tests.helpers.counted import of_work
 
 pytestmark = pytest.mark.one_stack
 ARM = Body("arm", Shape.box(0.03, 0.4), known={"mass": 0.5, "r": 0.2, "mu_c": 0.2})
@@ -165,6 +166,13 @@ def test_a_single_trajectory_shows_what_takes_half_of_its_error() -> None:
     assert law.share / fifth.share == pytest.approx(np.sqrt(3.0 / 0.5625), rel=0.01)
     assert set(found(PENDULUM, recorded(PENDULUM, rehearsal, law, 3.0))) == {"pivot_damping"}
     assert not found(PENDULUM, recorded(PENDULUM, rehearsal, law, 0.2))
+
+
+def test_the_laws_that_are_linearised_are_counted() -> None:
+    said: list[str] = []
+    rehearse(PENDULUM, catalogue=named("pivot_damping", "torque_gain"), progress=said.append)
+    assert of_work(said) == {"linearising 2 laws": 2}
+    assert any(one.startswith("linearising 2 laws on pieces of") for one in said)
 
 
 def test_parameters_are_by_label_or_name() -> None:

@@ -37,6 +37,7 @@ from pbrl_ppl.sampling.ensemble import Ensemble
 from pbrl_ppl.sampling.fitting import METHODS, fit
 from pbrl_ppl.scene import Shape, Wall
 from tests.helpers.carts import CART, cart_scene
+from tests.helpers.counted import of_work
 from tests.helpers.histories import NOISE, simulated_history
 
 pytestmark = pytest.mark.first(3)
@@ -436,6 +437,25 @@ def test_a_parameter_that_the_data_say_nothing_about_is_named(model) -> None:
     ):
         warnings.simplefilter("ignore", ConvergenceWarning)
         fit(physics_model(scene, problem_in(model).data.history), seed=1, **SHORT)
+
+
+@pytest.mark.parametrize(
+    ("method", "sentence", "total"),
+    [
+        # 1.4 proposals a draw, of which half are to be effective
+        ("importance", "weighing proposals until 70 are effective", 70),
+        # 4 to tune, then 3 draws of each of 20 walkers, 4 sweeps a draw
+        ("metropolis", "sampling chains of 16 sweeps", 4 + 3 * 4),
+        ("paper", "sampling chains", 2 * (20 + 50 * 4)),
+    ],
+)
+def test_draws_are_counted(puck, method, sentence, total) -> None:
+    said: list[str] = []
+    options = {"seed": 1, "draws": 50, "tune": 20, "thin": 4, "chains": 2, "cores": 1}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        fit(puck, method=method, progress=said.append, **options)
+    assert of_work(said) == {sentence: total}
 
 
 def test_unknown_method(model) -> None:
