@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from cycler import cycler
@@ -201,7 +201,8 @@ def shares_below(axes: Axes, samples: Mapping[str, Floats], size: float) -> tupl
 def png(figure: Figure, colours: int = 96) -> bytes:
     """Render a figure as a PNG picture, which a palette makes a third as large."""
     figure.set_dpi(130 if figure.get_figwidth() > NARROW else 170)
-    canvas, small = FigureCanvasAgg(figure), io.BytesIO()
+    canvas: Any = FigureCanvasAgg(figure)
+    small = io.BytesIO()
     with warnings.catch_warnings():
         # a name in letters that the font lacks is in the page's text all the same
         warnings.filterwarnings("ignore", message="Glyph .* missing from", category=UserWarning)
