@@ -242,6 +242,28 @@ def get2(typing, function, pointer):  # type: ignore[no-untyped-def]
     return types.UniTuple(types.float64, 2)(types.int64, types.int64), codegen
 
 
+def _loading(kind: ir.Type) -> Callable[..., object]:
+    """Return numba's code generator for an element of an array by the array's address."""
+
+    def codegen(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        address, place = arguments
+        return builder.load(builder.gep(builder.inttoptr(address, kind.as_pointer()), [place]))
+
+    return codegen
+
+
+@intrinsic
+def whole_at(typing, address, place):  # type: ignore[no-untyped-def]
+    """Return a whole number of an array by the array's address."""
+    return types.int64(types.int64, types.int64), _loading(_PLACE)
+
+
+@intrinsic
+def real_at(typing, address, place):  # type: ignore[no-untyped-def]
+    """Return a real number of an array by the array's address."""
+    return types.float64(types.int64, types.int64), _loading(_DOUBLE)
+
+
 @intrinsic
 def call_law(typing, function, a, b, c, d):  # type: ignore[no-untyped-def]
     """Call an effect's law: four pointers to doubles."""

@@ -27,7 +27,6 @@ from pbrl_ppl.physics.laws import (
     act,
     begin_held,
     bound,
-    laws_of,
     set_memory,
     states_before,
 )
@@ -377,7 +376,8 @@ def _transition(  # type: ignore[no-untyped-def]
     driven = False
     for follows in world.kinematic:
         driven |= follows
-    acting = len(laws.commands) + len(laws.forces) > 0
+    acting = laws.n_commands + laws.n_forces > 0
+    remembered = memory.ctypes.data + 8 * memory.shape[1]
     still = world.still
     watch = len(still.obstacles) > 0 or k > 1
     place_bodies(fn, world, bodies, state)
@@ -401,19 +401,12 @@ def _transition(  # type: ignore[no-untyped-def]
             near = False
             if acting:
                 act(
-                    state,
-                    inputs[h],
-                    laws,
-                    s / substeps,
-                    (s + 1) / substeps,
-                    acted,
-                    memory[1],
-                    held,
-                    False,
-                )
+                    state, inputs[h], laws, s / substeps, (s + 1) / substeps, acted, remembered,
+                    held, False,
+                )  # fmt: skip
                 for slot in range(held.shape[1]):
                     held[0, slot] += step * held[1, slot]
-            if len(laws.frictions) > 0:
+            if laws.n_frictions > 0:
                 set_brakes(world, laws, bodies, joints, state, acted)
             _push(fn, world, bodies, state, acted)
             place_wheels(fn, world, bodies, state, axes, step)
@@ -427,7 +420,7 @@ def _transition(  # type: ignore[no-untyped-def]
                 touched = _TOUCHED if near else touched
         copy(state, out[h])
         if memory.shape[1] > 0:
-            act(state, inputs[h], laws, LATE, 1.0, acted, memory[1], held, True)
+            act(state, inputs[h], laws, LATE, 1.0, acted, remembered, held, True)
         end += 1
     return touched, end
 
@@ -459,7 +452,7 @@ def rollout(fn, world, batch, items, begins, whole, out):  # type: ignore[no-unt
     for place in range(len(items)):
         item = items[place]
         p, t = item // n, item % n
-        begin, laws = begins[place], laws_of(batch, p)
+        begin, laws = begins[place], batch.laws[p]
         first = intervals(bodies, p, t, horizon)[begin if timed else 0]
         before_begin = states_before(batch, out, item, begin)
         if p != proposal:

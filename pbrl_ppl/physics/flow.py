@@ -10,21 +10,19 @@ Equations I, section II.6): the motion is a continuous function of parameters an
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
-from pbrl_ppl.physics.calls import compiled, copy, inner
+from pbrl_ppl.physics.calls import compiled, copy, inner, real_at, whole_at
 from pbrl_ppl.physics.laws import (
     COMMAND,
     FIRST,
     JUMPS,
     LATE,
+    OTHER,
     WRENCHES,
-    Laws,
     act,
     begin_held,
-    laws_of,
     set_memory,
     states_before,
 )
@@ -61,7 +59,6 @@ from pbrl_ppl.physics.motion import (
 )
 from pbrl_ppl.physics.solids import near_contact
 from pbrl_ppl.physics.tree import ALONG, LINK, TURNING
-from pbrl_ppl.state import Floats
 
 #: Times of the stages; weights of the slopes before each, and in the last row those of the error.
 _TIMES = np.array([0.0, 0.2, 0.3, 0.8, 8 / 9, 1.0, 1.0])
@@ -100,18 +97,18 @@ def _slope(work, laws, u, a, inputs, share, low, high):  # type: ignore[no-untyp
 
 
 @inner
-def _load(work, flow, u, inputs, share, low, high):  # type: ignore[no-untyped-def]
+def _load(work, laws, u, inputs, share, low, high):  # type: ignore[no-untyped-def]
     """Set what acts there: wrenches, forces, and rows of friction."""
-    laws, motion, held = flow.laws, work.motion, work.n + 1
-    for s in range(flow.held):
+    motion, held = work.motion, work.n + 1
+    for s in range(work.n_held):
         work.held[0, s] = motion[u - 1, held + s]
-    if len(laws.commands) + len(laws.forces) > 0:
+    if laws.n_commands + laws.n_forces > 0:
         begin = min(max(low + _SHORTEST, share), high - _WINDOW)  # past a jump that is no switch
         act(
-            work.states, inputs, laws, begin, begin + _WINDOW, work.acted, flow.memory[1],
+            work.states, inputs, laws, begin, begin + _WINDOW, work.acted, work.memory,
             work.held, False,
         )  # fmt: skip
-    for s in range(flow.held):
+    for s in range(work.n_held):
         motion[u, held + s] = work.held[1, s]
     set_forces(work, u)
     set_rows(work, u)
@@ -122,10 +119,10 @@ def _load(work, flow, u, inputs, share, low, high):  # type: ignore[no-untyped-d
 def _switch(laws, low):  # type: ignore[no-untyped-def]
     """Return the first time after ``low`` at which a command jumps, as a share of the interval."""
     high = 1.0
-    for e in range(len(laws.commands)):
-        law = laws.commands[e]
-        if law[JUMPS] > 0:
-            share = laws.command_parameters[law[FIRST]]
+    for e in range(laws.n_commands):
+        law = laws.commands + 8 * (OTHER + 1) * e
+        if whole_at(law, JUMPS) > 0:
+            share = real_at(laws.commands_values, whole_at(law, FIRST))
             share -= math.floor(share)
             if low + _SHORTEST < share < high - _SHORTEST:
                 high = share
@@ -133,18 +130,18 @@ def _switch(laws, low):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _slowest(work, laws, r):  # type: ignore[no-untyped-def]
+def _slowest(work, r):  # type: ignore[no-untyped-def]
     """Return the square of a ring's speed from which friction lets it slide by next to nothing."""
     ring, points = r - work.n_rows, work.rings.shape[1] - POINTS
     slowing = work.rings[ring, GRIP, 0] * points / work.links[work.kinds[r, 1], MASS]
-    return 2.0 * slowing * _COAST * laws.tolerance * laws.length
+    return 2.0 * slowing * _COAST * work.tolerance * work.length
 
 
 @inner
-def _size(work, laws, r):  # type: ignore[no-untyped-def]
+def _size(work, r):  # type: ignore[no-untyped-def]
     """Return the natural size of a row's way: of a wheel's in m, or of its joint's coordinate."""
     if work.kinds[r, 0] >= ALONG:
-        return laws.length
+        return work.length
     return work.motion[SIZE, work.tree[work.kinds[r, 1], LINK.first]]
 
 
@@ -168,7 +165,7 @@ def _decide(work, laws, inputs, share, low, high):  # type: ignore[no-untyped-de
     count = work.n_rows
     set_places(work, Q, U)
     _load(work, laws, U, inputs, share, low, high)  # for the rows
-    stop = _begin_modes(work, laws)
+    stop = _begin_modes(work)
     for _ in range(5 * work.n_kinds + 2):
         _slope(work, laws, U, SLOPES + 1, inputs, share, low, high)
         worst, back, most = -1, -1, 1.0 - _STILL
@@ -186,7 +183,7 @@ def _decide(work, laws, inputs, share, low, high):  # type: ignore[no-untyped-de
         if back >= 0:  # it holds, since another slips
             kinds[back, 2], kinds[back, 3] = STICK, 1
             continue
-        if _slide(work, laws):
+        if _slide(work):
             continue
         if not stop:
             break
@@ -200,7 +197,7 @@ def _decide(work, laws, inputs, share, low, high):  # type: ignore[no-untyped-de
 
 
 @inner
-def _begin_modes(work, laws):  # type: ignore[no-untyped-def]
+def _begin_modes(work):  # type: ignore[no-untyped-def]
     """Set modes by the speeds: rows and rings with a speed slip, and the others stick.
 
     Returns whether any that sticks has a speed yet, which is to be stopped.
@@ -208,20 +205,20 @@ def _begin_modes(work, laws):  # type: ignore[no-untyped-def]
     kinds, rows, count, moves = work.kinds, work.rows, work.n_rows, False
     for r in range(work.n_kinds):
         # what stuck before moves by the error of steps alone
-        still = 100.0 * laws.tolerance if kinds[r, 2] == STICK else _STILL
+        still = 100.0 * work.tolerance if kinds[r, 2] == STICK else _STILL
         greatest = rows[r, BOUND] if r < count else work.rings[r - count, GRIP, 0]
         kinds[r, 2], kinds[r, 3] = STICK if greatest > 0.0 else SMOOTH, 1
         if greatest == 0.0:
             continue
         if r < count:
             speed = row_speed(work, r, U)
-            size = _size(work, laws, r)
-            if abs(speed) * laws.time_step > still * size:
+            size = _size(work, r)
+            if abs(speed) * work.time_step > still * size:
                 kinds[r, 2] = 1 if speed > 0.0 else -1
             moved = speed != 0.0
         else:
             square = set_twist(work, r - count, kinds[r, 1], U, TWIST)
-            if square > _slowest(work, laws, r):
+            if square > _slowest(work, r):
                 kinds[r, 2] = SLIDE
             moved = square > 0.0
         if kinds[r, 2] == STICK:
@@ -234,7 +231,7 @@ def _begin_modes(work, laws):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _slide(work, laws):  # type: ignore[no-untyped-def]
+def _slide(work):  # type: ignore[no-untyped-def]
     """Let rings slide whose reaction exceeds what they can hold; return whether any does.
 
     They get a first speed, with which the direction of their friction is known.
@@ -259,13 +256,13 @@ def _slide(work, laws):  # type: ignore[no-untyped-def]
     for r in range(count, work.n_kinds):
         kinds[r, 3] = 1 if kinds[r, 2] == SLIDE else 0
     for j in range(work.n):
-        motion[U, j] += 1e-6 * laws.time_step * motion[END_U, j]
+        motion[U, j] += 1e-6 * work.time_step * motion[END_U, j]
     set_places(work, Q, U)
     return True
 
 
 @inner
-def _margin(work, laws, u):  # type: ignore[no-untyped-def]
+def _margin(work, u):  # type: ignore[no-untyped-def]
     """Return by how much no row switches, by speeds in a row of the motion and forces as solved."""
     least = 1.0
     for r in range(work.n_rows):
@@ -274,15 +271,15 @@ def _margin(work, laws, u):  # type: ignore[no-untyped-def]
             bound = max(work.rows[r, BOUND], 1e-300)
             least = min(least, 1.0 - abs(work.rows[r, FORCE]) / bound)
         elif mode != SMOOTH:
-            size = _size(work, laws, r)
-            least = min(least, mode * row_speed(work, r, u) * laws.time_step / size)
+            size = _size(work, r)
+            least = min(least, mode * row_speed(work, r, u) * work.time_step / size)
     return least
 
 
 @inner
-def _first_margin(work, laws):  # type: ignore[no-untyped-def]
+def _first_margin(work):  # type: ignore[no-untyped-def]
     """Return by how much nothing switches where a step begins."""
-    least = _margin(work, laws, U)
+    least = _margin(work, U)
     for r in range(work.n_rows, work.n_kinds):
         if work.kinds[r, 2] == STICK:
             least = min(least, -strain(work, r - work.n_rows, work.kinds[r, 1]))
@@ -306,8 +303,8 @@ def _step(work, laws, inputs, share, low, high, width):  # type: ignore[no-untyp
     way.
     """
     motion, kinds, rings = work.motion, work.kinds, work.rings
-    n, count, seconds, end, way = work.n, work.n_rows, width * laws.time_step, 1.0, 1.0
-    ends = n + 1 + laws.held  # after the numbers of laws, which have speeds alone
+    n, count, seconds, end, way = work.n, work.n_rows, width * work.time_step, 1.0, 1.0
+    ends = n + 1 + work.n_held  # after the numbers of laws, which have speeds alone
     for j in range(ends):
         if j != n:
             motion[SLOPES, j] = motion[U, j]
@@ -323,7 +320,7 @@ def _step(work, laws, inputs, share, low, high, width):  # type: ignore[no-untyp
         _slope(work, laws, END_U, SLOPES + 2 * stage + 1, inputs, at, low, high)
         for j in range(n + 1, ends):
             motion[SLOPES + 2 * stage, j] = motion[END_U, j]
-        end = _margin(work, laws, END_U)
+        end = _margin(work, END_U)
         way = min(way, end)
     for r in range(count, work.n_kinds):
         if kinds[r, 2] == STICK:
@@ -341,10 +338,10 @@ def _step(work, laws, inputs, share, low, high, width):  # type: ignore[no-untyp
         if j != n:
             q = _weighted(motion, 7, SLOPES, j)
             u = _weighted(motion, 7, SLOPES + 1, j) if j < n else 0.0
-            error = max(error, seconds * (abs(q) + laws.time_step * abs(u)) / motion[SIZE, j])
+            error = max(error, seconds * (abs(q) + work.time_step * abs(u)) / motion[SIZE, j])
             if not math.isfinite(q + u):
                 return np.inf, end, way
-    return error / laws.tolerance, end, way
+    return error / work.tolerance, end, way
 
 
 @inner
@@ -361,11 +358,11 @@ def _advance(work, laws, still, inputs, low, high, budget, wanted):  # type: ign
     while share < high:
         if fresh:
             _decide(work, laws, inputs, share, low, high)
-            fresh, left = False, _first_margin(work, laws)
+            fresh, left = False, _first_margin(work)
         if locating:
             width = begin + (until - begin) * before / (before - after)
         else:
-            width = min(wanted, _way(work, laws, still)) if still.watched else wanted
+            width = min(wanted, _way(work, still)) if still.watched else wanted
             last = width >= high - share
             width = min(width, high - share)
         budget -= 1
@@ -404,9 +401,9 @@ def _advance(work, laws, still, inputs, low, high, budget, wanted):  # type: ign
             fresh, left = end < -_LOCATED, end
             wider = width * min(5.0, 0.9 * max(error, 1e-9) ** -0.2)
             wanted = min(1.0, max(wanted, wider) if last or wanted > width else wider)
-        fresh |= _accept(work, laws)
+        fresh |= _accept(work)
         share = high if last else share + width
-        _follow_paths(work, laws.time_step * width)
+        _follow_paths(work, work.time_step * width)
         if still.watched and near_contact(
             work.states, still.radii, still.obstacles, still.can_touch
         ):
@@ -415,10 +412,10 @@ def _advance(work, laws, still, inputs, low, high, budget, wanted):  # type: ign
 
 
 @inner
-def _accept(work, laws):  # type: ignore[no-untyped-def]
+def _accept(work):  # type: ignore[no-untyped-def]
     """Begin the next step where one ends; return whether a ring that slides is to stop."""
     motion, n, stops = work.motion, work.n, False
-    for j in range(n + 1, n + 1 + laws.held):
+    for j in range(n + 1, n + 1 + work.n_held):
         motion[Q, j], motion[U, j] = motion[END_Q, j], motion[END_U, j]
     for j in range(n):
         motion[Q, j], motion[U, j] = motion[END_Q, j], motion[END_U, j]
@@ -428,7 +425,7 @@ def _accept(work, laws):  # type: ignore[no-untyped-def]
         for d in range(3):
             work.rings[ring, TWIST, d] = work.rings[ring, TWIST_END, d]
             square += work.rings[ring, TWIST, d] ** 2
-        stops |= work.kinds[r, 2] == SLIDE and square <= _slowest(work, laws, r)
+        stops |= work.kinds[r, 2] == SLIDE and square <= _slowest(work, r)
     return stops
 
 
@@ -441,24 +438,13 @@ def _follow_paths(work, seconds):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _way(work, laws, still):  # type: ignore[no-untyped-def]
+def _way(work, still):  # type: ignore[no-untyped-def]
     """Return the share of an interval in which no body moves by more than half the smallest."""
     fastest = 1e-300
     for k in range(work.n_bodies):
         square = work.states[k, 3] ** 2 + work.states[k, 4] ** 2
         fastest = max(fastest, math.sqrt(square))
-    return max(_SHORTEST, 0.5 * still.length / (fastest * laws.time_step))
-
-
-class Flow(NamedTuple):
-    """Laws of a proposal, what they remember, and what steps are measured by."""
-
-    laws: Laws
-    memory: Floats  # (2, slot), see `laws.set_memory`
-    held: int  # numbers of force laws
-    time_step: float  # s
-    tolerance: float  # error of a step, as a share of natural sizes
-    length: float  # natural size of a way (m)
+    return max(_SHORTEST, 0.5 * still.length / (fastest * work.time_step))
 
 
 @inner
@@ -492,13 +478,12 @@ def rollout(works, still, batch, items, begins, out):  # type: ignore[no-untyped
     n, horizon, proposal, bodies = len(batch.inputs), batch.inputs.shape[1], -1, work.n_bodies
     timed = rows.shape[1] > 1
     memory, at = np.zeros((2, batch.slots)), np.full(2, -1)
+    work.memory, work.n_held = memory.ctypes.data + 8 * batch.slots, batch.held
+    work.time_step, work.tolerance, work.length = batch.time_step, batch.tolerance, still.length
     for place in range(len(items)):
         item = items[place]
         p, t = item // n, item % n
-        laws = laws_of(batch, p)
-        flow = Flow(
-            laws, memory, batch.held, batch.time_step, batch.tolerance, still.length
-        )  # fmt: skip
+        laws = batch.laws[p]
         if p != proposal:
             proposal = p
             _place_discs(still, discs[p])
@@ -525,9 +510,11 @@ def rollout(works, still, batch, items, begins, out):  # type: ignore[no-untyped
             while high < 1.0 and budget > 0:
                 low, high = high, 1.0
                 high = _switch(laws, low)
-                budget, wanted = _advance(work, flow, still, inputs, low, high, budget, wanted)
+                budget, wanted = _advance(work, laws, still, inputs, low, high, budget, wanted)
             if batch.slots > 0:
-                act(work.states, inputs, laws, LATE, 1.0, work.acted, memory[1], work.held, True)
+                act(
+                    work.states, inputs, laws, LATE, 1.0, work.acted, work.memory, work.held, True
+                )  # fmt: skip
             if budget < 0:
                 begins[place] = h
                 break

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pbrl_ppl.effects import Attached, Command, Force, Friction, at_stage, holder
-from pbrl_ppl.physics.calls import call_law, inner, law_address
+from pbrl_ppl.physics.calls import call_law, inner, law_address, real_at, whole_at
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import WRENCH, Floats, Ints
 
@@ -25,6 +26,7 @@ MORE = 4
 #: body that the torque acts back on, relative to which the law sees angle and speed (-1: none). Of
 #: a force, REMEMBER is the address of `rate`, and JUMPS that of `begin` (0: none).
 LAW, ON, FIRST, REMEMBER, SLOT, SLOTS, ALONE, UNDER, JUMPS, BEGINS, OTHER = range(11)
+_ROW = 8 * (OTHER + 1)  # bytes
 
 
 def law_tables(scene: Scene, effects: tuple[Attached, ...]) -> tuple[Ints, Ints, Ints, int, int]:
@@ -73,26 +75,39 @@ def _row(
     return row
 
 
-class Laws(NamedTuple):
-    """Laws of a proposal: rows of integers, with columns as above, and their parameters."""
+#: Laws of a proposal: how many commands, forces and frictions; the addresses of their rows, with
+#: columns as above, and of their parameters. One record: to pass arrays costs more than most laws.
+LAWS = np.dtype(
+    [
+        (name, np.int64)
+        for kind in ("commands", "forces", "frictions")
+        for name in (f"n_{kind}", kind, f"{kind}_values")
+    ]
+    + [("time_step", np.float64)],
+    align=True,
+)
 
-    commands: Ints
-    command_parameters: Floats
-    forces: Ints
-    force_parameters: Floats
-    frictions: Ints
-    friction_parameters: Floats
-    time_step: float  # s
 
+def laws_of(tables: Sequence[Ints], values: Sequence[Floats], time_step: float) -> NDArray[np.void]:
+    """Return the record of each proposal's laws, shape (proposal,); the arrays must be kept.
 
-@inner
-def laws_of(batch, p):  # type: ignore[no-untyped-def]
-    """Return the laws of a proposal."""
-    given = batch.given
-    return Laws(
-        batch.commands, given[3][p], batch.forces, given[4][p], batch.frictions, given[5][p],
-        batch.time_step,
-    )  # fmt: skip
+    Parameters
+    ----------
+    tables : sequence of ndarray
+        Rows of commands, forces and frictions, shape (law, column).
+    values : sequence of ndarray
+        Their parameters, shape (proposal, parameter).
+    time_step : float
+        Length of an interval (s).
+    """
+    records = np.zeros(len(values[0]), dtype=LAWS)
+    records["time_step"] = time_step
+    kinds = ("commands", "forces", "frictions")
+    for kind, rows, numbers in zip(kinds, tables, values, strict=True):
+        records[f"n_{kind}"], records[kind] = len(rows), rows.ctypes.data
+        places = numbers.strides[0] * np.arange(len(numbers))
+        records[f"{kind}_values"] = numbers.ctypes.data + places
+    return records
 
 
 @inner
@@ -104,8 +119,9 @@ def act(  # type: ignore[no-untyped-def]
     ``state`` is (body, 6) and ``interval`` the inputs of the interval, (body, 3 or more); ``begin``
     and ``end`` of the substep are shares of the interval. ``acted`` (body + 4, 12) becomes command,
     command before and wrench of each body; of the other rows a command law sees the first three.
-    ``memory`` is that of command laws when the interval begins; ``after`` it, it is brought up to
-    date. ``held`` (2, slot) has the numbers of force laws, and gets their rates of change.
+    ``memory`` is the address of that of command laws when the interval begins; ``after`` it, it is
+    brought up to date. ``held`` (2, slot) has the numbers of force laws, and gets their rates of
+    change.
     """
     k, data, stride = len(interval), acted.ctypes.data, 8 * ACTED
     known = interval.shape[1] > 3
@@ -116,15 +132,17 @@ def act(  # type: ignore[no-untyped-def]
             acted[i, WRENCHES + w] = 0.0  # by how much actuators are turned, for now
         acted[i, TIME] = interval[i, 7] + begin * laws.time_step if known else np.inf
         acted[i, INTERVAL] = laws.time_step
-    for e in range(len(laws.commands)):
-        law = laws.commands[e]
-        i, alone, state_at = law[ON], law[ALONE], state.ctypes.data + 48 * law[ON]
-        parameters_at = laws.command_parameters.ctypes.data + 8 * law[FIRST]
+    for e in range(laws.n_commands):
+        law = laws.commands + _ROW * e
+        i, alone = whole_at(law, ON), whole_at(law, ALONE)
+        slot, slots, other = whole_at(law, SLOT), whole_at(law, SLOTS), whole_at(law, OTHER)
+        state_at = state.ctypes.data + 48 * i
+        parameters_at = laws.commands_values + 8 * whole_at(law, FIRST)
         for w in range(ACTED):
             acted[k, w] = acted[i, w]
         acted[k, 6], acted[k, 7] = begin, end
-        for s in range(law[SLOTS]):
-            acted[k + 1 + s // ACTED, s % ACTED] = memory[law[SLOT] + s]
+        for s in range(slots):
+            acted[k + 1 + s // ACTED, s % ACTED] = real_at(memory, slot + s)
         wrench_at = data + stride * i
         if alone >= 0:
             wrench_at = data + stride * (k + 3)
@@ -132,37 +150,40 @@ def act(  # type: ignore[no-untyped-def]
                 acted[k, w] = acted[i, alone] if w == 0 else 0.0
                 acted[k, PREVIOUS + w] = acted[i, PREVIOUS + alone] if w == 0 else 0.0
                 acted[k + 3, w] = acted[k, w]
-        if law[OTHER] >= 0:
+        if other >= 0:
             for d in range(6):
                 acted[k + 3, 6 + d] = state[i, d]
-            acted[k + 3, 8] -= state[law[OTHER], 2]
-            acted[k + 3, 11] -= state[law[OTHER], 5]
+            acted[k + 3, 8] -= state[other, 2]
+            acted[k + 3, 11] -= state[other, 5]
             state_at = data + stride * (k + 3) + 48
-        call_law(law[LAW], state_at, data + stride * k, parameters_at, wrench_at)
+        call_law(whole_at(law, LAW), state_at, data + stride * k, parameters_at, wrench_at)
         if alone >= 0:
             acted[i, alone] = acted[k + 3, 0]
-        if after and law[SLOTS] > 0:
-            at = memory.ctypes.data + 8 * law[SLOT]
-            call_law(law[REMEMBER], state_at, data + stride * k, parameters_at, at)
+        if after and slots > 0:
+            remember = whole_at(law, REMEMBER)
+            call_law(remember, state_at, data + stride * k, parameters_at, memory + 8 * slot)
     for i in range(k):
         for w in range(3):
             acted[i, WRENCHES + w] = acted[i, COMMAND + w]
-    for e in range(len(laws.commands)):
-        if laws.commands[e, OTHER] >= 0:
-            acted[laws.commands[e, OTHER], WRENCHES + 2] -= acted[laws.commands[e, ON], COMMAND + 2]
-    for e in range(0 if after else len(laws.forces)):
-        law = laws.forces[e]
-        at, state_at = data + stride * law[ON], state.ctypes.data + 48 * law[ON]
-        seen, parameters_at = at, laws.force_parameters.ctypes.data + 8 * law[FIRST]
-        if law[SLOTS] > 0:
+    for e in range(laws.n_commands):
+        law = laws.commands + _ROW * e
+        if whole_at(law, OTHER) >= 0:
+            torque = acted[whole_at(law, ON), COMMAND + 2]
+            acted[whole_at(law, OTHER), WRENCHES + 2] -= torque
+    for e in range(0 if after else laws.n_forces):
+        law = laws.forces + _ROW * e
+        i, slot, slots = whole_at(law, ON), whole_at(law, SLOT), whole_at(law, SLOTS)
+        at, state_at = data + stride * i, state.ctypes.data + 48 * i
+        seen, parameters_at = at, laws.forces_values + 8 * whole_at(law, FIRST)
+        if slots > 0:
             seen = data + stride * k
             for w in range(ACTED):
-                acted[k, w] = acted[law[ON], w]
-            for s in range(law[SLOTS]):
-                acted[k + 1 + s // ACTED, s % ACTED] = held[0, law[SLOT] + s]
-            rates_at = held.ctypes.data + 8 * (held.shape[1] + law[SLOT])
-            call_law(law[REMEMBER], state_at, seen, parameters_at, rates_at)
-        call_law(law[LAW], state_at, seen, parameters_at, at + 8 * WRENCHES)
+                acted[k, w] = acted[i, w]
+            for s in range(slots):
+                acted[k + 1 + s // ACTED, s % ACTED] = held[0, slot + s]
+            rates_at = held.ctypes.data + 8 * (held.shape[1] + slot)
+            call_law(whole_at(law, REMEMBER), state_at, seen, parameters_at, rates_at)
+        call_law(whole_at(law, LAW), state_at, seen, parameters_at, at + 8 * WRENCHES)
 
 
 @inner
@@ -171,13 +192,15 @@ def begin_held(state, laws, acted, held):  # type: ignore[no-untyped-def]
     k = len(acted) - MORE
     for s in range(held.shape[1]):
         held[0, s] = held[1, s] = 0.0
-    for e in range(len(laws.forces)):
-        law = laws.forces[e]
-        if law[SLOTS] > 0 and law[JUMPS] != 0:
+    for e in range(laws.n_forces):
+        law = laws.forces + _ROW * e
+        begin = whole_at(law, JUMPS)
+        if whole_at(law, SLOTS) > 0 and begin != 0:
             call_law(
-                law[JUMPS], state.ctypes.data + 48 * law[ON], acted.ctypes.data + 8 * ACTED * k,
-                laws.force_parameters.ctypes.data + 8 * law[FIRST],
-                held.ctypes.data + 8 * law[SLOT],
+                begin, state.ctypes.data + 48 * whole_at(law, ON),
+                acted.ctypes.data + 8 * ACTED * k,
+                laws.forces_values + 8 * whole_at(law, FIRST),
+                held.ctypes.data + 8 * whole_at(law, SLOT),
             )  # fmt: skip
 
 
@@ -198,12 +221,13 @@ def set_memory(batch, laws, p, t, begin, start, acted, memory, held, at):  # typ
         _begin_memory(laws, inputs[first, 0], start, acted, memory[0], held)
     for earlier in range(first, t):
         for h in range(inputs.shape[1]):
-            act(start, inputs[earlier, h], laws, LATE, 1.0, acted, memory[0], held, True)
+            act(start, inputs[earlier, h], laws, LATE, 1.0, acted, memory.ctypes.data, held, True)
     at[0], at[1] = p, t
     for s in range(memory.shape[1]):
         memory[1, s] = memory[0, s]
+    now = memory.ctypes.data + 8 * memory.shape[1]
     for h in range(begin):
-        act(start, inputs[t, h], laws, LATE, 1.0, acted, memory[1], held, True)
+        act(start, inputs[t, h], laws, LATE, 1.0, acted, now, held, True)
 
 
 @inner
@@ -214,15 +238,16 @@ def _begin_memory(laws, interval, start, acted, memory, held):  # type: ignore[n
     """
     older = (interval.shape[1] - 9) // 3
     oldest = PREVIOUS if older == 0 else 6 + 3 * older
-    for e in range(len(laws.commands)):
-        law = laws.commands[e]
-        for s in range(law[SLOTS]):
-            w = s % 3 if law[ALONE] < 0 else law[ALONE]
-            last, now = interval[law[ON], oldest + w], interval[law[ON], w]
-            if law[BEGINS] >= 0 and interval[0, 7] < np.inf:
-                last += laws.command_parameters[law[BEGINS]] * (now - last)
-            there = law[ALONE] < 0 or s % 3 == 0
-            memory[law[SLOT] + s] = last if there else 0.0
+    for e in range(laws.n_commands):
+        law = laws.commands + _ROW * e
+        i, alone, begins = whole_at(law, ON), whole_at(law, ALONE), whole_at(law, BEGINS)
+        for s in range(whole_at(law, SLOTS)):
+            w = s % 3 if alone < 0 else alone
+            last, now = interval[i, oldest + w], interval[i, w]
+            if begins >= 0 and interval[0, 7] < np.inf:
+                last += real_at(laws.commands_values, begins) * (now - last)
+            there = alone < 0 or s % 3 == 0
+            memory[whole_at(law, SLOT) + s] = last if there else 0.0
     past = np.zeros((len(interval), 9))
     for age in range(older - 1, -1, -1):
         now, before = PREVIOUS if age == 0 else 6 + 3 * age, 9 + 3 * age
@@ -230,21 +255,21 @@ def _begin_memory(laws, interval, start, acted, memory, held):  # type: ignore[n
             for w in range(3):
                 past[i, w] = interval[i, now + w]
                 past[i, PREVIOUS + w] = interval[i, before + w]
-        act(start, past, laws, LATE, 1.0, acted, memory, held, True)
+        act(start, past, laws, LATE, 1.0, acted, memory.ctypes.data, held, True)
 
 
 @inner
 def bound(base, laws, i, under, state, torque, rest, speed, acted):  # type: ignore[no-untyped-def]
     """Return the greatest force of dry friction in the hinge of body ``i``, or under it."""
     k, data = len(acted) - MORE, acted.ctypes.data
-    for e in range(len(laws.frictions)):
-        law = laws.frictions[e]
-        if law[ON] == i and law[UNDER] == under:
+    for e in range(laws.n_frictions):
+        law = laws.frictions + _ROW * e
+        if whole_at(law, ON) == i and whole_at(law, UNDER) == under:
             acted[k, 0], acted[k, 1], acted[k, 2] = torque, rest, speed
             acted[k + 3, 0] = base
             call_law(
-                law[LAW], state.ctypes.data + 48 * i, data + 8 * ACTED * k,
-                laws.friction_parameters.ctypes.data + 8 * law[FIRST],
+                whole_at(law, LAW), state.ctypes.data + 48 * i, data + 8 * ACTED * k,
+                laws.frictions_values + 8 * whole_at(law, FIRST),
                 data + 8 * ACTED * (k + 3),
             )  # fmt: skip
             base = max(acted[k + 3, 0], 0.0)

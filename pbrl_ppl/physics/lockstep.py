@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pbrl_ppl.physics.calls import compiled, inner
-from pbrl_ppl.physics.laws import ACTED, LATE, MORE, act, begin_held, laws_of, set_memory
+from pbrl_ppl.physics.laws import ACTED, LATE, MORE, act, begin_held, set_memory
 from pbrl_ppl.physics.properties import COLUMN
 from pbrl_ppl.physics.solids import reaches, segment
 from pbrl_ppl.physics.world import World
@@ -301,7 +301,7 @@ def rollout(wheels, still, batch, items, begins, out):  # type: ignore[no-untype
     start, inputs = batch.start, batch.inputs
     n, horizon, moving = len(inputs), inputs.shape[1], len(still.radii)
     timed = rows.shape[1] > 1
-    acting = len(batch.commands) + len(batch.forces) > 0
+    acting = batch.laws[0].n_commands + batch.laws[0].n_forces > 0
     own_discs = np.zeros((BLOCK, discs.shape[1], 3))
     proposal, transition = np.zeros(BLOCK, np.int64), np.zeros(BLOCK, np.int64)
     first, until = np.zeros(BLOCK, np.int64), np.zeros(BLOCK, np.int64)
@@ -349,7 +349,7 @@ def rollout(wheels, still, batch, items, begins, out):  # type: ignore[no-untype
                     p, t = proposal[i], transition[i]
                     for k in range(moving):
                         get_state(bodies[k], i, states, k)
-                    laws = laws_of(batch, p)
+                    laws = batch.laws[p]
                     set_memory(batch, laws, p, t, first[i], states, acted, memory, held[i], at)
                     begin_held(states, laws, acted, held[i])
                     for slot in range(batch.slots):
@@ -361,8 +361,9 @@ def rollout(wheels, still, batch, items, begins, out):  # type: ignore[no-untype
                             for k in range(moving):
                                 get_state(bodies[k], i, states, k)
                             act(
-                                states, inputs[t, h], laws_of(batch, p), s / substeps,
-                                (s + 1) / substeps, acted, remembered[i], held[i], False,
+                                states, inputs[t, h], batch.laws[p], s / substeps,
+                                (s + 1) / substeps, acted, remembered[i].ctypes.data, held[i],
+                                False,
                             )  # fmt: skip
                             for slot in range(batch.held):
                                 held[i, 0, slot] += step * held[i, 1, slot]
@@ -380,8 +381,11 @@ def rollout(wheels, still, batch, items, begins, out):  # type: ignore[no-untype
                     p, t, h = proposal[i], transition[i], min(first[i] + ahead, horizon - 1)
                     for k in range(moving):
                         get_state(bodies[k], i, states, k)
-                    laws = laws_of(batch, p)
-                    act(states, inputs[t, h], laws, LATE, 1.0, acted, remembered[i], held[i], True)
+                    laws = batch.laws[p]
+                    act(
+                        states, inputs[t, h], laws, LATE, 1.0, acted, remembered[i].ctypes.data,
+                        held[i], True,
+                    )  # fmt: skip
                 for i in range(width):
                     item, h = items[begin + i], first[i] + ahead
                     if touched[i]:

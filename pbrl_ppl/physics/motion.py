@@ -67,6 +67,10 @@ _SOFT = 1e-11
 #: cost more than what they hold.
 WORK = np.dtype(
     [(name, np.int64) for name in ("n_links", "n", "n_rows", "n_kinds", "n_bodies")]
+    # numbers of force laws, and the address of what command laws remember
+    + [(name, np.int64) for name in ("n_held", "memory")]
+    # the interval (s), the error of a step as a share of natural sizes, and that of a way (m)
+    + [(name, np.float64) for name in ("time_step", "tolerance", "length")]
     + [
         ("tree", np.int64, (MOST, 9)),
         ("kinds", np.int64, (MOST, 4)),  # of rows, then rings (-1): link, mode, if that is settled
@@ -331,7 +335,7 @@ def set_rows(work, u):  # type: ignore[no-untyped-def]
 @inner
 def set_bounds(work, laws, u):  # type: ignore[no-untyped-def]
     """Set the greatest forces of dry friction that laws change, where forces and rows are set."""
-    if len(laws.frictions) == 0:
+    if laws.n_frictions == 0:
         return
     tree, motion, acted, states = work.tree, work.motion, work.acted, work.states
     for r in range(work.n_kinds):

@@ -13,6 +13,7 @@ from queue import SimpleQueue
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pbrl_ppl.effects import Clock, needs_inputs
 from pbrl_ppl.errors import SimulationError
@@ -21,7 +22,7 @@ from pbrl_ppl.parameters import Layout, differentiate
 from pbrl_ppl.physics import calls, compiled, flow, lockstep
 from pbrl_ppl.physics.calls import pointers, still
 from pbrl_ppl.physics.joints import LENGTH, on_rod
-from pbrl_ppl.physics.laws import law_tables
+from pbrl_ppl.physics.laws import law_tables, laws_of
 from pbrl_ppl.physics.motion import work_of
 from pbrl_ppl.physics.properties import EngineInput, EngineProperties
 from pbrl_ppl.physics.settings import PhysicsSettings
@@ -45,9 +46,7 @@ class Batch(NamedTuple):
     """What the rollouts take: see `compiled.rollout`."""
 
     given: tuple[Floats, ...]
-    commands: Ints
-    forces: Ints
-    frictions: Ints
+    laws: NDArray[np.void]  # (proposal,), of dtype `laws.LAWS`
     slots: int
     held: int
     follows: Bools
@@ -389,9 +388,11 @@ class Simulator:
 
         So many engine steps are worth a thread of their own.
         """
+        (*tables, slots, held), time_step = self._laws, self.physics.scene.time_step
         batch = Batch(
-            tuple(numbers[:-1]), *self._laws, continues_previous(inputs), starts, inputs,
-            self.physics.scene.time_step, *self.levels, self.physics.tolerance,
+            numbers[:3], laws_of(tables, numbers[3:6], time_step), slots, held,
+            continues_previous(inputs), starts, inputs, time_step, *self.levels,
+            self.physics.tolerance,
         )  # fmt: skip
         steps = len(out) * inputs.shape[1] * int(self.levels[0].sum())
         workers = max(1, min(self.physics.threads, len(out), steps // a_thread))
