@@ -401,8 +401,8 @@ def _transition(  # type: ignore[no-untyped-def]
             near = False
             if acting:
                 act(
-                    state, inputs[h], laws, s / substeps, (s + 1) / substeps, acted, remembered,
-                    held, False,
+                    state, inputs[h].ctypes.data, laws, s / substeps, (s + 1) / substeps, acted,
+                    remembered, held, False,
                 )  # fmt: skip
                 for slot in range(held.shape[1]):
                     held[0, slot] += step * held[1, slot]
@@ -420,7 +420,7 @@ def _transition(  # type: ignore[no-untyped-def]
                 touched = _TOUCHED if near else touched
         copy(state, out[h])
         if memory.shape[1] > 0:
-            act(state, inputs[h], laws, LATE, 1.0, acted, remembered, held, True)
+            act(state, inputs[h].ctypes.data, laws, LATE, 1.0, acted, remembered, held, True)
         end += 1
     return touched, end
 

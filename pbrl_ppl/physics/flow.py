@@ -87,17 +87,17 @@ _COAST = 0.1
 
 
 @inner
-def _slope(work, laws, u, a, inputs, share, low, high):  # type: ignore[no-untyped-def]
+def _slope(work, laws, u, a, share, low, high):  # type: ignore[no-untyped-def]
     """Compute accelerations (row a) at places that are set and a time in a piece of the interval.
 
     ``low`` and ``high`` are the ends of the piece, as shares of the interval.
     """
-    _load(work, laws, u, inputs, share, low, high)
+    _load(work, laws, u, share, low, high)
     solve(work, u, a, False)
 
 
 @inner
-def _load(work, laws, u, inputs, share, low, high):  # type: ignore[no-untyped-def]
+def _load(work, laws, u, share, low, high):  # type: ignore[no-untyped-def]
     """Set what acts there: wrenches, forces, and rows of friction."""
     motion, held = work.motion, work.n + 1
     for s in range(work.n_held):
@@ -105,7 +105,7 @@ def _load(work, laws, u, inputs, share, low, high):  # type: ignore[no-untyped-d
     if laws.n_commands + laws.n_forces > 0:
         begin = min(max(low + _SHORTEST, share), high - _WINDOW)  # past a jump that is no switch
         act(
-            work.states, inputs, laws, begin, begin + _WINDOW, work.acted, work.memory,
+            work.states, work.inputs, laws, begin, begin + _WINDOW, work.acted, work.memory,
             work.held, False,
         )  # fmt: skip
     for s in range(work.n_held):
@@ -155,7 +155,7 @@ def _set_wheel(work, r, mode):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _decide(work, laws, inputs, share, low, high):  # type: ignore[no-untyped-def]
+def _decide(work, laws, share, low, high):  # type: ignore[no-untyped-def]
     """Set which rows and rings stick and which way the others slip; and the step's first slopes.
 
     Rows with a speed slip. Of the others all stick first; that which is pulled hardest gives way,
@@ -164,10 +164,10 @@ def _decide(work, laws, inputs, share, low, high):  # type: ignore[no-untyped-de
     motion, kinds, rows = work.motion, work.kinds, work.rows
     count = work.n_rows
     set_places(work, Q, U)
-    _load(work, laws, U, inputs, share, low, high)  # for the rows
+    _load(work, laws, U, share, low, high)  # for the rows
     stop = _begin_modes(work)
     for _ in range(5 * work.n_kinds + 2):
-        _slope(work, laws, U, SLOPES + 1, inputs, share, low, high)
+        _slope(work, laws, U, SLOPES + 1, share, low, high)
         worst, back, most = -1, -1, 1.0 - _STILL
         for r in range(count):
             if kinds[r, 3] == 0 and kinds[r, 2] == STICK:
@@ -296,7 +296,7 @@ def _weighted(motion, stage, first, j):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _step(work, laws, inputs, share, low, high, width):  # type: ignore[no-untyped-def]
+def _step(work, laws, share, low, high, width):  # type: ignore[no-untyped-def]
     """Try a step of a width (share of the interval) from its first slopes.
 
     Returns its error over the tolerance, and by how much nothing switches: at its end, and on the
@@ -317,7 +317,7 @@ def _step(work, laws, inputs, share, low, high, width):  # type: ignore[no-untyp
                 motion[END_U, j] = motion[SLOPES + 2 * stage, j] = u
         set_places(work, END_Q, END_U)
         at = share + _TIMES[stage] * width
-        _slope(work, laws, END_U, SLOPES + 2 * stage + 1, inputs, at, low, high)
+        _slope(work, laws, END_U, SLOPES + 2 * stage + 1, at, low, high)
         for j in range(n + 1, ends):
             motion[SLOPES + 2 * stage, j] = motion[END_U, j]
         end = _margin(work, END_U)
@@ -345,7 +345,7 @@ def _step(work, laws, inputs, share, low, high, width):  # type: ignore[no-untyp
 
 
 @inner
-def _advance(work, laws, still, inputs, low, high, budget, wanted):  # type: ignore[no-untyped-def]
+def _advance(work, laws, still, low, high, budget, wanted):  # type: ignore[no-untyped-def]
     """Move through a piece of an interval in which no command jumps.
 
     Begins with steps of a ``wanted`` width. Returns the steps left, and the width wanted next. Left
@@ -357,7 +357,7 @@ def _advance(work, laws, still, inputs, low, high, budget, wanted):  # type: ign
     begin, before, until, after, kept = 0.0, 0.0, 0.0, 0.0, 0
     while share < high:
         if fresh:
-            _decide(work, laws, inputs, share, low, high)
+            _decide(work, laws, share, low, high)
             fresh, left = False, _first_margin(work)
         if locating:
             width = begin + (until - begin) * before / (before - after)
@@ -368,7 +368,7 @@ def _advance(work, laws, still, inputs, low, high, budget, wanted):  # type: ign
         budget -= 1
         if budget <= 0:
             return 0, wanted
-        error, end, way = _step(work, laws, inputs, share, low, high, width)
+        error, end, way = _step(work, laws, share, low, high, width)
         if locating:  # regula falsi (Illinois)
             if abs(end) > _LOCATED and until - begin > 1e-12:
                 if end > 0.0:
@@ -502,6 +502,7 @@ def rollout(works, still, batch, items, begins, out):  # type: ignore[no-untyped
                 for s in range(batch.held):
                     work.motion[Q, work.n + 1 + s] = work.held[0, s]
             inputs, budget, low, high = batch.inputs[t, h], MOST_STEPS, 0.0, 0.0
+            work.inputs = inputs.ctypes.data
             for k in range(bodies):
                 for w in range(3):
                     work.acted[k, COMMAND + w] = work.acted[k, WRENCHES + w] = inputs[k, w]
@@ -510,10 +511,11 @@ def rollout(works, still, batch, items, begins, out):  # type: ignore[no-untyped
             while high < 1.0 and budget > 0:
                 low, high = high, 1.0
                 high = _switch(laws, low)
-                budget, wanted = _advance(work, laws, still, inputs, low, high, budget, wanted)
+                budget, wanted = _advance(work, laws, still, low, high, budget, wanted)
             if batch.slots > 0:
                 act(
-                    work.states, inputs, laws, LATE, 1.0, work.acted, work.memory, work.held, True
+                    work.states, work.inputs, laws, LATE, 1.0, work.acted, work.memory, work.held,
+                    True,
                 )  # fmt: skip
             if budget < 0:
                 begins[place] = h

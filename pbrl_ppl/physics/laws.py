@@ -76,19 +76,22 @@ def _row(
 
 
 #: Laws of a proposal: how many commands, forces and frictions; the addresses of their rows, with
-#: columns as above, and of their parameters. One record: to pass arrays costs more than most laws.
+#: columns as above, and of their parameters. Then the number of bodies, the columns of a body's
+#: inputs and the interval (s). One record: to pass arrays costs more than most laws.
 LAWS = np.dtype(
     [
         (name, np.int64)
         for kind in ("commands", "forces", "frictions")
         for name in (f"n_{kind}", kind, f"{kind}_values")
     ]
-    + [("time_step", np.float64)],
+    + [("n_bodies", np.int64), ("width", np.int64), ("time_step", np.float64)],
     align=True,
 )
 
 
-def laws_of(tables: Sequence[Ints], values: Sequence[Floats], time_step: float) -> NDArray[np.void]:
+def laws_of(
+    tables: Sequence[Ints], values: Sequence[Floats], inputs: Floats, time_step: float
+) -> NDArray[np.void]:
     """Return the record of each proposal's laws, shape (proposal,); the arrays must be kept.
 
     Parameters
@@ -97,10 +100,13 @@ def laws_of(tables: Sequence[Ints], values: Sequence[Floats], time_step: float) 
         Rows of commands, forces and frictions, shape (law, column).
     values : sequence of ndarray
         Their parameters, shape (proposal, parameter).
+    inputs : ndarray
+        Shape (transition, H, body, column).
     time_step : float
         Length of an interval (s).
     """
     records = np.zeros(len(values[0]), dtype=LAWS)
+    records["n_bodies"], records["width"] = inputs.shape[2:]
     records["time_step"] = time_step
     kinds = ("commands", "forces", "frictions")
     for kind, rows, numbers in zip(kinds, tables, values, strict=True):
@@ -112,25 +118,26 @@ def laws_of(tables: Sequence[Ints], values: Sequence[Floats], time_step: float) 
 
 @inner
 def act(  # type: ignore[no-untyped-def]
-    state, interval, laws, begin, end, acted, memory, held, after
+    state, inputs, laws, begin, end, acted, memory, held, after
 ):  # fmt: skip
     """Compute the wrench on each body in a substep: the command stage, then the force stage.
 
-    ``state`` is (body, 6) and ``interval`` the inputs of the interval, (body, 3 or more); ``begin``
-    and ``end`` of the substep are shares of the interval. ``acted`` (body + 4, 12) becomes command,
-    command before and wrench of each body; of the other rows a command law sees the first three.
-    ``memory`` is the address of that of command laws when the interval begins; ``after`` it, it is
-    brought up to date. ``held`` (2, slot) has the numbers of force laws, and gets their rates of
-    change.
+    ``state`` is (body, 6), and ``inputs`` the address of those of the interval, (body, column);
+    ``begin`` and ``end`` of the substep are shares of the interval. ``acted`` (body + 4, 12)
+    becomes command, command before and wrench of each body; of the other rows a command law sees
+    the first three. ``memory`` is the address of that of command laws when the interval begins;
+    ``after`` it, it is brought up to date. ``held`` (2, slot) has the numbers of force laws, and
+    gets their rates of change.
     """
-    k, data, stride = len(interval), acted.ctypes.data, 8 * ACTED
-    known = interval.shape[1] > 3
+    k, data, stride = laws.n_bodies, acted.ctypes.data, 8 * ACTED
+    known = laws.width > 3
     for i in range(k):
+        row = inputs + 8 * laws.width * i
         for w in range(3):
-            acted[i, COMMAND + w] = interval[i, w]
-            acted[i, PREVIOUS + w] = interval[i, 3 + w] if known else 0.0
+            acted[i, COMMAND + w] = real_at(row, w)
+            acted[i, PREVIOUS + w] = real_at(row, 3 + w) if known else 0.0
             acted[i, WRENCHES + w] = 0.0  # by how much actuators are turned, for now
-        acted[i, TIME] = interval[i, 7] + begin * laws.time_step if known else np.inf
+        acted[i, TIME] = real_at(row, 7) + begin * laws.time_step if known else np.inf
         acted[i, INTERVAL] = laws.time_step
     for e in range(laws.n_commands):
         law = laws.commands + _ROW * e
@@ -221,13 +228,14 @@ def set_memory(batch, laws, p, t, begin, start, acted, memory, held, at):  # typ
         _begin_memory(laws, inputs[first, 0], start, acted, memory[0], held)
     for earlier in range(first, t):
         for h in range(inputs.shape[1]):
-            act(start, inputs[earlier, h], laws, LATE, 1.0, acted, memory.ctypes.data, held, True)
+            at_interval = inputs[earlier, h].ctypes.data
+            act(start, at_interval, laws, LATE, 1.0, acted, memory.ctypes.data, held, True)
     at[0], at[1] = p, t
     for s in range(memory.shape[1]):
         memory[1, s] = memory[0, s]
     now = memory.ctypes.data + 8 * memory.shape[1]
     for h in range(begin):
-        act(start, inputs[t, h], laws, LATE, 1.0, acted, now, held, True)
+        act(start, inputs[t, h].ctypes.data, laws, LATE, 1.0, acted, now, held, True)
 
 
 @inner
@@ -248,14 +256,14 @@ def _begin_memory(laws, interval, start, acted, memory, held):  # type: ignore[n
                 last += real_at(laws.commands_values, begins) * (now - last)
             there = alone < 0 or s % 3 == 0
             memory[whole_at(law, SLOT) + s] = last if there else 0.0
-    past = np.zeros((len(interval), 9))
+    past = np.zeros((laws.n_bodies, laws.width))
     for age in range(older - 1, -1, -1):
         now, before = PREVIOUS if age == 0 else 6 + 3 * age, 9 + 3 * age
         for i in range(len(past)):
             for w in range(3):
                 past[i, w] = interval[i, now + w]
                 past[i, PREVIOUS + w] = interval[i, before + w]
-        act(start, past, laws, LATE, 1.0, acted, memory.ctypes.data, held, True)
+        act(start, past.ctypes.data, laws, LATE, 1.0, acted, memory.ctypes.data, held, True)
 
 
 @inner

@@ -361,7 +361,7 @@ def rollout(wheels, still, batch, items, begins, out):  # type: ignore[no-untype
                             for k in range(moving):
                                 get_state(bodies[k], i, states, k)
                             act(
-                                states, inputs[t, h], batch.laws[p], s / substeps,
+                                states, inputs[t, h].ctypes.data, batch.laws[p], s / substeps,
                                 (s + 1) / substeps, acted, remembered[i].ctypes.data, held[i],
                                 False,
                             )  # fmt: skip
@@ -383,8 +383,8 @@ def rollout(wheels, still, batch, items, begins, out):  # type: ignore[no-untype
                         get_state(bodies[k], i, states, k)
                     laws = batch.laws[p]
                     act(
-                        states, inputs[t, h], laws, LATE, 1.0, acted, remembered[i].ctypes.data,
-                        held[i], True,
+                        states, inputs[t, h].ctypes.data, laws, LATE, 1.0, acted,
+                        remembered[i].ctypes.data, held[i], True,
                     )  # fmt: skip
                 for i in range(width):
                     item, h = items[begin + i], first[i] + ahead

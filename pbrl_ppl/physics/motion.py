@@ -67,8 +67,9 @@ _SOFT = 1e-11
 #: cost more than what they hold.
 WORK = np.dtype(
     [(name, np.int64) for name in ("n_links", "n", "n_rows", "n_kinds", "n_bodies")]
-    # numbers of force laws, and the address of what command laws remember
-    + [(name, np.int64) for name in ("n_held", "memory")]
+    # numbers of force laws, and the addresses of what command laws remember and of an interval's
+    # inputs
+    + [(name, np.int64) for name in ("n_held", "memory", "inputs")]
     # the interval (s), the error of a step as a share of natural sizes, and that of a way (m)
     + [(name, np.float64) for name in ("time_step", "tolerance", "length")]
     + [

@@ -390,7 +390,7 @@ class Simulator:
         """
         (*tables, slots, held), time_step = self._laws, self.physics.scene.time_step
         batch = Batch(
-            numbers[:3], laws_of(tables, numbers[3:6], time_step), slots, held,
+            numbers[:3], laws_of(tables, numbers[3:6], inputs, time_step), slots, held,
             continues_previous(inputs), starts, inputs, time_step, *self.levels,
             self.physics.tolerance,
         )  # fmt: skip
