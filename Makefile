@@ -9,7 +9,7 @@ CART := models/shopping_cart
 
 PAPER := shopping_cart apartment wrong_model wrong_model_box2d scaling
 
-.PHONY: demo paper test test-fast test-generation test-long lint notebooks docs clean
+.PHONY: demo paper test test-fast test-generation test-long test-properties lint notebooks docs clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.installed
@@ -39,6 +39,10 @@ test-generation: $(VENV)/.installed-test
 
 test-long: $(VENV)/.installed-test
 	$(PYTEST) -m long $(PYTEST_ARGS)
+
+# the properties that Hypothesis tries, with four times as many examples as `make test`
+test-properties: $(VENV)/.installed-test
+	$(PYTEST) -m hypothesis --hypothesis-profile long $(PYTEST_ARGS)
 
 lint: $(VENV)/.installed-lint
 	$(BIN)/ruff check .
