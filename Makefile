@@ -27,10 +27,10 @@ paper: $(VENV)/.installed-test
 # One worker runs a whole file, so that its fixtures are made once; the marker `first` sets the order.
 PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --durations 10
 
-test: $(VENV)/.installed-test
+test: $(VENV)/.compiled
 	$(PYTEST) $(PYTEST_ARGS)
 
-test-fast: $(VENV)/.installed-test
+test-fast: $(VENV)/.compiled
 	$(PYTEST) -m 'not slow and not long' $(PYTEST_ARGS)
 
 # the fast tests that depend on the generation of PyMC and ArviZ
@@ -68,6 +68,12 @@ clean:
 	rm -rf .venv .venv-next build out *.egg-info
 	rm -rf .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# Each worker of the tests would compile all of the engine's loops, a minute: each process here compiles half.
+$(VENV)/.compiled: $(wildcard pbrl_ppl/physics/*.py) | $(VENV)/.installed-test
+	$(BIN)/python -m tests.helpers.compilation flow & \
+	    $(BIN)/python -m tests.helpers.compilation lockstep compiled && wait $$!
+	touch $@
 
 # Some distributions package Python without ensurepip: there the system's pip fills the environment.
 $(BIN)/python:

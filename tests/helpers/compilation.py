@@ -1,7 +1,10 @@
-"""Compile the engine's loops into their cache: ``python -m tests.helpers.compilation``.
+"""Compile the engine's loops into their cache: ``python -m tests.helpers.compilation [LOOP ...]``.
 
-Of pytest workers that begin without a cache each compiles all of them.
+Of pytest workers that begin without a cache each compiles all of them. The loops are ``lockstep``
+of single bodies, ``flow`` of joined ones, and ``compiled`` of contacts; without an argument, all.
 """
+
+import sys
 
 from pbrl_ppl.physics import Simulator, compiled, flow, lockstep
 from pbrl_ppl.scene import Body, Scene
@@ -9,19 +12,30 @@ from tests.helpers.engines import BOX, cart, chain, proposals
 from tests.helpers.worlds import G, simulator
 
 
-def main() -> None:
-    """Predict once by each loop: of single bodies, of joined ones, and of contacts."""
+def alone():
+    """Return a simulator of the cart without walls, its first states and its actions."""
     _, start, actions = cart(walls=False)
-    alone = Scene(time_step=0.1, normal_gravity=G, bodies=(Body("cart", BOX, wheel=True),))
-    for engine, (made, begin, inputs) in (
-        ("auto", (simulator(alone), start, actions)),
-        ("auto", chain()),
-        ("chipmunk", cart(walls=True)),
-    ):
+    scene = Scene(time_step=0.1, normal_gravity=G, bodies=(Body("cart", BOX, wheel=True),))
+    return simulator(scene), start, actions
+
+
+#: Loop -> its module, an engine, and what makes a simulator, states and actions that it is run on.
+LOOPS = {
+    "lockstep": (lockstep, "auto", alone),
+    "flow": (flow, "auto", chain),
+    "compiled": (compiled, "chipmunk", lambda: cart(walls=True)),
+}
+
+
+def main(*names: str) -> None:
+    """Predict once by each of these loops, or by all."""
+    for name in names or LOOPS:
+        module, engine, make = LOOPS[name]
+        made, begin, inputs = make()
         loop = Simulator(made.physics.changed(engine=engine))
         loop(proposals(loop.physics.layout, 1), begin[:2], inputs[:2])
-    assert all(loop.rollout.signatures for loop in (lockstep, flow, compiled))
+        assert module.rollout.signatures
 
 
 if __name__ == "__main__":
-    main()
+    main(*sys.argv[1:])
