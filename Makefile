@@ -9,7 +9,7 @@ CART := models/shopping_cart
 
 PAPER := shopping_cart apartment wrong_model wrong_model_box2d scaling
 
-.PHONY: demo paper test test-fast test-generation test-long lint notebooks docs clean
+.PHONY: demo paper test test-fast test-generation test-long test-properties lint notebooks docs clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.installed
@@ -27,10 +27,10 @@ paper: $(VENV)/.installed-test
 # One worker runs a whole file, so that its fixtures are made once; the marker `first` sets the order.
 PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --durations 10
 
-test: $(VENV)/.installed-test
+test: $(VENV)/.compiled
 	$(PYTEST) $(PYTEST_ARGS)
 
-test-fast: $(VENV)/.installed-test
+test-fast: $(VENV)/.compiled
 	$(PYTEST) -m 'not slow and not long' $(PYTEST_ARGS)
 
 # the fast tests that depend on the generation of PyMC and ArviZ
@@ -39,6 +39,10 @@ test-generation: $(VENV)/.installed-test
 
 test-long: $(VENV)/.installed-test
 	$(PYTEST) -m long $(PYTEST_ARGS)
+
+# the properties that Hypothesis tries, with four times as many examples as `make test`
+test-properties: $(VENV)/.installed-test
+	$(PYTEST) -m hypothesis --hypothesis-profile long $(PYTEST_ARGS)
 
 lint: $(VENV)/.installed-lint
 	$(BIN)/ruff check .
@@ -64,6 +68,13 @@ clean:
 	rm -rf .venv .venv-next build out *.egg-info
 	rm -rf .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# Each worker of the tests would compile the engine's loops, a minute: each process here compiles half.
+COMPILE := $(BIN)/python -c "import sys; from pbrl_ppl.physics import compile_loops; compile_loops(sys.argv[1:])"
+
+$(VENV)/.compiled: $(wildcard pbrl_ppl/physics/*.py) | $(VENV)/.installed-test
+	$(COMPILE) joined & $(COMPILE) single touching && wait $$!
+	touch $@
 
 # Some distributions package Python without ensurepip: there the system's pip fills the environment.
 $(BIN)/python:

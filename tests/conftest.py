@@ -22,8 +22,10 @@ os.environ.setdefault("PYTENSOR_FLAGS", "traceback__limit=0,gcc__cxxflags=-O0")
 # One pytest worker per processor: BLAS threads would wait for each other. NumPy reads this when it
 # is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# The same examples on every machine, and no failure because a machine is slow.
-settings.register_profile("project", deadline=None, derandomize=True)
+# The same examples on every machine, and no failure because a machine is slow. The suite tries 25
+# examples of a property, `make test-properties` four times as many.
+settings.register_profile("project", deadline=None, derandomize=True, max_examples=25)
+settings.register_profile("long", deadline=None, derandomize=True, max_examples=100)
 settings.load_profile("project")
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from pbrl_ppl.physics import compiled, flow, lockstep
 from pbrl_ppl.physics.calls import compile_beside
 from pbrl_ppl.physics.physics import Transition
@@ -19,7 +21,7 @@ _SCENES = {
 }
 
 
-def compile_loops(names: tuple[str, ...] = tuple(LOOPS)) -> None:
+def compile_loops(names: Iterable[str] = tuple(LOOPS)) -> None:
     """Compile these of `LOOPS`: predict one interval by each."""
     for name in names:
         puck = Transition(_SCENES[name], {"mass": 1.0, "r": 0.0, "mu_c": 0.0}, check_start=False)

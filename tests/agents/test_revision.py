@@ -10,7 +10,7 @@ from pbrl_ppl.errors import EffectError
 from pbrl_ppl.parameters import Prior
 from tests.helpers.tasks import CART, CART_TRUTH
 
-pytestmark = pytest.mark.one_stack
+pytestmark = [pytest.mark.one_stack, pytest.mark.first(2)]
 
 EFFECTS = {effect.name: effect for effect in catalogue}
 SIZES = {

@@ -15,7 +15,7 @@ from pbrl_ppl.scene import Body, Recording, Scene, Shape
 from tests.helpers import raw_logs
 from tests.helpers.bags import Bag
 
-pytestmark = pytest.mark.one_stack
+pytestmark = [pytest.mark.one_stack, pytest.mark.first(2)]
 
 PUCK = Scene(time_step=0.1, bodies=(Body("puck", Shape.circle(0.1)),))
 

@@ -18,7 +18,7 @@ from tests.helpers.free_puck import BOX, DISC, Disc, box2d, fitted
 from tests.helpers.histories import NOISE
 from tests.helpers.places import MODELS
 
-pytestmark = [pytest.mark.one_stack, pytest.mark.first(3)]
+pytestmark = [pytest.mark.one_stack, pytest.mark.first(2)]
 
 EFFECTS = {effect.name: effect for effect in catalogue}
 

@@ -199,7 +199,8 @@ def millinewtons(frame):
 @pytest.mark.slow
 @pytest.mark.parametrize("wrong", [degrees, unpushed, millinewtons])
 def test_nonsense_is_never_adequate(wrong, clean) -> None:
-    found = loop([wrong(frame) for frame in clean])
+    """Of half of the trajectories: the loop fits laws to nonsense for long."""
+    found = loop([wrong(frame[frame["trajectory"] < 4]) for frame in clean])
     assert found.verdict != "adequate"
     assert found.unexplained is not None
     assert not all(test.passed for test in found.tests)

@@ -354,7 +354,7 @@ def own_effects() -> tuple[Effect, Effect]:
     )
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 @given(st.floats(0.0, 3.0), st.floats(-2.0, 2.0))
 def test_own_effect_on_both_paths(c, speed) -> None:
     """v = v0 / sqrt(1 + 2 c v0^2 t / m)."""

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy import stats
@@ -61,7 +61,6 @@ def test_leading_axes_of_draws() -> None:
 
 
 @given(turns=hnp.arrays(np.int64, (N, H, K), elements=st.integers(-50, 50)))
-@settings(deadline=None, max_examples=50)
 def test_full_turns_of_measured_angles_change_nothing(turns) -> None:
     observations, predicted = case()
     shifted = observations.values.copy()

@@ -16,8 +16,6 @@ from pbrl_ppl.sampling import fit, physics_model
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.histories import simulated_history
 
-pytestmark = pytest.mark.first(4)
-
 TRUTH = {"mass": 3.0, "linear_drag_coefficient": 2.0, "constant_force_force_x": 1.0}
 TRUTH |= {"constant_force_force_y": -0.5}
 TWO = {"mass": 3.0, "linear_drag_coefficient": 2.0}

@@ -47,7 +47,7 @@ from tests.helpers.histories import simulated_history
 from tests.helpers.joints import HINGED, reference_anchors, scene
 from tests.helpers.worlds import G, body
 
-pytestmark = [pytest.mark.one_stack, pytest.mark.first(3)]
+pytestmark = [pytest.mark.one_stack, pytest.mark.first(2)]
 
 # Python 3.12 and later warn of a fork in a process with threads; PyMC's chains start by fork
 FORK = pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
@@ -68,11 +68,11 @@ NOISE = (0.002, 0.002, 0.004, 0.01, 0.01, 0.02)
 
 
 def recorded(kind: str, *joined: str) -> tuple[Scene, History]:
-    """A scene that does not say what is joined, and twenty transitions of what is."""
+    """A scene that does not say what is joined, and ten transitions of what is."""
     joints = (Joint(kind, joined, *ANCHORS[kind, *joined]),) if joined else ()
     truth = scene(*joints, poses=LINED)
     history = simulated_history(
-        truth, {}, seed=2, trajectories=10, intervals=2, noise=NOISE, poses=LINED, substeps=20
+        truth, {}, seed=2, trajectories=5, intervals=2, noise=NOISE, poses=LINED, substeps=20
     )  # fmt: skip
     return scene(Joint(kind, known=False), poses=LINED).replace(substeps=5), history
 
@@ -253,12 +253,16 @@ def test_probabilities_are_those_of_weighted_prior_draws(joined) -> None:
 # -- finding ---------------------------------------------------------------------------------------
 
 
+#: Fixtures of configurations that other tests take too.
+SHARED = {("hinge", "a", "b"): "found", ("hinge",): "found_loose"}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("joined", [*ANCHORS, ("hinge",), ("distance",)], ids="-".join)
 def test_what_is_joined_is_found(joined, request) -> None:
-    """Twenty transitions with the noise of motion capture."""
-    if joined == ("hinge", "a", "b"):
-        found = request.getfixturevalue("found")
+    """Ten transitions with the noise of motion capture."""
+    if joined in SHARED:
+        found = request.getfixturevalue(SHARED[joined])
     else:
         found = weigh(problem_in(physics_model(*recorded(*joined))), seed=1)
     best = max(found, key=lambda each: each.probability)
@@ -279,7 +283,7 @@ def test_two_joints_are_found() -> None:
     given = Joint("hinge", ("a", "b"), *ANCHORS["hinge", "a", "b"]), rod
     truth = scene(*given, poses=LINED).subset("ab")
     history = simulated_history(
-        truth, {}, seed=2, trajectories=10, intervals=2, noise=NOISE, poses=LINED[:2], substeps=20
+        truth, {}, seed=2, trajectories=5, intervals=2, noise=NOISE, poses=LINED[:2], substeps=20
     )
     unknown = Joint("hinge", known=False, name="pin"), Joint("distance", known=False, name="rod")
     free = scene(*unknown, poses=LINED).subset("ab").replace(substeps=5)
@@ -325,6 +329,18 @@ def model() -> pm.Model:
 def found(model) -> list[Weighed]:
     """Its configurations, weighed."""
     return weigh(problem_in(model), seed=1)
+
+
+@pytest.fixture(scope="module")
+def loose() -> pm.Model:
+    """Boxes without a joint, of which the scene says that there may be a hinge."""
+    return physics_model(*recorded("hinge"))
+
+
+@pytest.fixture(scope="module")
+def found_loose(loose) -> list[Weighed]:
+    """Its configurations, weighed."""
+    return weigh(problem_in(loose), seed=1)
 
 
 @pytest.fixture
@@ -536,7 +552,9 @@ def test_probabilities_need_a_joint_of_unknown_bodies() -> None:
 @pytest.mark.slow
 @FORK
 @SHORT
+@pytest.mark.usefixtures("known_weights")
 def test_the_same_seed_gives_the_same_posterior(model, fitted) -> None:
+    """Both parts run twice: `fitted` weighs the configurations itself, this fit takes `found`."""
     again = draws(fit(model, seed=1, **QUICK))
     for name, values in draws(fitted).items():
         np.testing.assert_array_equal(again[name], values)
@@ -554,12 +572,12 @@ def test_map_is_the_best_configuration_s_mode(model) -> None:
     np.testing.assert_allclose(Dynamics.of(idata).phi[0], [0, 1, *anchors], rtol=1e-12)
 
 
-def test_no_joint_is_found_where_there_is_none() -> None:
+def test_no_joint_is_found_where_there_is_none(loose, found_loose, monkeypatch) -> None:
     """The anchors' draws are then the prior's, and no warning of an uninformed one is due."""
-    none = physics_model(*recorded("hinge"))
+    monkeypatch.setattr("pbrl_ppl.sampling.fitting.weigh", lambda problem, **options: found_loose)
     with warnings.catch_warnings():
         warnings.simplefilter("error", UninformedWarning)
-        idata = fit(none, seed=1, method="map", progress=False)
+        idata = fit(loose, seed=1, method="map", progress=False)
     named = draws(idata)
     assert named["i_a"].item() == named["i_b"].item()
     assert next(iter(joint_probabilities(idata)["joint1"])) == "none"

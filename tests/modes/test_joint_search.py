@@ -13,10 +13,7 @@ from tests.helpers.histories import simulated_history
 from tests.helpers.joints import scene
 from tests.helpers.worlds import body
 
-pytestmark = [
-    pytest.mark.first(4),
-    pytest.mark.one_stack,  # nothing is sampled here
-]
+pytestmark = pytest.mark.one_stack  # nothing is sampled here
 NOISE = (0.002, 0.002, 0.004, 0.01, 0.01, 0.02)
 #: In the bounds of discs that do not touch.
 HINGES = {

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from threadpoolctl import threadpool_info, threadpool_limits
 
@@ -157,7 +157,6 @@ FRICTION = st.floats(0.01, 0.99)
 
 
 @given(x=PLACE, y=PLACE, angle=ANGLE, mu_x=FRICTION, mu_y=FRICTION)
-@settings(deadline=None, max_examples=40)
 def test_four_descriptions_of_a_wheel_are_one(problem, x, y, angle, mu_x, mu_y) -> None:
     """w_theta + pi, and w_theta +- pi/2 with mu_x and mu_y swapped: the same predictions."""
     layout = problem.layout

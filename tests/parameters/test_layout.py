@@ -7,7 +7,7 @@ import numpy as np
 import pymc as pm
 import pytest
 import scipy.stats as stats
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pbrl_ppl.effects import attach
@@ -155,7 +155,6 @@ priors = st.one_of(
 )
 
 
-@settings(deadline=None)
 @given(priors, st.integers(0, 2**32 - 1))
 def test_half_the_squared_residual_is_the_log_density(prior, seed) -> None:
     """Up to a constant: their sum has no spread over the support."""
@@ -165,7 +164,6 @@ def test_half_the_squared_residual_is_the_log_density(prior, seed) -> None:
     assert np.ptp(total) < 1e-8 * (1 + np.abs(density).max())
 
 
-@settings(deadline=None)
 @given(priors, st.integers(0, 2**32 - 1))
 def test_draws_lie_in_the_support(prior, seed) -> None:
     draws = prior.sample(np.random.default_rng(seed), 200)

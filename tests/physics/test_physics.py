@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pbrl_ppl.scene import Body, Scene, Shape, Wall
@@ -23,7 +23,6 @@ def floor(mu_x: float = 0.3, mu_y: float = 0.3, **kwargs: float) -> Scene:
 # -- no contact, no friction: exact ----------------------------------------------------------------
 
 
-@settings(deadline=None, max_examples=50)
 @given(triple, triple, triple)
 def test_constant_wrench_is_exact(pose, velocity, wrench) -> None:
     scene = Scene(time_step=0.1, bodies=(body("puck", BOX, mass=2.0),), gravity=(0.3, -9.81))
@@ -119,7 +118,6 @@ def test_restitution_at_a_wall(r, side, extrapolate) -> None:
     np.testing.assert_allclose(after[[1, 2, 4, 5]], 0.0, atol=1e-9)
 
 
-@settings(deadline=None, max_examples=60)
 @given(st.floats(0.0, 1.0), st.floats(0.0, 1.0), st.floats(0.5, 4.0), st.floats(-4.0, 4.0), number)
 def test_tangential_impulse_is_at_most_mu_times_the_normal_one(r, mu_c, vx, vy, omega) -> None:
     mass, radius = 2.0, 0.1
@@ -179,7 +177,6 @@ def _area_and_centroid(corners: np.ndarray) -> tuple[float, np.ndarray]:
     return area, ((corners + following) * cross[:, None]).sum(axis=0) / (6 * area)
 
 
-@settings(deadline=None, max_examples=40)
 @given(
     st.floats(0.2, 5.0),
     st.floats(0.0, 1.0),
@@ -214,7 +211,6 @@ def _energy(masses: np.ndarray, unit_moment: float, s: np.ndarray) -> float:
     )
 
 
-@settings(deadline=None, max_examples=40)
 @given(triple, triple, st.floats(0.0, 1.0), st.floats(0.0, 1.0), st.floats(0.0, 5.0))
 def test_energy_never_rises_without_an_action(pose, velocity, r, mu, drag) -> None:
     """Wheel, drag and walls only take energy away."""

@@ -235,7 +235,6 @@ def test_free_chain_keeps_momentum() -> None:
 number = st.floats(-2.0, 2.0)
 
 
-@settings(max_examples=25)
 @given(
     st.tuples(*[number] * 6),
     st.tuples(*[st.floats(-0.2, 0.2)] * 4),

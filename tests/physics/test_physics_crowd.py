@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
@@ -152,25 +152,21 @@ def difference(motion, push, move: Move = HOME, order=range(5)) -> float:
     return min(found)
 
 
-@settings(max_examples=40)
 @given(motions, pushes, st.tuples(number, number))
 def test_crowd_is_the_same_elsewhere(motion, push, shift) -> None:
     assert difference(motion, push, Move(shift=shift)) < TOLERANCE
 
 
-@settings(max_examples=40)
 @given(motions, pushes, st.floats(-np.pi, np.pi))
 def test_crowd_is_the_same_in_every_direction(motion, push, angle) -> None:
     assert difference(motion, push, Move(angle=angle)) < TOLERANCE
 
 
-@settings(max_examples=40)
 @given(motions, pushes)
 def test_crowd_is_the_same_in_a_mirror(motion, push) -> None:
     assert difference(motion, push, Move(mirror=True)) < TOLERANCE
 
 
-@settings(max_examples=40)
 @given(motions, pushes, st.permutations(range(5)))
 def test_order_of_the_bodies_does_not_matter(motion, push, order) -> None:
     assert difference(motion, push, order=order) < TOLERANCE
@@ -194,7 +190,6 @@ def test_crowd_collides() -> None:
 # -- impacts ---------------------------------------------------------------------------------------
 
 
-@settings(max_examples=60)
 @given(
     st.tuples(*[st.floats(0.1, 10.0)] * 2),
     st.tuples(*[st.floats(0.0, 1.0)] * 2),
@@ -246,7 +241,6 @@ def test_row_of_equal_discs_hands_the_speed_on() -> None:
     np.testing.assert_allclose(after[:4, 0], start[1:, 0] - 0.1, atol=2 / 800)
 
 
-@settings(max_examples=40)
 @given(
     st.lists(st.tuples(st.floats(0.2, 5.0), st.floats(0.0, 1.0)), min_size=5, max_size=5),
     st.floats(0.5, 2.0),
@@ -266,7 +260,6 @@ def test_row_of_any_discs_keeps_momentum(discs, speed) -> None:
     assert (np.diff(after[..., 0], axis=1) > 0.1 - 1e-4 - 2 * speed / 800).all()
 
 
-@settings(max_examples=60)
 @given(
     st.tuples(st.floats(0.2, 5.0), st.floats(0.2, 5.0)),
     st.tuples(*[st.floats(0.0, 1.0)] * 2),
@@ -330,7 +323,6 @@ def wheeled(wheel, mu_x: float, mu_y: float) -> Scene:
     return Scene(time_step=0.1, substeps=40, normal_gravity=G, bodies=(cart,))
 
 
-@settings(max_examples=60)
 @given(wheels, frictions, st.floats(-2.0, 2.0))
 def test_wheel_does_not_hinder_a_body_that_moves_along_it(wheel, mu_y, speed) -> None:
     velocity = speed * np.exp(1j * wheel["w_theta"])
@@ -340,7 +332,6 @@ def test_wheel_does_not_hinder_a_body_that_moves_along_it(wheel, mu_y, speed) ->
     np.testing.assert_allclose(after, straight, atol=1e-9)  # rounding
 
 
-@settings(max_examples=60)
 @given(wheels, frictions, frictions, st.tuples(number, number, number))
 def test_wheel_only_takes_energy(wheel, mu_x, mu_y, velocity) -> None:
     start = np.array([0.0, 0.0, 0.0, *velocity])

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pbrl_ppl.scene import Joint, Scene, Shape, Wall
@@ -36,7 +36,6 @@ def turned(vector, angle: float) -> np.ndarray:
     return np.array([[c, -s], [s, c]]) @ np.asarray(vector)
 
 
-@settings(deadline=None, max_examples=40)
 @given(states, wrenches, wheels, number, number)
 def test_translation(start, wrench, wheel, x, y) -> None:
     scene = cart(wheel)
@@ -46,7 +45,6 @@ def test_translation(start, wrench, wheel, x, y) -> None:
     np.testing.assert_allclose(there, here + shift, atol=1e-8)
 
 
-@settings(deadline=None, max_examples=40)
 @given(states, wrenches, wheels, number)
 def test_rotation(start, wrench, wheel, angle) -> None:
     def turn(state: np.ndarray) -> np.ndarray:
@@ -65,7 +63,6 @@ def test_rotation(start, wrench, wheel, angle) -> None:
     np.testing.assert_allclose(there, turn(here), atol=1e-7)
 
 
-@settings(deadline=None, max_examples=40)
 @given(states, wrenches, wheels)
 def test_mirror(start, wrench, wheel) -> None:
     """In a mirror along x: y, theta, vy, omega, force_y, torque, w_y, w_theta change sign."""
@@ -76,7 +73,6 @@ def test_mirror(start, wrench, wheel) -> None:
     np.testing.assert_allclose(there, flip * here, atol=1e-8)
 
 
-@settings(deadline=None, max_examples=25)
 @given(st.floats(-1.0, 1.0), st.floats(1.0, 3.0), number, number, st.integers(1, 7))
 def test_impact_is_the_same_in_every_direction(y, vx, vy, angle, shift) -> None:
     """A disc meets a wall; disc and wall are turned and moved together."""
@@ -95,7 +91,6 @@ def test_impact_is_the_same_in_every_direction(y, vx, vy, angle, shift) -> None:
     assert there[5] == pytest.approx(here[5], abs=1e-6)
 
 
-@settings(deadline=None, max_examples=25)
 @given(number, number, st.floats(0.0, 0.02), st.floats(0.0, 0.02))
 def test_mirrored_pendulum(theta, omega, damping, friction) -> None:
     scene = Scene(

@@ -121,7 +121,7 @@ scales = st.tuples(*(st.floats(*ends) for ends in ((-3, 3), (-6, 6), (-3, 2))))
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("name", RIGS)
-@settings(max_examples=6, derandomize=True, deadline=None)
+@settings(max_examples=6)
 @given(powers=scales)
 def test_similar_rigs_move_alike(name, engine, powers) -> None:
     length, mass, time = (10.0**power for power in powers)
@@ -207,7 +207,7 @@ ISOTROPIC = {
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("name", RIGS)
-@settings(max_examples=4, derandomize=True, deadline=None)
+@settings(max_examples=4)
 @given(
     turn=st.floats(-math.pi, math.pi),
     shift=st.tuples(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3)),

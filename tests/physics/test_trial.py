@@ -1,6 +1,7 @@
 """A user's own effect is tried before it runs inside a fit."""
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -73,10 +74,26 @@ def test_a_broken_effect_is_refused(history, stage, said) -> None:
         try_effect(own(stage), PUCK, history, patience=0.3)
 
 
-def test_the_whole_catalogue_passes(history) -> None:
+def test_the_whole_catalogue_passes_and_with_wrong_null_values_does_not(history) -> None:
+    """Without the second claim a trial that evaluates nothing would do."""
+    acting, refused, rng = set(), set(), np.random.default_rng(1)
     for scene in (PUCK, PUCK.replace(gravity=(0.0, -9.81))):
         for effect in catalogue:
             try_effect(effect, scene, history)
+            wrong = tuple(
+                replace(parameter, null=float(parameter.prior.sample(rng, 1)[0]))
+                for parameter in effect.parameters
+            )
+            if effect.applies(scene, PUCK.bodies[0]):
+                acting.add(effect.name)
+            try:
+                try_effect(replace(effect, parameters=wrong), scene, history)
+            except EffectError as error:
+                assert "does not vanish on puck at its null value" in str(error)
+                refused.add(effect.name)
+    # the mass changes after the recording, and a drifting frame does not change a free motion
+    assert acting - refused == {"mass_change", "sensor_drift"}
+    assert refused <= acting
 
 
 def push(state, command, parameters, wrench):
@@ -114,6 +131,10 @@ def test_a_null_value_that_is_not_zero_is_enough(history) -> None:
     size = EffectParameter("size", "1", Prior("normal"), null=0.5)
     effect = Effect("own", (size,), "made up", "a test", Command(halve))
     try_effect(effect, PUCK, history)
+    for null, shown in ((0.0, "0"), (0.499, "0.499")):
+        elsewhere = replace(effect, parameters=(replace(size, null=null),))
+        with pytest.raises(EffectError, match=rf"at its null value \(size = {shown}\): it changes"):
+            try_effect(elsewhere, PUCK, history)
 
 
 def test_the_null_value_is_tried_without_measured_velocities() -> None:

@@ -18,10 +18,7 @@ from pbrl_ppl.scene import Actuator, Joint, Scene, Shape, Wall
 from tests.helpers.pucks import ACROSS, FORCE, FREE, MASS, PUSHES, ROOM, known
 from tests.helpers.worlds import body, state
 
-pytestmark = [
-    pytest.mark.first(4),
-    pytest.mark.one_stack,  # nothing is fitted here
-]
+pytestmark = pytest.mark.one_stack  # nothing is fitted here
 
 
 # -- dynamics --------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from pbrl_ppl.scene import WORLD, Body, Joint, Scene, Shape
 from pbrl_ppl.state import STATE
 from tests.helpers.counted import of_work
 
-pytestmark = pytest.mark.one_stack
+pytestmark = [pytest.mark.one_stack, pytest.mark.first(2)]
 ARM = Body("arm", Shape.box(0.03, 0.4), known={"mass": 0.5, "r": 0.2, "mu_c": 0.2})
 PENDULUM = Scene(
     time_step=0.02, gravity=(0.0, -9.81), bodies=(ARM,), noise={"theta": 1e-3},

@@ -22,8 +22,6 @@ from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
 from tests.helpers.marks import OBJECT_MODE
 
-pytestmark = pytest.mark.first(4)
-
 CONTACT = {"r": 0.2, "mu_c": 0.3}
 DRAG = {"linear_drag_coefficient": 3.0}
 QUICK = {"draws": 700, "tune": 300, "chains": 2, "cores": 1, "progress": False}

@@ -1,6 +1,7 @@
 """Scenes: TOML there and back, shapes against numeric integration, and every rule."""
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -366,8 +367,17 @@ def test_bad_polygons(vertices: tuple[tuple[float, float], ...], message: str) -
         Shape("polygon", vertices=vertices)
 
 
-def test_cure_for_a_polygon_off_its_centroid_works() -> None:
-    Shape.polygon([(x - 1, y - 1) for x, y in ((0, 0), (3, 0), (0, 3))])
+@pytest.mark.parametrize(("dx", "dy"), [(0.0, 0.0), (-7.25, 0.3)])
+def test_cure_for_a_polygon_off_its_centroid_works(dx: float, dy: float) -> None:
+    """A right triangle with legs a has the unit moment a^2 / 9 about its centroid."""
+    corners = [(x + dx, y + dy) for x, y in ((0, 0), (3, 0), (0, 3))]
+    with pytest.raises(SceneError) as caught:
+        Shape.polygon(corners)
+    said = re.search(r"subtract \((.+), (.+)\) from every vertex", str(caught.value))
+    x_said, y_said = map(float, said.groups())
+    cured = Shape.polygon([(x - x_said, y - y_said) for x, y in corners])
+    np.testing.assert_allclose(cured.vertices, [(-1, -1), (2, -1), (-1, 2)], atol=1e-9)
+    assert cured.unit_moment == pytest.approx(1.0, rel=1e-9)
 
 
 def test_python_scenes_are_checked() -> None:
