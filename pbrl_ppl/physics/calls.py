@@ -265,6 +265,18 @@ def real_at(typing, address, place):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
+def put_at(typing, address, place, value):  # type: ignore[no-untyped-def]
+    """Set a real number of an array by the array's address."""
+
+    def codegen(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        start, at, number = arguments
+        builder.store(number, builder.gep(builder.inttoptr(start, _DOUBLE.as_pointer()), [at]))
+        return context.get_dummy_value()
+
+    return types.void(types.int64, types.int64, types.float64), codegen
+
+
+@intrinsic
 def call_law(typing, function, a, b, c, d):  # type: ignore[no-untyped-def]
     """Call an effect's law: four pointers to doubles."""
     return types.void(*[types.int64] * 5), _calling(ir.VoidType(), *[_PLACE] * 4)

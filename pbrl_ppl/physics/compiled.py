@@ -378,6 +378,7 @@ def _transition(  # type: ignore[no-untyped-def]
         driven |= follows
     acting = laws.n_commands + laws.n_forces > 0
     remembered = memory.ctypes.data + 8 * memory.shape[1]
+    state_at, acted_at, held_at = state.ctypes.data, acted.ctypes.data, held.ctypes.data
     still = world.still
     watch = len(still.obstacles) > 0 or k > 1
     place_bodies(fn, world, bodies, state)
@@ -392,6 +393,7 @@ def _transition(  # type: ignore[no-untyped-def]
             set_strengths(fn, world, bodies, True)
             enough = iterations(world.iterations, world.chained, bodies)
             call_int(fn.cpSpaceSetIterations, world.space, enough)
+        inputs_at = inputs[h].ctypes.data
         if driven:
             drive(fn, world, state, inputs[h])
         for i in range(k):
@@ -401,8 +403,8 @@ def _transition(  # type: ignore[no-untyped-def]
             near = False
             if acting:
                 act(
-                    state, inputs[h].ctypes.data, laws, s / substeps, (s + 1) / substeps, acted,
-                    remembered, held, False,
+                    state_at, inputs_at, laws, s / substeps, (s + 1) / substeps, acted_at,
+                    remembered, held_at, held.shape[1], False,
                 )  # fmt: skip
                 for slot in range(held.shape[1]):
                     held[0, slot] += step * held[1, slot]
@@ -420,7 +422,10 @@ def _transition(  # type: ignore[no-untyped-def]
                 touched = _TOUCHED if near else touched
         copy(state, out[h])
         if memory.shape[1] > 0:
-            act(state, inputs[h].ctypes.data, laws, LATE, 1.0, acted, remembered, held, True)
+            act(
+                state_at, inputs_at, laws, LATE, 1.0, acted_at, remembered, held_at,
+                held.shape[1], True,
+            )  # fmt: skip
         end += 1
     return touched, end
 

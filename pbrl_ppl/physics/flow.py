@@ -105,8 +105,8 @@ def _load(work, laws, u, share, low, high):  # type: ignore[no-untyped-def]
     if laws.n_commands + laws.n_forces > 0:
         begin = min(max(low + _SHORTEST, share), high - _WINDOW)  # past a jump that is no switch
         act(
-            work.states, work.inputs, laws, begin, begin + _WINDOW, work.acted, work.memory,
-            work.held, False,
+            work.states.ctypes.data, work.inputs, laws, begin, begin + _WINDOW,
+            work.acted.ctypes.data, work.memory, work.held.ctypes.data, work.held.shape[1], False,
         )  # fmt: skip
     for s in range(work.n_held):
         motion[u, held + s] = work.held[1, s]
@@ -514,8 +514,8 @@ def rollout(works, still, batch, items, begins, out):  # type: ignore[no-untyped
                 budget, wanted = _advance(work, laws, still, low, high, budget, wanted)
             if batch.slots > 0:
                 act(
-                    work.states, work.inputs, laws, LATE, 1.0, work.acted, work.memory, work.held,
-                    True,
+                    work.states.ctypes.data, work.inputs, laws, LATE, 1.0, work.acted.ctypes.data,
+                    work.memory, work.held.ctypes.data, work.held.shape[1], True,
                 )  # fmt: skip
             if budget < 0:
                 begins[place] = h

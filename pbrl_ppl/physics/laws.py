@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.effects import Attached, Command, Force, Friction, at_stage, holder
-from pbrl_ppl.physics.calls import call_law, inner, law_address, real_at, whole_at
+from pbrl_ppl.physics.calls import call_law, inner, law_address, put_at, real_at, whole_at
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import WRENCH, Floats, Ints
 
@@ -26,7 +26,7 @@ MORE = 4
 #: body that the torque acts back on, relative to which the law sees angle and speed (-1: none). Of
 #: a force, REMEMBER is the address of `rate`, and JUMPS that of `begin` (0: none).
 LAW, ON, FIRST, REMEMBER, SLOT, SLOTS, ALONE, UNDER, JUMPS, BEGINS, OTHER = range(11)
-_ROW = 8 * (OTHER + 1)  # bytes
+_ROW, _ACTED = 8 * (OTHER + 1), 8 * ACTED  # bytes of a law, and of a row of what acts
 
 
 def law_tables(scene: Scene, effects: tuple[Attached, ...]) -> tuple[Ints, Ints, Ints, int, int]:
@@ -118,79 +118,91 @@ def laws_of(
 
 @inner
 def act(  # type: ignore[no-untyped-def]
-    state, inputs, laws, begin, end, acted, memory, held, after
+    state, inputs, laws, begin, end, acted, memory, held, n_held, after
 ):  # fmt: skip
     """Compute the wrench on each body in a substep: the command stage, then the force stage.
 
-    ``state`` is (body, 6), and ``inputs`` the address of those of the interval, (body, column);
-    ``begin`` and ``end`` of the substep are shares of the interval. ``acted`` (body + 4, 12)
-    becomes command, command before and wrench of each body; of the other rows a command law sees
-    the first three. ``memory`` is the address of that of command laws when the interval begins;
-    ``after`` it, it is brought up to date. ``held`` (2, slot) has the numbers of force laws, and
-    gets their rates of change.
+    Arrays are given by their addresses: ``state`` (body, 6), and ``inputs`` of the interval, (body,
+    column); ``begin`` and ``end`` of the substep are shares of the interval. ``acted`` (body + 4,
+    12) becomes command, command before and wrench of each body; of the other rows a command law
+    sees the first three. ``memory`` is that of command laws when the interval begins; ``after`` it,
+    it is brought up to date. ``held`` (2, ``n_held``) has the numbers of force laws, and gets their
+    rates of change.
     """
-    k, data, stride = laws.n_bodies, acted.ctypes.data, 8 * ACTED
-    known = laws.width > 3
+    k, known = laws.n_bodies, laws.width > 3
+    seen = acted + _ACTED * k  # by command laws, and by force laws with numbers of their own
+    alone_at = seen + 3 * _ACTED
     for i in range(k):
-        row = inputs + 8 * laws.width * i
+        row, to = inputs + 8 * laws.width * i, acted + _ACTED * i
         for w in range(3):
-            acted[i, COMMAND + w] = real_at(row, w)
-            acted[i, PREVIOUS + w] = real_at(row, 3 + w) if known else 0.0
-            acted[i, WRENCHES + w] = 0.0  # by how much actuators are turned, for now
-        acted[i, TIME] = real_at(row, 7) + begin * laws.time_step if known else np.inf
-        acted[i, INTERVAL] = laws.time_step
+            put_at(to, COMMAND + w, real_at(row, w))
+            put_at(to, PREVIOUS + w, real_at(row, 3 + w) if known else 0.0)
+            put_at(to, WRENCHES + w, 0.0)  # by how much actuators are turned, for now
+        put_at(to, TIME, real_at(row, 7) + begin * laws.time_step if known else np.inf)
+        put_at(to, INTERVAL, laws.time_step)
     for e in range(laws.n_commands):
         law = laws.commands + _ROW * e
         i, alone = whole_at(law, ON), whole_at(law, ALONE)
         slot, slots, other = whole_at(law, SLOT), whole_at(law, SLOTS), whole_at(law, OTHER)
-        state_at = state.ctypes.data + 48 * i
-        parameters_at = laws.commands_values + 8 * whole_at(law, FIRST)
+        on, state_at = acted + _ACTED * i, state + 48 * i
+        values = laws.commands_values + 8 * whole_at(law, FIRST)
         for w in range(ACTED):
-            acted[k, w] = acted[i, w]
-        acted[k, 6], acted[k, 7] = begin, end
+            put_at(seen, w, real_at(on, w))
+        put_at(seen, 6, begin)
+        put_at(seen, 7, end)
         for s in range(slots):
-            acted[k + 1 + s // ACTED, s % ACTED] = real_at(memory, slot + s)
-        wrench_at = data + stride * i
+            put_at(seen, ACTED + s, real_at(memory, slot + s))
+        wrench = on
         if alone >= 0:
-            wrench_at = data + stride * (k + 3)
+            wrench = alone_at
             for w in range(3):
-                acted[k, w] = acted[i, alone] if w == 0 else 0.0
-                acted[k, PREVIOUS + w] = acted[i, PREVIOUS + alone] if w == 0 else 0.0
-                acted[k + 3, w] = acted[k, w]
+                now, before = real_at(on, alone), real_at(on, PREVIOUS + alone)
+                put_at(seen, w, now if w == 0 else 0.0)
+                put_at(seen, PREVIOUS + w, before if w == 0 else 0.0)
+                put_at(alone_at, w, now if w == 0 else 0.0)
         if other >= 0:
             for d in range(6):
-                acted[k + 3, 6 + d] = state[i, d]
-            acted[k + 3, 8] -= state[other, 2]
-            acted[k + 3, 11] -= state[other, 5]
-            state_at = data + stride * (k + 3) + 48
-        call_law(whole_at(law, LAW), state_at, data + stride * k, parameters_at, wrench_at)
+                off = real_at(state + 48 * other, d) if d in (2, 5) else 0.0
+                put_at(alone_at, 6 + d, real_at(state_at, d) - off)
+            state_at = alone_at + 48
+        call_law(whole_at(law, LAW), state_at, seen, values, wrench)
         if alone >= 0:
-            acted[i, alone] = acted[k + 3, 0]
+            put_at(on, alone, real_at(alone_at, 0))
         if after and slots > 0:
-            remember = whole_at(law, REMEMBER)
-            call_law(remember, state_at, data + stride * k, parameters_at, memory + 8 * slot)
+            call_law(whole_at(law, REMEMBER), state_at, seen, values, memory + 8 * slot)
     for i in range(k):
+        to = acted + _ACTED * i
         for w in range(3):
-            acted[i, WRENCHES + w] = acted[i, COMMAND + w]
+            put_at(to, WRENCHES + w, real_at(to, COMMAND + w))
     for e in range(laws.n_commands):
         law = laws.commands + _ROW * e
         if whole_at(law, OTHER) >= 0:
-            torque = acted[whole_at(law, ON), COMMAND + 2]
-            acted[whole_at(law, OTHER), WRENCHES + 2] -= torque
+            torque = real_at(acted + _ACTED * whole_at(law, ON), COMMAND + 2)
+            back = acted + _ACTED * whole_at(law, OTHER)
+            put_at(back, WRENCHES + 2, real_at(back, WRENCHES + 2) - torque)
     for e in range(0 if after else laws.n_forces):
         law = laws.forces + _ROW * e
         i, slot, slots = whole_at(law, ON), whole_at(law, SLOT), whole_at(law, SLOTS)
-        at, state_at = data + stride * i, state.ctypes.data + 48 * i
-        seen, parameters_at = at, laws.forces_values + 8 * whole_at(law, FIRST)
+        on, state_at = acted + _ACTED * i, state + 48 * i
+        see, values = on, laws.forces_values + 8 * whole_at(law, FIRST)
         if slots > 0:
-            seen = data + stride * k
+            see = seen
             for w in range(ACTED):
-                acted[k, w] = acted[i, w]
+                put_at(seen, w, real_at(on, w))
             for s in range(slots):
-                acted[k + 1 + s // ACTED, s % ACTED] = held[0, slot + s]
-            rates_at = held.ctypes.data + 8 * (held.shape[1] + slot)
-            call_law(whole_at(law, REMEMBER), state_at, seen, parameters_at, rates_at)
-        call_law(whole_at(law, LAW), state_at, seen, parameters_at, at + 8 * WRENCHES)
+                put_at(seen, ACTED + s, real_at(held, slot + s))
+            rates = held + 8 * (n_held + slot)
+            call_law(whole_at(law, REMEMBER), state_at, see, values, rates)
+        call_law(whole_at(law, LAW), state_at, see, values, on + 8 * WRENCHES)
+
+
+@inner
+def _remember(state, inputs, laws, acted, memory, held):  # type: ignore[no-untyped-def]
+    """Bring what command laws remember up to date after an interval; see `act`."""
+    act(
+        state.ctypes.data, inputs, laws, LATE, 1.0, acted.ctypes.data, memory, held.ctypes.data,
+        held.shape[1], True,
+    )  # fmt: skip
 
 
 @inner
@@ -229,13 +241,13 @@ def set_memory(batch, laws, p, t, begin, start, acted, memory, held, at):  # typ
     for earlier in range(first, t):
         for h in range(inputs.shape[1]):
             at_interval = inputs[earlier, h].ctypes.data
-            act(start, at_interval, laws, LATE, 1.0, acted, memory.ctypes.data, held, True)
+            _remember(start, at_interval, laws, acted, memory.ctypes.data, held)
     at[0], at[1] = p, t
     for s in range(memory.shape[1]):
         memory[1, s] = memory[0, s]
     now = memory.ctypes.data + 8 * memory.shape[1]
     for h in range(begin):
-        act(start, inputs[t, h].ctypes.data, laws, LATE, 1.0, acted, now, held, True)
+        _remember(start, inputs[t, h].ctypes.data, laws, acted, now, held)
 
 
 @inner
@@ -263,7 +275,7 @@ def _begin_memory(laws, interval, start, acted, memory, held):  # type: ignore[n
             for w in range(3):
                 past[i, w] = interval[i, now + w]
                 past[i, PREVIOUS + w] = interval[i, before + w]
-        act(start, past.ctypes.data, laws, LATE, 1.0, acted, memory.ctypes.data, held, True)
+        _remember(start, past.ctypes.data, laws, acted, memory.ctypes.data, held)
 
 
 @inner

@@ -308,6 +308,8 @@ def rollout(wheels, still, batch, items, begins, out):  # type: ignore[no-untype
     states, acted = np.empty((moving, 6)), np.zeros((moving + MORE, ACTED))
     memory, at = np.zeros((2, batch.slots)), np.full(2, -1)
     remembered, held = np.zeros((BLOCK, batch.slots)), np.zeros((BLOCK, 2, batch.held))
+    states_at, acted_at = states.ctypes.data, acted.ctypes.data
+    remembered_at, held_at = remembered.ctypes.data, held.ctypes.data
     for begin in range(0, len(items), BLOCK):
         width = min(BLOCK, len(items) - begin)
         longest = 0
@@ -361,9 +363,9 @@ def rollout(wheels, still, batch, items, begins, out):  # type: ignore[no-untype
                             for k in range(moving):
                                 get_state(bodies[k], i, states, k)
                             act(
-                                states, inputs[t, h].ctypes.data, batch.laws[p], s / substeps,
-                                (s + 1) / substeps, acted, remembered[i].ctypes.data, held[i],
-                                False,
+                                states_at, inputs[t, h].ctypes.data, batch.laws[p], s / substeps,
+                                (s + 1) / substeps, acted_at, remembered_at + 8 * batch.slots * i,
+                                held_at + 16 * batch.held * i, batch.held, False,
                             )  # fmt: skip
                             for slot in range(batch.held):
                                 held[i, 0, slot] += step * held[i, 1, slot]
@@ -383,8 +385,9 @@ def rollout(wheels, still, batch, items, begins, out):  # type: ignore[no-untype
                         get_state(bodies[k], i, states, k)
                     laws = batch.laws[p]
                     act(
-                        states, inputs[t, h].ctypes.data, laws, LATE, 1.0, acted,
-                        remembered[i].ctypes.data, held[i], True,
+                        states_at, inputs[t, h].ctypes.data, laws, LATE, 1.0, acted_at,
+                        remembered_at + 8 * batch.slots * i, held_at + 16 * batch.held * i,
+                        batch.held, True,
                     )  # fmt: skip
                 for i in range(width):
                     item, h = items[begin + i], first[i] + ahead

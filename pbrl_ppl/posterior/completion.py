@@ -182,9 +182,13 @@ def evaluate(
             states = parallel.predict(different)[which.ravel()]
             residual = problem.observations.residual(states)
             likelihood[part] = problem.log_density(residual, sigma[part], phi[part])
-        for i in rows[(begin <= rows) & (rows < begin + size)]:
-            states = parallel.predict(phi[i], parallel.physics.one_world)
-            predictive.append(problem.next_states(states, sigma[i], rng, phi[i]))
+        here = rows[(begin <= rows) & (rows < begin + size)]
+        if known is None and len(parallel.physics.simulator.parts) == 1:
+            drawn = states[here - begin]  # no parts that may meet in one world
+        else:
+            drawn = parallel.predict(phi[here], parallel.physics.one_world)
+        for i, predicted in zip(here, drawn, strict=True):
+            predictive.append(problem.next_states(predicted, sigma[i], rng, phi[i]))
     return likelihood, np.array(predictive)
 
 
