@@ -208,6 +208,6 @@ def png(figure: Figure, colours: int = 96) -> bytes:
         warnings.filterwarnings("ignore", message="Glyph .* missing from", category=UserWarning)
         canvas.draw()  # once: saving a figure draws it twice
     picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-    picture = picture.quantize(colours, dither=Image.Dither.NONE)
-    picture.save(small, format="png", optimize=True)
+    palette = Image.Quantize.FASTOCTREE, 0, None, Image.Dither.NONE
+    picture.quantize(colours, *palette).save(small, format="png")
     return small.getvalue()
