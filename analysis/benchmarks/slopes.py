@@ -72,7 +72,9 @@ def drive(rows: int = 24_800, step: float = 1e-3) -> tuple[pp.Scene, pp.History]
     scene = pp.Scene(
         time_step=step, gravity=(0.0, 0.0),
         bodies=(pp.Body("carriage", pp.Shape.box(0.2, 0.1), known={"mass": mass}),),
-        joints=(pp.Joint("slider", ("world", "carriage"), (0.0, 0.0), (0.0, 0.0), axis=(1.0, 0.0)),),
+        joints=(
+            pp.Joint("slider", ("world", "carriage"), (0.0, 0.0), (0.0, 0.0), axis=(1.0, 0.0)),
+        ),
     )  # fmt: skip
     rng, frames = np.random.default_rng(0), []
     for trajectory in range(2):
