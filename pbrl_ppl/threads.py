@@ -8,7 +8,7 @@ import signal
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, wraps
-from threading import Thread
+from threading import Thread, local
 from typing import ParamSpec, Self, TypeVar
 
 from threadpoolctl import ThreadpoolController
@@ -72,11 +72,22 @@ def in_parallel(
     """Return the function's values in the order of its arguments, a thread a processor.
 
     Simulations and linear algebra release the interpreter's lock. The ``sentence`` says what is
-    done, and how many items are.
+    done, and how many items are. What runs in one of these threads starts no others.
     """
-    pool, items = ThreadPoolExecutor(processors()), list(items)
+    items = list(items)
+    if in_worker():
+        return list(counted(map(function, items), len(items), sentence, say))
+    pool = ThreadPoolExecutor(processors(), initializer=setattr, initargs=(_THREAD, "works", True))
     with pool, _pools().limit(limits=1, user_api="blas"):
         return list(counted(pool.map(function, items), len(items), sentence, say))
+
+
+_THREAD = local()
+
+
+def in_worker() -> bool:
+    """Return whether this thread is one of :func:`in_parallel`: all processors have work."""
+    return getattr(_THREAD, "works", False)
 
 
 def processors() -> int:

@@ -30,6 +30,7 @@ from pbrl_ppl.physics.tree import MOST, tree_of
 from pbrl_ppl.physics.world import World
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import INPUT, STATE, THETA, VELOCITY, WRENCH, Bools, Floats, Ints
+from pbrl_ppl.threads import in_worker
 
 #: Bodies are near each other within this multiple of their radii: a step of half a radius that
 #: passes through the edge of a bounding circle ends in it.
@@ -395,7 +396,8 @@ class Simulator:
             self.physics.tolerance,
         )  # fmt: skip
         steps = len(out) * inputs.shape[1] * int(self.levels[0].sum())
-        workers = max(1, min(self.physics.threads, len(out), steps // a_thread))
+        threads = 1 if in_worker() else self.physics.threads
+        workers = max(1, min(threads, len(out), steps // a_thread))
         with self._lock:
             self._worlds[choice] = engines = self._worlds.pop(choice, [])
             while len(self._worlds) > kept:

@@ -9,9 +9,10 @@ import pymunk
 import pytest
 from pymunk import _chipmunk_cffi
 
-from pbrl_ppl.physics import calls, compiled, lockstep
+from pbrl_ppl.physics import calls, compilation, compile_for_search, compiled, flow, lockstep
 from pbrl_ppl.physics.calls import SOURCES, disk_cache, sources_digest
 from pbrl_ppl.physics.calls import compiled as decorator
+from pbrl_ppl.scene import Body, Joint, Scene, Shape
 
 #: Functions by the kinds of their arguments after the object, and of what they return.
 SIGNATURES = {
@@ -130,3 +131,34 @@ def test_without_a_folder_to_write_to_there_is_no_cache() -> None:
     function = decorator(names["double"])
     assert function._cache.cache_path is None
     assert function(1.5) == 3.0
+
+
+def test_another_process_compiles_what_is_asked_for_later(module, tmp_path) -> None:
+    """It is waited for, and its code is taken from the cache; what is there is not compiled."""
+    digest = "beside"
+    code = (
+        f"import sys, numba; sys.path.insert(0, {str(tmp_path)!r}); import loop\n"
+        "from pbrl_ppl.physics.calls import disk_cache\n"
+        f"one = numba.njit(loop.double); one._cache = disk_cache(loop.double, {digest!r}); one(1.5)"
+    )
+    dispatcher = numba.njit(module.double)
+    dispatcher._cache = disk_cache(module.double, digest)
+    calls.compile_beside(dispatcher, code)
+    assert calls.compiled_beside(dispatcher)(1.5) == 3.0
+    assert sum(dispatcher.stats.cache_hits.values()) == 1
+    again = numba.njit(module.double)
+    again._cache = disk_cache(module.double, digest)
+    calls.compile_beside(again, "raise SystemExit(1)")
+    assert again not in calls._BESIDE
+
+
+def test_a_search_compiles_the_loop_of_joined_bodies_beside(monkeypatch) -> None:
+    """A scene with a joint needs it at once: another process would only load the package."""
+    asked: list = []
+    monkeypatch.setattr(compilation, "compile_beside", lambda loop, code: asked.append(loop))
+    body = Body("puck", Shape.circle(0.1))
+    hinge = Joint("hinge", ("world", "puck"), (0.0, 0.0), (0.0, 0.0))
+    compile_for_search(Scene(time_step=0.1, bodies=(body,), joints=(hinge,)))
+    assert not asked
+    compile_for_search(Scene(time_step=0.1, bodies=(body,)))
+    assert asked == [flow.rollout]
