@@ -133,8 +133,9 @@ def test_without_a_folder_to_write_to_there_is_no_cache() -> None:
     assert function(1.5) == 3.0
 
 
-def test_another_process_compiles_what_is_asked_for_later(module, tmp_path) -> None:
+def test_another_process_compiles_what_is_asked_for_later(module, tmp_path, monkeypatch) -> None:
     """It is waited for, and its code is taken from the cache; what is there is not compiled."""
+    monkeypatch.syspath_prepend(tmp_path)  # the cache names the module
     digest = "beside"
     code = (
         f"import sys, numba; sys.path.insert(0, {str(tmp_path)!r}); import loop\n"
