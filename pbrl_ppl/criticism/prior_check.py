@@ -223,7 +223,7 @@ def _predicted_ends(problem: Problem, phi: Floats, last: Ints, chunk: int) -> Fl
     FitError
         If fewer than two are left.
     """
-    columns = list(problem.observations.columns)
+    columns, problem = list(problem.observations.columns), problem.coarse
     ends = np.concatenate(
         [
             _at(problem.predict(phi[i : i + chunk], problem.physics.one_world)[..., columns], last)
