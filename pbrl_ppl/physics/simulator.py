@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property, partial
 from itertools import compress
-from queue import SimpleQueue
 from typing import NamedTuple
 
 import numpy as np
@@ -131,44 +130,6 @@ class Engine:
                     done += 1
             left = begins < horizon
             items, begins = items[left], begins[left]
-
-
-def share_out(
-    run: Callable[[Engine, int, int], None], engines: list[Engine], n: int, chunk: int = 512
-) -> None:
-    """Run ``n`` items, a thread an engine.
-
-    Parameters
-    ----------
-    run : callable
-        Runs the items from a first to before a last on an engine.
-    engines : list of Engine
-        One or more.
-    n : int
-        Number of items.
-    chunk : int
-        Items of a thread's chunk, at least: each costs as much Python as some hundred items.
-    """
-    workers = len(engines)
-    if workers == 1:
-        run(engines[0], 0, n)
-        return
-    # chunks, so that a thread which the machine slows down takes fewer of them
-    chunks = min(4 * workers, max(workers, n // chunk))
-    edges = np.linspace(0, n, chunks + 1).astype(int)
-    idle: SimpleQueue[Engine] = SimpleQueue()
-    for engine in engines:
-        idle.put(engine)
-
-    def serve(first: int, last: int) -> None:
-        engine = idle.get()
-        try:
-            run(engine, first, last)
-        finally:
-            idle.put(engine)
-
-    with ThreadPoolExecutor(workers) as pool:
-        list(pool.map(serve, edges[:-1], edges[1:]))
 
 
 class Simulator:
@@ -404,11 +365,13 @@ class Simulator:
                 self._worlds.popitem(last=False)
             while len(engines) < workers:
                 engines.append(Engine(partial(self._new_world, choice), self.physics.engine))
-
-            def run(engine: Engine, first: int, last: int) -> None:
-                engine.rollout(batch, first, last, out)
-
-            share_out(run, engines[:workers], len(out))
+            edges = np.linspace(0, len(out), workers + 1).astype(int)
+            parts = zip(engines, edges[:-1], edges[1:], strict=False)
+            if workers == 1:
+                engines[0].rollout(batch, 0, len(out), out)
+                return
+            with ThreadPoolExecutor(workers) as pool:
+                list(pool.map(lambda part: part[0].rollout(batch, *part[1:], out), parts))
 
 
 def _each(states: Floats, proposals: int) -> Floats:
