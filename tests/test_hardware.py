@@ -15,6 +15,7 @@ import pbrl_ppl as pp
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.state import STATE
+from tests.helpers.examples import EXAMPLES
 from tests.helpers.falls import BALL, GRAVITY, fall
 from tests.helpers.places import ROOT
 
@@ -402,7 +403,7 @@ def test_without_recordings_the_board_says_so(board, runs, monkeypatch, tmp_path
 
 
 def test_all_recordings_beside_the_project_are_on_the_board(board, measured) -> None:
-    """Each folder and each raw file, with laws that the catalogue or an actuator has."""
+    """Each folder and each raw file, with laws of the catalogue, an example or an actuator."""
     if not measured.SHARED.is_dir():
         pytest.skip(f"no recordings at {measured.SHARED}")
     every = board.chosen(settings(None))
@@ -413,8 +414,8 @@ def test_all_recordings_beside_the_project_are_on_the_board(board, measured) -> 
     assert folders <= told
     lines = (measured.SHARED / "raw" / "README.md").read_text().splitlines()
     assert sum(line.startswith("| `") for line in lines) == len(board.RAW)
-    catalogue = {effect.name for effect in pp.catalogue} | {"pwm_dead_zone"}
-    assert all(each.right <= catalogue for each in every)
+    laws = {effect.name for effect in pp.catalogue} | {*EXAMPLES, "pwm_dead_zone"}
+    assert all(each.right <= laws for each in every)
     (pair,) = (each for each in every if each.name == "pair-linear-drag")
     assert (pair.laws, pair.body) == (("linear_drag",), "desk")
 

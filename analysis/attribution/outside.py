@@ -100,7 +100,6 @@ _EFFECTS = (
 )
 #: Laws of the catalogue that contain one of these, and are left out of the loop's beside it.
 CONTAINING = {
-    "cubic_drag": "power_drag",
     "actuator_lag": "first_order_lag",
     "stribeck": "sliding_stribeck",
 }

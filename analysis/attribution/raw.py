@@ -115,7 +115,7 @@ RAW = (
         "coast",
         _FOLDER / "coast",
         laws=("quadratic_drag",),
-        same_data={"quadratic_drag": ("power_drag", "quadratic_drag_by_axis")},
+        same_data={"quadratic_drag": ("quadratic_drag_by_axis",)},
     ),
     Raw(
         "count16-wrap",
@@ -182,7 +182,6 @@ anchor_b = [0.0, 0.0]
         "slow-motion",
         _FOLDER,
         laws=("quadratic_drag",),
-        same_data={"quadratic_drag": ("power_drag",)},
         train="slow-motion",
         new=("--units", "time=8/s", "--side", "--body", "ball=circle:0.02"),
         edits=(_weighed(0.0027),),

@@ -94,13 +94,11 @@ SHAPE = (
     "torque_saturation",
     "saturation",
     "force_cutoff",
-    "gain_by_speed",
 )
 DRY = (
     "pivot_friction",
     "pivot_load_friction",
     "pivot_stribeck",
-    "pivot_angle_friction",
     "pivot_hysteresis",
 )
 ANGLE = (
@@ -116,7 +114,6 @@ PLACE = ("spring", "cubic_spring")
 DRAG = (
     "linear_drag",
     "quadratic_drag",
-    "power_drag",
     "drag_by_axis",
     "quadratic_drag_by_axis",
     "wind",
@@ -156,14 +153,9 @@ CASES = {
         torque=lambda z, u, t: -sign(z[:, 1:]) * (0.2 * np.abs(u) + 0.1 * np.abs(_weight(z))),
         family=DRY,
     ),
-    "pivot_angle_friction": Case(
-        torque=lambda z, u, t: -sign(z[:, 1:]) * np.maximum(0.05 + 0.04 * np.cos(z[:, :1]), 0.0),
-        also=("pivot_friction",),
-        family=DRY,
-    ),
     "quadratic_drag": Case(
         torque=lambda z, u, t: -0.004 * np.abs(z[:, 1:]) * z[:, 1:],
-        family=(*DRAG, "quadratic_angular_drag", "power_angular_drag"),
+        family=(*DRAG, "quadratic_angular_drag"),
     ),
     "cubic_torsion_spring": Case(torque=lambda z, u, t: -0.3 * z[:, :1] ** 3, family=ANGLE),
     "upper_stop": Case(torque=lambda z, u, t: -2.0 * np.maximum(z[:, :1] - 0.5, 0.0), family=ANGLE),
@@ -175,21 +167,15 @@ CASES = {
         torque=lambda z, u, t: 3.0 * np.abs(u) * u - u, also=("torque_gain",), family=SHAPE
     ),
     "gain_by_sign": Case(torque=lambda z, u, t: 0.15 * np.abs(u), family=SHAPE),
-    "gain_by_speed": Case(torque=lambda z, u, t: -0.06 * np.abs(u) * z[:, 1:], family=SHAPE),
     "encoder_eccentricity": Case(measure=lambda z, t: z + 0.05 * np.sin(z), family=ANGLE),
     "sensor_drift": Case(measure=lambda z, t: z + 0.02 * t, family=("sensor_drift",)),
     "drag_by_axis": Case("puck", lambda z, u, t: polar(z, 0.1, 0.6, 1), family=DRAG),
     "quadratic_drag_by_axis": Case("puck", lambda z, u, t: polar(z, 0.1, 0.5, 2), family=DRAG),
     "wind": Case("puck", lambda z, u, t: _blown(z), family=DRAG),
-    "power_drag": Case(
-        "puck",
-        lambda z, u, t: -0.3 * z[:, 3:] * (1, 1, 0) * np.hypot(z[:, 3:4], z[:, 4:5]) ** 0.5,
-        family=DRAG,
-    ),
     "quadratic_angular_drag": Case(
         "puck",
         lambda z, u, t: pushes(0 * z[:, 0], 0 * z[:, 0], -3e-4 * np.abs(z[:, 5]) * z[:, 5]),
-        family=("angular_drag", "quadratic_angular_drag", "power_angular_drag"),
+        family=("angular_drag", "quadratic_angular_drag"),
     ),
     "cubic_spring": Case(
         "puck",
@@ -204,7 +190,6 @@ CASES = {
             "sliding_friction",
             "angular_drag",
             "quadratic_angular_drag",
-            "power_angular_drag",
         ),
     ),
     "askew_camera": Case(

@@ -31,7 +31,7 @@ SHOWN = {
     "lower_stop": {"angle": -0.2},
 }
 #: Laws that change the friction of another.
-BESIDE = {"sliding_stribeck": "sliding_friction", "pivot_angle_friction": "pivot_friction"}
+BESIDE = {"sliding_stribeck": "sliding_friction"}
 
 
 @cache

@@ -22,7 +22,7 @@ from scipy.stats import binom
 
 import pbrl_ppl as pp
 from pbrl_ppl.errors import ConvergenceWarning, UninformedWarning
-from pbrl_ppl.reporting import plot_prior_check, plot_rank, plot_trace, summary
+from pbrl_ppl.reporting import plot_prior_check, plot_rank, summary
 
 ROOT = next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "pyproject.toml").is_file())
 CART = ROOT / "models" / "shopping_cart"
@@ -103,22 +103,14 @@ print(worst.round(3))
 tables["with drag"].round(4)
 
 # %% [markdown]
-# Trace plot: chains that mix look like noise about one level, and all alike. It is the same
-# picture on both generations of ArviZ; `az.plot_trace(idata, var_names=["mass"])` works too.
-
-# %%
-shown = ["mass[cart]", "w_x[cart]", "mu_x[cart]", "angular_drag_coefficient[cart]"]
-figure = plot_trace(posteriors["with drag"], shown)
-figure.savefig(OUT / "02_trace.png", dpi=100)
-figure
-
-# %% [markdown]
 # Rank plot: the ranks of each chain's draws among all draws, minus those of uniform ranks.
 # Converged chains stay in the grey band. Draws of a Markov chain are correlated, so the band's
 # width follows from their effective sample size. `az.plot_rank` has no band in ArviZ 0.x, and in
 # 1.3 marks the points that a test of the ranks finds suspicious.
+# `az.plot_trace(idata, var_names=["mass"])` draws traces.
 
 # %%
+shown = ["mass[cart]", "w_x[cart]", "mu_x[cart]", "angular_drag_coefficient[cart]"]
 figure = plot_rank(posteriors["with drag"], shown)
 figure.savefig(OUT / "02_rank.png", dpi=100)
 figure

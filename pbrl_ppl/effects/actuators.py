@@ -452,27 +452,3 @@ command_power = Effect(
     family="shape of the command",
     unusual="a power of the command stands in for friction, which takes small commands",
 )
-
-
-def _by_speed(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
-    size = math.hypot(wrench[0], wrench[1])
-    if size > 0.0:
-        along = (wrench[0] * state[3] + wrench[1] * state[4]) / size
-        share = 1.0 - parameters[0] * along / parameters[1]
-        wrench[0] *= share
-        wrench[1] *= share
-    wrench[2] -= parameters[0] * abs(wrench[2]) * state[5] / parameters[2]
-
-
-gain_by_speed = Effect(
-    "gain_by_speed",
-    (EffectParameter("share", "1", Prior("half_normal", sigma=0.3)),),
-    "a push is weaker the faster the body already moves its way, by this share at the typical"
-    " speed: a propeller in its own wind, a motor near its idle speed",
-    "f = u (1 - a v / v0), with a typical speed v0",
-    Command(_by_speed),
-    constants=("speed", "turn_rate"),
-    log_odds=-1.0,
-    family="shape of the command",
-    unusual="a drag looks the same wherever commands are of one size",
-)

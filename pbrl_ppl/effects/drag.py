@@ -8,7 +8,6 @@ import numpy as np
 
 from pbrl_ppl.effects.effect import SIGNED, SIZE, Effect, EffectParameter, Force, is_unpivoted
 from pbrl_ppl.history import History
-from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene
 from pbrl_ppl.state import Floats
 
@@ -70,59 +69,6 @@ quadratic_angular_drag = Effect(
     "drag of a rotor, tau = -c |omega| omega",
     Force(_quadratic_angular),
     family="angular drag",
-)
-
-
-def _power(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
-    speed = math.sqrt(state[3] * state[3] + state[4] * state[4])
-    if speed > 0.0:
-        drag = parameters[0] * (speed / parameters[2]) ** parameters[1] / speed
-        wrench[0] -= drag * state[3]
-        wrench[1] -= drag * state[4]
-
-
-def _scan_exponents(scene: Scene, history: History, body: Body) -> Floats:
-    """Return exponents between and beyond the common ones; the derivative is taken by the size."""
-    return np.array([(np.nan, 1.5), (np.nan, 3.0)])
-
-
-_EXPONENT = EffectParameter(
-    "exponent", "1", Prior("truncated_normal", mu=2.0, sigma=0.7, lower=1.0, upper=3.0), null=2.0
-)
-
-power_drag = Effect(
-    "power_drag",
-    (EffectParameter("force", "N", SIZE, scale="force"), _EXPONENT),
-    "a force against the motion that grows with a power of the speed, and has this size at the"
-    " typical speed",
-    "power law, F = -f (|v| / v0)^p, with a typical speed v0",
-    Force(_power),
-    scan=_scan_exponents,
-    constants=("speed",),
-    log_odds=-2.0,
-    family="drag",
-    unusual="between linear and quadratic drag only clean and fast recordings tell",
-)
-
-
-def _angular_power(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
-    rate = abs(state[5])
-    if rate > 0.0:
-        wrench[2] -= parameters[0] * (rate / parameters[2]) ** parameters[1] * state[5] / rate
-
-
-power_angular_drag = Effect(
-    "power_angular_drag",
-    (EffectParameter("torque", "N m", SIZE, scale="torque"), _EXPONENT),
-    "a torque against the rotation that grows with a power of the angular speed, and has this size"
-    " at the typical one",
-    "power law, tau = -t (|omega| / omega0)^p, with a typical angular speed omega0",
-    Force(_angular_power),
-    scan=_scan_exponents,
-    constants=("turn_rate",),
-    log_odds=-2.0,
-    family="angular drag",
-    unusual="between linear and quadratic drag only clean and fast recordings tell",
 )
 
 

@@ -26,7 +26,6 @@ from pbrl_ppl.scene import Body, Scene
 from pbrl_ppl.state import Floats
 
 _FRICTION = Prior("half_normal", sigma=0.5)
-_DIFFERENCE = Prior("normal", sigma=0.5)
 #: Speeds of turning and of sliding at which Stribeck's curve falls.
 _SLOW = Prior("log_normal", mu=-1.5, sigma=1.0)
 _TURN_RATE = EffectParameter("speed", "rad/s", _SLOW, null=0.2, scale="turn_rate")
@@ -124,28 +123,6 @@ pivot_load_friction = Effect(
     applies=is_pivoted,
     log_odds=-1.0,
     family="dry friction",
-)
-
-
-def _vary_with_angle(state: Floats, load: Floats, parameters: Floats, most: Floats) -> None:
-    most[0] *= 1.0 + parameters[0] * math.cos(state[2]) + parameters[1] * math.sin(state[2])
-
-
-pivot_angle_friction = Effect(
-    "pivot_angle_friction",
-    (
-        EffectParameter("cosine", "1", _DIFFERENCE),
-        EffectParameter("sine", "1", _DIFFERENCE),
-    ),
-    "dry friction in the hinge that is stronger at some angles, by this share: the bearing is bent"
-    " or worn",
-    "Coulomb's law with a first harmonic of the angle, tau (1 + a cos(theta) + b sin(theta))",
-    Friction(_vary_with_angle),
-    applies=is_pivoted,
-    log_odds=-3.0,
-    family="dry friction",
-    unusual="few hinges rub at one side; it takes any misfit of an angle",
-    needs=("places",),
 )
 
 

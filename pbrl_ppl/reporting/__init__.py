@@ -9,7 +9,6 @@ from pbrl_ppl.reporting.logs_page import render_logs as render_logs
 from pbrl_ppl.reporting.page import Source as Source
 from pbrl_ppl.reporting.posterior_plots import plot_prior_check as plot_prior_check
 from pbrl_ppl.reporting.posterior_plots import plot_rank as plot_rank
-from pbrl_ppl.reporting.posterior_plots import plot_trace as plot_trace
 from pbrl_ppl.reporting.posterior_summary import summary as summary
 from pbrl_ppl.reporting.reports import in_brief as in_brief
 from pbrl_ppl.reporting.reports import render as render

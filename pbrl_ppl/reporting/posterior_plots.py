@@ -23,10 +23,14 @@ from pbrl_ppl.reporting.posterior_summary import (
 from pbrl_ppl.state import Floats
 
 
-def plot_trace(
+def plot_rank(
     posterior: Idata, parameters: Sequence[str] | None = None, width: float = style.WIDE
 ) -> Figure:
-    """Plot the draws of each chain of some parameters, one after the other.
+    """Plot how evenly the ranks of each chain's draws are spread.
+
+    A curve is the share of a chain's draws below each rank, less what an even spread gives. The
+    band follows from the effective sample sizes of the chains: chains that agree stay inside it 99
+    times of 100.
 
     Parameters
     ----------
@@ -36,24 +40,6 @@ def plot_trace(
         Labels such as ``mass[cart]``; by default those with the worst R-hat.
     width : float
         Width of the figure (inches).
-    """
-    draws = _chosen(posterior, parameters)
-    count = len(draws.data_vars)
-    figure, panels = style.blank_figure(width, 1.7, count, min(count, 2), None, spare=0.6)
-    for axes, (name, values) in zip(panels, draws.items(), strict=False):
-        axes.plot(values.transpose("draw", "chain"), linewidth=0.5, alpha=0.5)
-        style.name_axes(axes, str(name), "draw", small=True)
-    return figure
-
-
-def plot_rank(
-    posterior: Idata, parameters: Sequence[str] | None = None, width: float = style.WIDE
-) -> Figure:
-    """Plot how evenly the ranks of each chain's draws are spread; arguments as :func:`plot_trace`.
-
-    A curve is the share of a chain's draws below each rank, less what an even spread gives. The
-    band follows from the effective sample sizes of the chains: chains that agree stay inside it 99
-    times of 100.
     """
     draws = _chosen(posterior, parameters)
     # by chain: chains that differ have few effective draws together

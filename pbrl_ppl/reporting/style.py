@@ -208,6 +208,8 @@ def png(figure: Figure, colours: int = 96) -> bytes:
         warnings.filterwarnings("ignore", message="Glyph .* missing from", category=UserWarning)
         canvas.draw()  # once: saving a figure draws it twice
     picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-    palette = Image.Quantize.FASTOCTREE, 0, None, Image.Dither.NONE
-    picture.quantize(colours, *palette).save(small, format="png")
+    picture = picture.quantize(colours, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+    levels = picture.getpalette() or []
+    picture.putpalette([255 if level > 251 else level for level in levels])  # means are not white
+    picture.save(small, format="png")
     return small.getvalue()

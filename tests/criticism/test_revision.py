@@ -140,7 +140,7 @@ def test_a_catalogued_effect_is_named_with_its_size(make_history) -> None:
 def test_an_effect_outside_the_catalogue_gets_no_wrong_name(make_history) -> None:
     """Quadratic drag takes most of a linear one, 83 % of its square: the verdict stays open."""
     frames = box2d(make_history, 4, linear_drag=0.6)
-    found = loop(frames, catalogue=without("linear_drag", "drag_by_axis", "power_drag"))
+    found = loop(frames, catalogue=without("linear_drag", "drag_by_axis"))
     assert found.candidates[0].effect == "quadratic_drag"
     assert found.verdict == "unexplained"
     assert found.unexplained.body == "puck"

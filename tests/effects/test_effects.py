@@ -29,12 +29,11 @@ AWAY = {
     "force_cutoff": 5.0,
     "magnus_force": 0.01,
     "quadratic_angular_drag": 1e-3,
-    "power_angular_drag": 1e-3,
     "cubic_torsion_spring": 1e-2,
     "pivot_hysteresis": 1e-2,
 }
 #: What changes dry friction under a body needs some.
-BESIDE = {"sliding_stribeck": "sliding_friction", "pivot_angle_friction": "pivot_friction"}
+BESIDE = {"sliding_stribeck": "sliding_friction"}
 PATHS = pytest.mark.parametrize("path", ["auto", "python"])
 
 

@@ -22,13 +22,16 @@ from tests.helpers.worlds import BY_NAME, G
 pytestmark = pytest.mark.one_stack
 
 NAMES = {
+    "angle_friction": ("pivot_angle_friction",),
     "cable": ("cable",),
     "fading_gain": ("fading_gain",),
     "friction_by_place": ("friction_by_place", "slider_place_friction"),
     "gain_by_place": ("gain_by_place",),
+    "gain_by_speed": ("gain_by_speed",),
     "one_way_damping": ("pivot_one_way_damping",),
     "periodic": ("periodic_force", "periodic_torque"),
     "point_attractor": ("point_attractor",),
+    "power_drag": ("power_drag", "power_angular_drag"),
     "power_limit": ("power_limit",),
     "ripple": ("ripple",),
     "sloshing": ("sloshing",),
@@ -40,13 +43,15 @@ PUSH = np.array([1.5, -0.8, 0.05])
 START = np.array([0.5, -0.3, 0.2, 0.8, 0.6, 0.5])
 #: Mean place and range of the body, which laws by place have as constants (m).
 MEAN, RANGE = np.array([0.3, 0.1]), 2.0
+#: Its typical speeds, which laws by speed have as constants (m/s, rad/s).
+SPEED, TURN_RATE = 0.9, 0.6
 FLAT = np.array([1.0, 1.0, 0.0])
 Wrench = Callable[[float, Floats], Floats]
 
 
 def world(rig: str = "", substeps: int = 400) -> Scene:
     """A disc in free space, on a floor, on a hinge at its centre or on a rail along x."""
-    typical = {"x": MEAN[0], "y": MEAN[1], "range": RANGE}
+    typical = {"x": MEAN[0], "y": MEAN[1], "range": RANGE, "speed": SPEED, "turn_rate": TURN_RATE}
     disc = Body("disc", DISC, known={"mass": MASS, "r": 0.0, "mu_c": 0.0}, typical=typical)
     joint = {
         "hinge": Joint("hinge", ("disc", "world"), (0.0, 0.0), (0.0, 0.0)),
@@ -159,6 +164,26 @@ def rubbed(t: float, z: Floats) -> Floats:
     return np.array([-(0.3 + 0.2 * (z[0] - MEAN[0]) / RANGE), 0.0, 0.0])
 
 
+def dragged(t: float, z: Floats) -> Floats:
+    speed = np.hypot(z[3], z[4])
+    return PUSH - 0.7 * (speed / SPEED) ** 1.6 / speed * FLAT * z[3:]
+
+
+def slowed(t: float, z: Floats) -> Floats:
+    against = 0.03 * (abs(z[5]) / TURN_RATE) ** 1.4 * np.sign(z[5])
+    return PUSH - np.array([0.0, 0.0, against])
+
+
+def by_speed(t: float, z: Floats) -> Floats:
+    along = PUSH[:2] @ z[3:5] / np.hypot(*PUSH[:2])
+    shares = np.array([along / SPEED, along / SPEED, z[5] / TURN_RATE])
+    return PUSH * (1.0 - 0.2 * shares)  # its torque is positive
+
+
+def worn(t: float, z: Floats) -> Floats:
+    return np.array([0.0, 0.0, -0.006 * (1.0 + 0.4 * np.cos(z[2]) + 0.3 * np.sin(z[2]))])
+
+
 def damped(t: float, z: Floats) -> Floats:
     return np.array([0.0, 0.0, -0.03 * abs(z[5])])
 
@@ -182,6 +207,9 @@ CASES = (
     Case({"fading_gain": (0.5,)}, lambda t, z: PUSH * np.exp(-0.5 * t)),
     Case({"power_limit": (0.6,)}, limited),
     Case({"gain_by_place": (0.3, -0.2)}, by_place),
+    Case({"gain_by_speed": (0.2,)}, by_speed),
+    Case({"power_drag": (0.7, 1.6)}, dragged),
+    Case({"power_angular_drag": (0.03, 1.4)}, slowed),
     Case(
         {"sliding_friction": (0.02, 0.1), "friction_by_place": (0.4, 0.3)},
         rough, "floor", START * (1, 1, 1, 1, 1, 0), STILL,
@@ -189,6 +217,10 @@ CASES = (
     Case(
         {"slider_friction": (0.3,), "slider_place_friction": (0.2, 0.0)},
         rubbed, "rail", START * (1, 0, 0, 1, 0, 0), STILL,
+    ),
+    Case(
+        {"pivot_friction": (0.006,), "pivot_angle_friction": (0.4, 0.3)},
+        worn, "hinge", START * (0, 0, 1, 0, 0, 1), STILL,
     ),
     Case(
         {"pivot_one_way_damping": (0.03,)}, damped, "hinge", START * (0, 0, 1, 0, 0, 1), STILL

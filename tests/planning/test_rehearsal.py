@@ -137,10 +137,10 @@ def test_a_law_that_needs_what_is_not_measured_is_unseen() -> None:
 
 
 def test_unusual_laws_are_named_where_common_ones_leave_much_more_than_noise() -> None:
-    """A drag of another power looks quadratic; a wrong inertia looks like no common law."""
-    laws = named("quadratic_drag", "power_drag", "torque_gain", "inertia_scale")
+    """A power of the command looks like a gain; a wrong inertia looks like no common law."""
+    laws = named("torque_gain", "command_power", "inertia_scale")
     rehearsal = rehearse(PENDULUM, catalogue=laws, seed=1)
-    assert law_of(rehearsal, "power_drag").named == "quadratic_drag"
+    assert law_of(rehearsal, "command_power").named == "torque_gain"
     assert law_of(rehearsal, "inertia_scale").named == "inertia_scale"
 
 

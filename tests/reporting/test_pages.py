@@ -65,7 +65,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {name: folder / f"{name}.html" for name in pages}
 
 
-@pytest.mark.parametrize(("name", "pictures"), [("loop", 10), ("posterior", 7)])
+@pytest.mark.parametrize(("name", "pictures"), [("loop", 9), ("posterior", 6)])
 def test_page_as_a_file(files: dict[str, Path], name: str, pictures: int) -> None:
     html = files[name].read_text(encoding="utf-8")
     stands_alone(html, pictures)

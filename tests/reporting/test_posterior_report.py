@@ -24,7 +24,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarn
 @pytest.mark.parametrize("generation", GENERATIONS)
 def test_page_of_a_file(generation: str) -> None:
     html = render_posterior(load_posterior(file(generation)))
-    stands_alone(html, pictures=7)
+    stands_alone(html, pictures=6)
     text = Page(html).text
     assert "Posterior of puck. The data inform 1 of 1 parameters." in text
     assert "Did the sampler work? Yes. The chains agree" in text
@@ -37,7 +37,7 @@ def test_page_of_a_file(generation: str) -> None:
 @pytest.mark.usefixtures("undrawn")
 def test_page_of_whole_trajectories() -> None:
     html = render_posterior(revised().posterior_after)
-    stands_alone(html, pictures=7)
+    stands_alone(html, pictures=6)
     text = Page(html).text
     assert "Posterior of puck with linear drag of puck. The data inform 2 of 2 parameters." in text
     assert "likelihood of whole trajectories; sampler laplace" in text
