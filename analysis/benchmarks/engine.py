@@ -192,6 +192,12 @@ def naive(
 
 
 @numba.njit(nogil=True)
+def _prepare(fn, world, bodies, joints):  # type: ignore[no-untyped-def]
+    compiled.set_properties(fn, world, bodies, joints)
+    compiled.set_strengths(fn, world, bodies, True)
+
+
+@numba.njit(nogil=True)
 def _bare(fn, world, start, step, substeps):  # type: ignore[no-untyped-def]
     body = world.bodies[0]
     for t in range(len(start)):
@@ -209,9 +215,7 @@ def bare(simulator: Simulator, phi: np.ndarray, start: np.ndarray) -> Callable[[
     world.space.iterations = world.iterations
     given = simulator._properties(phi[None])
     where = calls.pointers(world)
-    first = given.bodies[0, 0]
-    compiled.set_properties(calls.FUNCTIONS, where, first, given.joints[0])
-    compiled.set_strengths(calls.FUNCTIONS, where, first, True)
+    _prepare(calls.FUNCTIONS, where, given.bodies[0, 0], given.joints[0])
 
     def run() -> None:
         _bare(calls.FUNCTIONS, where, start, TIME_STEP / SUBSTEPS, SUBSTEPS)

@@ -120,7 +120,17 @@ def inner(function: Callable[..., object]) -> Any:
 
     What would let Python call it, which takes its arrays and tuples apart, is left out.
     """
-    return _dispatcher(function, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+    dispatcher = _dispatcher(function, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+
+    def refuse(*given: object) -> None:
+        raise TypeError(f"{function.__name__} can be called by compiled functions alone")
+
+    def keep(result: Any) -> None:
+        dispatcher.overloads[tuple(result.signature.args)] = result
+
+    # numba would call a wrapper that is not there
+    dispatcher._compile_for_args, dispatcher.add_overload = refuse, keep
+    return dispatcher
 
 
 @inner

@@ -133,6 +133,15 @@ def test_without_a_folder_to_write_to_there_is_no_cache() -> None:
     assert function(1.5) == 3.0
 
 
+def test_python_cannot_call_a_function_of_compiled_ones() -> None:
+    """It has no wrapper; without the refusal the interpreter would crash."""
+    quarter = calls.inner(lambda x: 0.25 * x)
+    half = numba.njit(lambda x: 2.0 * quarter(x))
+    assert half(3.0) == 1.5
+    with pytest.raises(TypeError, match="compiled functions alone"):
+        quarter(3.0)
+
+
 def test_another_process_compiles_what_is_asked_for_later(module, tmp_path, monkeypatch) -> None:
     """It is waited for, and its code is taken from the cache; what is there is not compiled."""
     monkeypatch.syspath_prepend(tmp_path)  # the cache names the module
