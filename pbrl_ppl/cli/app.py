@@ -173,7 +173,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         stderr; 3 where chains have not converged; 130 if interrupted.
     """
     os.environ.setdefault("MPLBACKEND", "Agg")  # commands show no windows
-    gc.set_threshold(100_000, 20, 20)  # compilation makes millions of objects that stay
+    if argv is None:
+        gc.set_threshold(100_000, 20, 20)  # compilation makes millions of objects that stay
     if argv is None and "forkserver" in multiprocessing.get_all_start_methods():
         # a fork of this process, by PyMC's chains, could copy a lock that a thread holds
         multiprocessing.set_start_method("forkserver", force=True)

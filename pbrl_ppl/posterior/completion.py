@@ -183,6 +183,8 @@ def evaluate(
             residual = problem.observations.residual(states)
             likelihood[part] = problem.log_density(residual, sigma[part], phi[part])
         here = rows[(begin <= rows) & (rows < begin + size)]
+        if not len(here):
+            continue
         if known is None and len(parallel.physics.simulator.parts) == 1:
             drawn = states[here - begin]  # no parts that may meet in one world
         else:

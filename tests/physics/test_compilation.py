@@ -73,7 +73,7 @@ def test_pymunk_objects_hold_pointers_to_their_structs() -> None:
 
 
 def test_the_digest_follows_contents_and_names(tmp_path) -> None:
-    source = tmp_path / "loop.py"
+    source = tmp_path / "doubling.py"
     source.write_text("STEP = 1\n")
     first = sources_digest(tmp_path)
     source.touch()
@@ -89,9 +89,9 @@ def test_the_digest_follows_contents_and_names(tmp_path) -> None:
 @pytest.fixture
 def module(tmp_path) -> ModuleType:
     """A module in a file, with a function to compile."""
-    path = tmp_path / "loop.py"
+    path = tmp_path / "doubling.py"
     path.write_text("def double(x):\n    return 2.0 * x\n")
-    spec = importlib.util.spec_from_file_location("loop", path)
+    spec = importlib.util.spec_from_file_location("doubling", path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
@@ -147,9 +147,9 @@ def test_another_process_compiles_what_is_asked_for_later(module, tmp_path, monk
     monkeypatch.syspath_prepend(tmp_path)  # the cache names the module
     digest = "beside"
     code = (
-        f"import sys, numba; sys.path.insert(0, {str(tmp_path)!r}); import loop\n"
+        f"import sys, numba; sys.path.insert(0, {str(tmp_path)!r}); import doubling\n"
         "from pbrl_ppl.physics.calls import disk_cache\n"
-        f"one = numba.njit(loop.double); one._cache = disk_cache(loop.double, {digest!r}); one(1.5)"
+        f"one = numba.njit(doubling.double); one._cache = disk_cache(doubling.double, {digest!r}); one(1.5)"
     )
     dispatcher = numba.njit(module.double)
     dispatcher._cache = disk_cache(module.double, digest)
