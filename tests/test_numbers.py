@@ -11,6 +11,7 @@ from pbrl_ppl.effects import attach, catalogue
 from pbrl_ppl.history import History, with_units
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.physics import Physics
+from tests.helpers.examples import EXAMPLES
 from tests.helpers.free_puck import Disc
 from tests.helpers.similar import in_frame, similar, similar_history
 from tests.helpers.variants import (
@@ -24,7 +25,8 @@ from tests.helpers.variants import (
 )
 
 #: Effects that act by the time.
-TIMED = [one for one in catalogue if getattr(one.stage, "timed", False)]
+LAWS = (*catalogue, *EXAMPLES.values())
+TIMED = [one for one in LAWS if getattr(one.stage, "timed", False)]
 #: Standard deviations by which posteriors may differ: a millionth but where digits are lost, or the
 #: noise of x and y is another.
 BOUNDS = {"far": 1e-3, "turned": 0.3}

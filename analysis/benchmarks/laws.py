@@ -53,7 +53,7 @@ class Case:
     rig: str = "arm"
     torque: Callable[[Floats, Floats, float], Floats] = lambda z, u, t: 0.0
     command: Callable[[Floats, Floats, float], Floats] | None = None
-    measure: Callable[[Floats, Floats], Floats] = lambda z, t: z
+    measure: Callable[[Floats], Floats] = lambda z: z
     late: float = 0.0
     also: tuple[str, ...] = ()
     family: tuple[str, ...] = field(default=())
@@ -88,7 +88,6 @@ LATE = (
 )
 SHAPE = (
     "command_power",
-    "gain_by_sign",
     "dead_zone",
     "torque_dead_zone",
     "torque_saturation",
@@ -107,7 +106,6 @@ ANGLE = (
     "upper_stop",
     "lower_stop",
     "cogging",
-    "askew_angle",
     "encoder_eccentricity",
 )
 PLACE = ("spring", "cubic_spring")
@@ -166,9 +164,7 @@ CASES = {
     "command_power": Case(
         torque=lambda z, u, t: 3.0 * np.abs(u) * u - u, also=("torque_gain",), family=SHAPE
     ),
-    "gain_by_sign": Case(torque=lambda z, u, t: 0.15 * np.abs(u), family=SHAPE),
-    "encoder_eccentricity": Case(measure=lambda z, t: z + 0.05 * np.sin(z), family=ANGLE),
-    "sensor_drift": Case(measure=lambda z, t: z + 0.02 * t, family=("sensor_drift",)),
+    "encoder_eccentricity": Case(measure=lambda z: z + 0.05 * np.sin(z), family=ANGLE),
     "drag_by_axis": Case("puck", lambda z, u, t: polar(z, 0.1, 0.6, 1), family=DRAG),
     "quadratic_drag_by_axis": Case("puck", lambda z, u, t: polar(z, 0.1, 0.5, 2), family=DRAG),
     "wind": Case("puck", lambda z, u, t: _blown(z), family=DRAG),
@@ -193,7 +189,7 @@ CASES = {
         ),
     ),
     "askew_camera": Case(
-        "puck", measure=lambda z, t: _askew(z), family=("askew_camera", "sensor_scale")
+        "puck", measure=lambda z: _askew(z), family=("askew_camera", "sensor_scale")
     ),
 }
 
@@ -256,10 +252,9 @@ def recorded(case: Case, seed: int) -> pp.History:
         if (k + 1) % FINE == 0:
             rows.append(z.copy())
     path = np.stack(rows, axis=1)
-    time_of = STEP * np.arange(ROWS)
     states, wrenches = np.full((N, ROWS, 1, 6), np.nan), np.zeros((N, ROWS - 1, 1, 3))
     for i in range(ROWS):
-        poses = case.measure(path[:, i, : 1 if arm else 3], time_of[i])
+        poses = case.measure(path[:, i, : 1 if arm else 3])
         columns = [2] if arm else [0, 1, 2]
         states[:, i, 0, columns] = poses + rng.normal(size=poses.shape) * (
             1e-3 if arm else (5e-4, 5e-4, 1e-3)

@@ -46,7 +46,6 @@ FORMULAS = {
     "force_gain": "u → factor · u",
     "torque_gain": "tau → factor · tau",
     "anisotropic_gain": "(u_x, u_y) → (x · u_x, y · u_y)",
-    "gain_by_sign": "u → u + share · |u|, each component",
     "command_power": "u → u (|u| / u₀)^(exponent − 1), u₀ a typical force or torque",
     "sliding_friction": "|F| ≤ mu m g against sliding, |torque| ≤ radius · mu m g against turning",
     "turning_friction": "|torque| ≤ torque against turning",
@@ -81,8 +80,6 @@ FORMULAS = {
     "sensor_scale": "measured = (length · x, length · y, angle · θ), rates likewise",
     "askew_camera": "measured place = (x, y) / (1 + along_x · x + along_y · y)",
     "encoder_eccentricity": "measured angle = θ + cosine · cos θ + sine · sin θ",
-    "askew_angle": "measured angle = θ + cosine · cos 2θ + sine · sin 2θ",
-    "sensor_drift": "measured = state + (x, y, theta) · t",
     "frame_rotation": "measured position and velocity = R(angle) · true ones; θ + angle",
     "heavy_tails": "noise of Student's t with 1 / inverse_nu degrees of freedom",
 }
@@ -133,13 +130,12 @@ LOOK_ALIKES = (
     (("actuator_delay", "first_order_lag", "rate_limit", "torque_rate_limit", "actuator_backlash",
       "torque_backlash"),
      "if commands change slowly; record steps of several sizes"),
-    (("command_power", "gain_by_sign", "dead_zone", "torque_dead_zone", "torque_saturation"),
+    (("command_power", "dead_zone", "torque_dead_zone", "torque_saturation"),
      "if commands have few sizes; record many"),
     (("torsion_spring", "cubic_torsion_spring", "upper_stop", "lower_stop", "cogging",
-      "encoder_eccentricity", "askew_angle"),
+      "encoder_eccentricity"),
      "over a narrow range of angles"),
     (("spring", "cubic_spring"), "over a narrow range of places"),
-    (("constant_force", "sensor_drift"), "in short trajectories"),
     (("sensor_scale", "askew_camera"), "if the body stays at a place"),
 )  # fmt: skip
 #: Measured rigs on which an effect was named; see the page on hardware.

@@ -409,28 +409,6 @@ torque_dead_zone, torque_saturation, torque_rate_limit, torque_backlash = (
 )
 
 
-def _by_sign(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
-    for i in range(3):
-        wrench[i] += parameters[0] * abs(wrench[i])
-
-
-gain_by_sign = Effect(
-    "gain_by_sign",
-    (
-        EffectParameter(
-            "share", "1", Prior("truncated_normal", mu=0.0, sigma=0.3, lower=-1.0, upper=1.0)
-        ),
-    ),
-    "pushes one way are stronger than the other way, by this share of the command each: a propeller"
-    " or a valve is not symmetric",
-    "gain of an actuator by sign, f = u + a |u|",
-    Command(_by_sign),
-    log_odds=-1.0,
-    family="shape of the command",
-    unusual="few drives push more one way; a constant force looks the same",
-)
-
-
 def _by_power(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
     force, torque = math.hypot(wrench[0], wrench[1]) / parameters[1], abs(wrench[2]) / parameters[2]
     if force > 0.0:

@@ -44,7 +44,6 @@ catalogue: tuple[Effect, ...] = (
     actuators.force_gain,
     actuators.torque_gain,
     actuators.anisotropic_gain,
-    actuators.gain_by_sign,
     actuators.command_power,
     friction.sliding_friction,
     friction.turning_friction,
@@ -78,8 +77,6 @@ catalogue: tuple[Effect, ...] = (
     sensors.sensor_scale,
     sensors.askew_camera,
     sensors.encoder_eccentricity,
-    sensors.askew_angle,
-    sensors.sensor_drift,
     sensors.frame_rotation,
     sensors.heavy_tails,
 )

@@ -15,7 +15,7 @@ from pbrl_ppl.effects.effect import (
     is_unpivoted,
 )
 from pbrl_ppl.parameters import Prior
-from pbrl_ppl.state import POSE, STATE, STATE_UNITS, Floats
+from pbrl_ppl.state import STATE, STATE_UNITS, Floats
 
 #: Natural units of a body's state; an angle has none.
 _SCALES = ("range", "range", "", "speed", "speed", "turn_rate")
@@ -28,15 +28,12 @@ class _WithOpposites:
     measure: Callable[[Floats, Values], Floats]
 
     def __call__(self, measured: Floats, parameters: Values) -> Floats:
-        opposite = {n: value if n == "time" else -value for n, value in parameters.items()}
-        return self.measure(measured, opposite)
+        return self.measure(measured, {name: -value for name, value in parameters.items()})
 
 
-def _undone_by_opposites(
-    measure: Callable[[Floats, Values], Floats], timed: bool = False
-) -> Sensor:
+def _undone_by_opposites(measure: Callable[[Floats, Values], Floats]) -> Sensor:
     """Return the stage of a measurement that the opposite parameters undo."""
-    return Sensor(measure, _WithOpposites(measure), timed)
+    return Sensor(measure, _WithOpposites(measure))
 
 
 def _bias(parameters: Values) -> Floats:
@@ -145,48 +142,29 @@ askew_camera = Effect(
 )
 
 
-def _harmonic(state: Floats, parameters: Values, order: int) -> Floats:
-    phase = order * state[..., 2]
-    c, s = parameters["cosine"], parameters["sine"]
-    measured = np.array(np.broadcast_to(state, (*np.broadcast_shapes(phase.shape, c.shape), 6)))
-    measured[..., 2] += c * np.cos(phase) + s * np.sin(phase)
-    measured[..., 5] *= 1.0 + order * (s * np.cos(phase) - c * np.sin(phase))
+def _off_centre(state: Floats, parameters: Values) -> Floats:
+    theta, c, s = state[..., 2], parameters["cosine"], parameters["sine"]
+    measured = np.array(np.broadcast_to(state, (*np.broadcast_shapes(theta.shape, c.shape), 6)))
+    measured[..., 2] += c * np.cos(theta) + s * np.sin(theta)
+    measured[..., 5] *= 1.0 + s * np.cos(theta) - c * np.sin(theta)
     return measured
 
 
-def _without_harmonic(measured: Floats, parameters: Values, order: int, tries: int = 30) -> Floats:
+def _without_off_centre(measured: Floats, parameters: Values, tries: int = 30) -> Floats:
     state = np.array(measured)
     for _ in range(tries):  # a contraction where the measured angle grows with the angle
-        off = _harmonic(state, parameters, order) - state
+        off = _off_centre(state, parameters) - state
         state = np.where(np.arange(6) == 2, measured - off, np.broadcast_to(measured, off.shape))
-    slope = _harmonic(np.where(np.arange(6) == 5, 1.0, state), parameters, order)[..., 5]
+    slope = _off_centre(np.where(np.arange(6) == 5, 1.0, state), parameters)[..., 5]
     state[..., 5] = measured[..., 5] / slope
     return np.asarray(state)
 
 
-def _off_centre(state: Floats, parameters: Values) -> Floats:
-    return _harmonic(state, parameters, 1)
-
-
-def _without_off_centre(measured: Floats, parameters: Values) -> Floats:
-    return _without_harmonic(measured, parameters, 1)
-
-
-def _as_ellipse(state: Floats, parameters: Values) -> Floats:
-    return _harmonic(state, parameters, 2)
-
-
-def _without_ellipse(measured: Floats, parameters: Values) -> Floats:
-    return _without_harmonic(measured, parameters, 2)
-
-
-# of a camera that looks askew by an angle a it is (1 - cos a) / 2: 0.03 rad for 20 degrees
 _HARMONIC = Prior("normal", sigma=0.03)
-_PARTS = (EffectParameter("cosine", "rad", _HARMONIC), EffectParameter("sine", "rad", _HARMONIC))
 
 encoder_eccentricity = Effect(
     "encoder_eccentricity",
-    _PARTS,
+    (EffectParameter("cosine", "rad", _HARMONIC), EffectParameter("sine", "rad", _HARMONIC)),
     "the angle is measured too large on one side of the turn and too small on the other: the"
     " encoder's disc is off its centre",
     "first harmonic of an encoder's error, a cos(theta) + b sin(theta)",
@@ -196,47 +174,6 @@ encoder_eccentricity = Effect(
     family="place and angle",
     unusual="it takes any misfit of an angle; encoders are seldom off by as much",
     needs=("places", "theta"),
-)
-
-askew_angle = Effect(
-    "askew_angle",
-    _PARTS,
-    "the angle is measured too large in two opposite quarters of the turn and too small in the"
-    " others: the camera looks askew at the plane of motion",
-    "second harmonic of a circle seen as an ellipse, a cos(2 theta) + b sin(2 theta)",
-    Sensor(_as_ellipse, _without_ellipse),
-    applies=is_pivoted,
-    log_odds=-6.0,
-    family="place and angle",
-    unusual="it takes any misfit of an angle; few cameras look so askew",
-    needs=("places", "camera"),
-)
-
-
-def _drift(state: Floats, parameters: Values) -> Floats:
-    time = np.where(np.isfinite(parameters["time"]), parameters["time"], 0.0)
-    nothing = np.zeros(())
-    rates = [parameters.get(name, nothing) for name in POSE]
-    shift = [rate * time for rate in rates] + rates
-    return np.asarray(state + np.stack(np.broadcast_arrays(*shift), axis=-1))
-
-
-sensor_drift = Effect(
-    "sensor_drift",
-    tuple(
-        EffectParameter(
-            name, f"{unit}/s", Prior("normal", sigma=0.1), scale=scale, hinged=name == "theta"
-        )
-        for name, unit, scale in zip(
-            POSE, STATE_UNITS[:3], ("range/time", "range/time", "/time"), strict=True
-        )
-    ),
-    "what is measured moves away steadily from the start of each trajectory on: a gyroscope's"
-    " integral, a tag that slips",
-    "sensor drift, x + a t",
-    _undone_by_opposites(_drift, timed=True),
-    log_odds=-4.0,
-    unusual="encoders and cameras do not drift within a recording",
 )
 
 

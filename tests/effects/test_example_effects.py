@@ -23,10 +23,12 @@ pytestmark = pytest.mark.one_stack
 
 NAMES = {
     "angle_friction": ("pivot_angle_friction",),
+    "askew_angle": ("askew_angle",),
     "cable": ("cable",),
     "fading_gain": ("fading_gain",),
     "friction_by_place": ("friction_by_place", "slider_place_friction"),
     "gain_by_place": ("gain_by_place",),
+    "gain_by_sign": ("gain_by_sign",),
     "gain_by_speed": ("gain_by_speed",),
     "one_way_damping": ("pivot_one_way_damping",),
     "periodic": ("periodic_force", "periodic_torque"),
@@ -34,6 +36,7 @@ NAMES = {
     "power_drag": ("power_drag", "power_angular_drag"),
     "power_limit": ("power_limit",),
     "ripple": ("ripple",),
+    "sensor_drift": ("sensor_drift",),
     "sloshing": ("sloshing",),
 }
 MASS, STEP, N = 2.0, 0.1, 15
@@ -188,14 +191,35 @@ def damped(t: float, z: Floats) -> Floats:
     return np.array([0.0, 0.0, -0.03 * abs(z[5])])
 
 
+def steady(t: float, z: Floats) -> Floats:
+    return PUSH
+
+
+def drifted(t: Floats, z: Floats) -> Floats:
+    rates = np.array([[0.05], [-0.03], [0.02]])
+    return z + np.concatenate([rates * t, rates + 0.0 * t])
+
+
+def askew(t: Floats, z: Floats) -> Floats:
+    c, s = np.cos(2.0 * z[2]), np.sin(2.0 * z[2])
+    seen = z.copy()
+    seen[2] += 0.05 * c + 0.1 * s
+    seen[5] *= 1.0 + 2.0 * (0.1 * c - 0.05 * s)
+    return seen
+
+
 class Case(NamedTuple):
-    """A law's parameters with those of laws beside it, its formula, and what it acts on."""
+    """A law's parameters with those of laws beside it, its formula, and what it acts on.
+
+    ``seen(t, z)`` is what is measured of states (6, n) at times (n,).
+    """
 
     values: Mapping[str, tuple[float, ...]]
     wrench: Wrench
     rig: str = ""
     start: Floats = START
     push: Floats = PUSH
+    seen: Callable[[Floats, Floats], Floats] = lambda t, z: z
 
 
 STILL = np.zeros(3)
@@ -208,6 +232,8 @@ CASES = (
     Case({"power_limit": (0.6,)}, limited),
     Case({"gain_by_place": (0.3, -0.2)}, by_place),
     Case({"gain_by_speed": (0.2,)}, by_speed),
+    Case({"gain_by_sign": (0.3,)}, lambda t, z: PUSH * (1.3, 0.7, 1.3)),
+    Case({"sensor_drift": (0.05, -0.03, 0.02)}, steady, seen=drifted),
     Case({"power_drag": (0.7, 1.6)}, dragged),
     Case({"power_angular_drag": (0.03, 1.4)}, slowed),
     Case(
@@ -225,6 +251,10 @@ CASES = (
     Case(
         {"pivot_one_way_damping": (0.03,)}, damped, "hinge", START * (0, 0, 1, 0, 0, 1), STILL
     ),
+    Case(
+        {"askew_angle": (0.05, 0.1)},
+        lambda t, z: PUSH * (0, 0, 1), "hinge", START * (0, 0, 1, 0, 0, 1), seen=askew,
+    ),
 )  # fmt: skip
 
 
@@ -237,8 +267,9 @@ def test_a_law_is_its_formula(case) -> None:
 
     times = STEP * np.arange(1, N + 1)
     expected = solve_ivp(slope, (0, times[-1]), case.start, "DOP853", times, rtol=1e-9, atol=1e-9)
-    got = states(world(case.rig), case.values, case.start, case.push)
-    np.testing.assert_allclose(got, expected.y.T, atol=2e-3)
+    start = case.seen(np.zeros(1), case.start[:, None])[:, 0]
+    got = states(world(case.rig), case.values, start, case.push)
+    np.testing.assert_allclose(got, case.seen(times, expected.y).T, atol=2e-3)
 
 
 @pytest.mark.parametrize("engine", ["auto", "chipmunk"])

@@ -7,6 +7,7 @@ from pbrl_ppl.effects import candidates, catalogue
 from pbrl_ppl.effects.effect import Command
 from pbrl_ppl.history import History
 from pbrl_ppl.scene import Body, Joint, Recording, Scene, Shape
+from tests.helpers.examples import EXAMPLES
 
 ARM = Scene(
     time_step=0.02,
@@ -15,12 +16,14 @@ ARM = Scene(
     joints=(Joint("hinge", ("arm", "world"), (0.0, 0.15), (0.0, 0.0)),),
 )
 PUCK = Scene(time_step=0.1, bodies=(Body("puck", Shape.circle(0.1), known={"mass": 1.0}),))
+#: The catalogue, and a law of a hinge that needs a camera.
+LAWS = (*catalogue, EXAMPLES["askew_angle"])
 CAMERA = {"askew_camera", "askew_angle"}
-PLACES = {effect.name for effect in catalogue if "places" in effect.needs} - CAMERA
+PLACES = {effect.name for effect in LAWS if "places" in effect.needs} - CAMERA
 
 
 def names(scene: Scene, history: History) -> set[str]:
-    return {one.effect.name for one in candidates(scene, (), catalogue, history)}
+    return {one.effect.name for one in candidates(scene, (), LAWS, history)}
 
 
 def swinging(push: float = 0.0) -> History:

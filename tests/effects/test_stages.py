@@ -21,6 +21,7 @@ from pbrl_ppl.parameters import Prior
 from pbrl_ppl.physics import Physics, Simulator, build_layout
 from pbrl_ppl.physics.world import FINER
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
+from tests.helpers.examples import EXAMPLES
 from tests.helpers.plain import simulator_of
 from tests.helpers.worlds import BY_NAME, G, body, phi_of, predict, state
 
@@ -263,13 +264,16 @@ def room() -> Scene:
 
 def test_both_paths_agree_with_effects_of_every_stage() -> None:
     scene, rng = room(), np.random.default_rng(4)
-    fitting = [effect for effect in catalogue if effect.applies(scene, scene.dynamic[0])]
+    laws = (*catalogue, EXAMPLES["sensor_drift"])  # a measurement that knows the time
+    fitting = [effect for effect in laws if effect.applies(scene, scene.dynamic[0])]
     attached = attach(scene, fitting)
     layout = build_layout(scene, attached)
     phi = np.stack([prior.sample(rng, 3) for prior in layout.priors], axis=1)
     phi[:, layout.index("hidden_obstacle_x", "cart")] = [0.6, 0.0, 3.0]
     phi[:, layout.index("hidden_obstacle_y", "cart")] = [0.0, 0.7, 3.0]
     phi[:2, layout.index("distance_joint_length", "cart")] = 0.0  # a rod pulls hard at once
+    for name in ("b_x", "b_y"):  # its end on the floor is where the cart starts
+        phi[2, layout.index(f"distance_joint_{name}", "cart")] = 0.0
     for name in ("x", "y", "theta"):  # a minute's drift takes a start far off the rod
         phi[2, layout.index(f"sensor_drift_{name}", "cart")] = 0.0
     start = rng.normal(0, 1, (8, 1, 6)) * [0.2, 0.2, 1, 2, 2, 2]

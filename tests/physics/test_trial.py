@@ -80,19 +80,20 @@ def test_the_whole_catalogue_passes_and_with_wrong_null_values_does_not(history)
     for scene in (PUCK, PUCK.replace(gravity=(0.0, -9.81))):
         for effect in catalogue:
             try_effect(effect, scene, history)
-            wrong = tuple(
-                replace(parameter, null=float(parameter.prior.sample(rng, 1)[0]))
-                for parameter in effect.parameters
-            )
             if effect.applies(scene, PUCK.bodies[0]):
                 acting.add(effect.name)
-            try:
-                try_effect(replace(effect, parameters=wrong), scene, history)
-            except EffectError as error:
-                assert "does not vanish on puck at its null value" in str(error)
-                refused.add(effect.name)
-    # the mass changes after the recording, and a drifting frame does not change a free motion
-    assert acting - refused == {"mass_change", "sensor_drift"}
+            for _ in range(20):  # an obstacle may be far away, and a threshold below all pushes
+                wrong = tuple(
+                    replace(parameter, null=float(parameter.prior.sample(rng, 1)[0]))
+                    for parameter in effect.parameters
+                )
+                try:
+                    try_effect(replace(effect, parameters=wrong), scene, history)
+                except EffectError as error:
+                    assert "does not vanish on puck at its null value" in str(error)
+                    refused.add(effect.name)
+                    break
+    assert acting - refused == {"mass_change"}  # after the recording
     assert refused <= acting
 
 
