@@ -149,7 +149,8 @@ def test_another_process_compiles_what_is_asked_for_later(module, tmp_path, monk
     code = (
         f"import sys, numba; sys.path.insert(0, {str(tmp_path)!r}); import doubling\n"
         "from pbrl_ppl.physics.calls import disk_cache\n"
-        f"one = numba.njit(doubling.double); one._cache = disk_cache(doubling.double, {digest!r}); one(1.5)"
+        "one = numba.njit(doubling.double)\n"
+        f"one._cache = disk_cache(doubling.double, {digest!r}); one(1.5)"
     )
     dispatcher = numba.njit(module.double)
     dispatcher._cache = disk_cache(module.double, digest)
