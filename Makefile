@@ -25,7 +25,7 @@ paper: $(VENV)/.installed-test
 	    $(PAPER:%=out/%$(if $(findstring --quick,$(PAPER_ARGS)),_quick))
 
 # One worker runs a whole file, so that its fixtures are made once; the marker `first` sets the order.
-PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --durations 10
+PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --durations 20
 
 test: $(VENV)/.compiled
 	$(PYTEST) $(PYTEST_ARGS)

@@ -7,6 +7,7 @@ other platforms :data:`AVAILABLE` is false, and there is no engine.
 
 from __future__ import annotations
 
+import atexit
 import hashlib
 import platform
 import subprocess
@@ -102,10 +103,11 @@ def compile_beside(function: Any, code: str) -> None:
     """Compile a function into its cache in another process, which runs this code, if it is not."""
     index = getattr(getattr(function._cache, "_cache_file", None), "_index_path", None)
     if function not in _BESIDE and index is not None and not Path(index).exists():
-        _BESIDE[function] = subprocess.Popen(
+        _BESIDE[function] = process = subprocess.Popen(
             [sys.executable, "-c", code], start_new_session=True,
             stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )  # fmt: skip
+        atexit.register(setattr, process, "returncode", 0)  # it may go on without a warning
 
 
 def compiled_beside(function: Any) -> Any:
