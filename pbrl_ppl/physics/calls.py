@@ -113,7 +113,8 @@ def compile_beside(function: Any, code: str) -> None:
 def compiled_beside(function: Any) -> Any:
     """Return a function, once no other process compiles it."""
     if function in _BESIDE:
-        _BESIDE[function].wait()
+        with suppress(subprocess.TimeoutExpired):
+            _BESIDE[function].wait(120.0)
     return function
 
 
