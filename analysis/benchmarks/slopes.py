@@ -10,6 +10,7 @@ case, with all code compiled before. ``slope`` is that of the seconds' logarithm
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import sys
 import time
@@ -64,9 +65,9 @@ def cart(transitions: int) -> tuple[pp.Scene, pp.History]:
 
 
 def drive(rows: int = 24_800, step: float = 1e-3) -> tuple[pp.Scene, pp.History]:
-    """Return a linear drive, and a recording at 1 kHz: integrated here, by the closed form.
+    """Return a linear drive, and a recording at 1 kHz by the closed form.
 
-    Between rows the force is constant, and so is the sign of the speed but for one step a stroke.
+    Between rows the force is constant, and so is dry friction until the carriage stops.
     """
     mass, viscous, dry, zero = DRIVE
     scene = pp.Scene(
@@ -85,15 +86,16 @@ def drive(rows: int = 24_800, step: float = 1e-3) -> tuple[pp.Scene, pp.History]
         for pushed in force:
             places.append(x)
             pull = pushed + zero
-            sign = np.sign(v) if v != 0.0 else np.sign(pull) * (abs(pull) > dry)
-            end = (pull - dry * sign) / viscous
-            decay = np.exp(-viscous * step / mass)
-            after = end + (v - end) * decay
-            if sign != 0.0 and after * sign < 0.0:
-                after = 0.0
-            if sign != 0.0:
-                x += 0.5 * step * (v + after)
-            v = after if sign != 0.0 else 0.0
+            left = step
+            while left > 0.0 and (v != 0.0 or abs(pull) > dry):
+                end = (pull - dry * math.copysign(1.0, v or pull)) / viscous
+                span = left
+                if v * end < 0.0:
+                    span = min(left, mass / viscous * math.log1p(-v / end))
+                decay = math.exp(-viscous * span / mass)
+                x += end * span + (v - end) * mass / viscous * (1.0 - decay)
+                v, left = end + (v - end) * decay, left - span
+                v = 0.0 if left > 0.0 else v
         noisy = np.array(places) + 2e-6 * rng.standard_normal(len(places))
         frames.append(
             pd.DataFrame({"x": noisy, "y": 0.0, "theta": 0.0, "force_x": force, "time": time_s})

@@ -124,6 +124,8 @@ def refit(
     alone, or from a part of the way: the best of these.
     """
     known = {*mode.problem.layout.labels}
+    # where the engine diverges a regression has no size
+    begin = {label: value for label, value in begin.items() if np.isfinite(value)}
     new = {label: value for label, value in begin.items() if label not in known}
     problem, phi = with_effects(mode, effects, new)
     if is_simulated(problem):

@@ -8,7 +8,7 @@ import pytest
 import pbrl_ppl as pp
 from pbrl_ppl.criticism.score import Library
 from pbrl_ppl.criticism.subsets import best_subsets, worth
-from pbrl_ppl.criticism.table import Table, share, sizes_of
+from pbrl_ppl.criticism.table import Table, refit, share, sizes_of
 from pbrl_ppl.effects import candidates
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.likelihood import in_pieces
@@ -95,6 +95,14 @@ def test_each_set_of_laws_is_fitted_once(table) -> None:
     assert table.fitted(mode, (second, first)) is mode
     assert table.without(mode, first) is table.without(mode, first)
     assert table.laws(table.without(mode, first)) == (second,)
+
+
+def test_a_refit_begins_without_sizes_that_are_no_numbers(table) -> None:
+    """A regression has none where the engine diverges; the refit finds the same model."""
+    (mode,) = (table.modes[key] for key in table.modes if len(key) == 2)
+    effects, bare = mode.problem.physics.effects, table.modes[frozenset()]
+    lost = dict.fromkeys(mode.problem.layout.labels, np.nan)
+    np.testing.assert_allclose(refit(bare, effects, lost).sigma, mode.sigma, rtol=0.01)
 
 
 def test_the_value_is_the_log_evidence_with_the_odds_of_the_laws(table) -> None:
