@@ -525,7 +525,8 @@ class Search:
         fair = {  # a law of an impossible size takes no others with it
             key - {law}: _without(begin, law)
             for key, begin in moves.items() if key in table.modes
-            for law in key - laws if far_out(table.modes[key], [law]) >= most
+            for law in table.laws(table.modes[key])
+            if law not in laws and far_out(table.modes[key], [law]) >= most
         }  # fmt: skip
         moves = {**moves, **fair}
         table.race(now, {key: begin for key, begin in fair.items() if len(key) > len(laws)})
@@ -560,7 +561,7 @@ class Search:
             table.modes[laws] = climb.mode = again
             if table.value(mode) - table.value(again) < needed:
                 return again
-        if new := {*table.laws(mode)} - laws:
+        if new := [law for law in table.laws(mode) if law not in laws]:
             self.say(f"simulations name {' and '.join(map(_name, new))}")
         return mode
 
@@ -614,7 +615,7 @@ class Search:
             for law, part in shares.items()
         }
         named = {name for one in climb.lengths for name in one.accepted}
-        for law in {*climb.earlier} - {*laws, *climb.small, *rejected}:
+        for law in (one for one in climb.earlier if one not in {*laws, *climb.small, *rejected}):
             if _name(law) in named:
                 rejected[law] = "longer simulations do not need it"
         for law, why in rejected.items():

@@ -217,7 +217,8 @@ class Table:
         if behind is not None and is_simulated_mode(behind):
             return fit_pieces(behind.problem, behind.phi, rounds, **_CLIMB)
         effects = tuple(one for one in near.problem.physics.effects if one in laws)
-        new = tuple(one for one in laws if one not in effects)
+        # not in the order of a set, which differs from run to run
+        new = sorted((one for one in laws if one not in effects), key=lambda one: one.labels)
         return refit(near, (*self.declared, *effects, *new), begin, rounds)
 
     def race(

@@ -97,6 +97,14 @@ def test_each_set_of_laws_is_fitted_once(table) -> None:
     assert table.laws(table.without(mode, first)) == (second,)
 
 
+def test_a_model_does_not_depend_on_the_order_of_its_laws(dragged_and_pulled) -> None:
+    """That of a set differs from run to run, for it hashes functions by their addresses."""
+    laws = [law for law in candidates(DISC, (), OFFERED) if "drag" in law.effect.name]
+    models = [Table((), 6).fitted(dragged_and_pulled, given) for given in (laws, laws[::-1])]
+    assert models[0].problem.layout.labels == models[1].problem.layout.labels
+    np.testing.assert_array_equal(models[0].phi, models[1].phi)
+
+
 def test_a_refit_begins_without_sizes_that_are_no_numbers(table) -> None:
     """A regression has none where the engine diverges; the refit finds the same model."""
     (mode,) = (table.modes[key] for key in table.modes if len(key) == 2)
