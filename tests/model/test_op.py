@@ -293,7 +293,7 @@ def test_every_catalogue_effect_compiles_into_the_op() -> None:
         effect.name for effect in catalogue
         if effect.applies(scene, scene.dynamic[0]) and effect.name != "distance_joint"
     )  # fmt: skip
-    assert len(names) > 50
+    assert len(names) > 40
     op = make(effects=names, gravity=(0.0, -0.5))
     phi = np.array([max(prior.centre, 0.05) for prior in op.physics.layout.priors])
     _, start, actions = inputs(make())
