@@ -21,12 +21,12 @@ from pbrl_ppl.physics.calls import (
 from pbrl_ppl.physics.laws import (
     ACTED,
     COMMAND,
-    LATE,
     MORE,
     WRENCHES,
     act,
     begin_held,
     bound,
+    remember,
     set_memory,
     states_before,
 )
@@ -422,10 +422,7 @@ def _transition(  # type: ignore[no-untyped-def]
                 touched = _TOUCHED if near else touched
         copy(state, out[h])
         if memory.shape[1] > 0:
-            act(
-                state_at, inputs_at, laws, LATE, 1.0, acted_at, remembered, held_at,
-                held.shape[1], True,
-            )  # fmt: skip
+            remember(state, inputs_at, laws, acted, remembered, held)
         end += 1
     return touched, end
 

@@ -18,11 +18,11 @@ from pbrl_ppl.physics.laws import (
     COMMAND,
     FIRST,
     JUMPS,
-    LATE,
-    OTHER,
+    ROW,
     WRENCHES,
     act,
     begin_held,
+    remember,
     set_memory,
     states_before,
 )
@@ -120,7 +120,7 @@ def _switch(laws, low):  # type: ignore[no-untyped-def]
     """Return the first time after ``low`` at which a command jumps, as a share of the interval."""
     high = 1.0
     for e in range(laws.n_commands):
-        law = laws.commands + 8 * (OTHER + 1) * e
+        law = laws.commands + ROW * e
         if whole_at(law, JUMPS) > 0:
             share = real_at(laws.commands_values, whole_at(law, FIRST))
             share -= math.floor(share)
@@ -513,10 +513,7 @@ def rollout(works, still, batch, items, begins, out):  # type: ignore[no-untyped
                 high = _switch(laws, low)
                 budget, wanted = _advance(work, laws, still, low, high, budget, wanted)
             if batch.slots > 0:
-                act(
-                    work.states.ctypes.data, work.inputs, laws, LATE, 1.0, work.acted.ctypes.data,
-                    work.memory, work.held.ctypes.data, work.held.shape[1], True,
-                )  # fmt: skip
+                remember(work.states, work.inputs, laws, work.acted, work.memory, work.held)
             if budget < 0:
                 begins[place] = h
                 break

@@ -26,7 +26,7 @@ MORE = 4
 #: body that the torque acts back on, relative to which the law sees angle and speed (-1: none). Of
 #: a force, REMEMBER is the address of `rate`, and JUMPS that of `begin` (0: none).
 LAW, ON, FIRST, REMEMBER, SLOT, SLOTS, ALONE, UNDER, JUMPS, BEGINS, OTHER = range(11)
-_ROW, _ACTED = 8 * (OTHER + 1), 8 * ACTED  # bytes of a law, and of a row of what acts
+ROW, _ACTED = 8 * (OTHER + 1), 8 * ACTED  # bytes of a law, and of a row of what acts
 
 
 def law_tables(scene: Scene, effects: tuple[Attached, ...]) -> tuple[Ints, Ints, Ints, int, int]:
@@ -141,7 +141,7 @@ def act(  # type: ignore[no-untyped-def]
         put_at(to, TIME, real_at(row, 7) + begin * laws.time_step if known else np.inf)
         put_at(to, INTERVAL, laws.time_step)
     for e in range(laws.n_commands):
-        law = laws.commands + _ROW * e
+        law = laws.commands + ROW * e
         i, alone = whole_at(law, ON), whole_at(law, ALONE)
         slot, slots, other = whole_at(law, SLOT), whole_at(law, SLOTS), whole_at(law, OTHER)
         on, state_at = acted + _ACTED * i, state + 48 * i
@@ -175,13 +175,13 @@ def act(  # type: ignore[no-untyped-def]
         for w in range(3):
             put_at(to, WRENCHES + w, real_at(to, COMMAND + w))
     for e in range(laws.n_commands):
-        law = laws.commands + _ROW * e
+        law = laws.commands + ROW * e
         if whole_at(law, OTHER) >= 0:
             torque = real_at(acted + _ACTED * whole_at(law, ON), COMMAND + 2)
             back = acted + _ACTED * whole_at(law, OTHER)
             put_at(back, WRENCHES + 2, real_at(back, WRENCHES + 2) - torque)
     for e in range(0 if after else laws.n_forces):
-        law = laws.forces + _ROW * e
+        law = laws.forces + ROW * e
         i, slot, slots = whole_at(law, ON), whole_at(law, SLOT), whole_at(law, SLOTS)
         on, state_at = acted + _ACTED * i, state + 48 * i
         see, values = on, laws.forces_values + 8 * whole_at(law, FIRST)
@@ -197,7 +197,7 @@ def act(  # type: ignore[no-untyped-def]
 
 
 @inner
-def _remember(state, inputs, laws, acted, memory, held):  # type: ignore[no-untyped-def]
+def remember(state, inputs, laws, acted, memory, held):  # type: ignore[no-untyped-def]
     """Bring what command laws remember up to date after an interval; see `act`."""
     act(
         state.ctypes.data, inputs, laws, LATE, 1.0, acted.ctypes.data, memory, held.ctypes.data,
@@ -212,7 +212,7 @@ def begin_held(state, laws, acted, held):  # type: ignore[no-untyped-def]
     for s in range(held.shape[1]):
         held[0, s] = held[1, s] = 0.0
     for e in range(laws.n_forces):
-        law = laws.forces + _ROW * e
+        law = laws.forces + ROW * e
         begin = whole_at(law, JUMPS)
         if whole_at(law, SLOTS) > 0 and begin != 0:
             call_law(
@@ -241,13 +241,13 @@ def set_memory(batch, laws, p, t, begin, start, acted, memory, held, at):  # typ
     for earlier in range(first, t):
         for h in range(inputs.shape[1]):
             at_interval = inputs[earlier, h].ctypes.data
-            _remember(start, at_interval, laws, acted, memory.ctypes.data, held)
+            remember(start, at_interval, laws, acted, memory.ctypes.data, held)
     at[0], at[1] = p, t
     for s in range(memory.shape[1]):
         memory[1, s] = memory[0, s]
     now = memory.ctypes.data + 8 * memory.shape[1]
     for h in range(begin):
-        _remember(start, inputs[t, h].ctypes.data, laws, acted, now, held)
+        remember(start, inputs[t, h].ctypes.data, laws, acted, now, held)
 
 
 @inner
@@ -259,7 +259,7 @@ def _begin_memory(laws, interval, start, acted, memory, held):  # type: ignore[n
     older = (interval.shape[1] - 9) // 3
     oldest = PREVIOUS if older == 0 else 6 + 3 * older
     for e in range(laws.n_commands):
-        law = laws.commands + _ROW * e
+        law = laws.commands + ROW * e
         i, alone, begins = whole_at(law, ON), whole_at(law, ALONE), whole_at(law, BEGINS)
         for s in range(whole_at(law, SLOTS)):
             w = s % 3 if alone < 0 else alone
@@ -275,7 +275,7 @@ def _begin_memory(laws, interval, start, acted, memory, held):  # type: ignore[n
             for w in range(3):
                 past[i, w] = interval[i, now + w]
                 past[i, PREVIOUS + w] = interval[i, before + w]
-        _remember(start, past.ctypes.data, laws, acted, memory.ctypes.data, held)
+        remember(start, past.ctypes.data, laws, acted, memory.ctypes.data, held)
 
 
 @inner
@@ -283,7 +283,7 @@ def bound(base, laws, i, under, state, torque, rest, speed, acted):  # type: ign
     """Return the greatest force of dry friction in the hinge of body ``i``, or under it."""
     k, data = len(acted) - MORE, acted.ctypes.data
     for e in range(laws.n_frictions):
-        law = laws.frictions + _ROW * e
+        law = laws.frictions + ROW * e
         if whole_at(law, ON) == i and whole_at(law, UNDER) == under:
             acted[k, 0], acted[k, 1], acted[k, 2] = torque, rest, speed
             acted[k + 3, 0] = base

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pbrl_ppl.physics.calls import compiled, inner
-from pbrl_ppl.physics.laws import ACTED, LATE, MORE, act, begin_held, set_memory
+from pbrl_ppl.physics.laws import ACTED, MORE, act, begin_held, remember, set_memory
 from pbrl_ppl.physics.properties import COLUMN
 from pbrl_ppl.physics.solids import reaches, segment
 from pbrl_ppl.physics.world import World
@@ -384,11 +384,9 @@ def rollout(wheels, still, batch, items, begins, out):  # type: ignore[no-untype
                     for k in range(moving):
                         get_state(bodies[k], i, states, k)
                     laws = batch.laws[p]
-                    act(
-                        states_at, inputs[t, h].ctypes.data, laws, LATE, 1.0, acted_at,
-                        remembered_at + 8 * batch.slots * i, held_at + 16 * batch.held * i,
-                        batch.held, True,
-                    )  # fmt: skip
+                    inputs_at = inputs[t, h].ctypes.data
+                    slots_at = remembered_at + 8 * batch.slots * i
+                    remember(states, inputs_at, laws, acted, slots_at, held[i])
                 for i in range(width):
                     item, h = items[begin + i], first[i] + ahead
                     if touched[i]:
