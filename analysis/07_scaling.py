@@ -29,10 +29,10 @@ from experiments import origin, save, to_end
 from matplotlib.axes import Axes
 
 import pbrl_ppl as pp
+from pbrl_ppl import Body, Physics, Scene, Shape, Wall
 from pbrl_ppl.model import problem_in
 from pbrl_ppl.modes import find_mode
-from pbrl_ppl.physics import Physics, Simulator, build_layout
-from pbrl_ppl.scene import Body, Scene, Shape, Wall
+from pbrl_ppl.physics import Simulator, build_layout
 from pbrl_ppl.state import STATE, WRENCH
 
 OUT = Path("out") / "scaling"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pbrl_ppl import History
 from pbrl_ppl.criticism.held_out import rollout
-from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem, first_states, observed_coordinates
 from pbrl_ppl.scene import state_sizes
 from pbrl_ppl.state import STATE, THETA, wrapped

@@ -20,13 +20,13 @@ from running import sources
 
 import pbrl_ppl as pp
 from attribution.fitted_initial_states import forecast_errors
-from pbrl_ppl.criticism import NOT_CONVERGED, Loop, close_loop
+from pbrl_ppl import Loop, Physics, close_loop
+from pbrl_ppl.criticism import NOT_CONVERGED
 from pbrl_ppl.criticism.held_out import HeldOut, forecast
 from pbrl_ppl.criticism.refinement import checked_histories
 from pbrl_ppl.history import thinned
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import trajectory_mode
-from pbrl_ppl.physics import Physics
 from pbrl_ppl.posterior import draws
 from pbrl_ppl.reporting import plot_rollout, png
 from pbrl_ppl.reporting.words import verdict_in_words

@@ -17,7 +17,7 @@ import pbrl_ppl as pp
 from attribution.baselines import ask_baselines
 from attribution.cases import CATALOGUED, Case
 from attribution.oracle import Oracle, ask, declared_mode, sized, true_parameters
-from pbrl_ppl.criticism import close_loop
+from pbrl_ppl import close_loop
 from pbrl_ppl.threads import Work
 
 #: Parameters of which more than one value is the truth: any number between two trajectories.

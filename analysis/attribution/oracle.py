@@ -12,15 +12,14 @@ from attribution.bodies import mh
 from attribution.cases import OUTSIDE, Case
 from attribution.outside import OUTSIDE_EFFECTS, parameters_of
 from attribution.sizes import STRONGEST
+from pbrl_ppl import Attached, Physics
 from pbrl_ppl.criticism.criteria import DEFAULT
 from pbrl_ppl.criticism.held_out import HeldOut, forecast, longest_rollout, rollout_horizon
 from pbrl_ppl.criticism.refinement import with_enough_substeps
 from pbrl_ppl.criticism.table import share, weights
-from pbrl_ppl.effects import Attached
 from pbrl_ppl.likelihood import Problem, bodies_acceleration, in_pieces
 from pbrl_ppl.modes import Mode, find_mode, fit_pieces, piece_lengths, trajectory_mode
 from pbrl_ppl.parameters import inside
-from pbrl_ppl.physics import Physics
 from pbrl_ppl.state import STATE
 
 #: Chance alone gives what the oracle calls detected less often than this.

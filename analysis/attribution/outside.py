@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 import pbrl_ppl as pp
-from pbrl_ppl.effects.effect import Command
+from pbrl_ppl import Command
 
 _REFERENCE = "attribution benchmark"
 

@@ -24,8 +24,8 @@ import numpy as np
 import pandas as pd
 
 import pbrl_ppl as pp
+from pbrl_ppl import Transition
 from pbrl_ppl.history import from_segments
-from pbrl_ppl.physics import Transition
 from pbrl_ppl.state import STATE, WRENCH
 
 sys.path.insert(0, str(Path(__file__).parents[1]))

@@ -26,14 +26,13 @@ import pymunk
 import pytensor
 import pytensor.tensor as pt
 
-from pbrl_ppl import Body, Scene, Shape, SimulatorOp
+from pbrl_ppl import Body, History, Joint, Physics, Scene, Shape, SimulatorOp, Wall
 from pbrl_ppl.effects import attach
-from pbrl_ppl.history import History, fill_joints
+from pbrl_ppl.history import fill_joints
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.parameters import Layout, box, differentiate
-from pbrl_ppl.physics import PartedSimulator, Physics, Simulator, build_layout, calls, compiled
+from pbrl_ppl.physics import PartedSimulator, Simulator, build_layout, calls, compiled
 from pbrl_ppl.physics.world import World
-from pbrl_ppl.scene import Joint, Wall
 
 MODELS = Path(__file__).parents[2] / "models"
 APARTMENT = MODELS / "apartment" / "scene.toml"

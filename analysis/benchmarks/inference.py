@@ -29,13 +29,14 @@ from pytensor.graph.basic import Apply
 from pytensor.graph.op import Op
 
 import pbrl_ppl as pp
+from pbrl_ppl import Physics
 from pbrl_ppl.history import lever
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.model import LogLikelihoodOp, problem_in
 from pbrl_ppl.model.declaration import random_variable
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.parameters import WHEEL_PARAMETERS
-from pbrl_ppl.physics import PartedSimulator, Physics, build_layout
+from pbrl_ppl.physics import PartedSimulator, build_layout
 from pbrl_ppl.posterior.store import convergence, group
 from pbrl_ppl.sampling.fitting import METHODS
 

@@ -23,11 +23,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pbrl_ppl as pp
+from pbrl_ppl import Physics
 from pbrl_ppl.criticism import closing, score
 from pbrl_ppl.effects import candidates
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import find_mode, trajectory_mode
-from pbrl_ppl.physics import Physics
 from pbrl_ppl.reporting import render
 
 sys.path.insert(0, str(Path(__file__).parent))

@@ -19,9 +19,8 @@ import numpy as np
 from scipy.stats import binomtest
 
 import pbrl_ppl as pp
+from pbrl_ppl import Dynamics, Wall
 from pbrl_ppl.physics import build_layout
-from pbrl_ppl.planning import Dynamics
-from pbrl_ppl.scene import Wall
 
 sys.path.insert(0, str(Path(__file__).parent))
 from engine import MODELS

@@ -15,10 +15,8 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl import Body, Scene, Shape
+from pbrl_ppl import Body, Joint, Physics, Scene, Shape
 from pbrl_ppl.history import fill_joints
-from pbrl_ppl.physics import Physics
-from pbrl_ppl.scene import Joint
 
 KNOWN = {"mass": 0.3, "r": 0.2, "mu_c": 0.2}
 LAWS = ("quadratic_drag", "pivot_friction", "pivot_damping")

@@ -7,10 +7,19 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from pbrl_ppl.effects import Effect, Noise, Structure, catalogue
-from pbrl_ppl.history import History, with_units
-from pbrl_ppl.physics import Physics
-from pbrl_ppl.scene import Body, Joint, Scene, Shape
+from pbrl_ppl import (
+    Body,
+    Effect,
+    History,
+    Joint,
+    Noise,
+    Physics,
+    Scene,
+    Shape,
+    Structure,
+    catalogue,
+)
+from pbrl_ppl.history import with_units
 from pbrl_ppl.state import STATE, STATE_UNITS, Floats
 
 #: Share of the motion that a law changes in its picture.

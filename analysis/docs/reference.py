@@ -12,8 +12,8 @@ from typing import Any
 
 import typer
 
+from pbrl_ppl import Command, Effect, EffectParameter, catalogue
 from pbrl_ppl.cli.app import app
-from pbrl_ppl.effects import Command, Effect, EffectParameter, catalogue
 from pbrl_ppl.effects.effect import STAGES
 
 ROOT = Path(__file__).parents[2]

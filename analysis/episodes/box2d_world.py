@@ -11,7 +11,7 @@ from typing import Any, final
 import numpy as np
 
 from episodes.world import EpisodeError, World
-from pbrl_ppl.agents import Task
+from pbrl_ppl import Task
 from pbrl_ppl.physics import scenery
 from pbrl_ppl.scene import WORLD
 from pbrl_ppl.state import Floats

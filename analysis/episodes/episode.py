@@ -11,9 +11,9 @@ import numpy as np
 import xarray as xr
 
 from episodes.world import EpisodeError
+from pbrl_ppl import History, Scene
 from pbrl_ppl.files import write_atomically
-from pbrl_ppl.history import History, from_segments
-from pbrl_ppl.scene import Scene
+from pbrl_ppl.history import from_segments
 from pbrl_ppl.state import STATE, STATE_UNITS, WRENCH, WRENCH_UNITS, Floats
 
 _KIND = "episode"

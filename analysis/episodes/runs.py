@@ -17,8 +17,7 @@ import numpy as np
 from episodes.episode import VARIABLES, Episode
 from episodes.processes import as_ended, processes, processors
 from episodes.world import AnyWorld, EpisodeError, check_action, check_state
-from pbrl_ppl.agents import Agent
-from pbrl_ppl.posterior import save_posterior
+from pbrl_ppl import Agent, save_posterior
 
 #: Makes an agent from a seed.
 MakeAgent = Callable[[int], Agent]

@@ -10,11 +10,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pbrl_ppl.agents import Task
-from pbrl_ppl.effects import Attached, Effect
-from pbrl_ppl.errors import PbrlError
+from pbrl_ppl import Attached, Dynamics, Effect, PbrlError, Task
 from pbrl_ppl.physics import touching
-from pbrl_ppl.planning import Dynamics, start_state
+from pbrl_ppl.planning import start_state
 from pbrl_ppl.state import STATE, Floats
 
 

@@ -13,7 +13,8 @@ from typing import Any
 from running import cache_file, limited, sources
 
 import pbrl_ppl as pp
-from pbrl_ppl.criticism import ADEQUATE, close_loop
+from pbrl_ppl import close_loop
+from pbrl_ppl.criticism import ADEQUATE
 from recordings.cases import Case
 from recordings.oracle import Oracle, ask
 

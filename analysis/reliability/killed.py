@@ -132,7 +132,7 @@ def torn(path: Path) -> str:
                 return f"{path.name}: no end"
             pd.read_csv(path)
         elif path.suffix == ".toml":
-            from pbrl_ppl.scene import Scene
+            from pbrl_ppl import Scene
 
             Scene.load(path)
         elif path.suffix in (".png", ".gif"):

@@ -25,10 +25,8 @@ import numpy as np
 import pandas as pd
 from PIL import Image
 
-from pbrl_ppl import cli
-from pbrl_ppl.errors import PbrlError
+from pbrl_ppl import PbrlError, cli, load_posterior
 from pbrl_ppl.files import json_values
-from pbrl_ppl.posterior import load_posterior
 from pbrl_ppl.posterior.store import groups
 
 if str(Path(__file__).parents[2]) not in sys.path:  # helpers are shared with the tests
@@ -78,7 +76,7 @@ LAUGHS = '<!DOCTYPE m [<!ENTITY a0 "ha">' + "".join(
 
 def library(argv: list[str]) -> int:
     """Read a MuJoCo model in place of a command."""
-    from pbrl_ppl.mjcf import scene_from_mjcf
+    from pbrl_ppl import scene_from_mjcf
 
     try:
         scene_from_mjcf(argv[1])
@@ -92,8 +90,7 @@ def inputs(base: Path) -> None:
     """Write a valid file of each kind."""
     from scipy.io import savemat
 
-    from pbrl_ppl.history import History
-    from pbrl_ppl.scene import Scene
+    from pbrl_ppl import History, Scene
     from tests.helpers.bags import Bag
 
     prepare(base)

@@ -25,9 +25,8 @@ from pathlib import Path
 import numpy as np
 
 import pbrl_ppl as pp
+from pbrl_ppl import History, Scene
 from pbrl_ppl.errors import PbrlWarning
-from pbrl_ppl.history import History
-from pbrl_ppl.scene import Scene
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT))

@@ -14,7 +14,6 @@ from task import LIBRARY_FILE, SCENE, TRUTH
 
 import pbrl_ppl as pp
 from pbrl_ppl.history import from_segments
-from pbrl_ppl.physics import build_layout
 
 #: Transitions of each trial, and the noise of what is measured (m, rad, m/s, rad/s).
 COUNT, SIGMA = 60, 0.005
@@ -38,7 +37,7 @@ def trial(number: int, name: str, copy: int) -> tuple[pp.Scene, pp.History]:
     """Random pushes of one instance from random states, a wall beside it in a third of them."""
     rng = np.random.default_rng([7, number, copy])
     alone = SCENE.subset([name])
-    body, layout = alone.dynamic[0], build_layout(SCENE)
+    body, layout = alone.dynamic[0], pp.Physics(SCENE).layout
     truth = layout.to_dict(layout.to_vector(TRUTH))
     known = {
         block.name: truth[block.name][block.owners.index(name)]

@@ -7,7 +7,8 @@ inverse that is found step by step.
 import numpy as np
 
 import pbrl_ppl as pp
-from pbrl_ppl.effects import Sensor, is_pivoted
+from pbrl_ppl import Sensor
+from pbrl_ppl.effects import is_pivoted
 
 
 def harmonic(theta, parameters):

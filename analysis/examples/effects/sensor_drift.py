@@ -7,7 +7,7 @@ off by the rates. A law of the sensor that depends on the time.
 import numpy as np
 
 import pbrl_ppl as pp
-from pbrl_ppl.effects import Sensor
+from pbrl_ppl import Sensor
 
 
 def drift(parameters):
