@@ -407,26 +407,3 @@ torque_dead_zone, torque_saturation, torque_rate_limit, torque_backlash = (
     of_component(law, f"torque_{suffix}", sentence, "torque")
     for suffix, (law, sentence, _) in OF_COMPONENTS.items()
 )
-
-
-def _by_power(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
-    force, torque = math.hypot(wrench[0], wrench[1]) / parameters[1], abs(wrench[2]) / parameters[2]
-    if force > 0.0:
-        wrench[0] *= force ** (parameters[0] - 1.0)
-        wrench[1] *= force ** (parameters[0] - 1.0)
-    if torque > 0.0:
-        wrench[2] *= torque ** (parameters[0] - 1.0)
-
-
-command_power = Effect(
-    "command_power",
-    (EffectParameter("exponent", "1", Prior("log_normal", mu=0.0, sigma=0.5), null=1.0),),
-    "the push grows with a power of the command, not in proportion: the thrust of a propeller grows"
-    " with the square of its speed",
-    "f = f0 (u / f0)^p, with a typical force f0",
-    Command(_by_power),
-    constants=("force", "torque"),
-    log_odds=-1.0,
-    family="shape of the command",
-    unusual="a power of the command stands in for friction, which takes small commands",
-)

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pbrl_ppl.effects import actuators, drag, forces, friction, obstacles, sensors, springs
+from pbrl_ppl.effects import actuators, forces, friction, sensors, springs
 from pbrl_ppl.effects.actuation import actuation, laws_of_actuators
 from pbrl_ppl.effects.effect import Attached, Command, Effect, Noise, is_pivoted
 from pbrl_ppl.errors import EffectError
@@ -27,12 +27,12 @@ catalogue: tuple[Effect, ...] = (
     friction.slider_damping,
     friction.slider_friction,
     friction.slider_stribeck,
-    drag.linear_drag,
-    drag.quadratic_drag,
-    drag.angular_drag,
-    drag.quadratic_angular_drag,
-    drag.drag_by_axis,
-    drag.quadratic_drag_by_axis,
+    forces.linear_drag,
+    forces.quadratic_drag,
+    forces.angular_drag,
+    forces.quadratic_angular_drag,
+    forces.drag_by_axis,
+    forces.quadratic_drag_by_axis,
     forces.gravity_tilt,
     forces.constant_force,
     forces.body_force,
@@ -44,7 +44,6 @@ catalogue: tuple[Effect, ...] = (
     actuators.force_gain,
     actuators.torque_gain,
     actuators.anisotropic_gain,
-    actuators.command_power,
     friction.sliding_friction,
     friction.turning_friction,
     friction.sliding_stribeck,
@@ -61,17 +60,15 @@ catalogue: tuple[Effect, ...] = (
     actuators.torque_rate_limit,
     actuators.actuator_backlash,
     actuators.torque_backlash,
-    drag.magnus_force,
-    drag.wind,
+    forces.magnus_force,
+    forces.wind,
     springs.spring,
     springs.torsion_spring,
-    springs.cubic_spring,
-    springs.cubic_torsion_spring,
     springs.upper_stop,
     springs.lower_stop,
     forces.cogging,
     forces.mass_change,
-    obstacles.hidden_obstacle,
+    springs.hidden_obstacle,
     springs.distance_joint,
     sensors.sensor_bias,
     sensors.sensor_scale,

@@ -137,7 +137,7 @@ class Properties:
 
 
 @dataclass(frozen=True)
-class Added:
+class Addition:
     """Modification that adds parameters to properties; equal to its copies in other processes.
 
     Parameters
@@ -156,7 +156,7 @@ class Added:
 
 def adding(**parameters: str) -> Properties:
     """Return the stage that adds parameters to the properties of these names."""
-    return Properties(Added(tuple(parameters.items())))
+    return Properties(Addition(tuple(parameters.items())))
 
 
 @final

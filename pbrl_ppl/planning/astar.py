@@ -20,7 +20,7 @@ from pbrl_ppl.physics import depth_of, overlap
 from pbrl_ppl.planning.actions import ActionSet, play
 from pbrl_ppl.planning.dynamics import TransitionModel, remembered
 from pbrl_ppl.planning.goals import Goal, Target
-from pbrl_ppl.planning.search import SearchResult, Task, contact_cost, tail_mean
+from pbrl_ppl.planning.search import FoundPlan, SearchTask, contact_cost, tail_mean
 from pbrl_ppl.scene import Body, Scene, Shape
 from pbrl_ppl.state import Bools, Floats
 
@@ -33,13 +33,13 @@ _WIDEST, _WIDEST_ANGLE = 0.2, 0.1
 
 
 def astar(
-    task: Task,
+    task: SearchTask,
     *,
     weight: float = 3.0,
     improve: bool = False,
     share: float = 0.5,
     every: float = 0.5,
-) -> SearchResult:
+) -> FoundPlan:
     """Search for the quickest actions that bring bodies to the goal.
 
     The cost of a plan is its time and the penalties for contact. A node holds the states under all
@@ -51,7 +51,7 @@ def astar(
 
     Parameters
     ----------
-    task : Task
+    task : SearchTask
         Model, start, goal, actions and limits.
     weight : float
         Of the heuristic: 1 is A*, which goes on until no node of the queue can lead to a cheaper
@@ -67,7 +67,7 @@ def astar(
 
     Returns
     -------
-    SearchResult
+    FoundPlan
         If the goal is not reached, the plan that ends nearest to it in L2 distance. An empty plan
         counts only where bodies are at rest: others do not stay where they are.
 
@@ -112,7 +112,7 @@ def astar(
     path = search.path(search.best or search.nearest)
     which = np.array([[action for action, n in path for _ in range(n)]], dtype=np.intp)
     wrenches = play(task.dynamics, task.start, task.actions, which, mean_angle)[0]
-    return SearchResult(wrenches, reached, stopped, search.generated, time.monotonic() - begin)
+    return FoundPlan(wrenches, reached, stopped, search.generated, time.monotonic() - begin)
 
 
 class Edge(NamedTuple):
@@ -135,7 +135,9 @@ class Node(NamedTuple):
 class _Search:
     """State of the search: the tree, the open queue and the closed set."""
 
-    def __init__(self, task: Task, weight: float, rng: np.random.Generator | None = None) -> None:
+    def __init__(
+        self, task: SearchTask, weight: float, rng: np.random.Generator | None = None
+    ) -> None:
         self.dynamics, self.goal, self.actions = task.dynamics, task.goal, task.actions
         self.tail, self.weight, self.rng = task.tail, weight, rng
         self.scene = task.dynamics.scene

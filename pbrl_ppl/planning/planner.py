@@ -21,14 +21,14 @@ from pbrl_ppl.planning.actions import ActionSet
 from pbrl_ppl.planning.astar import astar
 from pbrl_ppl.planning.dynamics import Dynamics, TransitionModel, rollout
 from pbrl_ppl.planning.goals import Goal
-from pbrl_ppl.planning.search import NODES, SearchResult, Task, mppi, tail_mean
+from pbrl_ppl.planning.search import NODES, FoundPlan, SearchTask, mppi, tail_mean
 from pbrl_ppl.scene import Scene, nearest
 from pbrl_ppl.state import POSE, STATE, WRENCH, Floats
 
 if TYPE_CHECKING:
     from pbrl_ppl.posterior import Idata
 
-METHODS: dict[str, Callable[..., SearchResult]] = {"astar": astar, "mppi": mppi}
+METHODS: dict[str, Callable[..., FoundPlan]] = {"astar": astar, "mppi": mppi}
 
 
 class SearchOptions(TypedDict, total=False):
@@ -47,7 +47,7 @@ class SearchOptions(TypedDict, total=False):
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class Plan(SearchResult):
+class Plan(FoundPlan):
     """Wrenches that lead to a goal, and where the model says they lead.
 
     Attributes
@@ -262,7 +262,7 @@ def plan(
     rng = np.random.default_rng(seed)
     limit = np.inf if seconds is None else seconds
     say = progress or (lambda text: None)
-    task = Task(dynamics, first, goal, actions, tail, nodes, limit, noise, rng, say)
+    task = SearchTask(dynamics, first, goal, actions, tail, nodes, limit, noise, rng, say)
     result = METHODS[method](task, **options)
     states = rollout(dynamics, first, result.wrenches)
     distance = float(tail_mean(goal.distance(scene, states[:, -1]), tail))

@@ -25,8 +25,8 @@ NODES = 2_000_000
 
 
 @dataclass(frozen=True, eq=False)
-class Task:
-    """Task of a search.
+class SearchTask:
+    """SearchTask of a search.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ class Task:
 
 
 @dataclass(frozen=True, eq=False)
-class SearchResult:
+class FoundPlan:
     """Result of a search.
 
     Attributes
@@ -140,7 +140,7 @@ class Horizon:
 
     Parameters
     ----------
-    task : Task
+    task : SearchTask
         Model, goal, actions and risk.
     horizon : int
         Intervals looked ahead.
@@ -158,7 +158,12 @@ class Horizon:
     """
 
     def __init__(
-        self, task: Task, horizon: int, samples: int, iterations: int, rng: np.random.Generator
+        self,
+        task: SearchTask,
+        horizon: int,
+        samples: int,
+        iterations: int,
+        rng: np.random.Generator,
     ) -> None:
         self.task, self.rng = task, rng
         self.samples, self.iterations = samples, iterations
@@ -239,18 +244,18 @@ class Horizon:
 
 
 def mppi(
-    task: Task,
+    task: SearchTask,
     *,
     horizon: int = 15,
     samples: int = 256,
     iterations: int = 3,
     intervals: int = 200,
-) -> SearchResult:
+) -> FoundPlan:
     """Plan with MPPI until the model reaches the goal.
 
     Parameters
     ----------
-    task : Task
+    task : SearchTask
         Model, start, goal, actions and limits.
     horizon, samples, iterations : int
         As for :class:`Horizon`.
@@ -259,7 +264,7 @@ def mppi(
 
     Returns
     -------
-    SearchResult
+    FoundPlan
         If the goal is not reached, up to where it was nearest; a start in motion does not count.
 
     Raises
@@ -303,4 +308,4 @@ def mppi(
         stopped = "interrupted"
     chosen = np.array(wrenches[:best]).reshape(-1, len(start), 3)
     took = time.monotonic() - begin
-    return SearchResult(chosen, stopped == "goal", stopped, ahead.generated, took)
+    return FoundPlan(chosen, stopped == "goal", stopped, ahead.generated, took)

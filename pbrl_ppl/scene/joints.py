@@ -14,7 +14,7 @@ WORLD = "world"
 
 
 @dataclass(frozen=True)
-class JointKind:
+class JointTraits:
     """What the rest of the package needs to know of a kind of joint.
 
     Attributes
@@ -41,10 +41,10 @@ class JointKind:
 
 
 #: The kinds of joints by name. A new kind needs an entry here and one in `pbrl_ppl.physics`.
-JOINT_KINDS: Mapping[str, JointKind] = {
-    "hinge": JointKind(pins_anchors=True),
-    "slider": JointKind(slides=True),
-    "distance": JointKind(needs_reference_poses=True, stops_bodies=True),
+JOINT_KINDS: Mapping[str, JointTraits] = {
+    "hinge": JointTraits(pins_anchors=True),
+    "slider": JointTraits(slides=True),
+    "distance": JointTraits(needs_reference_poses=True, stops_bodies=True),
 }
 
 
@@ -143,7 +143,7 @@ class Joint:
             )
 
     @property
-    def traits(self) -> JointKind:
+    def traits(self) -> JointTraits:
         """What its kind implies."""
         return JOINT_KINDS[self.kind]
 

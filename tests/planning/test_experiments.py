@@ -13,8 +13,13 @@ from pbrl_ppl.criticism.closing import keep_groups
 from pbrl_ppl.criticism.results import Added, Law
 from pbrl_ppl.errors import EffectError, GoalError, PosteriorError
 from pbrl_ppl.planning import rollout
-from pbrl_ppl.planning.experiments import Separation
-from pbrl_ppl.planning.rivals import Rival, fit_rivals, kept_groups, named_effects
+from pbrl_ppl.planning.experiments import (
+    Rival,
+    Separation,
+    fit_rivals,
+    kept_groups,
+    named_effects,
+)
 from pbrl_ppl.posterior.record import scene_of
 from tests.helpers.free_puck import BOX, fitted, searched
 from tests.helpers.one_speed import SIZE, at_one_speed, record
@@ -210,7 +215,7 @@ def test_the_table_is_what_a_history_is_made_of(suggestion, tmp_path) -> None:
     ("names", "message"),
     [
         (("linear_drag",), "two or more"),
-        (("linear_drag", "quadratc_drag"), "did you mean 'quadratic_drag'"),
+        (("linear_drag", "quadratc_drag"), 'did you mean "quadratic_drag"'),
         (("linear_drag", "heavy_tails"), "of the noise"),
         (("linear_drag", "quadratic_drag on cart"), "does not apply to body 'cart'"),
     ],
