@@ -13,8 +13,6 @@ from pbrl_ppl.state import WRENCH, Floats
 
 _GAIN = Prior("log_normal", mu=0.0, sigma=0.5)
 _THRESHOLD = EffectParameter("threshold", "N", Prior("half_normal", sigma=0.5), scale="force")
-#: Force levels that a scan tries, and torques.
-_LEVELS, _FEW = 20, 8
 #: The components that are a force.
 _FORCE = (0, 1)
 #: No actuator reaches this force, in typical forces.
@@ -242,10 +240,16 @@ def _scan_levels(
     history: History,
     body: Body,
     components: tuple[int, ...] = _FORCE,
-    most: int | None = None,
+    most: int = 0,
+    *,
+    forces: int = 20,
+    few: int = 8,
 ) -> Floats:
-    """Return at most so many sizes between those commanded, shape (level, 1), N or N m."""
-    most = most or (_LEVELS if components == _FORCE else _FEW)
+    """Return at most so many sizes between those commanded, shape (level, 1), N or N m.
+
+    ``forces``, ``few``: levels that are tried of a force, and of a torque.
+    """
+    most = most or (forces if components == _FORCE else few)
     action = history.dataset["action"].sel(body=body.name).to_numpy()[..., components]
     size = np.linalg.norm(action, axis=-1)
     size = size[size > 0]  # not NaN either

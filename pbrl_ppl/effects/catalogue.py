@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
@@ -14,7 +13,7 @@ from pbrl_ppl.effects.actuation import actuation, laws_of_actuators
 from pbrl_ppl.effects.effect import Attached, Command, Effect, Noise, is_pivoted
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.history import History
-from pbrl_ppl.scene import Scene
+from pbrl_ppl.scene import Scene, nearest
 from pbrl_ppl.state import STATE, THETA, Floats
 
 #: Of effects that the data cannot separate, the earlier one is named: friction of a joint before
@@ -80,9 +79,7 @@ catalogue: tuple[Effect, ...] = (
 
 
 def attach(
-    scene: Scene,
-    extra: Iterable[Effect | Attached] = (),
-    effects: Iterable[Effect] = catalogue,
+    scene: Scene, extra: Iterable[Effect | Attached] = (), effects: Iterable[Effect] = catalogue
 ) -> tuple[Attached, ...]:
     """Return all effects of a model: those that the scene declares, then the extra ones.
 
@@ -116,9 +113,9 @@ def attach(
     extra, effects = tuple(extra), tuple(effects)
     bodies = {body.name: body for body in scene.dynamic}
     # a user's effect that is given may also be declared by name, as in a saved scene
-    listed = [item.effect if isinstance(item, Attached) else item for item in extra]
-    check_names((*effects, *listed))
-    by_name = {effect.name: effect for effect in (*effects, *listed)}
+    every = (*effects, *(getattr(item, "effect", item) for item in extra))
+    check_names(every)
+    by_name = {effect.name: effect for effect in every}
     result: list[Attached] = []
     given = {(item.effect.name, item.body) for item in extra if isinstance(item, Attached)}
     for body in scene.dynamic:
@@ -130,8 +127,7 @@ def attach(
                 result.append(acting.on(body.name))
         for name in body.effects:
             if name not in by_name:
-                near = difflib.get_close_matches(name, by_name, n=1)
-                hint = f"; did you mean {near[0]!r}?" if near else ""
+                hint = nearest(name, by_name)
                 raise EffectError(
                     f"body {body.name!r} declares the effect {name!r}, which is not in the"
                     f" catalogue{hint}; give an effect of your own as an argument, or with"

@@ -673,6 +673,13 @@ def holder(scene: Scene, attached: Attached) -> int:
     return -1
 
 
+def measured(history: History, body: Body, *names: str) -> Floats:
+    """Return a body's states where these coordinates are all known, shape (n, name)."""
+    rows = history.dataset["start"].sel(body=body.name, state=list(names)).to_numpy()
+    rows = rows.reshape(-1, len(names))
+    return np.asarray(rows[np.isfinite(rows).all(axis=1)])
+
+
 def body_points(body: Body) -> Floats:
     """Return the middle of a body and a point towards each side, in its frame, shape (5, 2), m."""
     x_min, x_max, y_min, y_max = body.shape.bounds

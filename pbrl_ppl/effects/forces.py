@@ -15,6 +15,7 @@ from pbrl_ppl.effects.effect import (
     Values,
     adding,
     is_unpivoted,
+    measured,
 )
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
@@ -140,8 +141,8 @@ def _wind(state: Floats, command: Floats, parameters: Floats, wrench: Floats) ->
 
 def _scan_winds(scene: Scene, history: History, body: Body) -> Floats:
     """Return winds in eight directions about the body's usual speed; the derivative is by drag."""
-    velocity = history.dataset["start"].sel(body=body.name, state=["vx", "vy"]).to_numpy()
-    speed = np.sqrt(np.nanmean((velocity**2).sum(axis=-1))) if np.isfinite(velocity).any() else 0.0
+    velocity = measured(history, body, "vx", "vy")
+    speed = np.sqrt((velocity**2).sum(axis=-1).mean()) if len(velocity) else 0.0
     turns = np.arange(8) * (np.pi / 4.0)
     winds = speed * np.outer((0.5, 1.5), np.exp(1j * turns)).ravel()
     return np.array([(np.nan, w.real, w.imag) for w in winds if speed > 0.0]).reshape(-1, 3)
@@ -284,9 +285,8 @@ def _cogging(state: Floats, command: Floats, parameters: Floats, wrench: Floats)
 
 def _scan_counts(scene: Scene, history: History, body: Body) -> Floats:
     """Return numbers of teeth of which the body passes some; the derivative is by the torques."""
-    theta = history.dataset["start"].sel(body=body.name, state="theta").to_numpy()
-    reach = float(np.nanmax(theta, initial=-np.inf) - np.nanmin(theta, initial=np.inf))
-    reach = min(reach, 2.0 * np.pi)
+    theta = measured(history, body, "theta")
+    reach = min(np.ptp(theta), 2.0 * np.pi) if len(theta) else 0.0
     counts = [n for n in (2, 3, 4, 6, 8, 12) if 2.0 * np.pi < n * reach < 2.0 * np.pi * 12.0]
     return np.array([(np.nan, np.nan, n) for n in counts]).reshape(-1, 3)
 

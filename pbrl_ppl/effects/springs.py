@@ -22,11 +22,12 @@ from pbrl_ppl.effects.effect import (
     is_pivoted,
     is_unjoined,
     is_unpivoted,
+    measured,
 )
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene, Shape
-from pbrl_ppl.state import Floats, turned, wrapped
+from pbrl_ppl.state import POSE, Floats, turned, wrapped
 
 
 def _poses(history: History, body: Body, width: int) -> Floats:
@@ -37,8 +38,7 @@ def _poses(history: History, body: Body, width: int) -> Floats:
     seen = history.dataset["observed"].sel(body=body.name, state=["x", "y"]).to_numpy()
     if not np.isfinite(seen).any():
         return np.empty((0, width))
-    poses = history.dataset["start"].sel(body=body.name).to_numpy()[..., :width].reshape(-1, width)
-    return np.asarray(poses[np.isfinite(poses).all(axis=1)])
+    return measured(history, body, *POSE[:width])
 
 
 def _spring(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
@@ -95,8 +95,7 @@ def _scan_angles(scene: Scene, history: History, body: Body, *, n_angles: int = 
     ``n_angles``: angles of rest.
     """
     angles = np.linspace(-np.pi, np.pi, n_angles, endpoint=False)
-    theta = history.dataset["start"].sel(body=body.name, state="theta").to_numpy().ravel()
-    off = np.abs(wrapped(theta[np.isfinite(theta), None] - angles))
+    off = np.abs(wrapped(measured(history, body, "theta") - angles))
     smooth = off.max(axis=0, initial=0.0) < np.pi - np.pi / n_angles
     return np.array([(np.nan, angle) for angle in (angles[smooth] if smooth.any() else angles)])
 
@@ -123,8 +122,7 @@ def _scan_range(scene: Scene, history: History, body: Body, shares: tuple[float,
 
     The derivative is taken by the stiffness.
     """
-    theta = history.dataset["start"].sel(body=body.name, state="theta").to_numpy().ravel()
-    theta = theta[np.isfinite(theta)]
+    theta = measured(history, body, "theta")
     if not len(theta) or not 0.0 < np.ptp(theta) < 2.0 * np.pi:
         return np.empty((0, 2))
     return np.array([(np.nan, theta.min() + share * np.ptp(theta)) for share in shares])

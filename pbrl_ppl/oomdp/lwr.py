@@ -16,7 +16,7 @@ from scipy.spatial.distance import cdist
 from pbrl_ppl.errors import FitError, HistoryError, SimulationError
 from pbrl_ppl.history import History, check_start
 from pbrl_ppl.oomdp.relations import Attributes, Condition, Relation, SectorContacts, condition
-from pbrl_ppl.scene import Scene, body_sizes, nearest
+from pbrl_ppl.scene import Scene, body_sizes, is_whole, nearest
 from pbrl_ppl.state import STATE, THETA, WRENCH, Bools, Floats, Ints, turned, wrapped
 
 #: Predicates of a condition, one flag each.
@@ -260,7 +260,7 @@ class Learner:
         share_classes: bool = False,
         relations: Sequence[Relation] = (),
     ) -> None:
-        if isinstance(neighbours, bool) or not isinstance(neighbours, int) or neighbours < 1:
+        if not is_whole(neighbours):
             raise FitError(f"LWR: neighbours is {neighbours!r}, expected a whole number from 1 up")
         if not 0 < bandwidth < np.inf:
             raise FitError(f"LWR: bandwidth is {bandwidth!r}, expected a number above 0")

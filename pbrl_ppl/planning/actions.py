@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.errors import GoalError
 from pbrl_ppl.planning.dynamics import TransitionModel, remembered
-from pbrl_ppl.planning.goals import check_pushed, is_finite, read_tables
-from pbrl_ppl.scene import Scene, nearest
+from pbrl_ppl.planning.goals import check_pushed, read_tables
+from pbrl_ppl.scene import Scene, checks
 from pbrl_ppl.state import THETA, WRENCH, Floats, turned
 
 if TYPE_CHECKING:
@@ -49,21 +49,11 @@ class Action:
     frame: str = "body"
 
     def __post_init__(self) -> None:
-        try:
-            numbers = np.array([*np.ravel(self.force), self.torque], dtype=float)
-        except (TypeError, ValueError, OverflowError):
-            numbers = np.full(3, np.nan)
-        if numbers.shape != (3,) or not np.isfinite(numbers).all():
-            raise GoalError(
-                f"action on {self.body}: force is {self.force!r} and torque {self.torque!r},"
-                " expected two finite numbers (N) and one (N m)"
-            )
-        object.__setattr__(self, "force", (float(numbers[0]), float(numbers[1])))
-        object.__setattr__(self, "torque", float(numbers[2]))
-        if self.frame not in ("body", "world"):
-            raise GoalError(
-                f"action on {self.body}: frame is {self.frame!r}, expected body or world"
-            )
+        where = f"action on {self.body}"
+        with checks.located(kind=GoalError):
+            checks.label(self.body, "action: body")
+            checks.settle(self, where, force=checks.vector, torque=checks.finite)
+            checks.settle(self, where, frame=checks.choice(("body", "world")))
 
 
 @dataclass(frozen=True)
@@ -98,16 +88,12 @@ class ActionSet:
             raise GoalError("actions: the set is empty; give at least one wrench on a body")
         if self.durations is None:
             return
-        if not isinstance(self.durations, Iterable):
-            raise GoalError(
-                f"actions: durations is {self.durations!r}, expected a list of them (s)"
-            )
-        object.__setattr__(self, "durations", tuple(self.durations))
-        if not self.durations:
+        with checks.located(kind=GoalError):
+            given = checks.listed(self.durations, "actions: durations", "a list of them (s)")
+            durations = tuple(checks.positive(one, "actions: a duration (s)") for one in given)
+        object.__setattr__(self, "durations", durations)
+        if not durations:
             raise GoalError("actions: there is no duration; give one (s)")
-        for value in self.durations:
-            if not is_finite(value) or not value > 0:
-                raise GoalError(f"actions: a duration is {value!r}, expected a positive number (s)")
 
     @classmethod
     def box(
@@ -296,24 +282,19 @@ def allowed_wrenches(
         actions.check(scene)
         return _OfActions(scene, actions, steps)
     names = [body.name for body in scene.moving]
-    low = np.zeros((len(names), len(WRENCH)))
-    high = low.copy()
+    low, high = np.zeros((2, len(names), len(WRENCH)))
+    check_pushed(scene, actions, "bounds")
     for body, bounds in actions.items():
-        check_pushed(scene, [body], "bounds")
-        for component, ends in bounds.items():
-            if component not in WRENCH:
-                raise GoalError(
-                    f'bounds of {body}: "{component}" is no component of a wrench'
-                    f"{nearest(component, WRENCH)}"
-                )
-            pair = np.asarray(ends, dtype=float).ravel()
-            if pair.shape != (2,) or not np.isfinite(pair).all() or pair[0] > pair[1]:
-                raise GoalError(
-                    f"bounds of {component} on {body}: got {ends!r}, expected the lowest and the"
-                    " highest value, two finite numbers"
-                )
+        with checks.located(kind=GoalError):
+            pairs = checks.table(bounds, f"bounds of {body}", dict.fromkeys(WRENCH, checks.vector))
+        for component, ends in pairs:
             at = names.index(body), WRENCH.index(component)
-            low[at], high[at] = pair
+            low[at], high[at] = ends
+            if ends[0] > ends[1]:
+                raise GoalError(
+                    f"bounds of {component} on {body} are {ends}, expected the lowest value and"
+                    " then the highest"
+                )
     if not (high > low).any():
         raise GoalError("bounds: nothing may vary; give a lowest and a higher highest value")
     return _Within(low, high, steps, hold or max(1, round(steps / pieces)))

@@ -24,13 +24,6 @@ from pbrl_ppl.planning.search import FoundPlan, SearchTask, contact_cost, tail_m
 from pbrl_ppl.scene import Body, Scene, Shape
 from pbrl_ppl.state import Bools, Floats
 
-#: Cells of the closed set ten tolerances from the goal, in tolerances and, for speeds, tolerances a
-#: sampling interval; further away and nearer they grow and shrink in proportion, between limits.
-_CELLS = np.array([4.0, 4.0, 5.0, 2.0, 2.0, 2.5])
-#: The largest tolerances that cells are in proportion to: of the position, as a share of the body's
-#: bounding radius, and of the angle (rad).
-_WIDEST, _WIDEST_ANGLE = 0.2, 0.1
-
 
 def astar(
     task: SearchTask,
@@ -147,9 +140,12 @@ class _Search:
         self.root = Node(root, task.dynamics.before, 0.0, Edge(0, -1, 0))
         self.generated = 1
         reach = [self.scene.body(target.body).shape.bounding_radius for target in self.goal.targets]
-        self.near = min(_WIDEST * min(reach), *self.goal.tolerances(self.scene))
-        turn = min(_WIDEST_ANGLE, *(target.angle_tolerance for target in self.goal.targets))
-        self.cells = _CELLS * np.array([self.near, self.near, turn] * 2)
+        # cells of the closed set ten tolerances from the goal, in tolerances and, for speeds,
+        # tolerances a sampling interval; of wide tolerances a part of the radius, or 0.1 rad
+        self.near = min(0.2 * min(reach), *self.goal.tolerances(self.scene))
+        turn = min(0.1, *(target.angle_tolerance for target in self.goal.targets))
+        sizes = np.array([self.near, self.near, turn] * 2)
+        self.cells = sizes * (4.0, 4.0, 5.0, 2.0, 2.0, 2.5)
         self.cells[3:] /= self.scene.time_step
         self.refined = 0
         self.begin()
@@ -285,13 +281,6 @@ def mean_angle(angle: Floats) -> Floats:
     return np.asarray(np.arctan2(np.sin(angle).mean(axis=0), np.cos(angle).mean(axis=0)))
 
 
-#: Least acceleration, in bounding radii (or rad) an interval squared: without a push, the time to
-#: the goal is long but finite, because others may hit the body.
-_LEAST = 1e-6
-#: Moves on the grid: to neighbours, and as a knight does, which cuts the error of eight directions.
-_MOVES = [(1, 0), (0, 1), (1, 1), (1, -1), (2, 1), (1, 2), (2, -1), (1, -2)]
-
-
 class TimeToGo:
     """Lower bound on the time to the goal, for pushes up to the strongest of the action set.
 
@@ -311,10 +300,18 @@ class TimeToGo:
         Says the strongest pushes.
     start : ndarray
         Shape (body, 6); the grid covers it.
+    least : float
+        Acceleration in bounding radii (or rad) an interval squared, at least: without a push, the
+        time to the goal is long but finite, because others may hit the body.
     """
 
     def __init__(
-        self, dynamics: TransitionModel, goal: Goal, actions: ActionSet, start: Floats
+        self,
+        dynamics: TransitionModel,
+        goal: Goal,
+        actions: ActionSet,
+        start: Floats,
+        least: float = 1e-6,
     ) -> None:
         scene = dynamics.scene
         self.goal, self.scene = goal, scene
@@ -324,9 +321,9 @@ class TimeToGo:
         for target, i, tolerance in zip(goal.targets, places, tolerances, strict=True):
             force, torque = actions.strongest(target.body)
             push, turn = dynamics.acceleration(target.body, force or anyone, torque)
-            body, least = scene.body(target.body), _LEAST / scene.time_step**2
-            push = np.maximum(push, least * body.shape.bounding_radius)[:, None]
-            turn = np.maximum(turn, least)[:, None]
+            body, slow = scene.body(target.body), least / scene.time_step**2
+            push = np.maximum(push, slow * body.shape.bounding_radius)[:, None]
+            turn = np.maximum(turn, slow)[:, None]
             around = _distances(scene, body, target, start[i])
             self._bounds.append((target, i, tolerance, push, turn, around))
 
@@ -416,8 +413,10 @@ def _graph(free: Bools) -> coo_array:
     # in a margin of two cells, which are not free, every move stays on the grid
     open_, number = (np.pad(a, 2) for a in (free, np.arange(free.size).reshape(free.shape)))
     cells, width = np.flatnonzero(open_), open_.shape[1]
+    # to neighbours, and as a knight does, which cuts the error of eight directions
+    moves = [(1, 0), (0, 1), (1, 1), (1, -1), (2, 1), (1, 2), (2, -1), (1, -2)]
     rows, columns, lengths = [], [], []
-    for dx, dy in _MOVES:
+    for dx, dy in moves:
         passed = np.ones(len(cells), dtype=bool)
         for t in np.linspace(0, 1, 2 * max(dx, abs(dy)) + 1):
             passed &= open_.flat[cells + round(dx * t) * width + round(dy * t)]

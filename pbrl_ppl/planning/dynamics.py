@@ -80,7 +80,7 @@ def remembered(wrenches: Floats, before: Floats) -> Floats:
     return np.concatenate([wrenches, before[..., : -len(WRENCH)]], axis=-1)
 
 
-def rollout(
+def predicted_path(
     model: TransitionModel,
     start: Floats,
     wrenches: Floats,
@@ -374,4 +374,4 @@ class Dynamics:
 
         With a generator, Eq. 13's noise is added after each interval.
         """
-        return rollout(self, start, wrenches, rng)
+        return predicted_path(self, start, wrenches, rng)

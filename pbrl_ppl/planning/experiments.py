@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
 from pathlib import Path
@@ -11,7 +11,6 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 from numpy.typing import ArrayLike
-from threadpoolctl import threadpool_limits
 
 from pbrl_ppl.criticism import Loop, rank_candidates, with_effects
 from pbrl_ppl.effects import Attached, Effect, Noise, catalogue
@@ -22,11 +21,12 @@ from pbrl_ppl.modes import FilteredMode, trajectory_mode
 from pbrl_ppl.parameters import differentiate
 from pbrl_ppl.physics import touching
 from pbrl_ppl.planning.actions import ActionSet, Allowed, Bounds, allowed_wrenches
-from pbrl_ppl.planning.dynamics import Dynamics, remembered, rollout
-from pbrl_ppl.planning.planner import start_state, table_of_plan
+from pbrl_ppl.planning.dynamics import Dynamics, predicted_path, remembered
+from pbrl_ppl.planning.planner import labelled, start_state, table_of_plan
 from pbrl_ppl.posterior import Fit, Idata, scene_of, stored_fields
 from pbrl_ppl.scene import Scene, body_sizes, nearest
 from pbrl_ppl.state import WRENCH, WRENCH_UNITS, Bools, Floats
+from pbrl_ppl.threads import Say, one_blas_thread, silent
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +185,7 @@ class _Paths:
     @classmethod
     def of(cls, dynamics: Dynamics, start: Floats, wrenches: Floats) -> _Paths:
         """Return the paths of each draw from a state under wrenches (n, time, body, 3)."""
-        states = rollout(dynamics, start, wrenches)
+        states = predicted_path(dynamics, start, wrenches)
         lost = np.asarray(~np.isfinite(states).all(axis=(2, 3, 4)))
         states[lost] = start
         last = np.broadcast_to(dynamics.before, (len(wrenches), *dynamics.before.shape))
@@ -421,6 +421,7 @@ class Suggestion:
         write_atomically(Path(path), lambda to: table.to_csv(to, index=False))
 
 
+@one_blas_thread
 def suggest_actions(
     known: Loop | Idata,
     start: Mapping[str, Sequence[float]] | ArrayLike,
@@ -433,7 +434,7 @@ def suggest_actions(
     seed: int = 0,
     before: ArrayLike | None = None,
     catalogue: Iterable[Effect] = catalogue,
-    progress: Callable[[str], None] | None = None,
+    progress: Say | None = None,
 ) -> Suggestion:
     """Find the actions that best separate effects that are confounded in the data so far.
 
@@ -498,9 +499,9 @@ def suggest_actions(
         said.sentences  # what is to be expected
         said.to_csv("next.csv")  # play it, record, and close the loop on both recordings
     """
-    progress = progress or (lambda stage: None)
-    posterior = known.posterior_after if isinstance(known, Loop) else known
-    catalogue = known.catalogue if isinstance(known, Loop) else tuple(catalogue)
+    posterior, catalogue, progress = known, tuple(catalogue), progress or silent
+    if isinstance(known, Loop):
+        posterior, catalogue = known.posterior_after, known.catalogue
     scene = scene_of(posterior)
     if effects is None and not (groups := kept_groups(posterior)):
         raise EffectError(
@@ -518,53 +519,31 @@ def suggest_actions(
     allowed = allowed_wrenches(
         scene, ActionSet.recorded(posterior) if actions is None else actions, steps, hold
     )
-    # matrices are small: threads of linear algebra only get in each other's way
-    with threadpool_limits(1, "blas"):
-        progress("fitting each effect to the recording")
-        rivals = fit_rivals(posterior, chosen, catalogue, draws, seed)
-        judge = Separation(rivals, first, last)
-        genes, at_random = _evolved(judge, allowed, np.random.default_rng(seed), progress)
-        progress("judging the best sequences")
-        wrenches = allowed.wrenches(genes, judge.dynamics[0], judge.start)
-        separation, meeting = judge(wrenches, draws)
+    progress("fitting each effect to the recording")
+    rivals = fit_rivals(posterior, chosen, catalogue, draws, seed)
+    judge = Separation(rivals, first, last)
+    genes, at_random = _evolved(judge, allowed, np.random.default_rng(seed), progress)
+    progress("judging the best sequences")
+    wrenches = allowed.wrenches(genes, judge.dynamics[0], judge.start)
+    separation, meeting = judge(wrenches, draws)
     best = int(np.argmax(_value(separation, meeting)))
     if not np.isfinite(separation[..., best]).all():
         raise GoalError(
             "actions: the engine diverges in all sequences; allow weaker actions or fewer steps"
         )
     names = [rival.name for rival in rivals]
-    return Suggestion(
-        scene,
-        first,
-        _labelled(scene, wrenches[best]),
-        xr.DataArray(
-            separation[..., best], {"true": names, "rival": names}, ("true", "rival"),
-            attrs={"units": "nats"},
-        ),
-        at_random,
-        bool(meeting[best]),
-    )  # fmt: skip
-
-
-def _labelled(scene: Scene, wrenches: Floats) -> xr.DataArray:
-    """Return wrenches (time, body, wrench) with their coordinates."""
-    return xr.DataArray(
-        wrenches,
-        {
-            "time": ("time", scene.time_step * np.arange(len(wrenches)), {"units": "s"}),
-            "body": [body.name for body in scene.moving],
-            "wrench": list(WRENCH),
-        },
-        ("time", "body", "wrench"),
-        attrs={"units": ", ".join(WRENCH_UNITS)},
-    )
+    pairs = {"true": names, "rival": names}
+    nats = xr.DataArray(separation[..., best], pairs, (*pairs,), attrs={"units": "nats"})
+    played = labelled(scene, wrenches[best], ("time", "body", "wrench"))
+    played.attrs["units"] = ", ".join(WRENCH_UNITS)
+    return Suggestion(scene, first, played, nats, at_random, bool(meeting[best]))
 
 
 def _evolved(
     judge: Separation,
     allowed: Allowed,
     rng: np.random.Generator,
-    progress: Callable[[str], None],
+    progress: Say,
     *,
     population: int = 40,
     n_parents: int = 10,

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from pbrl_ppl.errors import GoalError
-from pbrl_ppl.files import parse_toml, read_text, reason
-from pbrl_ppl.scene import Scene, nearest
+from pbrl_ppl.scene import Scene, checks, nearest
 from pbrl_ppl.state import POSE, Floats
 
 if TYPE_CHECKING:
@@ -58,18 +57,11 @@ class Target:
     speed: float | None = None
 
     def __post_init__(self) -> None:
-        for field in fields(self)[1:]:
-            value = getattr(self, field.name)
-            if value is None and field.default is None:
-                continue
-            if not is_number(value):
-                raise GoalError(
-                    f"goal of {self.body}: {field.name} is {value!r}, expected a number"
-                )
-            positive = field.name not in POSE
-            if not is_finite(value) or (positive and value <= 0):
-                what = "a positive number" if positive else "a finite number"
-                raise GoalError(f"goal of {self.body}: {field.name} is {value}, expected {what}")
+        with checks.located(kind=GoalError):
+            checks.label(self.body, "goal: body")
+            for field in fields(self)[1:]:
+                check = checks.finite if field.name in POSE else checks.positive
+                checks.settle(self, f"goal of {self.body}", **{field.name: check})
         if self.x is None and self.y is None and self.theta is None:
             raise GoalError(f"goal of {self.body}: x, y and theta are all free; give one")
 
@@ -109,20 +101,18 @@ class Goal:
         for name in names:
             if names.count(name) > 1:
                 raise GoalError(f"goal: {name} has {names.count(name)} targets; keep one")
-        penalty = self.contact_penalty
-        if not (
-            is_number(penalty) and (is_finite(penalty) or penalty == math.inf) and penalty >= 0
-        ):
-            raise GoalError(f"goal: contact_penalty is {self.contact_penalty}, expected 0 or more")
+        if self.contact_penalty != math.inf:
+            with checks.located(kind=GoalError):
+                checks.settle(self, "goal", contact_penalty=checks.not_negative)
 
     @classmethod
-    def of(cls, targets: Mapping[str, Sequence[float | None]], **options: float) -> Goal:
+    def of(cls, targets: Goal | Mapping[str, Sequence[float | None]], **options: float) -> Goal:
         """Return a goal from poses by body name: ``{"cart": (x, y, theta)}``, None where free.
 
         Parameters
         ----------
-        targets : mapping
-            Pose of each body, m and rad.
+        targets : mapping or Goal
+            Pose of each body, m and rad; a goal as it is.
         **options
             ``contact_penalty`` of the goal, and options of every target.
 
@@ -131,11 +121,12 @@ class Goal:
         GoalError
             If a pose has not three values, or an option is unknown.
         """
+        if isinstance(targets, Goal):
+            return targets
         penalty = {k: options.pop(k) for k in ("contact_penalty",) if k in options}
         known = [field.name for field in fields(Target)][4:]
-        for name in options:
-            if name not in known:
-                raise GoalError(f'goal: unknown option "{name}"{nearest(name, known)}')
+        with checks.located(kind=GoalError):
+            checks.keyed(options, "goal", (), known)
         for name, pose in targets.items():
             if len(pose) != 3:
                 raise GoalError(f"goal of {name}: got {len(pose)} values, expected x, y, theta")
@@ -248,43 +239,12 @@ def read_tables(
     GoalError
         If it is missing, is not TOML, has another key, or a table names no body.
     """
-    try:
-        document = parse_toml(read_text(Path(path)))
-    except FileNotFoundError:
-        raise GoalError(f"{what} {path}: there is no such file; check the path") from None
-    except (OSError, ValueError) as error:
-        raise GoalError(f"{what} {path}: cannot be read as TOML: {reason(error)}") from None
     key = kind.__name__.lower()
-    _check_keys(document, [*options, key], f"{what} {path}")
-    tables = document.pop(key, [])
-    if not (isinstance(tables, list) and all(isinstance(table, dict) for table in tables)):
-        raise GoalError(
-            f"{path}: {key} is {tables!r}, expected tables: [[{key}]], with two brackets"
-        )
-    for table in tables:
-        _check_keys(table, [field.name for field in fields(kind)], f"{path}: [[{key}]]")
-        if "body" not in table:
-            raise GoalError(f"{path}: one [[{key}]] has no body; name it")
-        if not isinstance(table["body"], str):
-            raise GoalError(f"{path}: [[{key}]]: body is {table['body']!r}, expected a name")
+    with checks.located(kind=GoalError):
+        text = checks.read_file(path, what)
+    with checks.located(f"{what} {path}", GoalError):
+        document = checks.document(text)
+        checks.keyed(document, "the file", (), (*options, key))
+        tables = [checks.fields_of(kind, table, at) for at, table in checks.tables(document, key)]
+    document.pop(key, None)
     return [kind(**table) for table in tables], document
-
-
-def is_number(value: object) -> bool:
-    """Return whether a value is a number."""
-    return isinstance(value, int | float | np.number) and not isinstance(value, bool)
-
-
-def is_finite(value: Any) -> bool:
-    """Return whether a value is a finite number, which integers of hundreds of digits are not."""
-    try:
-        return is_number(value) and math.isfinite(value)
-    except OverflowError:
-        return False
-
-
-def _check_keys(table: Mapping[str, object], known: list[str], where: str) -> None:
-    """Check the keys of a table; the error for an unknown one names the nearest known one."""
-    for key in table:
-        if key not in known:
-            raise GoalError(f'{where}: unknown key "{key}"{nearest(key, known)}')

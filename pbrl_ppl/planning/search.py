@@ -7,7 +7,6 @@ the other.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,9 +18,7 @@ from pbrl_ppl.planning.dynamics import TransitionModel, remembered
 from pbrl_ppl.planning.goals import Goal
 from pbrl_ppl.scene import Scene, smallest_radius
 from pbrl_ppl.state import Floats
-
-#: States that a search generates at most by default: 15 s or so for one body.
-NODES = 2_000_000
+from pbrl_ppl.threads import Say, silent
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +37,7 @@ class SearchTask:
         The goal is reached where the mean shortfall of the worst share of draws is within the
         tolerances: 1 for the expectation, less for conditional value at risk.
     nodes : int
-        States to generate at most, counting each draw's.
+        States to generate at most, counting each draw's; by default 15 s or so for one body.
     seconds : float
         Limit of time; with it, the plan depends on how busy the machine is.
     noise : bool
@@ -56,11 +53,11 @@ class SearchTask:
     goal: Goal
     actions: ActionSet
     tail: float = 1.0
-    nodes: int = NODES
+    nodes: int = 2_000_000
     seconds: float = np.inf
     noise: bool = False
     rng: np.random.Generator | None = None
-    progress: Callable[[str], None] = lambda text: None
+    progress: Say = silent
 
 
 @dataclass(frozen=True, eq=False)

@@ -50,7 +50,7 @@ class Shape:
 
     def __post_init__(self) -> None:
         needs = {"box": "size", "circle": "radius", "polygon": "vertices"}
-        checks.choice(self.kind, "shape: kind", needs, '"box", "circle" or "polygon"')
+        checks.settle(self, "shape", kind=checks.choice(needs))
         for kind, key in needs.items():
             present = getattr(self, key) is not None
             if present and kind != self.kind:
@@ -141,9 +141,8 @@ def _size(value: object, where: str) -> tuple[float, ...]:
 
 def _polygon(value: object, where: str) -> tuple[Point, ...]:
     """Return a polygon's corners as given, or raise."""
-    if isinstance(value, str) or not isinstance(value, Iterable):
-        raise SceneError(f"{where} is {value!r}, expected a list of points")
-    vertices: tuple[Point, ...] = tuple(checks.vector(point, where) for point in value)
+    points = checks.listed(value, where, "a list of points")
+    vertices: tuple[Point, ...] = tuple(checks.vector(point, where) for point in points)
     if len(vertices) < 3:
         raise SceneError(f"{where} has {len(vertices)} points, expected at least 3")
     for number, point in enumerate(vertices, start=1):
@@ -265,14 +264,11 @@ class Body:
         where = f'body "{self.name}"'
         if self.name == WORLD:
             raise SceneError(f'{where}: "world" is the name of the ground; choose another name')
-        if not isinstance(self.shape, Shape):
-            raise SceneError(f"{where}: shape is {self.shape!r}, expected a Shape")
-        checks.settle(self, where, wheel=checks.flag, static=checks.flag, kinematic=checks.flag)
-        pose = partial(checks.vector, length=3)
-        checks.settle(self, where, effects=checks.names, attributes=checks.names, pose=pose)
+        checks.settle(self, where, shape=checks.instance(Shape, "a Shape"))
+        checks.settle(self, where, **dict.fromkeys(("wheel", "static", "kinematic"), checks.flag))
+        checks.settle(self, where, **dict.fromkeys(("effects", "attributes"), checks.names))
+        checks.settle(self, where, pose=partial(checks.vector, length=3), object_class=checks.label)
         self._settle_tables(where)
-        if self.object_class is not None:
-            checks.label(self.object_class, f"{where}: class")
         if self.static and self.pose is None:
             raise SceneError(f"{where}: it is static and has no pose; add pose = [x, y, theta]")
         if self.static and self.wheel:

@@ -54,7 +54,7 @@ def test_attach_says_what_is_wrong() -> None:
     drag = BY_NAME["linear_drag"]
     with pytest.raises(EffectError, match=r"'puck' declares .*'linear_drga'.*mean 'linear_drag'"):
         attach(scene.with_effects("puck", "linear_drga"))
-    with pytest.raises(EffectError, match=r"not in the catalogue; give an effect .* \(known: "):
+    with pytest.raises(EffectError, match=r"not in the catalogue.*; give an effect .* \(known: "):
         attach(scene.with_effects("puck", "zzz"))
     with pytest.raises(EffectError, match=r"linear_drag is put on 'cart'.*puck, two"):
         attach(scene, [drag.on("cart")])
