@@ -247,11 +247,7 @@ class _RegressionAgent(Agent):
     _regression: ClassVar[type[LWR] | type[OOLWR]]
 
     def __init__(
-        self,
-        task: Task,
-        *,
-        learner: Mapping[str, Any] | None = None,
-        **options: Any,
+        self, task: Task, *, learner: Mapping[str, Any] | None = None, **options: Any
     ) -> None:
         super().__init__(task, **options)
         self._learner = self._regression(task.scene, **(learner or {}))

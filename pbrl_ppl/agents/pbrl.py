@@ -93,7 +93,8 @@ def revise(
     table.modes |= sets
     top = max(map(table.value, sets.values()))
     near = [laws for laws, mode in sets.items() if table.value(mode) > top - least]
-    mode, nats = _borne_out(table, highest, min(near, key=lambda laws: len(sets[laws].phi)), least)
+    fewest = min(near, key=lambda laws: len(sets[laws].phi))
+    mode, nats = _borne_out(table, highest, fewest, least)
     revisions = [
         Revision(
             law,
@@ -130,15 +131,12 @@ def _borne_out(
     return highest(()), {}
 
 
-#: Prediction errors up to this share of the natural sizes carry no information: they are the
-#: engine's.
-NEGLIGIBLE = 1e-4
-
-
 class PhysicsAgent(Agent):
     """Agent whose model is :class:`pbrl_ppl.Dynamics` of estimated parameters."""
 
     model: Dynamics | None = None
+    #: Share of the natural sizes up to which prediction errors carry no information: the engine's.
+    negligible: ClassVar[float] = 1e-4
 
     @property
     def estimates(self) -> Mapping[str, float]:
@@ -265,7 +263,7 @@ class PBRLAgent(PhysicsAgent):
         self._given = attach(task.scene, effects, self._catalogue)[declared:]
         self._transitions: list[tuple[Floats, Floats, Floats]] = []
         self._sigma = np.empty(0)
-        self._negligible = NEGLIGIBLE * body_sizes(task.scene)
+        self._negligible = self.negligible * body_sizes(task.scene)
         self.fits = self._fitted = self.criticisms = self._criticised = 0
 
     def observe(self, state: Floats, action: Floats, next_state: Floats) -> None:
@@ -476,7 +474,7 @@ class LibraryAgent(PhysicsAgent):
         scene = self.task.scene.subset(self.task.scene.owners[name])
         dynamics = Dynamics(scene, self._phi(build_layout(scene)), threads=1)
         error = prediction_errors(dynamics, *map(np.array, zip(*self._seen[name], strict=True)))
-        return bool((error > NEGLIGIBLE * body_sizes(scene)).any())
+        return bool((error > self.negligible * body_sizes(scene)).any())
 
     def _phi(self, layout: Layout) -> Floats:
         """Return the chosen parameters in a layout's order."""

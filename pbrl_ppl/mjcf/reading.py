@@ -158,12 +158,7 @@ class _View:
     """
 
     def __init__(
-        self,
-        model: mujoco.MjModel,
-        axes: Floats,
-        shapes: dict[str, Shape],
-        *,
-        even: float = 0.01,
+        self, model: mujoco.MjModel, axes: Floats, shapes: dict[str, Shape], *, even: float = 0.01
     ) -> None:
         import mujoco
 

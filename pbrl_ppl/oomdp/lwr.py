@@ -16,7 +16,7 @@ from scipy.spatial.distance import cdist
 from pbrl_ppl.errors import FitError, HistoryError, SimulationError
 from pbrl_ppl.history import History, check_start
 from pbrl_ppl.oomdp.relations import Attributes, Condition, Relation, SectorContacts, condition
-from pbrl_ppl.scene import Scene, body_sizes, is_whole, nearest
+from pbrl_ppl.scene import Scene, body_sizes, checks
 from pbrl_ppl.state import STATE, THETA, WRENCH, Bools, Floats, Ints, turned, wrapped
 
 #: Predicates of a condition, one flag each.
@@ -260,7 +260,7 @@ class Learner:
         share_classes: bool = False,
         relations: Sequence[Relation] = (),
     ) -> None:
-        if not is_whole(neighbours):
+        if not checks.is_whole(neighbours):
             raise FitError(f"LWR: neighbours is {neighbours!r}, expected a whole number from 1 up")
         if not 0 < bandwidth < np.inf:
             raise FitError(f"LWR: bandwidth is {bandwidth!r}, expected a number above 0")
@@ -490,11 +490,8 @@ class Learner:
             If the scene has no such dynamic body.
         """
         names = [mover.name for mover in self.scene.dynamic]
-        if body not in names:
-            raise FitError(
-                f'LWR: the scene has no moving body "{body}" that can be pushed'
-                f"{nearest(body, names)}"
-            )
+        with checks.located(kind=FitError):
+            checks.known(body, names, "LWR: the scene has no body that can be pushed called")
         return dict(zip(names, self._experience.values(), strict=True))[body]
 
     def _inputs(self, states: Floats, wrenches: Floats) -> Floats:

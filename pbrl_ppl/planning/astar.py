@@ -17,9 +17,8 @@ from scipy.sparse.csgraph import dijkstra
 
 from pbrl_ppl.errors import GoalError
 from pbrl_ppl.physics import depth_of, overlap
-from pbrl_ppl.planning.actions import ActionSet, play
 from pbrl_ppl.planning.dynamics import TransitionModel, remembered
-from pbrl_ppl.planning.goals import Goal, Target
+from pbrl_ppl.planning.goals import ActionSet, Goal, Target, play
 from pbrl_ppl.planning.search import FoundPlan, SearchTask, contact_cost, tail_mean
 from pbrl_ppl.scene import Body, Scene, Shape
 from pbrl_ppl.state import Bools, Floats

@@ -81,10 +81,7 @@ def remembered(wrenches: Floats, before: Floats) -> Floats:
 
 
 def predicted_path(
-    model: TransitionModel,
-    start: Floats,
-    wrenches: Floats,
-    rng: np.random.Generator | None = None,
+    model: TransitionModel, start: Floats, wrenches: Floats, rng: np.random.Generator | None = None
 ) -> Floats:
     """Play wrenches (..., time, body, 3) from a state (body, 6).
 

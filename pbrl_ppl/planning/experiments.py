@@ -20,8 +20,8 @@ from pbrl_ppl.likelihood import is_independent
 from pbrl_ppl.modes import FilteredMode, trajectory_mode
 from pbrl_ppl.parameters import differentiate
 from pbrl_ppl.physics import touching
-from pbrl_ppl.planning.actions import ActionSet, Allowed, Bounds, allowed_wrenches
 from pbrl_ppl.planning.dynamics import Dynamics, predicted_path, remembered
+from pbrl_ppl.planning.goals import ActionSet, Allowed, Bounds, allowed_wrenches
 from pbrl_ppl.planning.planner import labelled, start_state, table_of_plan
 from pbrl_ppl.posterior import Fit, Idata, scene_of, stored_fields
 from pbrl_ppl.scene import Scene, body_sizes, nearest
@@ -499,9 +499,9 @@ def suggest_actions(
         said.sentences  # what is to be expected
         said.to_csv("next.csv")  # play it, record, and close the loop on both recordings
     """
-    posterior, catalogue, progress = known, tuple(catalogue), progress or silent
     if isinstance(known, Loop):
-        posterior, catalogue = known.posterior_after, known.catalogue
+        known, catalogue = known.posterior_after, known.catalogue
+    posterior, catalogue, progress = known, tuple(catalogue), progress or silent
     scene = scene_of(posterior)
     if effects is None and not (groups := kept_groups(posterior)):
         raise EffectError(

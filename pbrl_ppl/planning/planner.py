@@ -17,10 +17,9 @@ from pbrl_ppl.errors import GoalError
 from pbrl_ppl.files import write_atomically
 from pbrl_ppl.history import table_of_arrays, with_paths
 from pbrl_ppl.physics import check_placement, overlap
-from pbrl_ppl.planning.actions import ActionSet
 from pbrl_ppl.planning.astar import astar
 from pbrl_ppl.planning.dynamics import Dynamics, TransitionModel, predicted_path
-from pbrl_ppl.planning.goals import Goal
+from pbrl_ppl.planning.goals import ActionSet, Goal
 from pbrl_ppl.planning.search import FoundPlan, SearchTask, mppi, tail_mean
 from pbrl_ppl.scene import Scene, checks, nearest
 from pbrl_ppl.state import POSE, STATE, WRENCH, Floats

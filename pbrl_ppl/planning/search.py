@@ -13,9 +13,8 @@ import numpy as np
 
 from pbrl_ppl.errors import GoalError
 from pbrl_ppl.physics import overlap
-from pbrl_ppl.planning.actions import ActionSet
 from pbrl_ppl.planning.dynamics import TransitionModel, remembered
-from pbrl_ppl.planning.goals import Goal
+from pbrl_ppl.planning.goals import ActionSet, Goal
 from pbrl_ppl.scene import Scene, smallest_radius
 from pbrl_ppl.state import Floats
 from pbrl_ppl.threads import Say, silent

@@ -7,7 +7,6 @@ from .bodies import Wall as Wall
 from .checks import CONTACT_NAMES as CONTACT_NAMES
 from .checks import PLACES as PLACES
 from .checks import Point as Point
-from .checks import is_whole as is_whole
 from .checks import nearest as nearest
 from .joints import NUMBERS as NUMBERS
 from .joints import WORLD as WORLD

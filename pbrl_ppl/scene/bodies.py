@@ -57,7 +57,8 @@ class Shape:
                 raise SceneError(f'shape: a {self.kind} has no "{key}"; drop it')
             if not present and kind == self.kind:
                 raise SceneError(f'shape: a {self.kind} needs "{key}"; add it')
-        checks.settle(self, "shape", size=_size, radius=checks.positive, vertices=_polygon)
+        size = partial(checks.vector, check=checks.positive)
+        checks.settle(self, "shape", size=size, radius=checks.positive, vertices=_polygon)
 
     @classmethod
     def box(cls, width: float, height: float) -> Shape:
@@ -134,15 +135,9 @@ def _moments(vertices: tuple[Point, ...]) -> tuple[float, Floats, float]:
     return area, corners[0] + centroid, float(second / area - centroid @ centroid)
 
 
-def _size(value: object, where: str) -> tuple[float, ...]:
-    """Return the width and the height of a box."""
-    return tuple(checks.positive(side, where) for side in checks.vector(value, where))
-
-
 def _polygon(value: object, where: str) -> tuple[Point, ...]:
     """Return a polygon's corners as given, or raise."""
-    points = checks.listed(value, where, "a list of points")
-    vertices: tuple[Point, ...] = tuple(checks.vector(point, where) for point in points)
+    vertices = checks.each(checks.vector, "a list of points")(value, where)
     if len(vertices) < 3:
         raise SceneError(f"{where} has {len(vertices)} points, expected at least 3")
     for number, point in enumerate(vertices, start=1):

@@ -36,6 +36,12 @@ def nearest(name: object, known: Iterable[str]) -> str:
     return f'; did you mean "{lower[close[0]]}"?' if close else ""
 
 
+def known(name: str, names: Sequence[str], where: str) -> None:
+    """Refuse a name that is none of these, after what ``where`` says of it."""
+    if name not in names:
+        raise SceneError(f'{where} "{name}"{nearest(name, names)}')
+
+
 @contextmanager
 def located(where: str = "", kind: type[PbrlError] = SceneError) -> Iterator[None]:
     """Raise a `SceneError` from inside with its place before its message, as another ``kind``."""
@@ -170,24 +176,28 @@ def label(value: object, where: str) -> str:
     return name
 
 
-def listed(value: object, where: str, expected: str) -> tuple[Any, ...]:
-    """Return the items of a list, which no text and no table is."""
-    if isinstance(value, str | Mapping) or not isinstance(value, Iterable):
-        raise SceneError(f"{where} is {value!r}, expected {expected}")
-    return tuple(value)
+def each(check: Check, expected: str = "a list") -> Callable[[object, str], tuple[Any, ...]]:
+    """Return the check of a list, which no text and no table is, whose items have one check."""
+
+    def checked(value: object, where: str) -> tuple[object, ...]:
+        if isinstance(value, str | Mapping) or not isinstance(value, Iterable):
+            raise SceneError(f"{where} is {value!r}, expected {expected}")
+        return tuple(check(item, where) for item in value)
+
+    return checked
 
 
 def names(value: object, where: str) -> tuple[str, ...]:
     """Return a tuple of different names."""
-    labels = tuple(label(name, where) for name in listed(value, where, "a list of names"))
+    labels = each(label, "a list of names")(value, where)
     if len(set(labels)) < len(labels):
         raise SceneError(f"{where} {list(labels)} names one twice; drop it")
     return labels
 
 
-def vector(value: object, where: str, length: int = 2) -> Any:
-    """Return a tuple of this many finite numbers."""
-    numbers = tuple(finite(item, where) for item in listed(value, where, f"{length} numbers"))
+def vector(value: object, where: str, length: int = 2, check: Check = finite) -> Any:
+    """Return a tuple of this many finite numbers, each of which has a check."""
+    numbers = each(check, f"{length} numbers")(value, where)
     if len(numbers) != length:
         raise SceneError(f"{where} has {len(numbers)} numbers, expected {length}")
     return numbers

@@ -149,8 +149,7 @@ class Joint:
 
 def _two_names(value: object, where: str) -> tuple[str, ...]:
     """Return the names of a joint's bodies."""
-    given = checks.listed(value, where, "two names")
-    bodies = tuple(checks.label(name, where) for name in given)
+    bodies = checks.each(checks.label, "two names")(value, where)
     if len(bodies) != 2:
         raise SceneError(f"{where} is {list(bodies)}, expected two names")
     if bodies[0] == bodies[1]:
@@ -287,12 +286,8 @@ def check_actuators(actuators: tuple[Actuator, ...], bodies: list[str]) -> None:
     """
     checks.different([actuator.name for actuator in actuators], "actuators")
     for actuator in actuators:
-        where = f'actuator "{actuator.name}"'
-        if actuator.body not in bodies:
-            raise SceneError(
-                f'{where}: "{actuator.body}" is no body that moves freely'
-                f"{checks.nearest(actuator.body, bodies)}"
-            )
+        where = f'actuator "{actuator.name}": no body that moves freely is called'
+        checks.known(actuator.body, bodies, where)
         mine = [other.name for other in actuators if other.body == actuator.body]
         if len(mine) > len(WRENCH):
             raise SceneError(

@@ -104,10 +104,8 @@ class Scene:
         checks.settle(self, "[world]", time_step=checks.positive, substeps=check_substeps)
         checks.settle(self, "[world]", test_is_later=checks.flag)
         for key, (_, kind) in _PARTS.items():
-            parts = tuple(getattr(self, key))
-            for part in parts:
-                checks.instance(kind, f"a {kind.__name__}")(part, f"scene: one of {key}")
-            object.__setattr__(self, key, parts)
+            parts = checks.each(checks.instance(kind, f"a {kind.__name__}"))
+            checks.settle(self, "scene", **{key: parts})
         noise = checks.table(self.noise, "[noise]", dict.fromkeys(STATE, checks.positive))
         object.__setattr__(self, "noise", noise)
         checks.settle(self, "scene", recording=checks.instance(Recording, "a Recording"))
@@ -136,17 +134,11 @@ class Scene:
         for position, joint in enumerate(self.joints, start=1):
             where = f"[[joint]] number {position}"
             for name in joint.bodies or ():
-                if name not in names:
-                    raise SceneError(
-                        f'{where}: there is no body "{name}"{checks.nearest(name, names)}'
-                    )
+                checks.known(name, names, f"{where}: there is no body")
             for index, probabilities in joint.prior:
                 for name, _ in probabilities:
-                    if name not in self.joinable:
-                        raise SceneError(
-                            f'{where}: prior {index} names "{name}", which is no moving body or'
-                            f" the world{checks.nearest(name, self.joinable)}"
-                        )
+                    said = f"{where}: prior {index} names what is no moving body or the world,"
+                    checks.known(name, self.joinable, said)
             could = joint.bodies or names
             if not any(body.name in could for body in self.dynamic):
                 raise SceneError(
@@ -284,11 +276,9 @@ class Scene:
         SceneError
             If there is none; the nearest name is given.
         """
-        for body in self.bodies:
-            if body.name == name:
-                return body
         names = [body.name for body in self.bodies]
-        raise SceneError(f'scene: there is no body "{name}"{checks.nearest(name, names)}')
+        checks.known(name, names, "scene: there is no body")
+        return self.bodies[names.index(name)]
 
     def reference_angle(self, name: str) -> float:
         """Return the angle in a body's reference pose (rad): 0 without one, and of the world."""
