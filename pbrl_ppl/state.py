@@ -48,7 +48,7 @@ def wrapped(angle: Angle) -> Angle:
     return result
 
 
-def turned(vectors: Floats, angle: Floats) -> Floats:
+def turned(vectors: Floats, angle: Floats | float) -> Floats:
     """Return vectors (..., 2) turned by angles that broadcast with their leading axes."""
     c, s = np.cos(angle), np.sin(angle)
     x, y = vectors[..., 0], vectors[..., 1]

@@ -87,7 +87,6 @@ LATE = (
     "torque_backlash",
 )
 SHAPE = (
-    "command_power",
     "dead_zone",
     "torque_dead_zone",
     "torque_saturation",
@@ -102,13 +101,11 @@ DRY = (
 )
 ANGLE = (
     "torsion_spring",
-    "cubic_torsion_spring",
     "upper_stop",
     "lower_stop",
     "cogging",
     "encoder_eccentricity",
 )
-PLACE = ("spring", "cubic_spring")
 DRAG = (
     "linear_drag",
     "quadratic_drag",
@@ -155,15 +152,11 @@ CASES = {
         torque=lambda z, u, t: -0.004 * np.abs(z[:, 1:]) * z[:, 1:],
         family=(*DRAG, "quadratic_angular_drag"),
     ),
-    "cubic_torsion_spring": Case(torque=lambda z, u, t: -0.3 * z[:, :1] ** 3, family=ANGLE),
     "upper_stop": Case(torque=lambda z, u, t: -2.0 * np.maximum(z[:, :1] - 0.5, 0.0), family=ANGLE),
     "lower_stop": Case(torque=lambda z, u, t: 2.0 * np.maximum(-0.5 - z[:, :1], 0.0), family=ANGLE),
     "cogging": Case(torque=lambda z, u, t: 0.05 * np.sin(8 * z[:, :1]), family=ANGLE),
     "torque_saturation": Case(torque=lambda z, u, t: np.clip(u, -0.25, 0.25) - u, family=SHAPE),
     "torque_dead_zone": Case(torque=lambda z, u, t: -np.clip(u, -0.1, 0.1), family=SHAPE),
-    "command_power": Case(
-        torque=lambda z, u, t: 3.0 * np.abs(u) * u - u, also=("torque_gain",), family=SHAPE
-    ),
     "encoder_eccentricity": Case(measure=lambda z: z + 0.05 * np.sin(z), family=ANGLE),
     "drag_by_axis": Case("puck", lambda z, u, t: polar(z, 0.1, 0.6, 1), family=DRAG),
     "quadratic_drag_by_axis": Case("puck", lambda z, u, t: polar(z, 0.1, 0.5, 2), family=DRAG),
@@ -172,11 +165,6 @@ CASES = {
         "puck",
         lambda z, u, t: pushes(0 * z[:, 0], 0 * z[:, 0], -3e-4 * np.abs(z[:, 5]) * z[:, 5]),
         family=("angular_drag", "quadratic_angular_drag"),
-    ),
-    "cubic_spring": Case(
-        "puck",
-        lambda z, u, t: -0.8 * (z[:, :3] * (1, 1, 0)) * (z[:, :2] ** 2).sum(1)[:, None],
-        family=PLACE,
     ),
     "turning_friction": Case(
         "puck",

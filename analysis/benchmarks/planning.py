@@ -19,7 +19,7 @@ import numpy as np
 
 import pbrl_ppl as pp
 from pbrl_ppl.planning.astar import TimeToGo, astar
-from pbrl_ppl.planning.search import Task
+from pbrl_ppl.planning.search import SearchTask
 
 sys.path.insert(0, str(Path(__file__).parent))
 from engine import naive
@@ -98,7 +98,7 @@ def measure_python() -> Iterator[Row]:
     ratios = []
     for start, _ in zip(starts(), range(5), strict=False):
         state = np.array([[*start["cart"], 0.0, 0.0, 0.0]])
-        found = astar(Task(dynamics, state, GOAL, PUSHES, nodes=100_000))
+        found = astar(SearchTask(dynamics, state, GOAL, PUSHES, nodes=100_000))
         ratios.append(found.nodes / found.seconds / python_astar(state, 3000))
     yield (
         "over_python_loop",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Unpack, final
+from typing import Any, ClassVar, final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,11 +19,10 @@ from pbrl_ppl.planning import (
     ActionSet,
     Dynamics,
     Goal,
-    SearchOptions,
     TransitionModel,
     plan,
+    predicted_path,
     remembered,
-    rollout,
     start_state,
 )
 from pbrl_ppl.posterior import Idata, scene_of
@@ -129,13 +128,6 @@ class Task:
         return self.actions.wrenches(self.scene, np.arange(count), heading)
 
 
-class AgentOptions(SearchOptions, total=False):
-    """Options of an :class:`Agent`."""
-
-    seed: int
-    nodes: int
-
-
 class Agent(ABC):
     """Agent that plans with a transition model; subclasses define how the model is learned.
 
@@ -173,9 +165,7 @@ class Agent(ABC):
     posterior: Idata | None = None
     added: tuple[Revision, ...] = ()
 
-    def __init__(
-        self, task: Task, *, seed: int = 0, nodes: int = 20_000, **options: Unpack[SearchOptions]
-    ) -> None:
+    def __init__(self, task: Task, *, seed: int = 0, nodes: int = 20_000, **options: Any) -> None:
         self.task, self.seed, self._nodes, self._options = task, seed, nodes, options
         self._rng = np.random.default_rng([seed, 0])  # [seed, 1] is the world's
         self._ahead = np.empty((0, len(task.scene.moving), 3))
@@ -239,7 +229,7 @@ class Agent(ABC):
         """Return wrenches (time, body, 3): the last plan's if it reaches the goal."""
         task = self.task
         if len(self._ahead):
-            end = rollout(model.after(self._last), state, self._ahead)[:, -1]
+            end = predicted_path(model.after(self._last), state, self._ahead)[:, -1]
             if float(task.goal.shortfall(task.scene, end).mean()) <= 1.0:  # false for NaN
                 return self._ahead
         planned = plan(
@@ -257,11 +247,7 @@ class _RegressionAgent(Agent):
     _regression: ClassVar[type[LWR] | type[OOLWR]]
 
     def __init__(
-        self,
-        task: Task,
-        *,
-        learner: Mapping[str, Any] | None = None,
-        **options: Unpack[AgentOptions],
+        self, task: Task, *, learner: Mapping[str, Any] | None = None, **options: Any
     ) -> None:
         super().__init__(task, **options)
         self._learner = self._regression(task.scene, **(learner or {}))
@@ -350,7 +336,7 @@ class TrueModelAgent(Agent):
         task: Task,
         parameters: Mapping[str, object],
         effects: Iterable[Effect | Attached] = (),
-        **options: Unpack[AgentOptions],
+        **options: Any,
     ) -> None:
         super().__init__(task, **options)
         self.model = Dynamics.known(task.scene, parameters, effects, threads=1)
@@ -441,7 +427,7 @@ def act(
     if intervals < 1 or (every is not None and every < 1):
         raise GoalError(f"act: every is {every} and intervals {intervals}, expected 1 or more")
     scene = idata.scene if isinstance(idata, TransitionModel) else scene_of(idata)
-    target = goal if isinstance(goal, Goal) else Goal.of(goal)
+    target = Goal.of(goal)
     target.check(scene)
 
     def is_reached(state: Floats) -> bool:

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import cache
 from itertools import combinations, compress
-from typing import Any, ClassVar, Unpack, final
+from typing import Any, ClassVar, final
 
 import numpy as np
 import pandas as pd
 
-from pbrl_ppl.agents.agent import Agent, AgentOptions, Revision, Task
+from pbrl_ppl.agents.agent import Agent, Revision, Task
 from pbrl_ppl.criticism import DEFAULT, Search, Table, are_alike, share, sizes_of
 from pbrl_ppl.effects import Attached, Effect, Structure, attach, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
@@ -69,12 +69,12 @@ def revise(
     def missing(mode: Mode) -> tuple[Attached, ...]:
         return candidates(problem.scene, mode.problem.physics.effects, tried)
 
-    def highest(laws: Iterable[Attached]) -> Mode:
-        return mode_with(frozenset(laws))
-
     @cache
-    def mode_with(laws: frozenset[Attached]) -> Mode:
+    def of(laws: frozenset[Attached]) -> Mode:
         return find_mode(problem.with_physics(effects=(*problem.physics.effects, *laws)), seed=seed)
+
+    def highest(laws: Iterable[Attached]) -> Mode:
+        return of(frozenset(laws))
 
     # priors are in units that the data show, and change with them
     every = {(law.effect.name, law.body): law for law in missing(highest(()))}
@@ -93,40 +93,50 @@ def revise(
     table.modes |= sets
     top = max(map(table.value, sets.values()))
     near = [laws for laws, mode in sets.items() if table.value(mode) > top - least]
-    laws = [*min(near, key=lambda laws: len(sets[laws].phi))]
-    while laws:  # from many starts: a local climb may end too low to do without a law
-        for key in (laws, *([one for one in laws if one != law] for law in laws)):
-            table.modes.setdefault(frozenset(key), highest(key))
-        mode = table.fitted(highest(()), laws)
-        nats = {law: table.value(mode) - table.value(table.without(mode, law)) for law in laws}
-        weakest = min(laws, key=lambda law: nats[law])
-        if nats[weakest] >= least:
-            break
-        laws.remove(weakest)
-    else:
-        return (), highest(())
+    fewest = min(near, key=lambda laws: len(sets[laws].phi))
+    mode, nats = _borne_out(table, highest, fewest, least)
     revisions = [
         Revision(
             law,
             before[law].transitions if law in before else problem.segments.n,
-            nats[law],
+            lost,
             share(table.without(mode, law), mode, table.weight),
             found[law].confounded if law in found else (),
         )
-        for law in laws
+        for law, lost in nats.items()
     ]
     return tuple(sorted(revisions, key=lambda law: -law.nats)), mode
 
 
-#: Prediction errors up to this share of the natural sizes carry no information: they are the
-#: engine's.
-NEGLIGIBLE = 1e-4
+def _borne_out(
+    table: Table,
+    highest: Callable[[Iterable[Attached]], Mode],
+    laws: Iterable[Attached],
+    least: float,
+) -> tuple[Mode, dict[Attached, float]]:
+    """Return the mode without laws that lose less than some nats, and what each other one loses.
+
+    ``highest`` searches from many starts: a local climb may end too low to do without a law.
+    """
+    kept = [*laws]
+    while kept:
+        for key in (kept, *([one for one in kept if one != law] for law in kept)):
+            table.modes.setdefault(frozenset(key), highest(key))
+        mode = table.fitted(highest(()), kept)
+        nats = {law: table.value(mode) - table.value(table.without(mode, law)) for law in kept}
+        weakest = min(kept, key=lambda law: nats[law])
+        if nats[weakest] >= least:
+            return mode, nats
+        kept.remove(weakest)
+    return highest(()), {}
 
 
 class PhysicsAgent(Agent):
     """Agent whose model is :class:`pbrl_ppl.Dynamics` of estimated parameters."""
 
     model: Dynamics | None = None
+    #: Share of the natural sizes up to which prediction errors carry no information: the engine's.
+    negligible: ClassVar[float] = 1e-4
 
     @property
     def estimates(self) -> Mapping[str, float]:
@@ -241,7 +251,7 @@ class PBRLAgent(PhysicsAgent):
         effects: Iterable[Effect | Attached] = (),
         revise: bool = False,
         catalogue: Iterable[Effect] = full_catalogue,
-        **options: Unpack[AgentOptions],
+        **options: Any,
     ) -> None:
         if (draws is not None and draws < 1) or not growth >= 0:
             raise FitError(f"PBRL: draws is {draws}, growth {growth}; expected at least 1 and 0")
@@ -253,7 +263,7 @@ class PBRLAgent(PhysicsAgent):
         self._given = attach(task.scene, effects, self._catalogue)[declared:]
         self._transitions: list[tuple[Floats, Floats, Floats]] = []
         self._sigma = np.empty(0)
-        self._negligible = NEGLIGIBLE * body_sizes(task.scene)
+        self._negligible = self.negligible * body_sizes(task.scene)
         self.fits = self._fitted = self.criticisms = self._criticised = 0
 
     def observe(self, state: Floats, action: Floats, next_state: Floats) -> None:
@@ -464,7 +474,7 @@ class LibraryAgent(PhysicsAgent):
         scene = self.task.scene.subset(self.task.scene.owners[name])
         dynamics = Dynamics(scene, self._phi(build_layout(scene)), threads=1)
         error = prediction_errors(dynamics, *map(np.array, zip(*self._seen[name], strict=True)))
-        return bool((error > NEGLIGIBLE * body_sizes(scene)).any())
+        return bool((error > self.negligible * body_sizes(scene)).any())
 
     def _phi(self, layout: Layout) -> Floats:
         """Return the chosen parameters in a layout's order."""

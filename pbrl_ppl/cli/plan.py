@@ -199,7 +199,7 @@ def suggest(
     catalogue = laws.catalogue()
     progress("reading the posterior")
     from pbrl_ppl.planning import ActionSet, suggest_actions
-    from pbrl_ppl.planning.rivals import kept_groups
+    from pbrl_ppl.planning.experiments import kept_groups
     from pbrl_ppl.posterior import load_posterior, scene_of
 
     idata = load_posterior(posterior)

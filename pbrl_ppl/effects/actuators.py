@@ -13,8 +13,6 @@ from pbrl_ppl.state import WRENCH, Floats
 
 _GAIN = Prior("log_normal", mu=0.0, sigma=0.5)
 _THRESHOLD = EffectParameter("threshold", "N", Prior("half_normal", sigma=0.5), scale="force")
-#: Force levels that a scan tries, and torques.
-_LEVELS, _FEW = 20, 8
 #: The components that are a force.
 _FORCE = (0, 1)
 #: No actuator reaches this force, in typical forces.
@@ -242,10 +240,16 @@ def _scan_levels(
     history: History,
     body: Body,
     components: tuple[int, ...] = _FORCE,
-    most: int | None = None,
+    most: int = 0,
+    *,
+    forces: int = 20,
+    few: int = 8,
 ) -> Floats:
-    """Return at most so many sizes between those commanded, shape (level, 1), N or N m."""
-    most = most or (_LEVELS if components == _FORCE else _FEW)
+    """Return at most so many sizes between those commanded, shape (level, 1), N or N m.
+
+    ``forces``, ``few``: levels that are tried of a force, and of a torque.
+    """
+    most = most or (forces if components == _FORCE else few)
     action = history.dataset["action"].sel(body=body.name).to_numpy()[..., components]
     size = np.linalg.norm(action, axis=-1)
     size = size[size > 0]  # not NaN either
@@ -406,27 +410,4 @@ OF_COMPONENTS = {
 torque_dead_zone, torque_saturation, torque_rate_limit, torque_backlash = (
     of_component(law, f"torque_{suffix}", sentence, "torque")
     for suffix, (law, sentence, _) in OF_COMPONENTS.items()
-)
-
-
-def _by_power(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
-    force, torque = math.hypot(wrench[0], wrench[1]) / parameters[1], abs(wrench[2]) / parameters[2]
-    if force > 0.0:
-        wrench[0] *= force ** (parameters[0] - 1.0)
-        wrench[1] *= force ** (parameters[0] - 1.0)
-    if torque > 0.0:
-        wrench[2] *= torque ** (parameters[0] - 1.0)
-
-
-command_power = Effect(
-    "command_power",
-    (EffectParameter("exponent", "1", Prior("log_normal", mu=0.0, sigma=0.5), null=1.0),),
-    "the push grows with a power of the command, not in proportion: the thrust of a propeller grows"
-    " with the square of its speed",
-    "f = f0 (u / f0)^p, with a typical force f0",
-    Command(_by_power),
-    constants=("force", "torque"),
-    log_odds=-1.0,
-    family="shape of the command",
-    unusual="a power of the command stands in for friction, which takes small commands",
 )

@@ -2,90 +2,44 @@
 
 from __future__ import annotations
 
-import difflib
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 
-from pbrl_ppl.effects import actuators, drag, forces, friction, obstacles, sensors, springs
+from pbrl_ppl.effects import actuators, forces, friction, sensors, springs
 from pbrl_ppl.effects.actuation import actuation, laws_of_actuators
 from pbrl_ppl.effects.effect import Attached, Command, Effect, Noise, is_pivoted
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.history import History
-from pbrl_ppl.scene import Scene
+from pbrl_ppl.scene import Scene, nearest
 from pbrl_ppl.state import STATE, THETA, Floats
 
 #: Of effects that the data cannot separate, the earlier one is named: friction of a joint before
 #: drag on a body, which looks the same on a single pendulum, and the simpler before the richer.
 catalogue: tuple[Effect, ...] = (
-    friction.pivot_damping,
-    friction.pivot_friction,
-    friction.pivot_load_friction,
-    friction.pivot_stribeck,
-    friction.slider_damping,
-    friction.slider_friction,
-    friction.slider_stribeck,
-    drag.linear_drag,
-    drag.quadratic_drag,
-    drag.angular_drag,
-    drag.quadratic_angular_drag,
-    drag.drag_by_axis,
-    drag.quadratic_drag_by_axis,
-    forces.gravity_tilt,
-    forces.constant_force,
-    forces.body_force,
-    forces.constant_torque,
-    forces.push_offset,
-    actuators.actuator_rotation,
-    forces.inertia_scale,
-    forces.com_offset,
-    actuators.force_gain,
-    actuators.torque_gain,
-    actuators.anisotropic_gain,
-    actuators.command_power,
-    friction.sliding_friction,
-    friction.turning_friction,
-    friction.sliding_stribeck,
-    friction.pivot_hysteresis,
-    friction.wheel,
-    actuators.actuator_delay,
-    actuators.first_order_lag,
-    actuators.dead_zone,
-    actuators.torque_dead_zone,
-    actuators.force_cutoff,
-    actuators.saturation,
-    actuators.torque_saturation,
-    actuators.rate_limit,
-    actuators.torque_rate_limit,
-    actuators.actuator_backlash,
-    actuators.torque_backlash,
-    drag.magnus_force,
-    drag.wind,
-    springs.spring,
-    springs.torsion_spring,
-    springs.cubic_spring,
-    springs.cubic_torsion_spring,
-    springs.upper_stop,
-    springs.lower_stop,
-    forces.cogging,
-    forces.mass_change,
-    obstacles.hidden_obstacle,
-    springs.distance_joint,
-    sensors.sensor_bias,
-    sensors.sensor_scale,
-    sensors.askew_camera,
-    sensors.encoder_eccentricity,
-    sensors.frame_rotation,
-    sensors.heavy_tails,
-)
+    friction.pivot_damping, friction.pivot_friction, friction.pivot_load_friction,
+    friction.pivot_stribeck, friction.slider_damping, friction.slider_friction,
+    friction.slider_stribeck, forces.linear_drag, forces.quadratic_drag, forces.angular_drag,
+    forces.quadratic_angular_drag, forces.drag_by_axis, forces.quadratic_drag_by_axis,
+    forces.gravity_tilt, forces.constant_force, forces.body_force, forces.constant_torque,
+    forces.push_offset, actuators.actuator_rotation, forces.inertia_scale, forces.com_offset,
+    actuators.force_gain, actuators.torque_gain, actuators.anisotropic_gain,
+    friction.sliding_friction, friction.turning_friction, friction.sliding_stribeck,
+    friction.pivot_hysteresis, friction.wheel, actuators.actuator_delay, actuators.first_order_lag,
+    actuators.dead_zone, actuators.torque_dead_zone, actuators.force_cutoff, actuators.saturation,
+    actuators.torque_saturation, actuators.rate_limit, actuators.torque_rate_limit,
+    actuators.actuator_backlash, actuators.torque_backlash, forces.magnus_force, forces.wind,
+    springs.spring, springs.torsion_spring, springs.upper_stop, springs.lower_stop, forces.cogging,
+    forces.mass_change, springs.hidden_obstacle, springs.distance_joint, sensors.sensor_bias,
+    sensors.sensor_scale, sensors.askew_camera, sensors.encoder_eccentricity,
+    sensors.frame_rotation, sensors.heavy_tails,
+)  # fmt: skip
 
 
 def attach(
-    scene: Scene,
-    extra: Iterable[Effect | Attached] = (),
-    effects: Iterable[Effect] = catalogue,
+    scene: Scene, extra: Iterable[Effect | Attached] = (), effects: Iterable[Effect] = catalogue
 ) -> tuple[Attached, ...]:
     """Return all effects of a model: those that the scene declares, then the extra ones.
 
@@ -116,41 +70,32 @@ def attach(
     >>> [a.effect.name for a in attach(Scene(time_step=0.1, bodies=(cart,)))]
     ['linear_drag']
     """
-    extra, effects = tuple(extra), tuple(effects)
-    bodies = {body.name: body for body in scene.dynamic}
+    bodies, given = {body.name: body for body in scene.dynamic}, list[Attached]()
+    for item in extra:
+        given += item.over(scene)
     # a user's effect that is given may also be declared by name, as in a saved scene
-    listed = [item.effect if isinstance(item, Attached) else item for item in extra]
-    check_names((*effects, *listed))
-    by_name = {effect.name: effect for effect in (*effects, *listed)}
-    result: list[Attached] = []
-    given = {(item.effect.name, item.body) for item in extra if isinstance(item, Attached)}
+    every = (*effects, *(one.effect for one in given))
+    check_names(every)
+    by_name, result = {effect.name: effect for effect in every}, list[Attached]()
+    stated = {(one.effect.name, one.body) for one in given}
     for body in scene.dynamic:
         acting = actuation(scene, body.name)
         if acting is not None:
             own = laws_of_actuators(scene, body.name)
             by_name |= {acting.name: acting} | {effect.name: effect for _, effect in own}
-            if acting.name not in body.effects and (acting.name, body.name) not in given:
+            if acting.name not in body.effects and (acting.name, body.name) not in stated:
                 result.append(acting.on(body.name))
         for name in body.effects:
             if name not in by_name:
-                near = difflib.get_close_matches(name, by_name, n=1)
-                hint = f"; did you mean {near[0]!r}?" if near else ""
+                hint = nearest(name, by_name)
                 raise EffectError(
                     f"body {body.name!r} declares the effect {name!r}, which is not in the"
                     f" catalogue{hint}; give an effect of your own as an argument, or with"
                     f" --effect-file (known: {', '.join(by_name)})"
                 )
             result.append(by_name[name].on(body.name))
-    for item in extra:
-        if isinstance(item, Attached):
-            result.append(item)
-            continue
-        on = [item.on(body.name) for body in scene.dynamic if item.applies(scene, body)]
-        if not on:
-            raise EffectError(f"effect {item.name} applies to no body of this scene")
-        result.extend(on)
     seen: set[tuple[str, str]] = set()
-    for attached in result:
+    for attached in (*result, *given):
         name, on_body = attached.effect.name, attached.body
         if on_body not in bodies:
             raise EffectError(
@@ -162,7 +107,7 @@ def attach(
         if (name, on_body) in seen:
             raise EffectError(f"effect {name} is put on body {on_body!r} twice")
         seen.add((name, on_body))
-    return tuple(attached.in_si(scene) for attached in result)
+    return tuple(attached.in_si(scene) for attached in (*result, *given))
 
 
 def check_names(effects: Iterable[Effect]) -> None:

@@ -136,8 +136,14 @@ class Properties:
     timed: bool = False
 
 
+def _check_memory(numbers: int) -> None:
+    """Refuse more numbers than a law may remember."""
+    if not 0 <= numbers <= MOST_MEMORY:
+        raise EffectError(f"a law remembers {numbers} numbers, expected 0 to {MOST_MEMORY}")
+
+
 @dataclass(frozen=True)
-class Added:
+class Addition:
     """Modification that adds parameters to properties; equal to its copies in other processes.
 
     Parameters
@@ -156,7 +162,7 @@ class Added:
 
 def adding(**parameters: str) -> Properties:
     """Return the stage that adds parameters to the properties of these names."""
-    return Properties(Added(tuple(parameters.items())))
+    return Properties(Addition(tuple(parameters.items())))
 
 
 @final
@@ -236,10 +242,7 @@ class Command:
 
     def __post_init__(self) -> None:
         """Check the memory."""
-        if not 0 <= 3 * self.memory <= MOST_MEMORY:
-            raise EffectError(
-                f"a law remembers {self.memory} wrenches, expected 0 to {MOST_MEMORY // 3}"
-            )
+        _check_memory(3 * self.memory)
 
 
 @final
@@ -276,10 +279,7 @@ class Force:
 
     def __post_init__(self) -> None:
         """Check the memory."""
-        if not 0 <= self.memory <= MOST_MEMORY:
-            raise EffectError(
-                f"a law has {self.memory} numbers of its own, expected 0 to {MOST_MEMORY}"
-            )
+        _check_memory(self.memory)
 
 
 @final
@@ -552,6 +552,19 @@ class Effect:
         """Return the effect attached to the body of this name."""
         return Attached(self, body)
 
+    def over(self, scene: Scene) -> tuple[Attached, ...]:
+        """Return the effect on every dynamic body that it applies to.
+
+        Raises
+        ------
+        EffectError
+            If there is none.
+        """
+        on = tuple(self.on(body.name) for body in scene.dynamic if self.applies(scene, body))
+        if not on:
+            raise EffectError(f"effect {self.name} applies to no body of this scene")
+        return on
+
     def in_si(self, units: Units) -> Effect:
         """Return the effect with its priors and null values in SI units."""
         parameters = tuple(parameter.in_si(units) for parameter in self.parameters)
@@ -579,6 +592,10 @@ class Attached:
 
     effect: Effect
     body: str
+
+    def over(self, scene: Scene) -> tuple[Attached, ...]:
+        """Return itself, which is on one body; see :meth:`Effect.over`."""
+        return (self,)
 
     def in_si(self, scene: Scene) -> Attached:
         """Return the same with what the body has of it in SI units; see :func:`units_of`."""
@@ -671,6 +688,13 @@ def holder(scene: Scene, attached: Attached) -> int:
             (other,) = set(joint.bodies) - {attached.body}
             return names.index(other) if other in names else -1
     return -1
+
+
+def measured(history: History, body: Body, *names: str) -> Floats:
+    """Return a body's states where these coordinates are all known, shape (n, name)."""
+    rows = history.dataset["start"].sel(body=body.name, state=list(names)).to_numpy()
+    rows = rows.reshape(-1, len(names))
+    return np.asarray(rows[np.isfinite(rows).all(axis=1)])
 
 
 def body_points(body: Body) -> Floats:

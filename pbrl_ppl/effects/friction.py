@@ -19,6 +19,7 @@ from pbrl_ppl.effects.effect import (
     is_pivoted,
     is_sliding,
     is_unpivoted,
+    measured,
 )
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
@@ -34,9 +35,8 @@ _SPEED = EffectParameter("speed", "m/s", _SLOW, null=0.2, scale="speed")
 
 def _scan_speeds(scene: Scene, history: History, body: Body, columns: tuple[str, ...]) -> Floats:
     """Return two speeds below the body's usual ones; the derivative is taken by the friction."""
-    start = history.dataset["start"].sel(body=body.name, state=list(columns)).to_numpy()
-    speed = np.linalg.norm(start, axis=-1)
-    speed = speed[speed > 0.0]  # not NaN either
+    speed = np.linalg.norm(measured(history, body, *columns), axis=-1)
+    speed = speed[speed > 0.0]
     speeds = np.quantile(speed, [0.15, 0.45]) if len(speed) else ()
     return np.array([(np.nan, speed) for speed in speeds]).reshape(-1, 2)
 
@@ -93,10 +93,7 @@ def _fall_with_speed(state: Floats, load: Floats, parameters: Floats, most: Floa
 
 pivot_stribeck = Effect(
     "pivot_stribeck",
-    (
-        EffectParameter("torque", "N m", SIZE, scale="torque"),
-        _TURN_RATE,
-    ),
+    (EffectParameter("torque", "N m", SIZE, scale="torque"), _TURN_RATE),
     "dry friction in the hinge that is stronger near standstill than in motion: it sticks, then"
     " slips",
     "Stribeck's curve, tau = tau_s exp(-(omega/omega_s)^2) beside Coulomb's",
@@ -194,9 +191,8 @@ def _scan_radii(scene: Scene, history: History, body: Body) -> Floats:
 
     More friction would hold the body still now and then, where the derivative is meaningless.
     """
-    theta = history.dataset["start"].sel(body=body.name, state="theta").to_numpy()
     shares = [2.0 / 3.0]  # even pressure under a disc
-    if np.nanmax(theta) > np.nanmin(theta):
+    if len(np.unique(measured(history, body, "theta"))) > 1:
         shares += [0.2, 0.4, 1.0]
     return np.array([(np.nan, share * body.shape.bounding_radius) for share in shares])
 
@@ -222,10 +218,7 @@ def _fall_by_share(state: Floats, load: Floats, parameters: Floats, most: Floats
 
 sliding_stribeck = Effect(
     "sliding_stribeck",
-    (
-        EffectParameter("share", "1", SIZE),
-        _SPEED,
-    ),
+    (EffectParameter("share", "1", SIZE), _SPEED),
     "dry friction on the floor that is stronger near standstill than in motion, by this share",
     "Stribeck's curve, mu (1 + a exp(-(v/v_s)^2))",
     Friction(_fall_by_share, under=True),
@@ -238,10 +231,7 @@ sliding_stribeck = Effect(
 
 slider_stribeck = Effect(
     "slider_stribeck",
-    (
-        EffectParameter("force", "N", SIZE, scale="force"),
-        _SPEED,
-    ),
+    (EffectParameter("force", "N", SIZE, scale="force"), _SPEED),
     "dry friction in the slider that is stronger near standstill than in motion: it sticks, then"
     " slips",
     "Stribeck's curve, F = F_s exp(-(v/v_s)^2) beside Coulomb's",

@@ -36,14 +36,10 @@ def _undone_by_opposites(measure: Callable[[Floats, Values], Floats]) -> Sensor:
     return Sensor(measure, _WithOpposites(measure))
 
 
-def _bias(parameters: Values) -> Floats:
+def _add_bias(state: Floats, parameters: Values) -> Floats:
     nothing = np.zeros(())  # of what the effect does not have on a hinged body
     given = (parameters.get(name, nothing) for name in STATE)
-    return np.stack(np.broadcast_arrays(*given), axis=-1)
-
-
-def _add_bias(state: Floats, parameters: Values) -> Floats:
-    return state + _bias(parameters)
+    return state + np.stack(np.broadcast_arrays(*given), axis=-1)
 
 
 sensor_bias = Effect(

@@ -1,6 +1,6 @@
-"""Springs, springy stops, and rods that the scene does not show."""
+"""What holds or stops a body and the scene does not show: springs, stops, rods and obstacles."""
 
-from itertools import product
+from itertools import combinations, product
 from math import floor, pi
 
 import numpy as np
@@ -10,6 +10,7 @@ from pbrl_ppl.effects.effect import (
     ANY_ANGLE,
     SIGNED,
     SIZE,
+    Disc,
     Effect,
     EffectParameter,
     Force,
@@ -18,18 +19,15 @@ from pbrl_ppl.effects.effect import (
     Structure,
     Values,
     body_points,
+    is_pivoted,
     is_unjoined,
     is_unpivoted,
+    measured,
 )
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
-from pbrl_ppl.scene import Body, Scene
-from pbrl_ppl.state import Floats, wrapped
-
-_ANCHOR = (
-    EffectParameter("anchor_x", "m", SIGNED, scale="range", origin="x"),
-    EffectParameter("anchor_y", "m", SIGNED, scale="range", origin="y"),
-)
+from pbrl_ppl.scene import Body, Scene, Shape
+from pbrl_ppl.state import POSE, Floats, turned, wrapped
 
 
 def _poses(history: History, body: Body, width: int) -> Floats:
@@ -40,8 +38,7 @@ def _poses(history: History, body: Body, width: int) -> Floats:
     seen = history.dataset["observed"].sel(body=body.name, state=["x", "y"]).to_numpy()
     if not np.isfinite(seen).any():
         return np.empty((0, width))
-    poses = history.dataset["start"].sel(body=body.name).to_numpy()[..., :width].reshape(-1, width)
-    return np.asarray(poses[np.isfinite(poses).all(axis=1)])
+    return measured(history, body, *POSE[:width])
 
 
 def _spring(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
@@ -67,7 +64,8 @@ spring = Effect(
     "spring",
     (
         EffectParameter("stiffness", "N/m", SIZE, scale="force/length"),
-        *_ANCHOR,
+        EffectParameter("anchor_x", "m", SIGNED, scale="range", origin="x"),
+        EffectParameter("anchor_y", "m", SIGNED, scale="range", origin="y"),
     ),
     "a pull towards a place that grows with the distance: a cable or a hose drags at the body",
     "Hooke's law",
@@ -97,8 +95,7 @@ def _scan_angles(scene: Scene, history: History, body: Body, *, n_angles: int = 
     ``n_angles``: angles of rest.
     """
     angles = np.linspace(-np.pi, np.pi, n_angles, endpoint=False)
-    theta = history.dataset["start"].sel(body=body.name, state="theta").to_numpy().ravel()
-    off = np.abs(wrapped(theta[np.isfinite(theta), None] - angles))
+    off = np.abs(wrapped(measured(history, body, "theta") - angles))
     smooth = off.max(axis=0, initial=0.0) < np.pi - np.pi / n_angles
     return np.array([(np.nan, angle) for angle in (angles[smooth] if smooth.any() else angles)])
 
@@ -120,64 +117,15 @@ torsion_spring = Effect(
 )
 
 
-def _cubic_spring(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
-    x, y = state[0] - parameters[1], state[1] - parameters[2]
-    pull = parameters[0] * (x * x + y * y)
-    wrench[0] -= pull * x
-    wrench[1] -= pull * y
-
-
-cubic_spring = Effect(
-    "cubic_spring",
-    (
-        EffectParameter("stiffness", "N/m^3", SIGNED, scale="force/range^3"),
-        *_ANCHOR,
-    ),
-    "a pull towards a place that grows with the cube of the distance: a spring that hardens",
-    "Duffing's spring, F = -k r^3",
-    Force(_cubic_spring),
-    applies=is_unpivoted,
-    scan=_scan_anchors,
-    log_odds=-4.0,
-    family="place and angle",
-    unusual="springs that harden are rare, and it takes any misfit of a place",
-    needs=("places",),
-)
-
-
-def _cubic_torsion(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
-    off = state[2] - parameters[1]
-    off -= 2.0 * pi * floor((off + pi) / (2.0 * pi))
-    wrench[2] -= parameters[0] * off * off * off
-
-
 def _scan_range(scene: Scene, history: History, body: Body, shares: tuple[float, ...]) -> Floats:
     """Return angles at shares of the range that was measured; none if it turns all the way.
 
     The derivative is taken by the stiffness.
     """
-    theta = history.dataset["start"].sel(body=body.name, state="theta").to_numpy().ravel()
-    theta = theta[np.isfinite(theta)]
+    theta = measured(history, body, "theta")
     if not len(theta) or not 0.0 < np.ptp(theta) < 2.0 * np.pi:
         return np.empty((0, 2))
     return np.array([(np.nan, theta.min() + share * np.ptp(theta)) for share in shares])
-
-
-cubic_torsion_spring = Effect(
-    "cubic_torsion_spring",
-    (
-        EffectParameter("stiffness", "N m/rad^3", SIGNED, scale="torque"),
-        EffectParameter("angle", "rad", ANY_ANGLE),
-    ),
-    "a torque towards an angle that grows with the cube of the deflection: a spring that hardens",
-    "Duffing's spring, tau = -k theta^3",
-    Force(_cubic_torsion),
-    scan=ScanWith(_scan_range, (0.1, 0.5, 0.9)),
-    log_odds=-3.0,
-    family="place and angle",
-    unusual="springs that harden are rare, and it takes any misfit of an angle",
-    needs=("places",),
-)
 
 
 def _upper_stop(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
@@ -278,8 +226,8 @@ def _length(ends: Floats, poses: Floats) -> Floats:
 
 def _positions(point: Floats, poses: Floats) -> tuple[Floats, Floats]:
     """Return where a point of the body is in the world, shape (n,) each."""
-    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    return poses[:, 0] + c * point[0] - s * point[1], poses[:, 1] + s * point[0] + c * point[1]
+    x, y = (poses[:, :2] + turned(point, poses[:, 2])).T
+    return x, y
 
 
 def _centre(point: Floats, poses: Floats) -> Floats:
@@ -306,5 +254,126 @@ distance_joint = Effect(
     scan=_scan_rods,
     log_odds=-8.0,
     unusual="rods are seen",
+    needs=("places",),
+)
+
+
+def _discs(parameters: Values) -> tuple[Disc, ...]:
+    return (Disc(parameters["x"], parameters["y"], parameters["radius"]),)
+
+
+def _scan_discs(
+    scene: Scene,
+    history: History,
+    body: Body,
+    *,
+    hits: int = 16,
+    most_discs: int = 60,
+    stands_out: float = 3.0,
+    sizes: tuple[float, ...] = (0.25, 0.75, 2.0),
+    near: float = 0.1,
+    turns: tuple[float, ...] = (0.0, 0.3, -0.3),
+) -> Floats:
+    """Return discs that several hits agree on, then discs of single hits.
+
+    Where the velocity changed by ``dv``, the obstacle lies along ``-dv``. The change of the angular
+    velocity gives the distance of the impulse's line from the centre, and with it the point of the
+    outline that was hit; the disc's centre is one radius beyond.
+
+    ``hits``: intervals with the largest velocity changes that are taken for hits.
+    ``most_discs``: discs tried at most.
+    ``stands_out``: a hinge changes velocities all the time: there a hit exceeds this multiple of
+    the median change.
+
+    ``sizes``: radii of discs tried for a single hit, as shares of the body's radius.
+    ``near``: distance from a disc within which a hit agrees with it, as a share of the body's
+    radius.
+    ``turns``: angles by which friction may turn an impulse off the outline's normal (rad).
+    """
+    start = history.dataset["start"].sel(body=body.name).to_numpy()
+    begin, end = start[:, :-1].reshape(-1, 6), start[:, 1:].reshape(-1, 6)
+    seen = np.isfinite(begin).all(axis=1) & np.isfinite(end).all(axis=1)
+    begin, end = begin[seen], end[seen]
+    change = np.linalg.norm(end[:, 3:5] - begin[:, 3:5], axis=1)
+    order = np.argsort(-change)[:hits]
+    least = 1e-9 * np.abs(begin[:, 3:5]).max(initial=0.0)
+    if is_pivoted(scene, body) and len(change):
+        least = max(least, stands_out * float(np.median(change)))
+    order = order[change[order] > least]
+    point, inward = _hits(body.shape, begin[order], end[order], scene.time_step)
+    reach = body.shape.bounding_radius
+    scored = []
+    for i, j in combinations(range(len(point)), 2):  # point + radius * inward is the same for both
+        apart, turn = point[j] - point[i], inward[i] - inward[j]
+        if turn @ turn < 0.05:
+            continue
+        radius = float(apart @ turn / (turn @ turn))
+        if not 0.0 < radius < 4.0 * reach:
+            continue
+        centre = 0.5 * (point[i] + point[j] + radius * (inward[i] + inward[j]))
+        off = np.linalg.norm(point + radius * inward - centre, axis=1)
+        scored.append((int((off < near * reach).sum()), (*centre, radius)))
+    scored.sort(key=lambda agreed: -agreed[0])
+    discs = [disc for count, disc in scored[: most_discs // 4] if count > 1]
+    for at, way in zip(point, inward, strict=True):
+        for radius, turn in product(reach * np.array(sizes), turns):
+            discs.append((*(at + radius * turned(way, turn)), radius))
+    return np.array(discs[:most_discs]).reshape(-1, 3)
+
+
+def _hits(shape: Shape, begin: Floats, end: Floats, time_step: float) -> tuple[Floats, Floats]:
+    """Return the points of the outline that were hit, and the directions into the obstacle.
+
+    Shape (hit, 2) each, in the world; points in m.
+    """
+    dv = end[:, 3:5] - begin[:, 3:5]
+    size = np.linalg.norm(dv, axis=1)
+    inward = -dv / size[:, None]
+    # between two rows the body moves at its old velocity until the hit, then at its new one
+    early = (end[:, :2] - begin[:, :2]) / time_step - end[:, 3:5]
+    when = np.clip(-(early * dv).sum(axis=1) / size**2, 0.0, 1.0) * time_step
+    place = begin[:, :2] + when[:, None] * begin[:, 3:5]
+    theta = begin[:, 2] + when * begin[:, 5]
+    # r x J = I d(omega): distance of the impulse's line from the centre, positive to its left
+    offset = shape.unit_moment * (end[:, 5] - begin[:, 5]) / size
+    ways = zip(turned(inward, -theta), offset.tolist(), strict=True)
+    local = np.array([_exit(shape, way, off) for way, off in ways]).reshape(-1, 2)
+    return place + turned(local, theta), inward
+
+
+def _exit(shape: Shape, direction: Floats, offset: float) -> Floats:
+    """Return where a line, at an offset from the body's centre, leaves the outline."""
+    side = np.array([-direction[1], direction[0]])
+    if shape.outline is None:
+        radius = shape.bounding_radius
+        offset = min(max(offset, -radius), radius)
+        return np.asarray(offset * side + np.sqrt(radius**2 - offset**2) * direction)
+    corners = np.array(shape.outline)
+    across, along = corners @ side, corners @ direction
+    offset = min(max(offset, across.min()), across.max())
+    best = -np.inf
+    for i in range(len(corners)):
+        low, high = sorted((i - 1, i), key=lambda k: across[k])
+        if across[low] <= offset <= across[high]:
+            width = across[high] - across[low]
+            share = (offset - across[low]) / width if width > 0 else 0.0
+            ends = along[low] + share * (along[high] - along[low])
+            best = max(best, ends, along[high] if width == 0 else -np.inf)
+    return np.asarray(offset * side + best * direction)
+
+
+hidden_obstacle = Effect(
+    "hidden_obstacle",
+    (
+        EffectParameter("x", "m", SIGNED, scale="range", origin="x"),
+        EffectParameter("y", "m", SIGNED, scale="range", origin="y"),
+        EffectParameter("radius", "m", SIZE, scale="length"),
+    ),
+    "the body ran into something that the scene does not show",
+    "contact with a static disc",
+    Structure(_discs),
+    scan=_scan_discs,
+    log_odds=-8.0,
+    unusual="obstacles are seen; three numbers that take any misfit of a place",
     needs=("places",),
 )

@@ -22,13 +22,8 @@ from pbrl_ppl.state import Floats, Ints
 if TYPE_CHECKING:
     import mujoco
 
-#: mjtGeom as numbers, as in mjmodel.h.
-_PLANE, _SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX = 0, 2, 3, 4, 5, 6
-_GEOMS = ("plane", "height field", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
 #: mjtJoint in words.
 _JOINTS = ("a free joint", "a ball joint", "a slide", "a hinge")
-#: Smaller differences of mass distributions, relative to an even outline's, are none.
-_EVEN = 0.01
 
 
 def scene_from_mjcf(
@@ -158,15 +153,19 @@ def pair(point: Iterable[float]) -> tuple[float, float]:
 class _View:
     """A model in its reference configuration, seen in a plane, with what a scene leaves out.
 
-    ``axes`` are the plane's axes and its normal (3, 3).
+    ``axes`` are the plane's axes and its normal (3, 3). Differences of mass distributions from an
+    outline's are none up to a share ``even``.
     """
 
-    def __init__(self, model: mujoco.MjModel, axes: Floats, shapes: dict[str, Shape]) -> None:
+    def __init__(
+        self, model: mujoco.MjModel, axes: Floats, shapes: dict[str, Shape], *, even: float = 0.01
+    ) -> None:
         import mujoco
 
         self.model, self.data, self.axes, self.shapes = model, mujoco.MjData(model), axes, shapes
+        self.types = mujoco.mjtGeom
         mujoco.mj_forward(model, self.data)
-        self.left_out: list[str] = []
+        self.left_out, self.even = list[str](), even
         self.poses: dict[int, tuple[Floats, float]] = {}
 
     def name(self, i: int) -> str:
@@ -189,6 +188,10 @@ class _View:
     def geom_name(self, g: int) -> str:
         return str(self.model.geom(g).name) or f"geom{g}"
 
+    def geom_kind(self, g: int) -> str:
+        """Return the name of the kind of a geom: ``box``, ``hfield``, ``mesh``."""
+        return str(self.types(self.model.geom_type[g]).name).removeprefix("mjGEOM_").lower()
+
     def body(self, i: int, known_mass: bool) -> tuple[Body, Joint | None]:
         """Return a moving body, with those that are welded to it, and its hinge, if any.
 
@@ -202,10 +205,10 @@ class _View:
         prior = {} if known_mass else {"mass": {"mu": rounded(math.log(mass)), "sigma": 1.5}}
         size = shape.bounding_radius
         scale = moment / (mass * shape.unit_moment)
-        if abs(math.log(scale)) > _EVEN:
+        if abs(math.log(scale)) > self.even:
             prior["inertia_scale_scale"] = {"mu": rounded(math.log(scale)), "sigma": 0.1}
         offset = rotation(-theta) @ (centre - origin)
-        if np.abs(offset).max() > _EVEN * size:
+        if np.abs(offset).max() > self.even * size:
             for axis, value in zip("xy", offset, strict=True):
                 prior[f"com_offset_{axis}"] = {"mu": rounded(value), "sigma": rounded(size / 10)}
         for label, value in self.friction(i, held is not None).items():
@@ -315,7 +318,7 @@ class _View:
                 "linear_drag_coefficient": slide.mean(),
                 "angular_drag_coefficient": turn[0],
             }
-            if np.ptp(slide) > _EVEN * slide.max():
+            if np.ptp(slide) > self.even * slide.max():
                 self.left_out.append(f'different damping along the slides of "{self.name(i)}"')
             if dry.any():
                 self.left_out.append(
@@ -367,7 +370,7 @@ class _View:
             )
         shape = self.flat(geoms[0], theta)
         if shape is None:
-            kind = _GEOMS[min(int(self.model.geom_type[geoms[0]]), len(_GEOMS) - 1)]
+            kind = self.geom_kind(geoms[0])
             raise SceneError(
                 f'body "{name}": its geom "{self.geom_name(geoms[0])}" is a {kind} that has no'
                 " circle or rectangle for an outline in this plane; make it a box or a cylinder, or"
@@ -377,16 +380,16 @@ class _View:
 
     def flat(self, g: int, theta: float) -> tuple[Shape, Floats] | None:
         """Return a geom's outline in a frame that is turned by theta, and its centroid (2,)."""
-        kind, size = int(self.model.geom_type[g]), self.model.geom_size[g]
+        kind, size = self.geom_kind(g), self.model.geom_size[g]
         centre = self.place(self.data.geom_xpos[g])
         turned = self.axes @ self.data.geom_xmat[g].reshape(3, 3)  # its axes in columns
         upright, lying = abs(turned[2, 2]) > 1 - FLAT, abs(turned[2, 2]) < FLAT
-        is_round = kind == _ELLIPSOID and upright and abs(size[0] - size[1]) < FLAT * size[0]
-        if kind == _SPHERE or is_round or (kind in (_CAPSULE, _CYLINDER) and upright):
+        is_round = kind == "ellipsoid" and upright and abs(size[0] - size[1]) < FLAT * size[0]
+        if kind == "sphere" or is_round or (kind in ("capsule", "cylinder") and upright):
             return Shape.circle(rounded(size[0])), centre
-        if kind == _CYLINDER and lying:
+        if kind == "cylinder" and lying:
             along, half = turned[:2, 2], size[1::-1]
-        elif kind == _BOX and np.abs(turned[2]).max() > 1 - FLAT:
+        elif kind == "box" and np.abs(turned[2]).max() > 1 - FLAT:
             first, second = (k for k in range(3) if k != np.abs(turned[2]).argmax())
             along, half = turned[:2, first], size[[first, second]]
         else:
@@ -425,7 +428,7 @@ class _View:
                 continue
             height, shape = self.corners(g) @ self.axes[2], self.flat(g, 0.0)
             thick = FLAT * np.ptp(height)
-            if model.geom_type[g] == _PLANE:
+            if self.geom_kind(g) == "plane":
                 turned = self.axes @ self.data.geom_xmat[g].reshape(3, 3)
                 if abs(turned[2, 2]) < FLAT:
                     walls.append(self.wall(g, turned))

@@ -14,7 +14,7 @@ from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import Observations, Problem, estimate_sigma, log_noise_prior
 from pbrl_ppl.modes.importance import systematic
 from pbrl_ppl.parameters import ParameterLibrary
-from pbrl_ppl.physics import Part
+from pbrl_ppl.physics import EnginePart
 from pbrl_ppl.state import Floats, Ints
 
 
@@ -33,7 +33,7 @@ class _Combinations:
 
     most = 50_000_000
 
-    def __init__(self, problem: Problem, part: Part, table: Floats) -> None:
+    def __init__(self, problem: Problem, part: EnginePart, table: Floats) -> None:
         bodies = list(part.physics.scene.owners)
         priors = [library_of(problem).prior(body) for body in bodies]
         possible = [np.flatnonzero(p) for p in priors]

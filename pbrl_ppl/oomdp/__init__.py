@@ -2,7 +2,7 @@
 
 from .lwr import LWR as LWR
 from .lwr import OOLWR as OOLWR
-from .regression import Regression as Regression
+from .lwr import LocalRegression as LocalRegression
 from .relations import Attributes as Attributes
 from .relations import Condition as Condition
 from .relations import Pushed as Pushed

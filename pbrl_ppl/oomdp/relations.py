@@ -11,7 +11,7 @@ import numpy as np
 
 from pbrl_ppl.errors import FitError, HistoryError
 from pbrl_ppl.physics import Scenery, circles, scenery
-from pbrl_ppl.scene import WORLD, Scene, smallest_radius
+from pbrl_ppl.scene import WORLD, Scene, checks, smallest_radius
 from pbrl_ppl.state import Bools, Floats, turned
 
 #: Cond(s, a) of a body: the labels of the predicates that hold.
@@ -167,7 +167,7 @@ class SectorContacts:
     def __post_init__(self) -> None:
         for name in ("sectors", "rays"):
             value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+            if not checks.is_whole(value):
                 raise FitError(f"contacts: {name} is {value!r}, expected a whole number from 1 up")
         if self.radius is not None and not 0 <= self.radius < np.inf:
             raise FitError(f"contacts: radius is {self.radius!r}, expected a length of 0 m or more")

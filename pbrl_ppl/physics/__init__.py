@@ -2,9 +2,9 @@
 
 from .compilation import compile_for_search as compile_for_search
 from .compilation import compile_loops as compile_loops
+from .parts import EnginePart as EnginePart
 from .parts import Memory as Memory
 from .parts import OneWorld as OneWorld
-from .parts import Part as Part
 from .parts import PartedSimulator as PartedSimulator
 from .parts import independent_parts as independent_parts
 from .parts import joined_parts as joined_parts

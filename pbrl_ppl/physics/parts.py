@@ -163,7 +163,7 @@ class Memory:
 
 
 @dataclass(eq=False)
-class Part:
+class EnginePart:
     """One part: its engine, and where its parameters and bodies are in the whole."""
 
     simulator: Simulator
@@ -212,7 +212,7 @@ class PartedSimulator:
             places = [labels.index(label) for label in part_physics.layout.labels]
             bodies = [names.index(body.name) for body in part_physics.scene.moving]
             indices = np.array(places, dtype=int), np.array(bodies, dtype=int)
-            self.parts.append(Part(Simulator(part_physics), *indices))
+            self.parts.append(EnginePart(Simulator(part_physics), *indices))
 
     @property
     def steps(self) -> int:
@@ -260,7 +260,7 @@ class PartedSimulator:
         return out
 
 
-def _of(part: Part, start: Floats, actions: Floats) -> tuple[Floats, Floats]:
+def _of(part: EnginePart, start: Floats, actions: Floats) -> tuple[Floats, Floats]:
     return start[..., part.bodies, :], actions[:, :, part.bodies]
 
 

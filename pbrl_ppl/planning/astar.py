@@ -17,29 +17,21 @@ from scipy.sparse.csgraph import dijkstra
 
 from pbrl_ppl.errors import GoalError
 from pbrl_ppl.physics import depth_of, overlap
-from pbrl_ppl.planning.actions import ActionSet, play
 from pbrl_ppl.planning.dynamics import TransitionModel, remembered
-from pbrl_ppl.planning.goals import Goal, Target
-from pbrl_ppl.planning.search import SearchResult, Task, contact_cost, tail_mean
+from pbrl_ppl.planning.goals import ActionSet, Goal, Target, play
+from pbrl_ppl.planning.search import FoundPlan, SearchTask, contact_cost, tail_mean
 from pbrl_ppl.scene import Body, Scene, Shape
 from pbrl_ppl.state import Bools, Floats
 
-#: Cells of the closed set ten tolerances from the goal, in tolerances and, for speeds, tolerances a
-#: sampling interval; further away and nearer they grow and shrink in proportion, between limits.
-_CELLS = np.array([4.0, 4.0, 5.0, 2.0, 2.0, 2.5])
-#: The largest tolerances that cells are in proportion to: of the position, as a share of the body's
-#: bounding radius, and of the angle (rad).
-_WIDEST, _WIDEST_ANGLE = 0.2, 0.1
-
 
 def astar(
-    task: Task,
+    task: SearchTask,
     *,
     weight: float = 3.0,
     improve: bool = False,
     share: float = 0.5,
     every: float = 0.5,
-) -> SearchResult:
+) -> FoundPlan:
     """Search for the quickest actions that bring bodies to the goal.
 
     The cost of a plan is its time and the penalties for contact. A node holds the states under all
@@ -51,7 +43,7 @@ def astar(
 
     Parameters
     ----------
-    task : Task
+    task : SearchTask
         Model, start, goal, actions and limits.
     weight : float
         Of the heuristic: 1 is A*, which goes on until no node of the queue can lead to a cheaper
@@ -67,7 +59,7 @@ def astar(
 
     Returns
     -------
-    SearchResult
+    FoundPlan
         If the goal is not reached, the plan that ends nearest to it in L2 distance. An empty plan
         counts only where bodies are at rest: others do not stay where they are.
 
@@ -112,7 +104,7 @@ def astar(
     path = search.path(search.best or search.nearest)
     which = np.array([[action for action, n in path for _ in range(n)]], dtype=np.intp)
     wrenches = play(task.dynamics, task.start, task.actions, which, mean_angle)[0]
-    return SearchResult(wrenches, reached, stopped, search.generated, time.monotonic() - begin)
+    return FoundPlan(wrenches, reached, stopped, search.generated, time.monotonic() - begin)
 
 
 class Edge(NamedTuple):
@@ -135,7 +127,9 @@ class Node(NamedTuple):
 class _Search:
     """State of the search: the tree, the open queue and the closed set."""
 
-    def __init__(self, task: Task, weight: float, rng: np.random.Generator | None = None) -> None:
+    def __init__(
+        self, task: SearchTask, weight: float, rng: np.random.Generator | None = None
+    ) -> None:
         self.dynamics, self.goal, self.actions = task.dynamics, task.goal, task.actions
         self.tail, self.weight, self.rng = task.tail, weight, rng
         self.scene = task.dynamics.scene
@@ -145,9 +139,12 @@ class _Search:
         self.root = Node(root, task.dynamics.before, 0.0, Edge(0, -1, 0))
         self.generated = 1
         reach = [self.scene.body(target.body).shape.bounding_radius for target in self.goal.targets]
-        self.near = min(_WIDEST * min(reach), *self.goal.tolerances(self.scene))
-        turn = min(_WIDEST_ANGLE, *(target.angle_tolerance for target in self.goal.targets))
-        self.cells = _CELLS * np.array([self.near, self.near, turn] * 2)
+        # cells of the closed set ten tolerances from the goal, in tolerances and, for speeds,
+        # tolerances a sampling interval; of wide tolerances a part of the radius, or 0.1 rad
+        self.near = min(0.2 * min(reach), *self.goal.tolerances(self.scene))
+        turn = min(0.1, *(target.angle_tolerance for target in self.goal.targets))
+        sizes = np.array([self.near, self.near, turn] * 2)
+        self.cells = sizes * (4.0, 4.0, 5.0, 2.0, 2.0, 2.5)
         self.cells[3:] /= self.scene.time_step
         self.refined = 0
         self.begin()
@@ -283,13 +280,6 @@ def mean_angle(angle: Floats) -> Floats:
     return np.asarray(np.arctan2(np.sin(angle).mean(axis=0), np.cos(angle).mean(axis=0)))
 
 
-#: Least acceleration, in bounding radii (or rad) an interval squared: without a push, the time to
-#: the goal is long but finite, because others may hit the body.
-_LEAST = 1e-6
-#: Moves on the grid: to neighbours, and as a knight does, which cuts the error of eight directions.
-_MOVES = [(1, 0), (0, 1), (1, 1), (1, -1), (2, 1), (1, 2), (2, -1), (1, -2)]
-
-
 class TimeToGo:
     """Lower bound on the time to the goal, for pushes up to the strongest of the action set.
 
@@ -309,10 +299,18 @@ class TimeToGo:
         Says the strongest pushes.
     start : ndarray
         Shape (body, 6); the grid covers it.
+    least : float
+        Acceleration in bounding radii (or rad) an interval squared, at least: without a push, the
+        time to the goal is long but finite, because others may hit the body.
     """
 
     def __init__(
-        self, dynamics: TransitionModel, goal: Goal, actions: ActionSet, start: Floats
+        self,
+        dynamics: TransitionModel,
+        goal: Goal,
+        actions: ActionSet,
+        start: Floats,
+        least: float = 1e-6,
     ) -> None:
         scene = dynamics.scene
         self.goal, self.scene = goal, scene
@@ -322,9 +320,9 @@ class TimeToGo:
         for target, i, tolerance in zip(goal.targets, places, tolerances, strict=True):
             force, torque = actions.strongest(target.body)
             push, turn = dynamics.acceleration(target.body, force or anyone, torque)
-            body, least = scene.body(target.body), _LEAST / scene.time_step**2
-            push = np.maximum(push, least * body.shape.bounding_radius)[:, None]
-            turn = np.maximum(turn, least)[:, None]
+            body, slow = scene.body(target.body), least / scene.time_step**2
+            push = np.maximum(push, slow * body.shape.bounding_radius)[:, None]
+            turn = np.maximum(turn, slow)[:, None]
             around = _distances(scene, body, target, start[i])
             self._bounds.append((target, i, tolerance, push, turn, around))
 
@@ -414,8 +412,10 @@ def _graph(free: Bools) -> coo_array:
     # in a margin of two cells, which are not free, every move stays on the grid
     open_, number = (np.pad(a, 2) for a in (free, np.arange(free.size).reshape(free.shape)))
     cells, width = np.flatnonzero(open_), open_.shape[1]
+    # to neighbours, and as a knight does, which cuts the error of eight directions
+    moves = [(1, 0), (0, 1), (1, 1), (1, -1), (2, 1), (1, 2), (2, -1), (1, -2)]
     rows, columns, lengths = [], [], []
-    for dx, dy in _MOVES:
+    for dx, dy in moves:
         passed = np.ones(len(cells), dtype=bool)
         for t in np.linspace(0, 1, 2 * max(dx, abs(dy)) + 1):
             passed &= open_.flat[cells + round(dx * t) * width + round(dy * t)]

@@ -80,11 +80,8 @@ def remembered(wrenches: Floats, before: Floats) -> Floats:
     return np.concatenate([wrenches, before[..., : -len(WRENCH)]], axis=-1)
 
 
-def rollout(
-    model: TransitionModel,
-    start: Floats,
-    wrenches: Floats,
-    rng: np.random.Generator | None = None,
+def predicted_path(
+    model: TransitionModel, start: Floats, wrenches: Floats, rng: np.random.Generator | None = None
 ) -> Floats:
     """Play wrenches (..., time, body, 3) from a state (body, 6).
 
@@ -374,4 +371,4 @@ class Dynamics:
 
         With a generator, Eq. 13's noise is added after each interval.
         """
-        return rollout(self, start, wrenches, rng)
+        return predicted_path(self, start, wrenches, rng)

@@ -1,34 +1,162 @@
-"""Experiments: actions that separate effects that are confounded in the data so far."""
+"""Experiments: rival models that a recording cannot separate, and actions that separate them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 import xarray as xr
 from numpy.typing import ArrayLike
-from threadpoolctl import threadpool_limits
 
-from pbrl_ppl.effects import Effect, catalogue
-from pbrl_ppl.errors import EffectError, GoalError
+from pbrl_ppl.criticism import Loop, rank_candidates, with_effects
+from pbrl_ppl.effects import Attached, Effect, Noise, catalogue
+from pbrl_ppl.errors import EffectError, GoalError, PosteriorError
 from pbrl_ppl.files import write_atomically
+from pbrl_ppl.likelihood import is_independent
+from pbrl_ppl.modes import FilteredMode, trajectory_mode
 from pbrl_ppl.parameters import differentiate
 from pbrl_ppl.physics import touching
-from pbrl_ppl.planning.actions import ActionSet, Allowed, Bounds, allowed_wrenches
-from pbrl_ppl.planning.dynamics import Dynamics, remembered, rollout
-from pbrl_ppl.planning.planner import start_state, table_of_plan
-from pbrl_ppl.scene import Scene, body_sizes
+from pbrl_ppl.planning.dynamics import Dynamics, predicted_path, remembered
+from pbrl_ppl.planning.goals import ActionSet, Allowed, Bounds, allowed_wrenches
+from pbrl_ppl.planning.planner import labelled, start_state, table_of_plan
+from pbrl_ppl.posterior import Fit, Idata, scene_of, stored_fields
+from pbrl_ppl.scene import Scene, body_sizes, nearest
 from pbrl_ppl.state import WRENCH, WRENCH_UNITS, Bools, Floats
+from pbrl_ppl.threads import Say, one_blas_thread, silent
 
-if TYPE_CHECKING:  # with the samplers, which a plan does not need
-    from pbrl_ppl.criticism import Loop
-    from pbrl_ppl.planning.rivals import Rival
-    from pbrl_ppl.posterior import Idata
+
+@dataclass(frozen=True, eq=False)
+class Rival:
+    """A model with one effect of a group, fitted to the recording that they all explain.
+
+    Parameters
+    ----------
+    attached : Attached
+        The effect.
+    mode : FilteredMode
+        Of the model with this effect and without the others, fitted to whole trajectories.
+    draws : ndarray
+        Draws from its posterior, shape (draw, p).
+    sigma : ndarray
+        Noise parameters of the model that all rivals come from, shape (parameter,).
+    """
+
+    attached: Attached
+    mode: FilteredMode
+    draws: Floats
+    sigma: Floats
+
+    @property
+    def name(self) -> str:
+        """Return the names of the effect and of its body."""
+        return f"{self.attached.effect.name} on {self.attached.body}"
+
+
+def kept_groups(posterior: Idata) -> list[tuple[str, ...]]:
+    """Return the groups of effects that a posterior's recording cannot separate."""
+    return list(stored_fields(posterior, ("not_separable",)).get("not_separable", ()))
+
+
+def named_effects(
+    names: Sequence[str], scene: Scene, catalogue: Iterable[Effect]
+) -> list[Attached]:
+    """Return effects on bodies by names such as ``spring``, or ``spring on cart``.
+
+    Raises
+    ------
+    EffectError
+        If there are fewer than two, one is unknown, does not apply, or is an effect of the noise;
+        or if the body is left out and there are several.
+    """
+    by_name = {effect.name: effect for effect in catalogue}
+    named: list[Attached] = []
+    for text in names:
+        name, _, body = (part.strip() for part in text.partition(" on "))
+        if name not in by_name:
+            raise EffectError(f"effect {name!r} is not in the catalogue{nearest(name, by_name)}")
+        effect = by_name[name]
+        bodies = [one.name for one in scene.dynamic if effect.applies(scene, one)]
+        if body and body not in bodies:
+            raise EffectError(f"effect {name} does not apply to body {body!r}, only to {bodies}")
+        if not body and len(bodies) != 1:
+            raise EffectError(f"effect {name} may act on {bodies}; say which: '{name} on BODY'")
+        if isinstance(effect.stage, Noise):
+            raise EffectError(
+                f"effect {name} is of the noise: experiments cannot identify noise effects"
+            )
+        attached = effect.on(body or bodies[0]).in_si(scene)
+        if attached not in named:
+            named.append(attached)
+    if len(named) < 2:
+        raise EffectError(
+            f"effects: got {list(names)}, expected two or more to separate, such as"
+            " linear_drag and quadratic_drag"
+        )
+    return named
+
+
+def fit_rivals(
+    posterior: Idata,
+    effects: Sequence[Attached],
+    catalogue: Iterable[Effect],
+    draws: int,
+    seed: int,
+) -> list[Rival]:
+    """Fit a model with each of several effects to the recording that a posterior holds.
+
+    The posterior's model keeps its draws; the others are drawn from the Gaussian at the mode.
+
+    Parameters
+    ----------
+    posterior : InferenceData or DataTree
+        A posterior of whole trajectories.
+    effects : sequence of Attached
+        The effects; each model has one.
+    catalogue : iterable of Effect
+        Where the names of the posterior's effects are looked up.
+    draws : int
+        Number of draws from each model.
+    seed : int
+        Seed of the draws.
+
+    Raises
+    ------
+    PosteriorError
+        If the posterior is of single transitions, or holds fewer draws.
+    """
+    fit = Fit.of(posterior, catalogue)
+    problem, phi = fit.problem.with_physics(threads=2), fit.draws[0]
+    if is_independent(problem):
+        raise PosteriorError(
+            "posterior: it is of single transitions, which do not separate measurement noise from"
+            " process noise; take after.nc of close_loop, or fit whole trajectories"
+        )
+    if not 1 <= draws <= len(phi):
+        raise PosteriorError(f"posterior: {draws} draws were asked for, expected 1 to {len(phi)}")
+    # found from the draw of the highest density
+    declared, rng = trajectory_mode(problem, *fit.best), np.random.default_rng(seed)
+    present = [one for one in problem.physics.effects if one in effects]
+    base = declared
+    if present:
+        others = tuple(one for one in problem.physics.effects if one not in effects)
+        base = trajectory_mode(*with_effects(declared, others), declared.sigma)
+    fits = []
+    for attached in effects:
+        if present == [attached]:
+            chosen = phi[rng.choice(len(phi), draws, replace=False)]
+            fits.append(Rival(attached, declared, chosen, declared.sigma))
+            continue
+        (signature,) = rank_candidates(base, [attached])
+        estimate = signature.candidate.estimate.values()
+        sizes = dict(zip(attached.labels, estimate, strict=True))
+        start = with_effects(base, (*base.problem.physics.effects, attached), sizes)
+        mode = trajectory_mode(*start, base.sigma)
+        fits.append(Rival(attached, mode, mode.draws(rng, draws), declared.sigma))
+    return fits
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +185,7 @@ class _Paths:
     @classmethod
     def of(cls, dynamics: Dynamics, start: Floats, wrenches: Floats) -> _Paths:
         """Return the paths of each draw from a state under wrenches (n, time, body, 3)."""
-        states = rollout(dynamics, start, wrenches)
+        states = predicted_path(dynamics, start, wrenches)
         lost = np.asarray(~np.isfinite(states).all(axis=(2, 3, 4)))
         states[lost] = start
         last = np.broadcast_to(dynamics.before, (len(wrenches), *dynamics.before.shape))
@@ -208,10 +336,6 @@ class Separation:
         return (r**2).sum(axis=1) - absorbed - of_noise, np.linalg.slogdet(precision)[1]
 
 
-#: A log Bayes factor from which one effect is named alone: half the `decisive` score statistic.
-_NAMED = 5.0
-
-
 @dataclass(frozen=True, eq=False)
 class Suggestion:
     """Experiment that is expected to separate rival effects.
@@ -231,6 +355,9 @@ class Suggestion:
         Mean over random sequences of the same set, for the weakest pair (nats).
     meeting : bool
         Whether bodies may meet, where models are rough.
+    naming : float
+        Log Bayes factor from which one effect is named alone: half the ``decisive`` score statistic
+        of the criteria.
     """
 
     scene: Scene
@@ -239,6 +366,7 @@ class Suggestion:
     separation: xr.DataArray
     at_random: float
     meeting: bool
+    naming: float = 5.0
 
     @property
     def expected(self) -> float:
@@ -248,7 +376,7 @@ class Suggestion:
     @property
     def decisive(self) -> bool:
         """Whether one effect alone is expected to be named afterwards."""
-        return self.expected >= _NAMED
+        return self.expected >= self.naming
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -267,10 +395,10 @@ class Suggestion:
             " that is separated worst"
         )
         if not self.decisive:
-            times = int(np.ceil(_NAMED / max(self.expected, 1e-3)))
+            times = int(np.ceil(self.naming / max(self.expected, 1e-3)))
             more = f"repeat it {times} times, or " if times <= 20 else ""
             said.append(
-                f"a factor of {_NAMED:g} names one effect alone, which is not to be expected:"
+                f"a factor of {self.naming:g} names one effect alone, which is not to be expected:"
                 f" {more}allow stronger actions, more steps or another start"
             )
         if self.meeting:
@@ -293,6 +421,7 @@ class Suggestion:
         write_atomically(Path(path), lambda to: table.to_csv(to, index=False))
 
 
+@one_blas_thread
 def suggest_actions(
     known: Loop | Idata,
     start: Mapping[str, Sequence[float]] | ArrayLike,
@@ -305,7 +434,7 @@ def suggest_actions(
     seed: int = 0,
     before: ArrayLike | None = None,
     catalogue: Iterable[Effect] = catalogue,
-    progress: Callable[[str], None] | None = None,
+    progress: Say | None = None,
 ) -> Suggestion:
     """Find the actions that best separate effects that are confounded in the data so far.
 
@@ -370,15 +499,16 @@ def suggest_actions(
         said.sentences  # what is to be expected
         said.to_csv("next.csv")  # play it, record, and close the loop on both recordings
     """
-    # with the samplers, which a plan does not need
-    from pbrl_ppl.criticism import Loop
-    from pbrl_ppl.planning.rivals import fit_rivals, named_effects
-    from pbrl_ppl.posterior import scene_of
-
-    progress = progress or (lambda stage: None)
-    posterior = known.posterior_after if isinstance(known, Loop) else known
-    catalogue = known.catalogue if isinstance(known, Loop) else tuple(catalogue)
-    scene, effects = scene_of(posterior), _confounded(posterior) if effects is None else effects
+    if isinstance(known, Loop):
+        known, catalogue = known.posterior_after, known.catalogue
+    posterior, catalogue, progress = known, tuple(catalogue), progress or silent
+    scene = scene_of(posterior)
+    if effects is None and not (groups := kept_groups(posterior)):
+        raise EffectError(
+            "effects: the loop found none that its data cannot separate; name two or more,"
+            " such as effects=('linear_drag', 'quadratic_drag')"
+        )
+    effects = groups[0] if effects is None else effects
     chosen = named_effects(effects, scene, catalogue)
     if steps < 1 or (hold is not None and hold < 1):
         raise GoalError(f"steps is {steps} and hold {hold}; both must be at least 1")
@@ -389,65 +519,31 @@ def suggest_actions(
     allowed = allowed_wrenches(
         scene, ActionSet.recorded(posterior) if actions is None else actions, steps, hold
     )
-    # matrices are small: threads of linear algebra only get in each other's way
-    with threadpool_limits(1, "blas"):
-        progress("fitting each effect to the recording")
-        rivals = fit_rivals(posterior, chosen, catalogue, draws, seed)
-        judge = Separation(rivals, first, last)
-        genes, at_random = _evolved(judge, allowed, np.random.default_rng(seed), progress)
-        progress("judging the best sequences")
-        wrenches = allowed.wrenches(genes, judge.dynamics[0], judge.start)
-        separation, meeting = judge(wrenches, draws)
+    progress("fitting each effect to the recording")
+    rivals = fit_rivals(posterior, chosen, catalogue, draws, seed)
+    judge = Separation(rivals, first, last)
+    genes, at_random = _evolved(judge, allowed, np.random.default_rng(seed), progress)
+    progress("judging the best sequences")
+    wrenches = allowed.wrenches(genes, judge.dynamics[0], judge.start)
+    separation, meeting = judge(wrenches, draws)
     best = int(np.argmax(_value(separation, meeting)))
     if not np.isfinite(separation[..., best]).all():
         raise GoalError(
             "actions: the engine diverges in all sequences; allow weaker actions or fewer steps"
         )
     names = [rival.name for rival in rivals]
-    return Suggestion(
-        scene,
-        first,
-        _labelled(scene, wrenches[best]),
-        xr.DataArray(
-            separation[..., best], {"true": names, "rival": names}, ("true", "rival"),
-            attrs={"units": "nats"},
-        ),
-        at_random,
-        bool(meeting[best]),
-    )  # fmt: skip
-
-
-def _confounded(posterior: Idata) -> tuple[str, ...]:
-    """Return the first group of effects that a posterior's recording cannot separate."""
-    from pbrl_ppl.planning.rivals import kept_groups
-
-    if groups := kept_groups(posterior):
-        return groups[0]
-    raise EffectError(
-        "effects: the loop found none that its data cannot separate; name two or more,"
-        " such as effects=('linear_drag', 'quadratic_drag')"
-    )
-
-
-def _labelled(scene: Scene, wrenches: Floats) -> xr.DataArray:
-    """Return wrenches (time, body, wrench) with their coordinates."""
-    return xr.DataArray(
-        wrenches,
-        {
-            "time": ("time", scene.time_step * np.arange(len(wrenches)), {"units": "s"}),
-            "body": [body.name for body in scene.moving],
-            "wrench": list(WRENCH),
-        },
-        ("time", "body", "wrench"),
-        attrs={"units": ", ".join(WRENCH_UNITS)},
-    )
+    pairs = {"true": names, "rival": names}
+    nats = xr.DataArray(separation[..., best], pairs, (*pairs,), attrs={"units": "nats"})
+    played = labelled(scene, wrenches[best], ("time", "body", "wrench"))
+    played.attrs["units"] = ", ".join(WRENCH_UNITS)
+    return Suggestion(scene, first, played, nats, at_random, bool(meeting[best]))
 
 
 def _evolved(
     judge: Separation,
     allowed: Allowed,
     rng: np.random.Generator,
-    progress: Callable[[str], None],
+    progress: Say,
     *,
     population: int = 40,
     n_parents: int = 10,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, TypedDict
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -17,37 +17,22 @@ from pbrl_ppl.errors import GoalError
 from pbrl_ppl.files import write_atomically
 from pbrl_ppl.history import table_of_arrays, with_paths
 from pbrl_ppl.physics import check_placement, overlap
-from pbrl_ppl.planning.actions import ActionSet
 from pbrl_ppl.planning.astar import astar
-from pbrl_ppl.planning.dynamics import Dynamics, TransitionModel, rollout
-from pbrl_ppl.planning.goals import Goal
-from pbrl_ppl.planning.search import NODES, SearchResult, Task, mppi, tail_mean
-from pbrl_ppl.scene import Scene, nearest
+from pbrl_ppl.planning.dynamics import Dynamics, TransitionModel, predicted_path
+from pbrl_ppl.planning.goals import ActionSet, Goal
+from pbrl_ppl.planning.search import FoundPlan, SearchTask, mppi, tail_mean
+from pbrl_ppl.scene import Scene, checks, nearest
 from pbrl_ppl.state import POSE, STATE, WRENCH, Floats
+from pbrl_ppl.threads import Say, silent
 
 if TYPE_CHECKING:
     from pbrl_ppl.posterior import Idata
 
-METHODS: dict[str, Callable[..., SearchResult]] = {"astar": astar, "mppi": mppi}
-
-
-class SearchOptions(TypedDict, total=False):
-    """Options of the search of a plan, which agents pass on to :func:`plan`."""
-
-    method: str
-    tail: float
-    noise: bool
-    seconds: float | None
-    progress: Callable[[str], None] | None
-    weight: float
-    improve: bool
-    horizon: int
-    samples: int
-    iterations: int
+METHODS: dict[str, Callable[..., FoundPlan]] = {"astar": astar, "mppi": mppi}
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class Plan(SearchResult):
+class Plan(FoundPlan):
     """Wrenches that lead to a goal, and where the model says they lead.
 
     Attributes
@@ -168,11 +153,11 @@ def plan(
     tail: float = 1.0,
     noise: bool = False,
     seed: int = 0,
-    nodes: int = NODES,
+    nodes: int = SearchTask.nodes,
     seconds: float | None = None,
     before: ArrayLike | None = None,
     effects: Iterable[Effect] = catalogue,
-    progress: Callable[[str], None] | None = None,
+    progress: Say | None = None,
     **options: object,
 ) -> Plan:
     """Plan from a start to a goal with what a posterior knows, and nothing else.
@@ -252,42 +237,45 @@ def plan(
         dynamics = Dynamics.of(idata, draws, seed=seed, effects=effects)
         actions = ActionSet.recorded(idata) if actions is None else actions
     scene = dynamics.scene
-    goal = goal if isinstance(goal, Goal) else Goal.of(goal)
-    goal.check(scene)
+    goal = Goal.of(goal)
+    _check_goal(scene, goal)
     actions.check(scene)
     first = start_state(scene, start)
     if before is not None:
         dynamics = dynamics.after(np.asarray(before, dtype=float))
-    _check_room(scene, goal)
-    rng = np.random.default_rng(seed)
-    limit = np.inf if seconds is None else seconds
-    say = progress or (lambda text: None)
-    task = Task(dynamics, first, goal, actions, tail, nodes, limit, noise, rng, say)
+    rng, limit = np.random.default_rng(seed), np.inf if seconds is None else seconds
+    said = progress or silent
+    task = SearchTask(dynamics, first, goal, actions, tail, nodes, limit, noise, rng, said)
     result = METHODS[method](task, **options)
-    states = rollout(dynamics, first, result.wrenches)
+    states = predicted_path(dynamics, first, result.wrenches)
     distance = float(tail_mean(goal.distance(scene, states[:, -1]), tail))
     if noise:
         times = -(-64 // dynamics.draws)  # so many draws of Eq. 13's noise, at least
         states = np.concatenate(
-            [rollout(dynamics, first, result.wrenches, rng) for _ in range(times)]
+            [predicted_path(dynamics, first, result.wrenches, rng) for _ in range(times)]
         )
-    predicted = _labelled(scene, states)
+    predicted = labelled(scene, states, ("draw", "time", "body", "state"))
     return Plan(
-        **vars(result), scene=scene, goal=goal, start=first, predicted=predicted, distance=distance
+        **vars(result),
+        scene=scene,
+        goal=goal,
+        start=first,
+        predicted=predicted.to_dataset(name="predicted"),
+        distance=distance,
     )
 
 
-def _labelled(scene: Scene, states: Floats) -> xr.Dataset:
-    """Return predicted states (draw, time, body, state) as a dataset."""
-    return xr.Dataset(
-        {"predicted": (("draw", "time", "body", "state"), states)},
-        {
-            "draw": np.arange(len(states)),
-            "time": ("time", scene.time_step * np.arange(states.shape[1]), {"units": "s"}),
-            "body": [body.name for body in scene.moving],
-            "state": list(STATE),
-        },
-    )
+def labelled(scene: Scene, values: Floats, dims: Sequence[str]) -> xr.DataArray:
+    """Return values with coordinates for their dimensions: draw, time, body, state or wrench."""
+    times = scene.time_step * np.arange(values.shape[dims.index("time")])
+    coords = {
+        "draw": np.arange(len(values)),
+        "time": ("time", times, {"units": "s"}),
+        "body": [body.name for body in scene.moving],
+        "state": list(STATE),
+        "wrench": list(WRENCH),
+    }
+    return xr.DataArray(values, {dim: coords[dim] for dim in dims}, dims)
 
 
 def start_state(scene: Scene, start: Mapping[str, Sequence[float]] | ArrayLike) -> Floats:
@@ -307,11 +295,8 @@ def start_state(scene: Scene, start: Mapping[str, Sequence[float]] | ArrayLike) 
     """
     names = [body.name for body in scene.moving]
     if isinstance(start, Mapping):
-        for name in start:
-            if name not in names:
-                raise GoalError(
-                    f'start: the scene has no moving body "{name}"{nearest(name, names)}'
-                )
+        with checks.located(kind=GoalError):
+            checks.keyed(start, "start, which is of moving bodies", (), names)
         states = np.zeros((len(names), len(STATE)))
         for i, body in enumerate(scene.moving):
             if body.name not in start and body.pose is None:
@@ -337,8 +322,9 @@ def start_state(scene: Scene, start: Mapping[str, Sequence[float]] | ArrayLike) 
     return states
 
 
-def _check_room(scene: Scene, goal: Goal) -> None:
-    """Refuse targets inside walls or static bodies, by more than their tolerance."""
+def _check_goal(scene: Scene, goal: Goal) -> None:
+    """Refuse targets of no body, or inside walls or static bodies by more than their tolerance."""
+    goal.check(scene)
     for target, tolerance in zip(goal.targets, goal.tolerances(scene), strict=True):
         if target.x is None or target.y is None or target.theta is None:
             continue

@@ -7,26 +7,22 @@ the other.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from pbrl_ppl.errors import GoalError
 from pbrl_ppl.physics import overlap
-from pbrl_ppl.planning.actions import ActionSet
 from pbrl_ppl.planning.dynamics import TransitionModel, remembered
-from pbrl_ppl.planning.goals import Goal
+from pbrl_ppl.planning.goals import ActionSet, Goal
 from pbrl_ppl.scene import Scene, smallest_radius
 from pbrl_ppl.state import Floats
-
-#: States that a search generates at most by default: 15 s or so for one body.
-NODES = 2_000_000
+from pbrl_ppl.threads import Say, silent
 
 
 @dataclass(frozen=True, eq=False)
-class Task:
-    """Task of a search.
+class SearchTask:
+    """SearchTask of a search.
 
     Parameters
     ----------
@@ -40,7 +36,7 @@ class Task:
         The goal is reached where the mean shortfall of the worst share of draws is within the
         tolerances: 1 for the expectation, less for conditional value at risk.
     nodes : int
-        States to generate at most, counting each draw's.
+        States to generate at most, counting each draw's; by default 15 s or so for one body.
     seconds : float
         Limit of time; with it, the plan depends on how busy the machine is.
     noise : bool
@@ -56,15 +52,15 @@ class Task:
     goal: Goal
     actions: ActionSet
     tail: float = 1.0
-    nodes: int = NODES
+    nodes: int = 2_000_000
     seconds: float = np.inf
     noise: bool = False
     rng: np.random.Generator | None = None
-    progress: Callable[[str], None] = lambda text: None
+    progress: Say = silent
 
 
 @dataclass(frozen=True, eq=False)
-class SearchResult:
+class FoundPlan:
     """Result of a search.
 
     Attributes
@@ -140,7 +136,7 @@ class Horizon:
 
     Parameters
     ----------
-    task : Task
+    task : SearchTask
         Model, goal, actions and risk.
     horizon : int
         Intervals looked ahead.
@@ -158,7 +154,12 @@ class Horizon:
     """
 
     def __init__(
-        self, task: Task, horizon: int, samples: int, iterations: int, rng: np.random.Generator
+        self,
+        task: SearchTask,
+        horizon: int,
+        samples: int,
+        iterations: int,
+        rng: np.random.Generator,
     ) -> None:
         self.task, self.rng = task, rng
         self.samples, self.iterations = samples, iterations
@@ -239,18 +240,18 @@ class Horizon:
 
 
 def mppi(
-    task: Task,
+    task: SearchTask,
     *,
     horizon: int = 15,
     samples: int = 256,
     iterations: int = 3,
     intervals: int = 200,
-) -> SearchResult:
+) -> FoundPlan:
     """Plan with MPPI until the model reaches the goal.
 
     Parameters
     ----------
-    task : Task
+    task : SearchTask
         Model, start, goal, actions and limits.
     horizon, samples, iterations : int
         As for :class:`Horizon`.
@@ -259,7 +260,7 @@ def mppi(
 
     Returns
     -------
-    SearchResult
+    FoundPlan
         If the goal is not reached, up to where it was nearest; a start in motion does not count.
 
     Raises
@@ -303,4 +304,4 @@ def mppi(
         stopped = "interrupted"
     chosen = np.array(wrenches[:best]).reshape(-1, len(start), 3)
     took = time.monotonic() - begin
-    return SearchResult(chosen, stopped == "goal", stopped, ahead.generated, took)
+    return FoundPlan(chosen, stopped == "goal", stopped, ahead.generated, took)

@@ -1,5 +1,6 @@
 """Scenes: shapes, bodies, walls and joints as declared; TOML to `Scene` and back."""
 
+from . import checks as checks
 from .bodies import Body as Body
 from .bodies import Shape as Shape
 from .bodies import Wall as Wall

@@ -50,14 +50,15 @@ class Shape:
 
     def __post_init__(self) -> None:
         needs = {"box": "size", "circle": "radius", "polygon": "vertices"}
-        checks.choice(self.kind, "shape: kind", needs, '"box", "circle" or "polygon"')
+        checks.settle(self, "shape", kind=checks.choice(needs))
         for kind, key in needs.items():
             present = getattr(self, key) is not None
             if present and kind != self.kind:
                 raise SceneError(f'shape: a {self.kind} has no "{key}"; drop it')
             if not present and kind == self.kind:
                 raise SceneError(f'shape: a {self.kind} needs "{key}"; add it')
-        checks.settle(self, "shape", size=_size, radius=checks.positive, vertices=_polygon)
+        size = partial(checks.vector, check=checks.positive)
+        checks.settle(self, "shape", size=size, radius=checks.positive, vertices=_polygon)
 
     @classmethod
     def box(cls, width: float, height: float) -> Shape:
@@ -134,16 +135,9 @@ def _moments(vertices: tuple[Point, ...]) -> tuple[float, Floats, float]:
     return area, corners[0] + centroid, float(second / area - centroid @ centroid)
 
 
-def _size(value: object, where: str) -> tuple[float, ...]:
-    """Return the width and the height of a box."""
-    return tuple(checks.positive(side, where) for side in checks.vector(value, where))
-
-
 def _polygon(value: object, where: str) -> tuple[Point, ...]:
     """Return a polygon's corners as given, or raise."""
-    if isinstance(value, str) or not isinstance(value, Iterable):
-        raise SceneError(f"{where} is {value!r}, expected a list of points")
-    vertices: tuple[Point, ...] = tuple(checks.vector(point, where) for point in value)
+    vertices = checks.each(checks.vector, "a list of points")(value, where)
     if len(vertices) < 3:
         raise SceneError(f"{where} has {len(vertices)} points, expected at least 3")
     for number, point in enumerate(vertices, start=1):
@@ -265,14 +259,11 @@ class Body:
         where = f'body "{self.name}"'
         if self.name == WORLD:
             raise SceneError(f'{where}: "world" is the name of the ground; choose another name')
-        if not isinstance(self.shape, Shape):
-            raise SceneError(f"{where}: shape is {self.shape!r}, expected a Shape")
-        checks.settle(self, where, wheel=checks.flag, static=checks.flag, kinematic=checks.flag)
-        pose = partial(checks.vector, length=3)
-        checks.settle(self, where, effects=checks.names, attributes=checks.names, pose=pose)
+        checks.settle(self, where, shape=checks.instance(Shape, "a Shape"))
+        checks.settle(self, where, **dict.fromkeys(("wheel", "static", "kinematic"), checks.flag))
+        checks.settle(self, where, **dict.fromkeys(("effects", "attributes"), checks.names))
+        checks.settle(self, where, pose=partial(checks.vector, length=3), object_class=checks.label)
         self._settle_tables(where)
-        if self.object_class is not None:
-            checks.label(self.object_class, f"{where}: class")
         if self.static and self.pose is None:
             raise SceneError(f"{where}: it is static and has no pose; add pose = [x, y, theta]")
         if self.static and self.wheel:

@@ -1,13 +1,21 @@
 """Checks of a scene's values: each returns the value in canonical form or raises `SceneError`."""
 
+from __future__ import annotations
+
 import difflib
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from numbers import Real
-from typing import Any, TypeVar
+from dataclasses import MISSING, fields
+from numbers import Integral, Real
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from pbrl_ppl.errors import SceneError
+from pbrl_ppl.errors import PbrlError, SceneError
+from pbrl_ppl.files import parse_toml, read_text, reason
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 Value = TypeVar("Value")
 Point = tuple[float, float]
@@ -15,11 +23,10 @@ Named = tuple[tuple[str, float], ...]
 #: Takes a value and where it is; returns the value in canonical form.
 Check = Callable[[object, str], object]
 
+#: Keys that are not the names of the fields that they set.
+RENAMED = {"object_class": "class", "start": "from", "end": "to"}
 #: The parameters of Table 1 that a contact needs: all that a kinematic body has.
 CONTACT_NAMES = ("r", "mu_c")
-#: Largest absolute value of a number and smallest positive one, in SI units: their products, such
-#: as inertias, stay far from the limits of floating-point numbers.
-LARGEST, SMALLEST = 1e18, 1e-18
 
 
 def nearest(name: object, known: Iterable[str]) -> str:
@@ -29,18 +36,57 @@ def nearest(name: object, known: Iterable[str]) -> str:
     return f'; did you mean "{lower[close[0]]}"?' if close else ""
 
 
+def known(name: str, names: Sequence[str], where: str) -> None:
+    """Refuse a name that is none of these, after what ``where`` says of it."""
+    if name not in names:
+        raise SceneError(f'{where} "{name}"{nearest(name, names)}')
+
+
 @contextmanager
-def located(where: str) -> Iterator[None]:
-    """Prefix the message of a `SceneError` raised inside with its place."""
+def located(where: str = "", kind: type[PbrlError] = SceneError) -> Iterator[None]:
+    """Raise a `SceneError` from inside with its place before its message, as another ``kind``."""
     try:
         yield
     except SceneError as error:
-        raise SceneError(f"{where}: {error}") from None
+        raise kind(f"{where}: {error}" if where else str(error)) from None
 
 
-def finite(value: object, where: str) -> float:
-    """Return a finite number, of at most `LARGEST`, as a float."""
-    if isinstance(value, bool) or not isinstance(value, Real):
+def is_number(value: object) -> bool:
+    """Return whether a value is a number, which true and false are not."""
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
+def is_whole(value: Any, *, least: int = 1) -> bool:
+    """Return whether a value is a whole number, from ``least`` up."""
+    return is_number(value) and isinstance(value, Integral) and int(value) >= least
+
+
+def read_file(path: str | Path, what: str) -> str:
+    """Return the text of a file."""
+    try:
+        return read_text(Path(path))
+    except FileNotFoundError:
+        raise SceneError(f"{what} {path}: there is no such file; check the path") from None
+    except (OSError, UnicodeDecodeError) as error:
+        why = reason(error)
+        raise SceneError(f"{what} {path}: cannot be read as UTF-8 text: {why}") from None
+
+
+def document(text: str) -> dict[str, Any]:
+    """Return a TOML document."""
+    try:
+        return parse_toml(text)
+    except ValueError as error:
+        raise SceneError(f"not TOML: {error}") from None
+
+
+def finite(value: Any, where: str, *, largest: float = 1e18) -> float:
+    """Return a finite number as a float.
+
+    ``largest``: absolute value in SI units, at most: products, such as inertias, stay far from the
+    limits of floating-point numbers.
+    """
+    if not is_number(value):
         raise SceneError(f"{where} is {value!r}, expected a number")
     try:
         number = float(value)
@@ -48,22 +94,25 @@ def finite(value: object, where: str) -> float:
         number = math.inf
     if not math.isfinite(number):
         raise SceneError(f"{where} is {number}, expected a finite number")
-    if abs(number) > LARGEST:
+    if abs(number) > largest:
         raise SceneError(
-            f"{where} is {number:g}, expected at most {LARGEST:g} in SI units; check the number and"
+            f"{where} is {number:g}, expected at most {largest:g} in SI units; check the number and"
             " its unit"
         )
     return number
 
 
-def positive(value: object, where: str) -> float:
-    """Return a number above zero, of at least `SMALLEST`, as a float."""
+def positive(value: object, where: str, *, smallest: float = 1e-18) -> float:
+    """Return a number above zero as a float.
+
+    ``smallest``: value in SI units, at least.
+    """
     number = finite(value, where)
     if number <= 0:
         raise SceneError(f"{where} is {number}, expected more than 0")
-    if number < SMALLEST:
+    if number < smallest:
         raise SceneError(
-            f"{where} is {number:g}, expected at least {SMALLEST:g} in SI units; check the number"
+            f"{where} is {number:g}, expected at least {smallest:g} in SI units; check the number"
             " and its unit"
         )
     return number
@@ -85,17 +134,31 @@ def unit_interval(value: object, where: str) -> float:
     return number
 
 
-def flag(value: object, where: str) -> bool:
-    """Return a boolean."""
-    if not isinstance(value, bool):
-        raise SceneError(f"{where} is {value!r}, expected true or false")
-    return value
+def instance(kind: type, expected: str) -> Callable[[object, str], Any]:
+    """Return the check of a class's instances, which ``expected`` says in words."""
+
+    def check(value: object, where: str) -> object:
+        if not isinstance(value, kind):
+            raise SceneError(f"{where} is {value!r}, expected {expected}")
+        return value
+
+    return check
 
 
-def choice(value: object, where: str, known: Iterable[str], expected: str) -> None:
-    """Refuse what is not one of the known names, which ``expected`` lists in words."""
-    if value not in (names := tuple(known)):
-        raise SceneError(f"{where} is {value!r}, expected {expected}{nearest(value, names)}")
+flag, text = instance(bool, "true or false"), instance(str, "text")
+
+
+def choice(known: Iterable[str]) -> Check:
+    """Return the check of what is one of these names."""
+    listed = tuple(known)
+
+    def check(value: object, where: str) -> object:
+        if value not in listed:
+            expected = " or ".join(listed) + nearest(value, listed)
+            raise SceneError(f"{where} is {value!r}, expected {expected}")
+        return value
+
+    return check
 
 
 def different(labels: Sequence[str], what: str) -> None:
@@ -107,28 +170,34 @@ def different(labels: Sequence[str], what: str) -> None:
 
 def label(value: object, where: str) -> str:
     """Return a name: text that is not empty and has no blanks around it or control characters."""
-    if not isinstance(value, str):
-        raise SceneError(f"{where} is {value!r}, expected text")
-    if not value or value != value.strip() or not value.isprintable():
+    name: str = text(value, where)
+    if not name or name != name.strip() or not name.isprintable():
         raise SceneError(f"{where} is {value!r}, expected a name without blanks around it")
-    return value
+    return name
+
+
+def each(check: Check, expected: str = "a list") -> Callable[[object, str], tuple[Any, ...]]:
+    """Return the check of a list, which no text and no table is, whose items have one check."""
+
+    def checked(value: object, where: str) -> tuple[object, ...]:
+        if isinstance(value, str | Mapping) or not isinstance(value, Iterable):
+            raise SceneError(f"{where} is {value!r}, expected {expected}")
+        return tuple(check(item, where) for item in value)
+
+    return checked
 
 
 def names(value: object, where: str) -> tuple[str, ...]:
     """Return a tuple of different names."""
-    if isinstance(value, str) or not isinstance(value, Iterable):
-        raise SceneError(f"{where} is {value!r}, expected a list of names")
-    labels = tuple(label(name, where) for name in value)
+    labels = each(label, "a list of names")(value, where)
     if len(set(labels)) < len(labels):
         raise SceneError(f"{where} {list(labels)} names one twice; drop it")
     return labels
 
 
-def vector(value: object, where: str, length: int = 2) -> Any:
-    """Return a tuple of this many finite numbers."""
-    if isinstance(value, str | Mapping) or not isinstance(value, Iterable):
-        raise SceneError(f"{where} is {value!r}, expected {length} numbers")
-    numbers = tuple(finite(item, where) for item in value)
+def vector(value: object, where: str, length: int = 2, check: Check = finite) -> Any:
+    """Return a tuple of this many finite numbers, each of which has a check."""
+    numbers = each(check, f"{length} numbers")(value, where)
     if len(numbers) != length:
         raise SceneError(f"{where} has {len(numbers)} numbers, expected {length}")
     return numbers
@@ -176,6 +245,53 @@ def table(
         for name, check in checks.items()
         if name in entries
     )
+
+
+def entries(check: Check) -> Check:
+    """Return the check of a table whose names are free and whose values have one check."""
+
+    def checked(value: object, where: str) -> object:
+        pairs = items(value, where).items()
+        return tuple((name, check(item, f"{where} of {name}")) for name, item in pairs)
+
+    return checked
+
+
+def fields_of(kind: type[DataclassInstance], table: object, where: str) -> dict[str, Any]:
+    """Return values of a class's fields from a table whose keys are checked."""
+    names = {RENAMED.get(field.name, field.name): field for field in fields(kind)}
+    required = [key for key, field in names.items() if field.default is MISSING]
+    optional = [key for key in names if key not in required]
+    checked = keyed(table, where, required, optional)
+    return {names[key].name: value for key, value in checked.items()}
+
+
+def keyed(
+    table: object, where: str, required: Iterable[str], optional: Iterable[str]
+) -> dict[str, Any]:
+    """Return a table; refuse one with unknown keys or without the required ones."""
+    known = [*required, *optional]
+    if not isinstance(table, Mapping):
+        raise SceneError(f"{where} is {table!r}, expected a table of {', '.join(known)}")
+    for key in table:
+        if key not in known:
+            raise SceneError(f'unknown key "{key}" in {where}{nearest(key, known)}')
+    for key in required:
+        if key not in table:
+            raise SceneError(f'{where} has no "{key}"; add it')
+    return dict(table)
+
+
+def tables(contents: dict[str, Any], key: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the place and the table, for each of an array of tables."""
+    array = contents.get(key, [])
+    if not isinstance(array, list):
+        raise SceneError(f"{key} is not an array of tables; write [[{key}]], with two brackets")
+    for number, table in enumerate(array, start=1):
+        where = f"[[{key}]] number {number}"
+        if isinstance(table, Mapping) and "name" in table:
+            where += f' ("{table["name"]}")'
+        yield where, table
 
 
 def settle(part: object, where: str, **checks: Check) -> None:

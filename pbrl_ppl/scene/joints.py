@@ -1,7 +1,7 @@
 """Joints and actuators of a scene, and the tables of their kinds."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from pbrl_ppl.errors import SceneError
@@ -14,7 +14,7 @@ WORLD = "world"
 
 
 @dataclass(frozen=True)
-class JointKind:
+class JointTraits:
     """What the rest of the package needs to know of a kind of joint.
 
     Attributes
@@ -41,10 +41,10 @@ class JointKind:
 
 
 #: The kinds of joints by name. A new kind needs an entry here and one in `pbrl_ppl.physics`.
-JOINT_KINDS: Mapping[str, JointKind] = {
-    "hinge": JointKind(pins_anchors=True),
-    "slider": JointKind(slides=True),
-    "distance": JointKind(needs_reference_poses=True, stops_bodies=True),
+JOINT_KINDS: Mapping[str, JointTraits] = {
+    "hinge": JointTraits(pins_anchors=True),
+    "slider": JointTraits(slides=True),
+    "distance": JointTraits(needs_reference_poses=True, stops_bodies=True),
 }
 
 
@@ -97,9 +97,8 @@ class Joint:
     axis: Point | None = None
 
     def __post_init__(self) -> None:
-        kinds = " or ".join(f'"{kind}"' for kind in JOINT_KINDS)
-        checks.choice(self.kind, "joint: kind", JOINT_KINDS, kinds)
-        checks.settle(self, "joint", name=checks.label, known=checks.flag)
+        checks.settle(self, "joint", kind=checks.choice(JOINT_KINDS), name=checks.label)
+        checks.settle(self, "joint", known=checks.flag)
         if self.known and None in (self.bodies, self.anchor_a, self.anchor_b):
             raise SceneError(
                 "joint: it lacks bodies, anchor_a or anchor_b; add them, or set known = false to"
@@ -143,16 +142,14 @@ class Joint:
             )
 
     @property
-    def traits(self) -> JointKind:
+    def traits(self) -> JointTraits:
         """What its kind implies."""
         return JOINT_KINDS[self.kind]
 
 
 def _two_names(value: object, where: str) -> tuple[str, ...]:
     """Return the names of a joint's bodies."""
-    if isinstance(value, str) or not isinstance(value, Iterable):
-        raise SceneError(f"{where} is {value!r}, expected two names")
-    bodies = tuple(checks.label(name, where) for name in value)
+    bodies = checks.each(checks.label, "two names")(value, where)
     if len(bodies) != 2:
         raise SceneError(f"{where} is {list(bodies)}, expected two names")
     if bodies[0] == bodies[1]:
@@ -235,17 +232,17 @@ class Actuator:
         where = f'actuator "{self.name}"'
         if not self.name.isidentifier():
             raise SceneError(f"{where}: the name is part of parameters' names; use letters and _")
-        checks.choice(self.kind, f"{where}: kind", NUMBERS, ", ".join(NUMBERS))
-        checks.settle(self, where, at=checks.vector, full=checks.positive)
+        checks.settle(self, where, kind=checks.choice(NUMBERS), at=checks.vector)
         choices = {"servo": ("angle", "speed"), "wrench": WRENCH}.get(self.kind, ("",))
         object.__setattr__(self, "of", self.of or choices[0])
-        checks.choice(self.of, f"{where}: of", choices, " or ".join(choices))
-        checks.choice(self.frame, f"{where}: frame", ("body", "world"), "body or world")
-        allowed = dict.fromkeys(NUMBERS[self.kind], checks.finite)
+        checks.settle(self, where, of=checks.choice(choices), full=checks.positive)
+        checks.settle(self, where, frame=checks.choice(("body", "world")))
+        allowed: dict[str, checks.Check] = dict.fromkeys(NUMBERS[self.kind], checks.finite)
         if "limit" in allowed:
             allowed["limit"] = checks.not_negative
-        electric = dict.fromkeys(_ELECTRIC if self.kind == "motor" else (), checks.positive)
-        checks.settle_table(self, where, "known", allowed | electric, "number")
+        if self.kind == "motor":
+            allowed |= dict.fromkeys(_ELECTRIC, checks.positive)
+        checks.settle_table(self, where, "known", allowed, "number")
         priors = dict.fromkeys(NUMBERS[self.kind], checks.hyper_parameters)
         checks.settle_table(self, where, "prior", priors, "number")
         checks.not_both(self.known, self.prior, where)
@@ -289,12 +286,8 @@ def check_actuators(actuators: tuple[Actuator, ...], bodies: list[str]) -> None:
     """
     checks.different([actuator.name for actuator in actuators], "actuators")
     for actuator in actuators:
-        where = f'actuator "{actuator.name}"'
-        if actuator.body not in bodies:
-            raise SceneError(
-                f'{where}: "{actuator.body}" is no body that moves freely'
-                f"{checks.nearest(actuator.body, bodies)}"
-            )
+        where = f'actuator "{actuator.name}": no body that moves freely is called'
+        checks.known(actuator.body, bodies, where)
         mine = [other.name for other in actuators if other.body == actuator.body]
         if len(mine) > len(WRENCH):
             raise SceneError(

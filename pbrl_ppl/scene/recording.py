@@ -7,12 +7,23 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from pbrl_ppl.errors import SceneError
-from pbrl_ppl.scene.checks import choice, finite, flag, nearest, positive, settle
+from pbrl_ppl.scene.checks import (
+    Check,
+    choice,
+    entries,
+    finite,
+    flag,
+    is_number,
+    items,
+    names,
+    positive,
+    settle,
+    table,
+    text,
+)
 
 #: Separators by name; others are a single character.
 SEPARATORS = {"blank": r"\s+", "tab": "\t", "comma": ",", "semicolon": ";"}
-#: What the columns of velocities are.
-VELOCITIES = ("measured", "computed", "estimate")
 
 Pairs = tuple[tuple[str, Any], ...]
 
@@ -102,50 +113,7 @@ class Recording:
     topics: Pairs = ()
 
     def __post_init__(self) -> None:
-        tables = [field.name for field in fields(self) if field.type == "Pairs"]
-        settle(self, "[recording]", **dict.fromkeys(tables, _pairs))
-        for name, column in self.columns:
-            if isinstance(column, bool) or not isinstance(column, str | int | float | tuple):
-                raise SceneError(
-                    f"[recording]: column {name} is {column!r}, expected a name or a number"
-                )
-            if isinstance(column, tuple) and {"column", "zero"} != {*dict(column)}:
-                raise SceneError(
-                    f"[recording]: column {name} is {dict(column)}, expected a table such as"
-                    f' {{ column = "knee", zero = "hanging" }}'
-                )
-        if not isinstance(self.commands, str) or self.forces not in ("world", "body"):
-            raise SceneError(
-                f"[recording]: commands is {self.commands!r} and forces {self.forces!r}, expected"
-                ' the name of a file, and "world" or "body"'
-            )
-        topics = tuple((n, tuple(t) if isinstance(t, list) else t) for n, t in self.topics)
-        object.__setattr__(self, "topics", topics)
-        for key in ("units", "topics"):
-            for name, value in getattr(self, key):
-                texts = value if key == "topics" and isinstance(value, tuple) else (value,)
-                if not all(isinstance(text, str) for text in texts):
-                    raise SceneError(f"[recording]: {key} of {name} is {value!r}, expected text")
-        known = (*SEPARATORS, "")
-        if self.separator not in known and len(self.separator) != 1:
-            raise SceneError(
-                f"[recording]: separator is {self.separator!r}, expected one of"
-                f" {', '.join(SEPARATORS)} or one character"
-            )
-        settle(self, "[recording]", header=flag, hold=flag, resample=flag, trim=flag, camera=flag)
-        if "rate" in dict(self.time):
-            positive(dict(self.time)["rate"], "[recording]: time, rate")
-        expected = f"one of {', '.join(VELOCITIES)}"
-        choice(self.velocities, "[recording]: velocities", VELOCITIES, expected)
-        for name, value in self.not_seen:
-            finite(value, f"[recording]: not_seen of {name}")
-        cuts = ("every", "gaps", "rests", "jumps")
-        for name, value in self.cut:
-            if name not in cuts:
-                raise SceneError(
-                    f'[recording]: cut has no "{name}", only {", ".join(cuts)}{nearest(name, cuts)}'
-                )
-            positive(value, f"[recording]: cut, {name}")
+        settle(self, "[recording]", **_CHECKS)
 
     def table(self) -> dict[str, object]:
         """Return the entries of the TOML table: those that are not the defaults."""
@@ -160,14 +128,59 @@ class Recording:
         return replace(self, **tables)
 
 
-def _pairs(value: object, where: str) -> Pairs:
-    """Return names with their values."""
-    if isinstance(value, Mapping):
-        items = ((k, tuple(v.items()) if isinstance(v, Mapping) else v) for k, v in value.items())
-        return tuple(items)
-    if isinstance(value, tuple) and all(isinstance(e, tuple) and len(e) == 2 for e in value):
-        return value
-    raise SceneError(f"{where} is {value!r}, expected a table such as {{ x = ... }}")
+def _name_or_number(value: object, where: str) -> object:
+    """Return a name of a column, or a number, as it is."""
+    if not (is_number(value) or isinstance(value, str)):
+        raise SceneError(f"{where} is {value!r}, expected a name or a number")
+    return value
+
+
+def _column(value: object, where: str) -> object:
+    """Return a name or a number, or a column with its zero as pairs."""
+    if not isinstance(value, Mapping | tuple):
+        return _name_or_number(value, where)
+    column = items(value, where)
+    if {"column", "zero"} != {*column}:
+        raise SceneError(
+            f'{where} is {column}, expected a table such as {{ column = "knee", zero = "hanging" }}'
+        )
+    return tuple(column.items())
+
+
+def _topics(value: object, where: str) -> object:
+    """Return a topic, or several."""
+    return value if isinstance(value, str) else names(value, where)
+
+
+def _separator(value: object, where: str) -> object:
+    """Return a separator's name, a character, or nothing."""
+    if value not in (*SEPARATORS, "") and len(text(value, where)) != 1:
+        raise SceneError(
+            f"{where} is {value!r}, expected one of {', '.join(SEPARATORS)} or one character"
+        )
+    return value
+
+
+def _cuts(value: object, where: str) -> Pairs:
+    """Return where trajectories are cut."""
+    return table(value, where, dict.fromkeys(("every", "gaps", "rests", "jumps"), positive))
+
+
+def _clocks(value: object, where: str) -> object:
+    """Return the clocks, of which a rate is positive."""
+    if "rate" in (given := items(value, where)):
+        positive(given["rate"], f"{where}: rate")
+    return entries(_name_or_number)(value, where)
+
+
+#: The check of each attribute.
+_CHECKS: Mapping[str, Check] = {
+    **dict.fromkeys(("hold", "header", "resample", "trim", "camera"), flag),
+    **{"columns": entries(_column), "units": entries(text), "not_seen": entries(finite)},
+    **{"time": _clocks, "cut": _cuts, "topics": entries(_topics)},
+    **{"commands": text, "separator": _separator, "forces": choice(("world", "body"))},
+    "velocities": choice(("measured", "computed", "estimate")),
+}
 
 
 def column_of(entry: object) -> str:

@@ -11,14 +11,13 @@ import json
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from pbrl_ppl.errors import SceneError
-from pbrl_ppl.files import parse_toml, read_text, reason
 from pbrl_ppl.scene import checks
 from pbrl_ppl.scene.bodies import Body, Shape, Wall, check_classes
 from pbrl_ppl.scene.checks import Named, Point
@@ -39,12 +38,8 @@ _PARTS: Mapping[str, tuple[str, type]] = {
     "joints": ("joint", Joint),
     "actuators": ("actuator", Actuator),
 }
-#: Keys that are not the names of the fields that they set.
-_RENAMED = {"object_class": "class", "start": "from", "end": "to"}
 #: Values that are written of a body though they are empty.
 _EMPTY: Table = {"known": {}, "prior": {}, "effects": ()}
-#: Engine steps a sample, at most: twice what `close_loop` goes to where data are that exact.
-MOST_SUBSTEPS = 1280
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,15 +104,11 @@ class Scene:
         checks.settle(self, "[world]", time_step=checks.positive, substeps=check_substeps)
         checks.settle(self, "[world]", test_is_later=checks.flag)
         for key, (_, kind) in _PARTS.items():
-            parts = tuple(getattr(self, key))
-            for part in parts:
-                if not isinstance(part, kind):
-                    raise SceneError(f"scene: {key} holds {part!r}, expected a {kind.__name__}")
-            object.__setattr__(self, key, parts)
+            parts = checks.each(checks.instance(kind, f"a {kind.__name__}"))
+            checks.settle(self, "scene", **{key: parts})
         noise = checks.table(self.noise, "[noise]", dict.fromkeys(STATE, checks.positive))
         object.__setattr__(self, "noise", noise)
-        if self.recording is not None and not isinstance(self.recording, Recording):
-            raise SceneError(f"scene: recording is {self.recording!r}, expected a Recording")
+        checks.settle(self, "scene", recording=checks.instance(Recording, "a Recording"))
         self._check_bodies()
         self._check_joints()
         check_actuators(self.actuators, [body.name for body in self.dynamic])
@@ -143,17 +134,11 @@ class Scene:
         for position, joint in enumerate(self.joints, start=1):
             where = f"[[joint]] number {position}"
             for name in joint.bodies or ():
-                if name not in names:
-                    raise SceneError(
-                        f'{where}: there is no body "{name}"{checks.nearest(name, names)}'
-                    )
+                checks.known(name, names, f"{where}: there is no body")
             for index, probabilities in joint.prior:
                 for name, _ in probabilities:
-                    if name not in self.joinable:
-                        raise SceneError(
-                            f'{where}: prior {index} names "{name}", which is no moving body or'
-                            f" the world{checks.nearest(name, self.joinable)}"
-                        )
+                    said = f"{where}: prior {index} names what is no moving body or the world,"
+                    checks.known(name, self.joinable, said)
             could = joint.bodies or names
             if not any(body.name in could for body in self.dynamic):
                 raise SceneError(
@@ -178,14 +163,7 @@ class Scene:
         SceneError
             If the file is missing, is not TOML (says the line), or describes an impossible scene.
         """
-        path = Path(path)
-        try:
-            text = read_text(path)
-        except FileNotFoundError:
-            raise SceneError(f"scene {path}: there is no such file; check the path") from None
-        except (OSError, UnicodeDecodeError) as error:
-            why = reason(error)
-            raise SceneError(f"scene {path}: cannot be read as UTF-8 text: {why}") from None
+        text = checks.read_file(path, "scene")
         with checks.located(f"scene {path}"):
             return cls.from_toml(text)
 
@@ -198,25 +176,22 @@ class Scene:
         SceneError
             As `load`; an unknown key is named with its table and the nearest known key.
         """
-        try:
-            document = parse_toml(text)
-        except ValueError as error:
-            raise SceneError(f"not TOML: {error}") from None
+        document = checks.document(text)
         arrays = [key for key, _ in _PARTS.values()]
-        _checked(document, "the file", ["world"], ["noise", "recording", *arrays])
+        checks.keyed(document, "the file", ["world"], ["noise", "recording", *arrays])
         optional = ["gravity", "normal_gravity", "substeps", "test_is_later", "joints"]
-        world = _checked(document["world"], "[world]", ["time_step"], optional)
+        world = checks.keyed(document["world"], "[world]", ["time_step"], optional)
         if (joints := world.pop("joints", None)) not in ("any", None):
             raise SceneError(
                 f'[world]: joints is {joints!r}, expected "any" (any two bodies, or a body and the'
                 " world, may be joined by a rod); declare those that are there as [[joint]]"
             )
-        world["noise"] = _checked(document.get("noise", {}), "[noise]", [], STATE)
+        world["noise"] = checks.keyed(document.get("noise", {}), "[noise]", [], STATE)
         if "recording" in document:
-            entries = _entries(Recording, document["recording"], "[recording]")
+            entries = checks.fields_of(Recording, document["recording"], "[recording]")
             world["recording"] = Recording(**entries)
         for field, (key, kind) in _PARTS.items():
-            world[field] = tuple(_part(kind, *place) for place in _tables(document, key))
+            world[field] = tuple(_part(kind, *place) for place in checks.tables(document, key))
         scene = cls(**world)
         return scene.with_any_joints() if joints else scene
 
@@ -240,8 +215,8 @@ class Scene:
                     name: empty.get(name) if value in ((), "") else value
                     for name, value in vars(part).items()
                 }
-                for name in filter(table.__contains__, _RENAMED):
-                    table[_RENAMED[name]] = table.pop(name)
+                for name in filter(table.__contains__, checks.RENAMED):
+                    table[checks.RENAMED[name]] = table.pop(name)
                 yield f"[[{key}]]", table
 
     @property
@@ -301,11 +276,9 @@ class Scene:
         SceneError
             If there is none; the nearest name is given.
         """
-        for body in self.bodies:
-            if body.name == name:
-                return body
         names = [body.name for body in self.bodies]
-        raise SceneError(f'scene: there is no body "{name}"{checks.nearest(name, names)}')
+        checks.known(name, names, "scene: there is no body")
+        return self.bodies[names.index(name)]
 
     def reference_angle(self, name: str) -> float:
         """Return the angle in a body's reference pose (rad): 0 without one, and of the world."""
@@ -376,19 +349,21 @@ class Scene:
         return self.replace(bodies=tuple(changed if b is body else b for b in self.bodies))
 
 
-def check_substeps(value: object, where: str = "substeps") -> int:
+def check_substeps(value: Any, where: str = "substeps", *, most: int = 1280) -> int:
     """Return a number of engine steps a sample.
+
+    ``most``: twice what `close_loop` goes to where data are that exact.
 
     Raises
     ------
     SceneError
         If it is no whole number from 1 to the most that change a prediction.
     """
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+    if not checks.is_whole(value):
         raise SceneError(f"{where} is {value!r}, expected a whole number from 1 up")
-    if value > MOST_SUBSTEPS:
+    if value > most:
         raise SceneError(
-            f"{where} is {value}, expected at most {MOST_SUBSTEPS}: more change no"
+            f"{where} is {value}, expected at most {most}: more change no"
             " prediction and take long; use fewer, or record with a shorter time_step"
         )
     return int(value)
@@ -405,53 +380,16 @@ def toml_of(sections: Iterable[tuple[str, Mapping[str, object]]]) -> str:
 
 def _part(kind: type[Part], where: str, table: object) -> Part:
     """Return a body, wall, joint or actuator from its table."""
-    entries = _entries(kind, table, where)
-    shape = _entries(Shape, entries["shape"], f"shape of {where}") if kind is Body else None
+    entries = checks.fields_of(kind, table, where)
+    shape = checks.fields_of(Shape, entries["shape"], f"shape of {where}") if kind is Body else None
     with checks.located(where):
         if shape is not None:
             entries["shape"] = Shape(**shape)
         return kind(**entries)
 
 
-def _entries(kind: type[DataclassInstance], table: object, where: str) -> Table:
-    """Return values of a class's fields from a table whose keys are checked."""
-    names = {_RENAMED.get(field.name, field.name): field for field in fields(kind)}
-    required = [key for key, field in names.items() if field.default is MISSING]
-    optional = [key for key in names if key not in required]
-    checked = _checked(table, where, required, optional)
-    return {names[key].name: value for key, value in checked.items()}
-
-
-def _checked(table: object, where: str, required: Iterable[str], optional: Iterable[str]) -> Table:
-    """Return a table; refuse one with unknown keys or without the required ones."""
-    known = [*required, *optional]
-    if not isinstance(table, Mapping):
-        raise SceneError(f"{where} is {table!r}, expected a table of {', '.join(known)}")
-    for key in table:
-        if key not in known:
-            raise SceneError(f'unknown key "{key}" in {where}{checks.nearest(key, known)}')
-    for key in required:
-        if key not in table:
-            raise SceneError(f'{where} has no "{key}"; add it')
-    return dict(table)
-
-
-def _tables(document: Table, key: str) -> Iterator[tuple[str, Table]]:
-    """Yield the place and the table, for each of an array of tables."""
-    array = document.get(key, [])
-    if not isinstance(array, list):
-        raise SceneError(f"{key} is not an array of tables; write [[{key}]], with two brackets")
-    for number, table in enumerate(array, start=1):
-        where = f"[[{key}]] number {number}"
-        if isinstance(table, Mapping) and isinstance(table.get("name"), str):
-            where += f' ("{table["name"]}")'
-        yield where, table
-
-
 def _value(item: object) -> str:
     """Return one TOML value: a string, boolean, number, list or inline table."""
-    if isinstance(item, bool):
-        return "true" if item else "false"
     if isinstance(item, str):
         # TOML's basic strings take JSON's escapes, except that DEL must be escaped in TOML.
         return json.dumps(item, ensure_ascii=False).replace("\x7f", "\\u007f")
@@ -466,7 +404,7 @@ def _value(item: object) -> str:
         return "{ " + ", ".join(pairs) + " }" if pairs else "{}"
     if isinstance(item, tuple | list):
         return "[" + ", ".join(_value(part) for part in item) + "]"
-    return repr(item)
+    return repr(item).lower()  # a number, true or false
 
 
 def _is_entry(item: object) -> bool:

@@ -15,11 +15,6 @@ from pbrl_ppl.scene.checks import PLACES, UNITS, nearest
 
 #: Location and scale of the logarithm of a mass (kg) under Table 1, uninformative by default.
 MASS_PRIOR = 1.0, 1.5
-#: Range of the motion in body lengths, and its duration in samples, where neither the scene nor a
-#: recording shows them.
-_RANGE, _DURATION = 10.0, 100
-#: Larger exponents leave the floating-point numbers: such a prior is refused later.
-_LARGEST = 30.0
 
 
 @dataclass(frozen=True)
@@ -104,8 +99,15 @@ def check_product(product: str) -> None:
         _factor(factor)
 
 
-def units_of(scene: Scene, name: str) -> Units:
+def units_of(
+    scene: Scene, name: str, *, reach: float = 10.0, duration: int = 100, largest: float = 30.0
+) -> Units:
     """Return the natural units of a body: its ``typical``, and from the scene what that lacks.
+
+    ``reach``: range of the motion in body lengths where neither the scene nor a recording shows it.
+    ``duration``: that of the motion, likewise, in samples.
+    ``largest``: logarithm of a mass; more leaves the floating-point numbers, and such a prior is
+    refused later.
 
     Raises
     ------
@@ -116,11 +118,11 @@ def units_of(scene: Scene, name: str) -> Units:
     mass = dict(body.known).get("mass")
     if mass is None:  # the median of Table 1's log-normal
         mu = dict(dict(body.prior).get("mass", ())).get("mu", MASS_PRIOR[0])
-        mass = math.exp(min(mu, _LARGEST))
+        mass = math.exp(min(mu, largest))
     length = max([body.shape.bounding_radius, *_levers(scene, name)])
     gravity = max(math.hypot(*scene.gravity), scene.normal_gravity)
-    speed = math.sqrt(gravity * length) or length / (_DURATION * scene.time_step)
-    extent, centre = _RANGE * length, (0.0, 0.0)
+    speed = math.sqrt(gravity * length) or length / (duration * scene.time_step)
+    extent, centre = reach * length, (0.0, 0.0)
     if scene.extent is not None:
         x_min, x_max, y_min, y_max = scene.extent
         centre = (x_min + x_max) / 2, (y_min + y_max) / 2
@@ -129,7 +131,7 @@ def units_of(scene: Scene, name: str) -> Units:
     units = Units(
         mass=mass,
         length=length,
-        time=_DURATION * scene.time_step,
+        time=duration * scene.time_step,
         force=force,
         torque=force * length,
         speed=speed,

@@ -168,8 +168,7 @@ def test_what_comes_by_chance_takes_no_name_away() -> None:
     ("name", "size", "richer"),
     [
         ("saturation", 2.7, ()),
-        # cubic forces of the place make one together
-        ("spring", (0.5, 1.0, -0.5), ("cubic_spring",)),
+        ("spring", (0.5, 1.0, -0.5), ()),
         ("actuator_delay", 0.4, ("first_order_lag", "rate_limit", "actuator_backlash")),
         ("corrugation", (0.3, 0.3), ()),
     ],

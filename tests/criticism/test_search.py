@@ -203,7 +203,7 @@ def _colliding(seed: int, drag: float, e: float = 0.5, sd: float = 1e-3) -> tupl
 
 def test_laws_are_found_between_collisions() -> None:
     """A drag on both with its size within 4 sd, and none in clean recordings of the same."""
-    laws = some("linear_drag", "constant_force", "spring", "cubic_spring")
+    laws = some("linear_drag", "constant_force", "spring")
     scene, history = _colliding(0, drag=0.4)
     found = attribute(scene, history, catalogue=laws)
     assert sorted((law.effect, law.body) for law in found.laws) == [

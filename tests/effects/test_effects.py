@@ -29,7 +29,6 @@ AWAY = {
     "force_cutoff": 5.0,
     "magnus_force": 0.01,
     "quadratic_angular_drag": 1e-3,
-    "cubic_torsion_spring": 1e-2,
     "pivot_hysteresis": 1e-2,
 }
 #: What changes dry friction under a body needs some.

@@ -13,7 +13,7 @@ from pbrl_ppl.effects import catalogue
 from pbrl_ppl.history import History
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.physics.trial import try_effect
-from pbrl_ppl.scene import Body, Joint, Scene, Shape
+from pbrl_ppl.scene import Body, Joint, Scene, Shape, units_of
 from pbrl_ppl.state import Floats
 from tests.helpers.examples import EXAMPLES, FILES
 from tests.helpers.places import ROOT
@@ -25,11 +25,13 @@ NAMES = {
     "angle_friction": ("pivot_angle_friction",),
     "askew_angle": ("askew_angle",),
     "cable": ("cable",),
+    "command_power": ("command_power",),
     "fading_gain": ("fading_gain",),
     "friction_by_place": ("friction_by_place", "slider_place_friction"),
     "gain_by_place": ("gain_by_place",),
     "gain_by_sign": ("gain_by_sign",),
     "gain_by_speed": ("gain_by_speed",),
+    "hardening_spring": ("cubic_spring", "cubic_torsion_spring"),
     "one_way_damping": ("pivot_one_way_damping",),
     "periodic": ("periodic_force", "periodic_torque"),
     "point_attractor": ("point_attractor",),
@@ -183,6 +185,22 @@ def by_speed(t: float, z: Floats) -> Floats:
     return PUSH * (1.0 - 0.2 * shares)  # its torque is positive
 
 
+def bent(t: float, z: Floats) -> Floats:
+    """Return the push to the power of 1.5, in units of the typical force and torque."""
+    units = units_of(world(), "disc")
+    share = np.hypot(*PUSH[:2]) / units.force
+    return PUSH * np.sqrt((share, share, PUSH[2] / units.torque))
+
+
+def hard(t: float, z: Floats) -> Floats:
+    way = (z[:3] - (0.8, -0.4, 0.0)) * FLAT
+    return PUSH - 1.5 * (way @ way) * way
+
+
+def hard_to_turn(t: float, z: Floats) -> Floats:
+    return PUSH - (0.0, 0.0, 0.5 * (z[2] - 0.1) ** 3)
+
+
 def worn(t: float, z: Floats) -> Floats:
     return np.array([0.0, 0.0, -0.006 * (1.0 + 0.4 * np.cos(z[2]) + 0.3 * np.sin(z[2]))])
 
@@ -233,6 +251,9 @@ CASES = (
     Case({"gain_by_place": (0.3, -0.2)}, by_place),
     Case({"gain_by_speed": (0.2,)}, by_speed),
     Case({"gain_by_sign": (0.3,)}, lambda t, z: PUSH * (1.3, 0.7, 1.3)),
+    Case({"command_power": (1.5,)}, bent),
+    Case({"cubic_spring": (1.5, 0.8, -0.4)}, hard),
+    Case({"cubic_torsion_spring": (0.5, 0.1)}, hard_to_turn),
     Case({"sensor_drift": (0.05, -0.03, 0.02)}, steady, seen=drifted),
     Case({"power_drag": (0.7, 1.6)}, dragged),
     Case({"power_angular_drag": (0.03, 1.4)}, slowed),

@@ -122,6 +122,4 @@ def proposals(layout: Layout, n: int) -> np.ndarray:
             phi[:, i] = rng.uniform(0.0, 0.02, n)
         else:
             phi[:, i] = np.clip(0.1 * prior.sample(rng, n), *prior.support)
-        if label.startswith("cubic_spring_stiffness"):  # at 10 m a thousand times that at 1 m
-            phi[:, i] *= 0.1
     return phi

@@ -405,7 +405,7 @@ def test_forces_along_the_bodys_axes_turn_with_it() -> None:
     np.testing.assert_allclose(end[3:5], speed, atol=1e-4)
     plain = PlainSimulator(physics)(np.zeros(0), start, actions)
     np.testing.assert_allclose(plain[0, -1, 0], end, atol=1e-4)
-    with pytest.raises(SceneError, match='"world" or "body"'):
+    with pytest.raises(SceneError, match="expected world or body"):
         Recording(forces="ground")
 
 

@@ -323,7 +323,7 @@ def test_errors(cart) -> None:
         physics_model(scene, history, horizon=0)
     with pytest.raises(HistoryError, match=r"horizon is 7 intervals, and the longest .* 6"):
         physics_model(scene, history, horizon=7)
-    with pytest.raises(EffectError, match=r"'linear_dragg'.* did you mean 'linear_drag'"):
+    with pytest.raises(EffectError, match=r"'linear_dragg'.* did you mean \"linear_drag\""):
         physics_model(cart_scene(effects=("linear_dragg",)), history)
     with pytest.raises(EffectError, match="pivot_friction applies to no body"):
         physics_model(scene, history, [BY_NAME["pivot_friction"]])

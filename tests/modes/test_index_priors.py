@@ -56,7 +56,7 @@ def test_the_scene_file_says_it() -> None:
         ({"i_c": {"a": 1.0}}, 'unknown index "i_c" in prior of joint; did you mean "i_[ab]"?'),
         (
             {"i_a": {"e": 1.0}},
-            'number 1: prior i_a names "e", which is no moving body or the world; did you',
+            'number 1: prior i_a names what is no moving body or the world, "e"; did you',
         ),
         ({"i_a": {"wolrd": 1.0}}, 'did you mean "world"?'),
         ({"i_a": {"a": -0.1}}, "i_a a is -0.1, expected 0 or more"),

@@ -167,7 +167,7 @@ def test_a_scene_is_written_and_read() -> None:
     ("change", "message"),
     [
         ({"kind": "thrusters"}, 'did you mean "thruster"'),
-        ({"body": "disk"}, "is no body that moves freely"),
+        ({"body": "disk"}, "no body that moves freely"),
         ({"known": {"gian": 1.0}}, 'did you mean "gain"'),
         ({"known": {"gain": 1.0}, "prior": {"gain": {"mu": 0.0}}}, "both known and prior"),
         ({"frame": "room"}, "expected body or world"),

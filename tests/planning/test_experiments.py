@@ -12,9 +12,14 @@ from pbrl_ppl.cli import main
 from pbrl_ppl.criticism.closing import keep_groups
 from pbrl_ppl.criticism.results import Added, Law
 from pbrl_ppl.errors import EffectError, GoalError, PosteriorError
-from pbrl_ppl.planning import rollout
-from pbrl_ppl.planning.experiments import Separation
-from pbrl_ppl.planning.rivals import Rival, fit_rivals, kept_groups, named_effects
+from pbrl_ppl.planning import predicted_path
+from pbrl_ppl.planning.experiments import (
+    Rival,
+    Separation,
+    fit_rivals,
+    kept_groups,
+    named_effects,
+)
 from pbrl_ppl.posterior.record import scene_of
 from tests.helpers.free_puck import BOX, fitted, searched
 from tests.helpers.one_speed import SIZE, at_one_speed, record
@@ -141,7 +146,7 @@ def test_expected_is_what_bayes_factors_are_in_the_mean(posterior) -> None:
     moments = [_moments(judge, i, pushes) for i in range(2)]
     for i, j in ((0, 1), (1, 0)):
         gains = []
-        for path in rollout(judge.dynamics[i].at(rivals[i].draws), start, pushes)[:, 0, 1:]:
+        for path in predicted_path(judge.dynamics[i].at(rivals[i].draws), start, pushes)[:, 0, 1:]:
             for _ in range(50):
                 data = path.ravel() + factor @ rng.standard_normal(len(factor))
                 ours, theirs = (_density(data, mean, noise + cov) for mean, cov in moments)
@@ -154,8 +159,10 @@ def _moments(judge: Separation, rival: int, pushes: np.ndarray) -> tuple[np.ndar
     """Mean and covariance of a rival's predictions, by many draws."""
     draws = judge.rivals[rival].mode.draws(np.random.default_rng(0), 400)
     dynamics = judge.dynamics[rival]
-    cloud = rollout(dynamics.at(draws), judge.start, pushes)[:, 0, 1:].reshape(len(draws), -1)
-    return rollout(dynamics, judge.start, pushes)[0, 0, 1:].ravel(), np.cov(cloud.T)
+    cloud = predicted_path(dynamics.at(draws), judge.start, pushes)[:, 0, 1:].reshape(
+        len(draws), -1
+    )
+    return predicted_path(dynamics, judge.start, pushes)[0, 0, 1:].ravel(), np.cov(cloud.T)
 
 
 def _density(data: np.ndarray, mean: np.ndarray, cov: np.ndarray) -> float:
@@ -210,7 +217,7 @@ def test_the_table_is_what_a_history_is_made_of(suggestion, tmp_path) -> None:
     ("names", "message"),
     [
         (("linear_drag",), "two or more"),
-        (("linear_drag", "quadratc_drag"), "did you mean 'quadratic_drag'"),
+        (("linear_drag", "quadratc_drag"), 'did you mean "quadratic_drag"'),
         (("linear_drag", "heavy_tails"), "of the noise"),
         (("linear_drag", "quadratic_drag on cart"), "does not apply to body 'cart'"),
     ],

@@ -15,6 +15,7 @@ from pbrl_ppl.planning.rehearsal import Rehearsal, RehearsedLaw, rehearse
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene, Shape
 from pbrl_ppl.state import STATE
 from tests.helpers.counted import of_work
+from tests.helpers.examples import EXAMPLES
 
 pytestmark = [pytest.mark.one_stack, pytest.mark.first(2)]
 ARM = Body("arm", Shape.box(0.03, 0.4), known={"mass": 0.5, "r": 0.2, "mu_c": 0.2})
@@ -138,7 +139,7 @@ def test_a_law_that_needs_what_is_not_measured_is_unseen() -> None:
 
 def test_unusual_laws_are_named_where_common_ones_leave_much_more_than_noise() -> None:
     """A power of the command looks like a gain; a wrong inertia looks like no common law."""
-    laws = named("torque_gain", "command_power", "inertia_scale")
+    laws = (*named("torque_gain", "inertia_scale"), EXAMPLES["command_power"])
     rehearsal = rehearse(PENDULUM, catalogue=laws, seed=1)
     assert law_of(rehearsal, "command_power").named == "torque_gain"
     assert law_of(rehearsal, "inertia_scale").named == "inertia_scale"

@@ -1,0 +1,14 @@
+from .dynamics import PAST as PAST
+from .dynamics import Dynamics as Dynamics
+from .dynamics import TransitionModel as TransitionModel
+from .dynamics import predicted_path as predicted_path
+from .dynamics import remembered as remembered
+from .experiments import Suggestion as Suggestion
+from .experiments import suggest_actions as suggest_actions
+from .goals import Action as Action
+from .goals import ActionSet as ActionSet
+from .goals import Goal as Goal
+from .goals import Target as Target
+from .planner import Plan as Plan
+from .planner import plan as plan
+from .planner import start_state as start_state
