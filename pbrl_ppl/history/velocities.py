@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from math import comb
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.stats import f as f_distribution
 from scipy.stats import t as t_distribution
 
@@ -320,34 +321,17 @@ def position_noise(runs: Runs, dt: float) -> tuple[float, float]:
     return place * dt**2, max(0.0, square / max(n, 1) - 20 * place)
 
 
-#: Regressions of a velocity: rows before and after of its positions, whether the weights of rows
-#: at equal distances are opposite, and rows of other velocities, those of a tuple with one weight.
-REGRESSIONS: tuple[tuple[int, int, bool, tuple[tuple[int, ...], ...]], ...] = (
-    (1, 1, False, ()),
-    (2, 2, False, ()),
-    (5, 5, True, ()),
-    (10, 10, True, ()),
-    (4, 0, False, ()),
-    (10, 0, False, ()),
-    (2, 1, False, ((-1,),)),
-    (2, 2, False, ((-1, 1),)),
-    (3, 1, False, ((-1,), (-2,))),
-    (3, 3, False, ((-1, 1), (-2, 2))),
-    (8, 8, False, ()),
-)
-
-
 def computed_lag(
-    runs: Runs, dt: float, *, alarm: float = 1e-5, most: float = 0.25, pole: float = 0.1
+    runs: Runs, dt: float, *, alarm: float = 1e-5, most: float = 0.25, widest: int = 20
 ) -> float | None:
     """Return by how much (s) velocities computed from positions are late; None for measured ones.
 
-    Velocities are regressed on positions of neighbouring rows, and on neighbouring velocities as in
-    a low-pass. A velocity with independent noise differs from any sum of noisy positions with
-    weights ``w`` by a variance of at least ``|w|^2 s^2``, ``s`` being the positions' noise. A
-    computed velocity does not. The ratio of the residual variance to that bound is compared with
-    the lower tail of the F distribution, degrees of freedom corrected for serial correlation. The
-    lag is the group delay of the weights at low frequency.
+    Velocities are regressed on the positions of rows before and after. A velocity with independent
+    noise differs from any sum of noisy positions with weights ``w`` by a variance of at least
+    ``|w|^2 s^2``, ``s`` being the positions' noise. A computed velocity does not. The ratio of the
+    residual variance to that bound is compared with the lower tail of the F distribution, degrees
+    of freedom corrected for serial correlation. The lag is the group delay of the weights at low
+    frequency.
 
     Parameters
     ----------
@@ -356,13 +340,11 @@ def computed_lag(
     dt : float
         Time step (s).
     alarm : float
-        Size of the test of each regression.
+        Size of the test.
     most : float
         Largest ratio of the variances, however many rows there are.
-    pole : float
-        Least denominator of a low-pass at half the sampling rate: it is zero in a relation that
-        holds of noiseless measurements too, that the mean of two velocities is the difference
-        quotient.
+    widest : int
+        Rows before and after, at most; in short logs fewer, for two windows a weight.
 
     Examples
     --------
@@ -370,48 +352,36 @@ def computed_lag(
     >>> computed_lag([(x[1:], np.diff(x) / 0.1)], 0.1)
     0.05
     """
-    total = float(np.concatenate([np.zeros(0), *(rate for _, rate in runs)]).var()) if runs else 0.0
-    if not total > 0:
+    lengths = np.array([len(position) for position, _ in runs])
+    reaches = (n for n in range(widest, 0, -1) if np.maximum(lengths - 2 * n, 0).sum() >= 4 * n)
+    reach = next(reaches, 0)
+    if not reach or not any(rate.any() for _, rate in runs):
         return None
-    noise, found = _noise(runs, dt), []
-    shown = sum(max(len(position) - 3, 0) for position, _ in runs) / _correlation([-1, 3, -3, 1])
-    for before, after, odd, groups in REGRESSIONS:
-        place = np.arange(-before, after + 1)
-        windows = [
-            np.lib.stride_tricks.sliding_window_view(np.stack(run), len(place), axis=1)
-            for run in runs
-            if len(run[0]) >= len(place)
-        ]
-        if not windows:
-            continue
-        x, rates = np.concatenate(windows, axis=1)
-        one, y = np.eye(len(place)), rates[:, before]
-        sums = one - one[::-1] if odd else one - one[before]
-        sums = sums[before + 1 :] if odd else np.delete(sums, before, axis=0)
-        v = [rates[:, np.add(group, before)].sum(axis=1) for group in groups]
-        design = np.column_stack([*v, (x - x[:, [before]]) @ sums.T])
-        dof = len(y) - design.shape[1]
-        if dof < 3:
-            continue
-        inverse = np.linalg.pinv(design, rcond=1e-9)
-        errors = sums.T @ inverse[len(v) :]
-        a, b = inverse[: len(v)] @ y, errors @ y
-        if not b.any():  # positions that never change give no velocity
-            continue
-        count = np.array([len(group) for group in groups], dtype=np.float64)
-        gain = 1 - float(a @ count)
-        if 1 - float(a @ (count * [(-1.0) ** group[0] for group in groups])) < pole:
-            continue
-        variance = float(((y - design @ (inverse @ y)) ** 2).sum()) / dof
-        square = float(b @ b) - variance * float((errors**2).sum())  # less the weights' errors
-        share = min(most, float(f_distribution.ppf(alarm, dof / _correlation(b), max(shown, 1.0))))
-        slope, curve = float(b @ place), float(b @ place**2)
-        exact = len(y) > 4 * design.shape[1] and abs(slope * dt - gain) < 1e-6 * abs(gain)
-        if variance < max(share * square * noise, 1e-12 * total * exact) and slope * gain > 0:
-            lag = -curve / (2 * slope) - float(a @ [sum(group) for group in groups]) / gain
-            found.append((variance / square, round(lag, 6) * dt + 0.0))
-    late = min(found, default=(0.0, np.inf))[1]
-    return late if abs(late) < 100 * dt else None
+    place = np.arange(-reach, reach + 1)
+    windows = [
+        sliding_window_view(np.stack(run), len(place), axis=1)
+        for run in runs
+        if len(run[0]) >= len(place)
+    ]
+    x, rates = np.concatenate(windows, axis=1)
+    y = rates[:, reach]
+    inverse = np.linalg.pinv(np.delete(x - x[:, [reach]], reach, axis=1), rcond=1e-9)
+    # the weights of all rows add up to none
+    inverse = np.insert(inverse, reach, -inverse.sum(axis=0), axis=0)
+    b = inverse @ y
+    slope, curve = float(b @ place), float(b @ place**2)
+    if not slope > 0:  # positions that never change give no velocity
+        return None
+    dof = len(y) - 2 * reach
+    variance = float(((y - x @ b) ** 2).sum()) / dof
+    square = float(b @ b) - variance * float((inverse**2).sum())  # less the weights' errors
+    shown = sum(np.maximum(lengths - 3, 0)) / _correlation([-1, 3, -3, 1])
+    tail = f_distribution.ppf(alarm, dof / _correlation(b), max(shown, 1.0))
+    bound = min(most, float(tail)) * square * _noise(runs, dt)
+    exact = len(y) > 8 * reach and abs(slope * dt - 1) < 1e-6
+    total = float(np.concatenate([rate for _, rate in runs]).var())
+    lag = round(-curve / (2 * slope), 6) * dt + 0.0
+    return lag if variance < max(bound, 1e-12 * total * exact) and abs(lag) < 100 * dt else None
 
 
 def _noise(runs: Runs, dt: float, floor: float = 1e-3) -> float:
