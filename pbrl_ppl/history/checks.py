@@ -16,13 +16,10 @@ from pbrl_ppl.history.history import History
 from pbrl_ppl.history.kinematics import GAUSSIAN, column_noise, hung_bodies
 from pbrl_ppl.history.logs import Paths, in_words
 from pbrl_ppl.history.measures import TIME, unit_size, zero_angle
-from pbrl_ppl.history.units import rate_factor, unit_mismatch, unit_mismatches
+from pbrl_ppl.history.units import rate_factor, unit_mismatches, units_that_differ
 from pbrl_ppl.history.velocities import unused_velocities
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import THETA, VELOCITY, Floats, wrapped
-
-#: Whole numbers that range over more are no angles in rad or degrees, but counts.
-_COUNTS = 1440.0
 
 
 def read_scene(
@@ -96,13 +93,10 @@ def layout_cures(
     if clock := wrong_clock(history, scene):
         return [clock.sentence(scene)], {"time": clock.unit(present.get("time", "s"))}, False
     alone = len(history.bodies) == 1
-    for i, body in enumerate(history.bodies):
-        for d in range(VELOCITY):
-            sentence, cures = unit_mismatch(history, i, d)
-            keys = {column: column if alone else f"{body}.{column}" for column in cures}
-            if sentence:
-                said.append(sentence)
-                units |= {keys[name]: cures[name] for name in cures if keys[name] not in present}
+    for (body, _), (sentence, cures) in units_that_differ(history).items():
+        said.append(sentence)
+        cured = {k if alone else f"{history.bodies[body]}.{k}": v for k, v in cures.items()}
+        units |= {key: unit for key, unit in cured.items() if key not in present}
     unused = unused_velocities(history)
     rates = history.dataset["observed"].isel(state=slice(VELOCITY, None))
     measured = int(rates.notnull().any(("trajectory", "time")).sum())
@@ -162,11 +156,14 @@ def angle_warnings(history: History, scene: Scene) -> list[str]:
     return sentences
 
 
-def _degrees(angles: list[Floats], *, hinged: bool) -> str:
-    """Return why angles in rad look like degrees or counts; empty if they do not."""
+def _degrees(angles: list[Floats], *, hinged: bool, counts: float = 1440.0) -> str:
+    """Return why angles in rad look like degrees or counts; empty if they do not.
+
+    Whole numbers that range over more than ``counts`` are no angles in rad or degrees.
+    """
     steps = np.concatenate([np.abs(np.diff(run)) for run in angles])
     every = np.concatenate(angles)
-    if (every == np.round(every)).all() and np.ptp(every) > _COUNTS:
+    if (every == np.round(every)).all() and np.ptp(every) > counts:
         return (
             f"goes from {every.min():.6g} to {every.max():.6g} rad in whole numbers: looks like"
             ' counts: say how many there are to a turn: units = { theta = "8192/turn" }'
@@ -216,10 +213,6 @@ def _rest(angles: list[Floats], steady: float = 0.05) -> float:
     both = zip(angles, ends, strict=True)
     places = [float(np.median(end)) for run, end in both if np.ptp(end) < steady * np.ptp(run)]
     return float(np.median(places)) if places and np.ptp(places) < 0.3 else float("nan")
-
-
-#: Ratios of the frame rates of a camera and of its film.
-_RATIOS = (2.0, 4.0, 8.0, 10.0)
 
 
 @dataclass(frozen=True)
@@ -298,7 +291,8 @@ def wrong_clock(
         if body.name in held or scene.actuators_of(body.name) or sent.any():
             continue
         fall, error = _fall(data["observed"].to_numpy()[..., :2], down, scene.time_step)
-        ratios = (*_RATIOS, *(1 / ratio for ratio in _RATIOS))
+        # ratios of the frame rates of a camera and of its film
+        ratios = [ratio**sign for ratio in (2.0, 4.0, 8.0, 10.0) for sign in (1, -1)]
         factor = min(ratios, key=lambda one: abs(np.log(max(fall, 1e-300) * one**2 / gravity)))
         if abs(fall * factor**2 / gravity - 1) < near and error < certain * fall:
             return WrongClock(body.name, fall, gravity, factor)

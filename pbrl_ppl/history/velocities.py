@@ -11,7 +11,7 @@ from scipy.stats import t as t_distribution
 
 from pbrl_ppl.history.history import History
 from pbrl_ppl.history.kinematics import column_noise, finest_step, unwrapped
-from pbrl_ppl.history.units import unit_mismatch
+from pbrl_ppl.history.units import units_that_differ
 from pbrl_ppl.state import STATE, THETA, VELOCITY, Bools, Floats, wrapped
 
 #: Positions and velocities of rows without gaps, m and m/s or rad and rad/s.
@@ -147,7 +147,7 @@ def unused_velocities(history: History) -> tuple[UnusedVelocity, ...]:
     vx of puck was computed from x and is not used
     """
     dt, observed = float(history.dataset.attrs["time_step"]), history.dataset["observed"].to_numpy()
-    unused: list[UnusedVelocity] = []
+    unused, differ = list[UnusedVelocity](), units_that_differ(history)
     for body in np.flatnonzero(~history.dataset["kinematic"].to_numpy()):
         for d in range(3):
             runs = _runs(history, int(body), d)
@@ -162,7 +162,7 @@ def unused_velocities(history: History) -> tuple[UnusedVelocity, ...]:
                 unused.append(UnusedVelocity(*names, True, late if abs(late) > 0.05 * dt else 0.0))
             elif lag := velocity_lag(runs, dt):
                 unused.append(UnusedVelocity(*names, False, lag))
-            elif fault and not unit_mismatch(history, int(body), d)[0]:
+            elif fault and (body, d) not in differ:
                 unused.append(UnusedVelocity(*names, False, 0.0, fault=fault))
     return tuple(unused)
 
