@@ -9,23 +9,20 @@ import numpy as np
 import pandas as pd
 
 from pbrl_ppl.errors import HistoryError, LayoutError
-from pbrl_ppl.history.measures import TIME, stated_unit, unit_in_name, unit_size
+from pbrl_ppl.history.measures import TIME, numbers, stated_unit, unit_in_name, unit_size
 from pbrl_ppl.history.resampling import held_means
 from pbrl_ppl.scene import Recording, column_of
 from pbrl_ppl.state import STATE, WRENCH, Bools, Floats, Ints
 
 #: Names of columns of times, in lower case.
 TIMES = ("time", "t", "stamp", "timestamp", "header.stamp", "secs", "seconds", "sec")
-#: Seconds since 1970 of the years 2001 to 2036.
-_EPOCH = (1e9, 2.1e9)
-#: Rows further apart (s) are believed where the unit is declared only.
-_SLOWEST = 2.0
-
 Say = Callable[[str], None]
 
 
-def likely_unit(stamps: Floats) -> str:
+def likely_unit(stamps: Floats, slowest: float = 2.0) -> str:
     """Return the unit that stamps are likely in: by the year, or by the time between rows.
+
+    Rows further apart than ``slowest`` (s) are believed where the unit is declared only.
 
     Examples
     --------
@@ -38,12 +35,12 @@ def likely_unit(stamps: Floats) -> str:
     if len(stamps) < 2:
         return "s"
     for unit in ("s", "ms", "us", "ns"):
-        if _EPOCH[0] < float(np.median(stamps)) * TIME[unit] < _EPOCH[1]:
+        if 1e9 < float(np.median(stamps)) * TIME[unit] < 2.1e9:  # 2001 to 2036
             return unit
     # of bursts most steps are tiny, and one of a few is not; between runs there are pauses
     steps = np.sort(np.abs(np.diff(stamps)))
     step = float(steps[: max(1, int(0.9 * len(steps)))].mean())
-    if step < _SLOWEST:
+    if step < slowest:
         return "s"
     return next((unit for unit in ("ms", "us") if step * TIME[unit] <= 0.5), "ns")
 
@@ -73,11 +70,11 @@ def on_one_clock(
     HistoryError
         If a column of times is missing or two clocks have no time in common.
     """
-    columns, clocks, whole = dict(layout.columns), dict(layout.time), frame
-    own = {name: clocks[name] for name in clocks if name.rpartition(".")[2] in (*STATE, *WRENCH)}
+    clocks, whole = dict(layout.time), frame
     bare = {unit_in_name(str(column))[0]: column for column in frame.columns}
+    columns = {name: bare.get(column, column) for name, column in layout.columns}
+    own = {name: clocks[name] for name in clocks if name.rpartition(".")[2] in (*STATE, *WRENCH)}
     own = {name: bare.get(column, column) for name, column in own.items()}
-    columns = {name: bare.get(column, column) for name, column in columns.items()}
     for name, column in own.items():
         if column not in frame or columns.get(name, name) not in frame:
             raise HistoryError(
@@ -110,13 +107,13 @@ def on_one_clock(
             continue
         value = columns.get(key, key)
         stamps = _seconds(whole, column, layout, source)
-        values = pd.to_numeric(whole[value], errors="coerce").to_numpy(float)
+        values = numbers(whole[value])
         hold = key.rpartition(".")[2] in WRENCH and _holds(layout, stamps, values)
         frame = _brought(frame, str(value), stamps, values, say, hold=hold)
     if commands is not None:
         frame = _with_commands(frame, layout, commands, source, say)
-    first = float(np.nanmin(frame["time"]))
-    return frame.assign(time=frame["time"] - first) if abs(first) > _EPOCH[0] else frame
+    first = float(np.nanmin(frame["time"]))  # s since 1970
+    return frame.assign(time=frame["time"] - first) if abs(first) > 1e9 else frame
 
 
 def _seconds(frame: pd.DataFrame, name: str, layout: Recording, source: str) -> Floats:
@@ -173,7 +170,7 @@ def _at_rate(
                 f'{source}: [recording] time has counter = "{clocks["counter"]}", which is no'
                 f" column; it has {', '.join(map(str, frame.columns))}"
             )
-        count = pd.to_numeric(frame[clocks["counter"]], errors="coerce").to_numpy(float)
+        count = numbers(frame[clocks["counter"]])
     else:
         order = frame.groupby(keys).cumcount() if keys else np.arange(len(frame))
         count = np.asarray(order, dtype=float)
@@ -212,19 +209,16 @@ def _bursts(
     if not rate > 0 or hair.mean() < 0.4 or not _moves_within(frame, layout, rows, hair):
         return None
     entry: dict[str, str | float] = {"rate": _round_rate(rate)}
+    written = f"rate = {entry['rate']:g}"
     if counters:
         entry["counter"] = str(counters[0])
-    written = ", ".join(
-        f'{key} = "{value}"' if isinstance(value, str) else f"{key} = {value:g}"
-        for key, value in entry.items()
-    )
-    message = (
+        written += f', counter = "{counters[0]}"'
+    return (
         f"the stamps come in bursts, {hair.mean():.0%} of them within"
         f" {np.abs(steps[hair]).max():.2g} s of the row before ({int((steps < 0).sum())} go back):"
         f" they say when rows arrived, not when they were measured; if rows are even,"
         f" [recording] time = {{ {written} }}"
-    )
-    return message, entry
+    ), entry
 
 
 def _moves_within(frame: pd.DataFrame, layout: Recording, rows: Ints, hair: Bools) -> bool:
@@ -235,7 +229,7 @@ def _moves_within(frame: pd.DataFrame, layout: Recording, rows: Ints, hair: Bool
     for key, column in (*layout.columns, *((name, name) for name in STATE)):
         name = column_of(column)
         if key.rpartition(".")[2] in STATE and name in frame:
-            values = pd.to_numeric(frame[name].iloc[rows], errors="coerce").to_numpy(float)
+            values = numbers(frame[name].iloc[rows])
             change = np.abs(np.diff(values))
             if np.nanmedian(change[hair]) > 0.5 * np.nanmedian(change[~hair]):
                 return True
@@ -244,7 +238,7 @@ def _moves_within(frame: pd.DataFrame, layout: Recording, rows: Ints, hair: Bool
 
 def _is_counter(column: pd.Series) -> bool:
     """Return whether a column counts the rows."""
-    values = pd.to_numeric(column, errors="coerce").to_numpy(float)
+    values = numbers(column)
     steps = np.diff(values)
     whole = np.isfinite(values).all() and (values == np.round(values)).all()
     return bool(whole and (steps >= 0).all() and (steps == 1).mean() > 0.8)
@@ -327,7 +321,7 @@ def command_stamps(commands: pd.DataFrame, layout: Recording, source: str = "his
             f"{source}: {layout.commands} has no column of times; say which it is: [recording]"
             f' time = {{ commands = "..." }}; it has {", ".join(plain)}'
         )
-    numeric = np.asarray(pd.to_numeric(commands[time], errors="coerce"), dtype=float)
+    numeric = numbers(commands[time])
     unit = stated_time_unit(commands, str(time)) or likely_unit(numeric)
     return np.asarray(numeric * TIME[unit] + float(clocks.get("offset", 0.0)))
 
@@ -364,10 +358,10 @@ def _with_commands(
             f"{source}: its clock starts again, and commands in a file of their own need one clock"
             " throughout; write a file for each start"
         )
-    for name in dict.fromkeys(wanted.values()):
-        values = np.asarray(pd.to_numeric(commands[name], errors="coerce"), dtype=float)
+    for name in map(str, dict.fromkeys(wanted.values())):
+        values = numbers(commands[name])
         hold = _holds(layout, stamps, values)
-        frame = _brought(frame, str(name), stamps, values, say, hold=hold)
+        frame = _brought(frame, name, stamps, values, say, hold=hold)
     return frame
 
 
@@ -385,10 +379,10 @@ def _command_rows(frame: pd.DataFrame, columns: Mapping[str, object]) -> Bools:
         str(name) for name in frame if name not in states
     ]
     others = frame[sent].notna().to_numpy(dtype=bool)
-    if posed.all() or not posed.any():
-        return np.zeros(len(frame), dtype=bool)
+    if not posed.any():
+        return posed
     rare = others[posed].sum(axis=0) < 0.1 * others.sum(axis=0)
-    return np.asarray(~posed & others[:, rare].any(axis=1))
+    return ~posed & others[:, rare].any(axis=1)
 
 
 def _of_two_streams(
@@ -407,7 +401,7 @@ def _of_two_streams(
     sent = [name for key, name in named.items() if key.rpartition(".")[2] in WRENCH]
     brought = {}
     for name in (name for name in dict.fromkeys(sent) if name in frame):
-        values = pd.to_numeric(frame[name], errors="coerce").to_numpy(float, copy=True)
+        values = numbers(frame[name])
         hold, at_rows = _holds(layout, time, values), np.full(len(frame), np.nan)
         for number in np.unique(run[~alone]):
             here = run == number
@@ -421,11 +415,11 @@ def _of_two_streams(
 
 def with_later_commands(frame: pd.DataFrame, offset: float) -> pd.DataFrame:
     """Return a history's table whose commands are so many seconds later than their rows."""
-    time = pd.to_numeric(frame["time"], errors="coerce").to_numpy(float)
+    time = numbers(frame["time"])
     moved: dict[str, Floats] = {}
     for rows in frame.groupby(["trajectory", "body"], sort=False).indices.values():
         for name in WRENCH:
-            values = pd.to_numeric(frame[name].iloc[rows], errors="coerce").to_numpy(float)
+            values = numbers(frame[name].iloc[rows])
             moved.setdefault(name, np.full(len(frame), np.nan))[rows] = _at_times(
                 time[rows], time[rows] + offset, values, hold=True
             )
@@ -445,7 +439,7 @@ def in_order(frame: pd.DataFrame, say: Say, *, far: float = 5.0) -> pd.DataFrame
         A clock that falls back by more than so many rows' time starts again; rows that are out of
         order by less are sorted.
     """
-    time = pd.to_numeric(frame["time"], errors="coerce").to_numpy(float)
+    time = numbers(frame["time"])
     run = np.zeros(len(frame), dtype=int)
     groups = frame.groupby(["trajectory", "body"], sort=False, dropna=False).indices
     swapped, resets = 0, 0

@@ -22,6 +22,7 @@ from pbrl_ppl.history.files import COLUMNS
 from pbrl_ppl.history.guesses import with_derived
 from pbrl_ppl.history.measures import (
     in_si,
+    numbers,
     stated_units,
     unit_in_name,
     with_whole_counts,
@@ -228,8 +229,7 @@ def _picked(frame: pd.DataFrame, columns: Mapping[str, object]) -> pd.DataFrame:
     def values(column: object) -> object:
         if isinstance(column, tuple):
             name, sign, zero = column
-            numbers = np.asarray(pd.to_numeric(frame[name].to_numpy(), errors="coerce"), float)
-            return sign * (numbers - zero)
+            return sign * (numbers(frame[name]) - zero)
         return frame[column] if isinstance(column, str) and column in frame else column
 
     return pd.DataFrame(

@@ -14,6 +14,7 @@ from scipy.signal import find_peaks
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history.clocks import Say
 from pbrl_ppl.history.kinematics import column_noise, finest_step
+from pbrl_ppl.history.measures import numbers
 from pbrl_ppl.history.resampling import LONGEST
 from pbrl_ppl.history.rows import TIME_TOLERANCE
 from pbrl_ppl.scene import Recording, Scene
@@ -277,7 +278,7 @@ def propose(
         Pieces that one trajectory is cut to.
     """
     said = []
-    times = pd.to_numeric(frame["time"], errors="coerce").to_numpy(float)
+    times = numbers(frame["time"])
     indices = frame.groupby(["trajectory", "body"], sort=False).indices.values()
     groups = [np.asarray(rows, dtype=np.int64) for rows in indices]
     names = [name for name in STATE[:3] if name in frame]

@@ -298,7 +298,7 @@ class History:
         HistoryError
             If the horizon is not a whole number from 1 up, or no piece is left.
         """
-        if isinstance(horizon, bool) or not isinstance(horizon, int | np.integer) or horizon < 1:
+        if horizon < 1 or horizon != int(horizon):
             raise HistoryError(f"horizon is {horizon!r}, expected a whole number from 1 up")
         intervals = self.dataset["n_rows"].to_numpy() - 1
         trajectory, step = _cut(self.complete, intervals, int(horizon))
@@ -587,7 +587,8 @@ def _cut(complete: Bools, intervals: Ints, horizon: int) -> tuple[Ints, Ints]:
             if step >= free and (step + horizon <= count or not free):
                 pieces.append((trajectory, step))
                 free = step + horizon
-    return tuple(np.array(pieces, dtype=np.int64).reshape(-1, 2).T)
+    trajectories, steps = np.array(pieces, dtype=np.int64).reshape(-1, 2).T
+    return trajectories, steps
 
 
 def with_paths(scene: Scene, states: Floats, wrenches: Floats) -> tuple[Floats, Floats]:

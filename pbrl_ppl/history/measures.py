@@ -53,6 +53,11 @@ _UNITS: Mapping[str, Mapping[str, float]] = {
 }
 
 
+def numbers(column: pd.Series) -> Floats:
+    """Return the numbers of a column, a copy; NaN where a cell is none."""
+    return np.array(pd.to_numeric(column, errors="coerce"), dtype=float)
+
+
 def unit_in_name(name: str) -> tuple[str, str]:
     """Return a column's name without its unit, and the unit: of ``angle [deg]`` both.
 
@@ -198,7 +203,7 @@ def with_whole_counts(frame: pd.DataFrame, say: Callable[[str], None]) -> pd.Dat
     time = pd.to_numeric(frame["time"], errors="coerce") if "time" in frame else None
     frame = frame.copy()
     for name in (name for name in STATE if name in frame):
-        values = pd.to_numeric(frame[name], errors="coerce").to_numpy(float, copy=True)
+        values = numbers(frame[name])
         found = list[tuple[int, int]]()
         for body in pd.unique(bodies):
             rows = np.flatnonzero((bodies == body) & np.isfinite(values))

@@ -502,7 +502,7 @@ def test_messages_name_rows_of_the_file_and_no_piece(tmp_path: Path) -> None:
     frame.loc[70, "x"] = np.inf
     frame.to_csv(tmp_path / "a.csv", index=False)
     layout = Recording(columns={"time": "t"}, cut={"every": 2.0})
-    with pytest.raises(HistoryError, match=r"a.csv row 72: x is inf") as it:
+    with pytest.raises(HistoryError, match=r'a.csv row 72: x of body "puck" is inf') as it:
         History.load(tmp_path / "a.csv", PUCK.replace(recording=layout))
     assert not re.search(r"trajectory \d", str(it.value))
 
