@@ -18,10 +18,6 @@ from pbrl_ppl.state import STATE, THETA, VELOCITY, Bools, Floats, wrapped
 Runs = list[tuple[Floats, Floats]]
 
 
-#: Rows of the moving means that a smoothed velocity is compared with; 1 is no smoothing.
-_WINDOWS = (1, 3, 5, 9, 17, 33)
-
-
 @dataclass(frozen=True)
 class Contradiction:
     """What is wrong with a velocity column, and where.
@@ -180,11 +176,10 @@ def measured_alone(history: History, unused: Sequence[UnusedVelocity] | None = N
     unused = unused_velocities(history) if unused is None else unused
     if not unused:
         return history
-    columns = np.zeros((len(history.bodies), len(STATE)), dtype=bool)
+    observed = history.dataset["observed"].copy(deep=True)
     for velocity in unused:
-        columns[history.bodies.index(velocity.body), STATE.index(velocity.state)] = True
-    observed = history.dataset["observed"]
-    return History(history.dataset.assign(observed=observed.where(~columns)))
+        observed.loc[{"body": velocity.body, "state": velocity.state}] = np.nan
+    return History(history.dataset.assign(observed=observed))
 
 
 def velocity_lag(runs: Runs, dt: float, *, material: float = 0.05) -> float:
@@ -342,14 +337,12 @@ def position_noise(runs: Runs, dt: float) -> tuple[float, float]:
     >>> float(np.sqrt(position_noise([(x, v)], 0.01)[0]).round(4))
     0.002
     """
-    square = product = 0.0
-    n = m = 0
-    for position, rate in runs:
-        off = np.diff(np.diff(position) / dt - (rate[1:] + rate[:-1]) / 2, 2)
-        square, n = square + float(off @ off), n + len(off)
-        product, m = product + float(off[1:] @ off[:-1]), m + max(len(off) - 1, 0)
-    place = max(0.0, -(square / max(n, 1) + 4 * product / max(m, 1)) / 40)
-    return place * dt**2, max(0.0, square / max(n, 1) - 20 * place)
+    off = [np.diff(np.diff(x) / dt - (v[1:] + v[:-1]) / 2, 2) for x, v in runs]
+    n, m = max(sum(map(len, off)), 1), max(sum(max(len(one) - 1, 0) for one in off), 1)
+    square = sum(float(one @ one) for one in off) / n
+    product = sum(float(one[1:] @ one[:-1]) for one in off) / m
+    place = max(0.0, -(square + 4 * product) / 40)
+    return place * dt**2, max(0.0, square - 20 * place)
 
 
 def computed_lag(
@@ -426,10 +419,8 @@ def _noise(runs: Runs, dt: float, floor: float = 1e-3) -> float:
     positions = [position for position, _ in runs]
     eighth, ninth = (column_noise(positions, order) ** 2 for order in (8, 9))
     white = ninth * comb(18, 9) > 2.0 * eighth * comb(16, 8)
-    least = floor * eighth * white
-    return float(
-        np.clip(position_noise(runs, dt)[0], least, column_noise(positions, 8, robust=True) ** 2)
-    )
+    most = column_noise(positions, 8, robust=True) ** 2
+    return float(np.clip(position_noise(runs, dt)[0], floor * eighth * white, most))
 
 
 def _correlation(weights: Floats | list[int]) -> float:
@@ -481,18 +472,17 @@ def contradiction(
     inner = rate[:, 1:-1]
     kind, factor = _kind(middle, inner, found, tolerance), 0.0
     if not kind:
-        inner = inner + np.median((middle - inner)[seen])
-        found = _wrong(quotient, rate + np.median((middle - rate[:, 1:-1])[seen]), position, dt)[1]
-        off = np.sqrt(np.mean((middle - inner)[found] ** 2)) if found.sum() >= few else 0.0
+        bias = np.median((middle - inner)[seen])
+        found = _wrong(quotient, rate + bias, position, dt)[1]
+        off = np.sqrt(np.mean((middle - inner - bias)[found] ** 2)) if found.sum() >= few else 0.0
         if off < material * np.sqrt(np.mean(middle[seen] ** 2)):
             return None
         share = float(found.sum()) / float(seen.sum())
-        factor = _factor(middle[seen], rate[:, 1:-1][seen])
+        factor = _factor(middle[seen], inner[seen])
         rest = _wrong(quotient, factor * rate, position, dt)[1].sum()
         if not factor or rest > 0.05 * found.sum():
             turned = _wrong(quotient, -rate, position, dt)[1].sum() < 0.05 * found.sum()
-            late = "has the other sign" if turned else _late(quotient, rate, found)
-            factor, kind = 0.0, late or "is another quantity"
+            factor, kind = 0.0, "has the other sign" if turned else "is another quantity"
         else:
             kind = f"is {1 / factor:.3g} times the rate of its position, as in another unit"
     trajectory, row = (int(one) for one in np.argwhere(found)[0])
@@ -551,33 +541,3 @@ def _kind(middle: Floats, inner: Floats, found: Bools, tolerance: float) -> str:
         if high - low < 1.1 * size and np.quantile(off, 0.8) < min(tolerance, 0.2 * size):
             return f"wraps every {size:.3g}, as a counter that overflows"
     return "is 0" if np.mean(shown == 0.0) > 0.9 else ""
-
-
-def _late(quotient: Floats, rate: Floats, found: Bools, *, most: int = 8, left: float = 0.5) -> str:
-    """Return the delay and the smoothing that give the column from its position, in words.
-
-    ``most``: rows of delay; ``left``: share of the difference, root mean square, that may remain.
-    """
-    mean, best = (rate[:, 1:] + rate[:, :-1]) / 2, (np.inf, 0, 1)
-    # the intervals on both sides of each row that does not agree
-    wrong = np.pad(found, ((0, 0), (1, 0))) | np.pad(found, ((0, 0), (0, 1)))
-    for window in (one for one in _WINDOWS if one < quotient.shape[1] / 2):
-        smooth = np.full(quotient.shape, np.nan)
-        half = window // 2
-        smooth[:, half : quotient.shape[1] - half] = sliding_window_view(
-            quotient, window, axis=1
-        ).mean(axis=2)
-        for late in range(-most, window // 2 + most + 1):
-            moved = np.roll(smooth, late, axis=1)
-            off = (moved - mean)[wrong & np.isfinite(moved) & np.isfinite(quotient)]
-            if len(off) > 0.5 * wrong.sum():
-                best = min(best, (float(np.sqrt(np.mean(off**2))), late, window))
-    whole = (quotient - mean)[wrong & np.isfinite(quotient - mean)]
-    size, late, window = best
-    if not size < left * np.sqrt(np.mean(whole**2)):
-        return ""
-    words = [f"is smoothed over some {window} rows"] if window > 1 else []
-    words += [f"is {abs(late)} row{'s' * (abs(late) > 1)} {'late' if late > 0 else 'early'}"] * (
-        late != 0
-    )
-    return " and ".join(words)
