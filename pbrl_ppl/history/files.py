@@ -42,8 +42,8 @@ SUFFIXES = (".csv", ".parquet", ".nc")
 _PANDAS = tuple(int(part) for part in pd.__version__.split(".")[:2])
 _EXACT: dict[str, Any] = {} if _PANDAS >= (3, 1) else {"float_precision": "round_trip"}
 _MISSING = ["", "nan", "NaN", "NAN", "NA", "N/A", "null", "NULL", "None"]
-#: Rows that show what the columns hold, and lines that may be above them.
-_SAMPLE, _HEAD = 200, 30
+#: Rows that show what the columns hold.
+_SAMPLE = 200
 _NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?|[-+]?(nan|inf|infinity)", re.I)
 #: In place of the suffix of a folder.
 FOLDER = "a folder"
@@ -180,21 +180,14 @@ def _table_of(text: str, path: Path, layout: Recording) -> pd.DataFrame:
     named = [column for _, column in layout.columns if isinstance(column, str)]
     numbers = ["step", "time", *STATE, *WRENCH, *named]
     decimal = "," if separator != "," and _has_commas(lines[first:]) else "."
+    missing = dict.fromkeys((*numbers, *(columns if names is None else ())), _MISSING)
     try:
         frame: pd.DataFrame = pd.read_csv(
-            io.StringIO("\n".join(lines[first:])),
-            sep=separator,
-            names=columns,
-            header=None,
-            decimal=decimal,
-            dtype={"trajectory": "str", "body": "str"},
-            keep_default_na=False,
-            na_values=dict.fromkeys((*numbers, *(columns if names is None else ())), _MISSING),
-            skipinitialspace=True,
-            skip_blank_lines=False,
-            low_memory=False,
+            io.StringIO("\n".join(lines[first:])), sep=separator, names=columns, header=None,
+            decimal=decimal, dtype={"trajectory": "str", "body": "str"}, keep_default_na=False,
+            na_values=missing, skipinitialspace=True, skip_blank_lines=False, low_memory=False,
             **_EXACT,
-        )
+        )  # fmt: skip
     except (ValueError, pd.errors.ParserError) as error:
         raise HistoryError(f"history {path}: not a CSV table: {error}") from None
     if not isinstance(frame.index, pd.RangeIndex):
@@ -251,9 +244,12 @@ def _cells(line: str, separator: str) -> list[str]:
 
 
 def _head(
-    lines: list[str], separator: str, header: bool | None
+    lines: list[str], separator: str, header: bool | None, most: int = 30
 ) -> tuple[int, list[str] | None, dict[str, str]]:
-    """Return the first line of data, the columns' names (None without), and units of columns."""
+    """Return the first line of data, the columns' names (None without), and units of columns.
+
+    At most so many lines are above.
+    """
     filled = [i for i, line in enumerate(lines) if line.strip()]
     body = [_cells(lines[i], separator) for i in filled[1:][-_SAMPLE:]]
     width = Counter(map(len, body)).most_common(1)[0][0] if body else 0
@@ -263,32 +259,28 @@ def _head(
         for i in range(width)
     ]  # fmt: skip
 
-    def is_data(cells: list[str]) -> bool:
-        """Return whether a line fits below: no words where others have numbers."""
-        fits = not any(_is_word(cell) and n for cell, n in zip(cells, numeric, strict=False))
-        return fits and any(map(_is_number, cells))
+    def is_data(cells: list[str], below: list[str]) -> bool:
+        """Return whether a line has numbers where others have, or a name that the next one has."""
+        both = zip(cells, [*below, *[""] * len(cells)], numeric, strict=False)
+        wrong = any(number and _is_word(cell) and cell != after for cell, after, number in both)
+        return not wrong and any(map(_is_number, cells))
 
-    above: list[int] = []
+    cells = [_cells(lines[i].lstrip("#% "), separator) for i in filled[: most + 1]]
+    above = int(header is not False)  # if no line looks like data, the first names the columns
     if header is None:
-        for i in filled[:_HEAD]:
-            if is_data(_cells(lines[i].lstrip("#% "), separator)):
-                break
-            above.append(i)
-        else:
-            above = filled[:1]  # no line looks like data: the first one names the columns
-    elif header:
-        above = filled[:1]
+        pairs = zip(cells[:most], [*cells[1:], []], strict=False)
+        above = next((k for k, pair in enumerate(pairs) if is_data(*pair)), 1)
     if not above:
         return filled[0], None, {}
-    heads = [_cells(lines[i].lstrip("#% "), separator) for i in above]
-    full = [sum(cell != "" for cell in cells) for cells in heads]
+    heads = cells[:above]
+    full = [sum(cell != "" for cell in each) for each in heads]
     at = full.index(max(full))
     names, units = heads[at], {}
     under = heads[at + 1] if at + 1 < len(heads) else []
     if len(under) == len(names):
         units = {n: unit.strip("[]() ") for n, unit in zip(names, under, strict=True) if unit}
     # the last line of a head is the last that is left out
-    return above[-1] + 1, names, units
+    return filled[above - 1] + 1, names, units
 
 
 def _is_number(cell: str) -> bool:
@@ -328,14 +320,10 @@ def read_netcdf(path: Path, layout: Recording) -> pd.DataFrame:
             dataset = stored.load()
     except Exception as error:  # HDF5 raises many kinds on a damaged file
         raise HistoryError(f"history {path}: not a NetCDF file: {reason(error)}") from None
-    for name, last in (
-        ("observed", ("body", "state")),
-        ("action", ("body", "wrench")),
-        ("clock", ()),
-    ):
-        expected = ("trajectory", "time", *last)
+    of_body = {"observed": ("body", "state"), "action": ("body", "wrench")}
+    for name, last in (of_body | {"clock": ()}).items():
         got = dataset[name].dims if name in dataset else None
-        if got != expected:
+        if got != (expected := ("trajectory", "time", *last)):
             raise HistoryError(
                 f"history {path}: variable {name!r} has dimensions {got}, expected {expected}; "
                 "write the file with History.save"
@@ -466,12 +454,9 @@ def table_of_arrays(
     """
     which, step = np.nonzero(~np.isnan(clock))
     k = len(bodies)
-    columns = {
-        "trajectory": np.repeat(trajectory[which], k),
-        "step": np.repeat(step, k),
-        "time": np.repeat(clock[which, step], k),
-        "body": np.tile(np.array(bodies, dtype=object), len(step)),
-    }
+    each = {"trajectory": trajectory[which], "step": step, "time": clock[which, step]}
+    columns = {name: np.repeat(values, k) for name, values in each.items()}
+    columns["body"] = np.tile(np.array(bodies, dtype=object), len(step))
     for names, values in ((STATE, states), (WRENCH, wrenches)):
         rows = values[which, step].reshape(len(step) * k, -1)
         columns |= zip(names, rows.T, strict=True)
