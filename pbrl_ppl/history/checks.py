@@ -223,30 +223,27 @@ class WrongClock:
     ----------
     body : str
         Name of the body.
-    acceleration, gravity : float
-        The body's along gravity, and what the scene says (m/s^2).
+    acceleration : float
+        The body's along gravity (m/s^2).
     factor : float
         How many seconds the clock counts in a second.
 
     Examples
     --------
-    >>> clock = WrongClock("ball", 0.153, 9.81, 8.0)
+    >>> clock = WrongClock("ball", 0.153, 8.0)
     >>> clock.unit(), clock.unit("ms"), clock.unit("240/s")
     ('8/s', '8/ms', '1920/s')
     """
 
     body: str
     acceleration: float
-    gravity: float
     factor: float
 
     def unit(self, present: str = "s") -> str:
         """Return the unit of time that cures it, from the unit in which the times were read."""
         number, _, unit = present.rpartition("/")
-        if number:
-            return f"{self.factor * float(number):.10g}/{unit}"
-        known = present in TIME and unit_size("time", present) is not None
-        return f"{self.factor:.10g}/{present if known else 's'}"
+        unit = unit if number or unit in TIME else "s"
+        return f"{self.factor * float(number or 1):.10g}/{unit}"
 
     def sentence(self, scene: Scene) -> str:
         """Return what the fall shows, and the entries of the scene that cure it."""
@@ -295,7 +292,7 @@ def wrong_clock(
         ratios = [ratio**sign for ratio in (2.0, 4.0, 8.0, 10.0) for sign in (1, -1)]
         factor = min(ratios, key=lambda one: abs(np.log(max(fall, 1e-300) * one**2 / gravity)))
         if abs(fall * factor**2 / gravity - 1) < near and error < certain * fall:
-            return WrongClock(body.name, fall, gravity, factor)
+            return WrongClock(body.name, fall, factor)
     return None
 
 
@@ -339,10 +336,6 @@ def _fall(places: Floats, down: Floats, dt: float, *, clear: float = 0.05) -> tu
     return float(best[0]), error
 
 
-#: Rows by which commands may be shifted, either way.
-_MOST = 3
-
-
 def command_shifts(
     history: History, scene: Scene, *, clear: float = 30.0, whole: float = 0.15
 ) -> dict[str, int]:
@@ -376,8 +369,7 @@ def command_shifts(
         sent = data["action"].to_numpy().astype(float)
         for d in (THETA,) if body.name in hung else range(3):
             pushes = _pushes(scene, body.name, pose, sent, d)
-            scores = _scores(pose[..., d], pushes, turns=d == THETA)
-            if scores is not None and (shift := _shift(*scores, clear, whole)):
+            if shift := _shift(pose[..., d], pushes, clear, whole, turns=d == THETA):
                 found[body.name] = shift
                 break
     return found
@@ -412,30 +404,34 @@ def _pushes(scene: Scene, name: str, pose: Floats, sent: Floats, d: int) -> Floa
     return np.array([part * column for part in parts for column in along])
 
 
-def _scores(
-    place: Floats, pushes: Floats, *, turns: bool, few: int = 40
-) -> tuple[Floats, float, Floats] | None:
-    """Return log-likelihoods of each shift, that of the best with its neighbours, their weights."""
+def _shift(
+    place: Floats,
+    pushes: Floats,
+    clear: float,
+    whole_rows: float,
+    *,
+    turns: bool,
+    most: int = 3,
+    few: int = 40,
+) -> int:
+    """Return the shift by at most so many rows that is clear and of whole rows; 0 without one."""
     n = place.shape[1]
-    if not len(pushes) or n < 4 * _MOST + 2:
-        return None
-    rows = np.arange(_MOST + 1, n - _MOST - 2)
-    y = (place[:, rows + 1] - 2 * place[:, rows] + place[:, rows - 1]).ravel()
-    rest = [
-        np.ones_like(y),
-        place[:, rows].ravel(),
-        (place[:, rows + 1] - place[:, rows - 1]).ravel(),
-    ]
+    if not len(pushes) or n < 4 * most + 2:
+        return 0
+    rows = np.arange(most + 1, n - most - 2)
+    here, before, after = place[:, rows], place[:, rows - 1], place[:, rows + 1]
+    y = (after - 2 * here + before).ravel()
+    rest = [np.ones_like(y), here.ravel(), (after - before).ravel()]
     if turns:
-        rest += [np.sin(place[:, rows]).ravel(), np.cos(place[:, rows]).ravel()]
+        rest += [np.sin(here).ravel(), np.cos(here).ravel()]
     moved = {
         s: np.stack([(p[:, rows - 1 - s] + p[:, rows - s]).ravel() for p in pushes], axis=1)
-        for s in range(-_MOST - 1, _MOST + 2)
+        for s in range(-most - 1, most + 2)
     }
     whole = np.column_stack([y, *rest, *moved.values()])
     kept = np.isfinite(whole).all(axis=1)
     if kept.sum() < few or not any(np.ptp(one[kept], axis=0).any() for one in moved.values()):
-        return None
+        return 0
     base = np.stack([column[kept] for column in rest], axis=1)
     base = base / np.maximum(np.abs(base).max(axis=0), 1e-300)
 
@@ -446,20 +442,12 @@ def _scores(
         size = max(float(off @ off), 1e-18 * float(y[kept] @ y[kept]), 1e-300)
         return -0.5 * len(off) * np.log(size), best[base.shape[1] :]
 
-    shifts = range(-_MOST, _MOST + 1)
-    each = np.array([fit(s)[0] for s in shifts])
-    best = shifts[int(each.argmax())]
-    joint, weights = fit(best - 1, best, best + 1)
-    return each, joint, weights.reshape(3, -1)
-
-
-def _shift(each: Floats, joint: float, weights: Floats, clear: float, whole: float) -> int:
-    """Return the shift that is clear and of whole rows; 0 if there is none."""
-    best = int(each.argmax())
-    gain = each[best] - each[_MOST]
-    others = np.delete(each, best).max()
+    each = {s: fit(s)[0] for s in range(-most, most + 1)}
+    best = max(each, key=each.__getitem__)
+    joint, found = fit(best - 1, best, best + 1)
+    weights = found.reshape(3, -1)
     size = weights[:, int(np.abs(weights[1]).argmax())]
     off = float((size[2] - size[0]) / size.sum()) if size.sum() else np.inf
-    if each[best] - others < clear or abs(off) > whole or joint - each[best] > 0.1 * gain:
-        return 0
-    return best - _MOST
+    is_clear = each[best] - max(size for s, size in each.items() if s != best) >= clear
+    is_whole = abs(off) <= whole_rows and joint - each[best] <= 0.1 * (each[best] - each[0])
+    return best if is_clear and is_whole else 0

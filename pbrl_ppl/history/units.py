@@ -128,12 +128,10 @@ def shown_mass(
     pose = data["start"].sel(body=name).to_numpy()[..., :3].copy()
     pose[..., THETA] = np.unwrap(np.nan_to_num(pose[..., THETA]), axis=1)
     wrench = data["action"].sel(body=name).to_numpy()
-    columns, moment = slice(0, 2), 1.0
+    columns, moment = [0, 1], 1.0
     if name in hung_bodies(scene):
-        columns = slice(2, 3)
-        moment = body.shape.unit_moment + units_of(scene, name).length ** 2
-    rate = np.diff(pose[..., columns], axis=1) / scene.time_step
-    response = np.diff(rate, axis=1).ravel() / scene.time_step
+        columns, moment = [THETA], body.shape.unit_moment + units_of(scene, name).length ** 2
+    response = np.diff(pose[..., columns], 2, axis=1).ravel() / scene.time_step**2
     # between the middles of two intervals each command acts for half of the time
     push = (0.5 * (wrench[:, :-2, columns] + wrench[:, 1:-1, columns])).ravel() / moment
     seen = np.isfinite(response) & np.isfinite(push)
@@ -227,12 +225,10 @@ def rate_factor(
         change = np.diff(position[:, : n * span + 1 : span], axis=1).ravel()
         mean = ((rate[:, 1:] + rate[:, :-1]) / 2)[:, : n * span].reshape(len(rate), n, span)
         integral = dt * span * mean.mean(axis=2).ravel()
-        seen = np.isfinite(change) & np.isfinite(integral)
-        change, integral = change[seen], integral[seen]
-        if len(integral) < few:
-            continue
-        size = np.abs(integral)
-        fast = (size > 0) & (size >= np.quantile(size, 0.9) / 2)  # where noise counts least
+        size = np.abs(np.where(np.isfinite(change), integral, np.nan))
+        seen = np.isfinite(size).sum() >= few
+        # where noise counts least
+        fast = (size > 0) & (size >= np.nanquantile(size, 0.9) / 2) if seen else size > np.inf
         change, integral = change[fast], integral[fast]
         if len(integral) < few:
             continue
