@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -81,14 +81,13 @@ def on_one_clock(
                 f'{source}: [recording] time has {name} = "{column}", and the file has no such'
                 f" column, or none of {name}; it has {', '.join(map(str, frame.columns))}"
             )
+    states = [column for key, column in own.items() if key.rpartition(".")[2] in STATE]
     name = columns.get("time", "time")
-    states = [name for name in own if name.rpartition(".")[2] in STATE]
-    if name not in frame and states:
-        name = own[states[0]]
-    if isinstance(name, str) and name in frame:
+    name = name if name in frame else next(iter(states), name)
+    if name in frame:
         if own:  # of a longer column with a clock of its own the rows below are no rows
             frame = frame[frame[name].notna()]
-        time = _seconds(frame, name, layout, source)
+        time = _seconds(frame, str(name), layout, source)
         if not own and (alone := _command_rows(frame, columns)).any():
             frame = _of_two_streams(frame, columns, time, alone, layout, say)
             time = time[~alone]
@@ -226,13 +225,10 @@ def _moves_within(frame: pd.DataFrame, layout: Recording, rows: Ints, hair: Bool
 
     If not, the stamps are true, and rows are twice.
     """
-    for key, column in (*layout.columns, *((name, name) for name in STATE)):
-        name = column_of(column)
-        if key.rpartition(".")[2] in STATE and name in frame:
-            values = numbers(frame[name].iloc[rows])
-            change = np.abs(np.diff(values))
-            if np.nanmedian(change[hair]) > 0.5 * np.nanmedian(change[~hair]):
-                return True
+    for name in _present(frame, dict(layout.columns), STATE):
+        change = np.abs(np.diff(numbers(frame[name].iloc[rows])))
+        if np.nanmedian(change[hair]) > 0.5 * np.nanmedian(change[~hair]):
+            return True
     return False
 
 
@@ -335,13 +331,8 @@ def _with_commands(
     frame: pd.DataFrame, layout: Recording, commands: pd.DataFrame, source: str, say: Say
 ) -> pd.DataFrame:
     """Return a table with the commands of another file at its rows."""
-    columns, rows = dict(layout.columns), frame["time"].to_numpy(float)
-    stamps = command_stamps(commands, layout, source)
-    wanted = {
-        key: columns.get(key, key)
-        for key in dict.fromkeys((*columns, *WRENCH))
-        if key.rpartition(".")[2] in WRENCH and columns.get(key, key) in commands
-    }
+    rows, stamps = frame["time"].to_numpy(float), command_stamps(commands, layout, source)
+    wanted = _present(commands, dict(layout.columns), WRENCH)
     if not wanted:
         raise HistoryError(
             f"{source}: {layout.commands} has no column of a wrench; say which it is: columns ="
@@ -358,11 +349,25 @@ def _with_commands(
             f"{source}: its clock starts again, and commands in a file of their own need one clock"
             " throughout; write a file for each start"
         )
-    for name in map(str, dict.fromkeys(wanted.values())):
+    for name in wanted:
         values = numbers(commands[name])
         hold = _holds(layout, stamps, values)
         frame = _brought(frame, name, stamps, values, say, hold=hold)
     return frame
+
+
+def _present(frame: pd.DataFrame, columns: Mapping[str, object], names: Sequence[str]) -> list[str]:
+    """Return the columns of a table that are of these names of a history, each once."""
+    every = {key: column_of(columns.get(key, key)) for key in (*columns, *names)}
+    found = (column for key, column in every.items() if key.rpartition(".")[2] in names)
+    return [column for column in dict.fromkeys(found) if column in frame]
+
+
+def _falls_back(time: Floats, far: float) -> Bools:
+    """Return after which rows the clock falls back by more than so many rows' time."""
+    steps = np.diff(time)
+    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    return np.asarray(steps < -far * usual)
 
 
 def _command_rows(frame: pd.DataFrame, columns: Mapping[str, object]) -> Bools:
@@ -370,14 +375,11 @@ def _command_rows(frame: pd.DataFrame, columns: Mapping[str, object]) -> Bools:
 
     They have no state, but something that next to no row with a state has.
     """
-    named = {key: column_of(columns.get(key, key)) for key in (*columns, *STATE)}
-    states = [name for key, name in named.items() if key.rpartition(".")[2] in STATE]
-    states = [name for name in dict.fromkeys(states) if name in frame]
+    states = _present(frame, columns, STATE)
     posed = frame[states].notna().any(axis=1).to_numpy(dtype=bool)
-    sent = [name for key, name in named.items() if key.rpartition(".")[2] in WRENCH]
-    sent = [name for name in sent if name in frame] or [
-        str(name) for name in frame if name not in states
-    ]
+    named = {key: column for key, column in columns.items() if key.rpartition(".")[2] in WRENCH}
+    sent = [name for name in map(column_of, named.values()) if name in frame]
+    sent = sent or [str(name) for name in frame if name not in states]
     others = frame[sent].notna().to_numpy(dtype=bool)
     if not posed.any():
         return posed
@@ -394,20 +396,15 @@ def _of_two_streams(
     say: Say,
 ) -> pd.DataFrame:
     """Return the rows that have a state, with the commands of the other rows at their times."""
-    steps = np.diff(time)
-    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
-    run = np.append(0, np.cumsum(steps < -50.0 * usual))  # where the clock starts again
-    named = {key: column_of(columns.get(key, key)) for key in (*columns, *WRENCH)}
-    sent = [name for key, name in named.items() if key.rpartition(".")[2] in WRENCH]
+    run = np.append(0, np.cumsum(_falls_back(time, 50.0)))
     brought = {}
-    for name in (name for name in dict.fromkeys(sent) if name in frame):
+    for name in _present(frame, columns, WRENCH):
         values = numbers(frame[name])
         hold, at_rows = _holds(layout, time, values), np.full(len(frame), np.nan)
         for number in np.unique(run[~alone]):
             here = run == number
-            at_rows[here & ~alone] = _at_times(
-                time[here & ~alone], time[here], values[here], hold=hold
-            )
+            rows = here & ~alone
+            at_rows[rows] = _at_times(time[rows], time[here], values[here], hold=hold)
         brought[name] = at_rows[~alone]
     say(f"{int(alone.sum())} rows hold commands and no state: read as a stream of their own")
     return frame[~alone].assign(**brought)
@@ -415,14 +412,10 @@ def _of_two_streams(
 
 def with_later_commands(frame: pd.DataFrame, offset: float) -> pd.DataFrame:
     """Return a history's table whose commands are so many seconds later than their rows."""
-    time = numbers(frame["time"])
-    moved: dict[str, Floats] = {}
+    time, moved = numbers(frame["time"]), {name: numbers(frame[name]) for name in WRENCH}
     for rows in frame.groupby(["trajectory", "body"], sort=False).indices.values():
-        for name in WRENCH:
-            values = numbers(frame[name].iloc[rows])
-            moved.setdefault(name, np.full(len(frame), np.nan))[rows] = _at_times(
-                time[rows], time[rows] + offset, values, hold=True
-            )
+        for values in moved.values():
+            values[rows] = _at_times(time[rows], time[rows] + offset, values[rows], hold=True)
     return frame.assign(**moved)
 
 
@@ -444,11 +437,9 @@ def in_order(frame: pd.DataFrame, say: Say, *, far: float = 5.0) -> pd.DataFrame
     groups = frame.groupby(["trajectory", "body"], sort=False, dropna=False).indices
     swapped, resets = 0, 0
     for rows in groups.values():
-        steps = np.diff(time[rows])
-        usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
-        starts = steps < -far * usual
-        run[rows] = np.concatenate([[0], np.cumsum(starts)])
-        swapped += int(((steps < 0) & ~starts).sum())
+        starts = _falls_back(time[rows], far)
+        run[rows] = np.append(0, np.cumsum(starts))
+        swapped += int(((np.diff(time[rows]) < 0) & ~starts).sum())
         resets += int(starts.sum())
     if resets:
         say(f"the clock falls back {resets} times: a new trajectory begins there each time")
