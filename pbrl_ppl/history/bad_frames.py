@@ -13,19 +13,12 @@ from scipy.ndimage import maximum_filter1d
 from pbrl_ppl.errors import HistoryError, warn
 from pbrl_ppl.history.history import History, hashed
 from pbrl_ppl.history.kinematics import GAUSSIAN, RATE_REACH, column_noise, finest_step
+from pbrl_ppl.history.parts import joined_pieces
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE, STATE_UNITS, THETA, VELOCITY, Bools, Floats, wrapped
 
-#: Positions of a dimension without gaps, by trajectory.
-Series = dict[int, Floats]
 #: Least rows at rest, and of a trajectory without its ends.
 LEAST = 3
-#: Least rows of motion beside those at rest.
-BESIDE = 6
-#: Rows at rest, and rows of motion, that are looked at, at most.
-LONGEST = 200
-#: Robust standard deviations, and standard errors, of a bend.
-LIMIT = 8.0
 
 
 @dataclass(frozen=True)
@@ -405,23 +398,22 @@ def unmodelled_ends(history: History, scene: Scene) -> list[End]:
     push = np.nan_to_num(dataset["action"].to_numpy())[:, :, ~follows]
     found: dict[tuple[int, bool], End] = {}
     for body, d in product(np.flatnonzero(~follows), range(3)):
-        filled = [
-            _filled(observed[t, :n, body, d], d == THETA)
-            for t, n in enumerate(dataset["n_rows"].to_numpy())
-        ]
-        series = {t: values for t, values in enumerate(filled) if values is not None}
+        rows_of = enumerate(dataset["n_rows"].to_numpy())
+        filled = {t: _filled(observed[t, :n, body, d], d == THETA) for t, n in rows_of}
+        series = {t: values for t, values in filled.items() if values is not None}
         if not any(len(values) > 4 and np.ptp(values) > 0 for values in series.values()):
             continue
         noise = column_noise(series.values(), 4, robust=True)
         noise = max(noise, finest_step(np.concatenate([*series.values()])) / np.sqrt(12))
-        stops = _stops(series, push, noise)
+        search = _Ends(series, push, noise)
+        stops = search.stopped()
         for t, values in series.items():
             states, n = observed[t, : len(values)], len(values)
-            held, stopped = _held(values, push[t], series, noise), stops.get(t, 0)
-            if held and _moves(np.delete(states, body, axis=1)[: 2 * held + BESIDE, :, :3]):
-                held = 0
-            if stopped and _near(scene, int(body), states, n - stopped):
-                stopped = 0
+            held, stopped = search.held(t), stops.get(t, 0)
+            others = np.delete(states, body, axis=1)[: 2 * held + search.beside, :, :3]
+            # what others may set moving is not held
+            held *= not (np.fmax.reduce(others, axis=0) > np.fmin.reduce(others, axis=0)).any()
+            stopped *= not (stopped and _near(scene, int(body), states, n - stopped))
             for last, rows, what in ((False, held, "held"), (True, stopped, "stopped")):
                 if rows > (found[t, last].rows if (t, last) in found else 0):
                     times = clock[t, n - rows : n] if last else clock[t, :rows]
@@ -430,62 +422,89 @@ def unmodelled_ends(history: History, scene: Scene) -> list[End]:
     return [found[key] for key in sorted(found)]
 
 
-def _still(values: Floats, noise: float) -> int:
-    """Return the number of rows at the beginning that stay within the noise of their mean."""
-    mean = np.cumsum(values) / np.arange(1, len(values) + 1)
-    three = np.convolve(values, np.full(3, 1 / 3), "valid")
-    off = np.abs(three - mean[1:-1]) > 4 * noise / np.sqrt(3)
-    return int(np.argmax(off)) + 1 if off.any() else len(values)
+@dataclass(frozen=True)
+class _Ends:
+    """A search for unmodelled ends in a dimension of a body.
 
-
-def _windows(series: Series, n: int) -> tuple[Floats, list[tuple[int, int]]]:
-    """Return windows of all series, shape (window, n), and the trajectory and first row of each."""
-    at = [(t, i) for t, values in series.items() for i in range(len(values) - n + 1)]
-    return np.array([series[t][i : i + n] for t, i in at]).reshape(-1, n), at
-
-
-def _held(values: Floats, push: Floats, series: Series, noise: float) -> int:
-    """Return the rows at rest at the beginning, before it moves off without a command.
-
-    They are off the cubic through the rows after them, which a smooth motion from rest is not.
+    Attributes
+    ----------
+    series : dict of int to ndarray
+        Positions without gaps, by trajectory.
+    push : ndarray
+        Commands to all bodies, shape (trajectory, time, body, 3).
+    noise : float
+        Of a position.
+    beside : int
+        Least rows of motion beside those at rest.
+    longest : int
+        Rows at rest, and rows of motion, that are looked at, at most.
+    limit : float
+        Robust standard deviations, and standard errors, of a bend.
     """
-    still = _still(values, noise)
-    first = max(0, still - LONGEST)  # of a long rest its last rows are enough
-    for times in (1, 2, 4) if LEAST <= still < len(values) - BESIDE else ():
-        end = still + int(np.clip(times * (still - first), BESIDE, LONGEST))
-        if end > len(values) or push[:end].any():
-            break
-        rows = np.vstack([values[first:end], _windows(series, end - first)[0]])
-        _, far, sure, _ = outliers(rows, np.eye(end - first)[:, : still - first], 3, noise)
-        if ((far[0] > 3) & (sure[0] > LIMIT)).any():
-            return still
-    return 0
 
+    series: dict[int, Floats]
+    push: Floats
+    noise: float
+    beside: int = 6
+    longest: int = 200
+    limit: float = 8.0
 
-def _stops(series: Series, push: Floats, noise: float) -> dict[int, int]:
-    """Return the rows at the end after an abrupt change of velocity with constant commands.
+    def still(self, values: Floats) -> int:
+        """Return the number of first rows that stay within the noise of their mean."""
+        mean = np.cumsum(values) / np.arange(1, len(values) + 1)
+        three = np.convolve(values, np.full(3, 1 / 3), "valid")
+        off = np.abs(three - mean[1:-1]) > 4 * self.noise / np.sqrt(3)
+        return int(np.argmax(off)) + 1 if off.any() else len(values)
 
-    A change of the acceleration, as where dry friction ends a motion, must fit far worse.
-    """
-    best: dict[int, tuple[float, int]] = {}
-    still = {t: _still(values[::-1], noise) for t, values in series.items()}
-    for after in (3, 6, 12, 24):
-        rows, at = _windows(series, 3 * after)
-        time, places = np.arange(3 * after)[:, None], np.linspace(1, 3 * after - 2, 6 * after)
-        for place in 2 * after - 1 + np.arange(10) / 10 if len(rows) else ():
-            _, far, sure, misfit = outliers(rows, np.maximum(time - place, 0.0), 2, noise)
-            abrupt = np.flatnonzero(np.minimum(far, sure)[:, 0] > LIMIT)
-            if not len(abrupt):
-                continue
-            bent = [np.maximum(time - other, 0.0) ** 2 for other in places]
-            smooth = np.min([outliers(rows[abrupt], part, 2, noise)[3] for part in bent], axis=0)
-            for i in abrupt[misfit[abrupt] < 0.3 * smooth]:
-                (t, first), n = at[i], len(series[at[i][0]])
-                left = n - first - 2 * after
-                constant = not np.ptp(push[t, first : n - 1], axis=0).any()
-                if constant and left <= max(n // 4, min(still[t], n - BESIDE)):
-                    best[t] = max(best.get(t, (0.0, 0)), (float(sure[i, 0]), left))
-    return {t: left for t, (_, left) in best.items()}
+    def windows(self, n: int) -> tuple[Floats, list[tuple[int, int]]]:
+        """Return all windows, shape (window, n), and the trajectory and first row of each."""
+        at = [(t, i) for t, values in self.series.items() for i in range(len(values) - n + 1)]
+        return np.array([self.series[t][i : i + n] for t, i in at]).reshape(-1, n), at
+
+    def held(self, t: int) -> int:
+        """Return the rows at rest at a trajectory's beginning, before it moves uncommanded.
+
+        They are off the cubic through the rows after them, which a smooth motion from rest is not.
+        """
+        values = self.series[t]
+        still = self.still(values)
+        first = max(0, still - self.longest)  # of a long rest its last rows are enough
+        for times in (1, 2, 4) if LEAST <= still < len(values) - self.beside else ():
+            end = still + int(np.clip(times * (still - first), self.beside, self.longest))
+            if end > len(values) or self.push[t, :end].any():
+                break
+            rows = np.vstack([values[first:end], self.windows(end - first)[0]])
+            parts = np.eye(end - first)[:, : still - first]
+            _, far, sure, _ = outliers(rows, parts, 3, self.noise)
+            if ((far[0] > 3) & (sure[0] > self.limit)).any():
+                return still
+        return 0
+
+    def stopped(self) -> dict[int, int]:
+        """Return the rows after an abrupt change of velocity with constant commands, at an end.
+
+        A change of the acceleration, as where dry friction ends a motion, must fit far worse.
+        """
+        best: dict[int, tuple[float, int]] = {}
+        for after in (3, 6, 12, 24):
+            rows, at = self.windows(3 * after)
+            time, places = np.arange(3 * after)[:, None], np.linspace(1, 3 * after - 2, 6 * after)
+            for place in 2 * after - 1 + np.arange(10) / 10 if len(rows) else ():
+                part = np.maximum(time - place, 0.0)
+                _, far, sure, misfit = outliers(rows, part, 2, self.noise)
+                abrupt = np.flatnonzero(np.minimum(far, sure)[:, 0] > self.limit)
+                if not len(abrupt):
+                    continue
+                bent = [np.maximum(time - other, 0.0) ** 2 for other in places]
+                left = [outliers(rows[abrupt], part, 2, self.noise)[3] for part in bent]
+                for i in abrupt[misfit[abrupt] < 0.3 * np.min(left, axis=0)]:
+                    (t, first), values = at[i], self.series[at[i][0]]
+                    n = len(values) - first - 2 * after
+                    rest = min(self.still(values[::-1]), len(values) - self.beside)
+                    constant = not np.ptp(self.push[t, first : len(values) - 1], axis=0).any()
+                    if constant and n <= max(len(values) // 4, rest):
+                        best[t] = max(best.get(t, (0.0, 0)), (float(sure[i, 0]), n))
+        return {t: n for t, (_, n) in best.items()}
 
 
 def trimmed(history: History, ends: Iterable[End]) -> History:
@@ -526,39 +545,23 @@ def trimmed(history: History, ends: Iterable[End]) -> History:
         )
     if (kept == n_rows).all():
         return history
-    each, rows = np.arange(len(labels)), begin[:, None] + np.arange(kept.max())
-    result = dataset.isel(time=slice(kept.max())).assign(n_rows=dataset["n_rows"].copy(data=kept))
-    for name in ("observed", "action", "start", "clock"):
-        values = dataset[name].to_numpy()[each[:, None], np.minimum(rows, end[:, None] - 1)]
-        values[rows >= end[:, None]] = np.nan
-        result[name] = result[name].copy(data=values)
-    result["action"].to_numpy()[each, kept - 1] = np.nan
+    pieces = zip(range(len(labels)), begin, end - 1, strict=True)
+    result = joined_pieces(dataset, pieces).dataset.assign_coords(trajectory=dataset["trajectory"])
     # velocities estimated from positions across a stop
     never = ~np.isfinite(dataset["observed"].to_numpy()[..., 3:]).any(axis=(0, 1))
     for t in np.flatnonzero(end < n_rows):
         last = slice(max(kept[t] - RATE_REACH, 1), kept[t])
         result["start"].to_numpy()[t, last, :, 3:][:, never] = np.nan
-    before, late = dataset["before"].to_numpy().copy(), np.flatnonzero(begin)
-    before[late] = np.nan_to_num(dataset["action"].to_numpy()[late, begin[late] - 1])
-    return History(hashed(result.assign(before=dataset["before"].copy(data=before))))
+    return History(hashed(result))
 
 
 def _filled(values: Floats, angle: bool) -> Floats | None:
     """Return values with gaps interpolated, an angle without jumps; None with too many gaps."""
     known = np.flatnonzero(np.isfinite(values))
-    if len(known) < max(2 * BESIDE, 0.8 * len(values)):
-        return None
-    if known[0] > 0 or known[-1] < len(values) - 1:
+    if len(known) < max(12, 0.8 * len(values)) or not np.isfinite(values[[0, -1]]).all():
         return None
     level = np.unwrap(values[known]) if angle else values[known]
     return np.interp(np.arange(len(values)), known, level)
-
-
-def _moves(states: Floats) -> bool:
-    """Return whether any body of shape (time, body, 3) moves, and may set others moving."""
-    with np.errstate(invalid="ignore"):
-        spread = np.fmax.reduce(states, axis=0) - np.fmin.reduce(states, axis=0)
-    return bool((np.nan_to_num(spread) > 0).any())
 
 
 def _near(scene: Scene, body: int, states: Floats, row: int, slack: float = 0.25) -> bool:

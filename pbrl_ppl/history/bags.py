@@ -20,7 +20,6 @@ from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.files import reason
 from pbrl_ppl.history.files import FOLDER, reads
 from pbrl_ppl.scene import Recording, nearest
-from pbrl_ppl.state import Bools, Floats
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -121,7 +120,7 @@ def read_bag(
                     f" {have}"
                 )
             tables[topic] = _messages(reader, topic, there[topic], path, longest_array)
-    bodies = {body: _held([tables[name] for name in names], names, path)
+    bodies = {body: _held({name: tables[name] for name in names}, path)
               for body, names in listed.items()}  # fmt: skip
     first, *others = bodies.values()
     begin = max(table.index[0] for table in bodies.values())
@@ -162,18 +161,17 @@ def _read_topics(path: Path, layout: Recording) -> pd.DataFrame:
 
 def _listed(topics: object, path: Path) -> dict[str, list[str]]:
     """Return each body's topics, of which there is at least one."""
-    by_body = topics if isinstance(topics, Mapping) else {}
-    listed = {
-        body: [names] if isinstance(names, str) else list(names)
-        for body, names in by_body.items()
-        if isinstance(names, str | Sequence)
-    }
-    right = all(names and all(isinstance(n, str) for n in names) for names in listed.values())
-    if not listed or len(listed) < len(by_body) or not right:
+    try:
+        by_body = dict(topics).items()  # type: ignore[call-overload]
+        listed = {body: [names] if isinstance(names, str) else [*names] for body, names in by_body}
+        if not listed or not all(map(bool, listed.values())):
+            raise ValueError
+        "".join(name for names in listed.values() for name in names)  # texts
+    except (TypeError, ValueError):
         raise HistoryError(
             f"bag {path}: topics is {topics!r}, expected a topic for each body, such as"
             ' {"cart": "/odom"}'
-        )
+        ) from None
     if "" in listed and len(listed) > 1:
         raise HistoryError(
             f'bag {path}: topics names the body "" among {len(listed)}; name each body as the scene'
@@ -279,14 +277,14 @@ def _flatten(message: object, path: str, row: dict[str, float], longest: int) ->
         row["yaw"] = yaw if known else math.nan
 
 
-def _held(tables: list[pd.DataFrame], topics: list[str], path: Path) -> pd.DataFrame:
-    """Return the first table with the last row before of the others."""
-    whole, *others = tables
-    for table, topic in zip(others, topics[1:], strict=True):
+def _held(tables: dict[str, pd.DataFrame], path: Path) -> pd.DataFrame:
+    """Return the table of the first topic with the last row before of the others."""
+    (first, whole), *others = tables.items()
+    for topic, table in others:
         whole = whole[whole.index >= table.index[0]]
         if whole.empty:
             raise HistoryError(
-                f'bag {path}: "{topic}" begins after the last message of "{topics[0]}"; record them'
+                f'bag {path}: "{topic}" begins after the last message of "{first}"; record them'
                 " together, with the stamps of one clock"
             )
         last = table.reindex(whole.index, method="ffill")
@@ -299,17 +297,9 @@ def _interpolated(table: pd.DataFrame, stamps: pd.Index, longest_gap: float) -> 
     """Return a table's columns at other stamps (ns), within its own."""
     zero = table.index[0]  # doubles hold nanoseconds since 1970 to 0.2 microseconds alone
     have, want = ((index - zero).to_numpy().astype(float) for index in (table.index, stamps))
-    empty = _in_gaps(have, want, longest_gap)
+    gaps = np.append(np.diff(have), 0.0)
+    last = np.searchsorted(have, want, side="right") - 1
+    usual = float(np.median(gaps[:-1])) if len(have) > 1 else 0.0
+    empty = (gaps[last] > longest_gap * usual) & (have[last] < want)
     columns = {name: np.where(empty, np.nan, np.interp(want, have, table[name])) for name in table}
     return pd.DataFrame(columns, index=stamps)
-
-
-def _in_gaps(have: Floats, want: Floats, longest_gap: float) -> Bools:
-    """Return which times are between two others that are too far apart."""
-    if len(have) < 2:
-        return np.zeros(len(want), dtype=bool)
-    gaps = np.diff(have)
-    after = np.searchsorted(have, want).clip(1, len(have) - 1)
-    at_one = np.isin(want, have)
-    inside: Bools = (gaps[after - 1] > longest_gap * np.median(gaps)) & ~at_one
-    return inside

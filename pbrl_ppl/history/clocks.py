@@ -2,30 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
 import pandas as pd
 
 from pbrl_ppl.errors import HistoryError, LayoutError
-from pbrl_ppl.history.measures import TIME, stated_unit, unit_in_name, unit_size
+from pbrl_ppl.history.measures import TIME, numbers, stated_unit, unit_in_name, unit_size
 from pbrl_ppl.history.resampling import held_means
 from pbrl_ppl.scene import Recording, column_of
 from pbrl_ppl.state import STATE, WRENCH, Bools, Floats, Ints
 
 #: Names of columns of times, in lower case.
 TIMES = ("time", "t", "stamp", "timestamp", "header.stamp", "secs", "seconds", "sec")
-#: Seconds since 1970 of the years 2001 to 2036.
-_EPOCH = (1e9, 2.1e9)
-#: Rows further apart (s) are believed where the unit is declared only.
-_SLOWEST = 2.0
-
 Say = Callable[[str], None]
 
 
-def likely_unit(stamps: Floats) -> str:
+def likely_unit(stamps: Floats, slowest: float = 2.0) -> str:
     """Return the unit that stamps are likely in: by the year, or by the time between rows.
+
+    Rows further apart than ``slowest`` (s) are believed where the unit is declared only.
 
     Examples
     --------
@@ -38,12 +35,12 @@ def likely_unit(stamps: Floats) -> str:
     if len(stamps) < 2:
         return "s"
     for unit in ("s", "ms", "us", "ns"):
-        if _EPOCH[0] < float(np.median(stamps)) * TIME[unit] < _EPOCH[1]:
+        if 1e9 < float(np.median(stamps)) * TIME[unit] < 2.1e9:  # 2001 to 2036
             return unit
     # of bursts most steps are tiny, and one of a few is not; between runs there are pauses
     steps = np.sort(np.abs(np.diff(stamps)))
     step = float(steps[: max(1, int(0.9 * len(steps)))].mean())
-    if step < _SLOWEST:
+    if step < slowest:
         return "s"
     return next((unit for unit in ("ms", "us") if step * TIME[unit] <= 0.5), "ns")
 
@@ -73,25 +70,24 @@ def on_one_clock(
     HistoryError
         If a column of times is missing or two clocks have no time in common.
     """
-    columns, clocks, whole = dict(layout.columns), dict(layout.time), frame
-    own = {name: clocks[name] for name in clocks if name.rpartition(".")[2] in (*STATE, *WRENCH)}
+    clocks, whole = dict(layout.time), frame
     bare = {unit_in_name(str(column))[0]: column for column in frame.columns}
+    columns = {name: bare.get(column, column) for name, column in layout.columns}
+    own = {name: clocks[name] for name in clocks if name.rpartition(".")[2] in (*STATE, *WRENCH)}
     own = {name: bare.get(column, column) for name, column in own.items()}
-    columns = {name: bare.get(column, column) for name, column in columns.items()}
     for name, column in own.items():
         if column not in frame or columns.get(name, name) not in frame:
             raise HistoryError(
                 f'{source}: [recording] time has {name} = "{column}", and the file has no such'
                 f" column, or none of {name}; it has {', '.join(map(str, frame.columns))}"
             )
+    states = [column for key, column in own.items() if key.rpartition(".")[2] in STATE]
     name = columns.get("time", "time")
-    states = [name for name in own if name.rpartition(".")[2] in STATE]
-    if name not in frame and states:
-        name = own[states[0]]
-    if isinstance(name, str) and name in frame:
+    name = name if name in frame else next(iter(states), name)
+    if name in frame:
         if own:  # of a longer column with a clock of its own the rows below are no rows
             frame = frame[frame[name].notna()]
-        time = _seconds(frame, name, layout, source)
+        time = _seconds(frame, str(name), layout, source)
         if not own and (alone := _command_rows(frame, columns)).any():
             frame = _of_two_streams(frame, columns, time, alone, layout, say)
             time = time[~alone]
@@ -110,13 +106,13 @@ def on_one_clock(
             continue
         value = columns.get(key, key)
         stamps = _seconds(whole, column, layout, source)
-        values = pd.to_numeric(whole[value], errors="coerce").to_numpy(float)
+        values = numbers(whole[value])
         hold = key.rpartition(".")[2] in WRENCH and _holds(layout, stamps, values)
         frame = _brought(frame, str(value), stamps, values, say, hold=hold)
     if commands is not None:
         frame = _with_commands(frame, layout, commands, source, say)
-    first = float(np.nanmin(frame["time"]))
-    return frame.assign(time=frame["time"] - first) if abs(first) > _EPOCH[0] else frame
+    first = float(np.nanmin(frame["time"]))  # s since 1970
+    return frame.assign(time=frame["time"] - first) if abs(first) > 1e9 else frame
 
 
 def _seconds(frame: pd.DataFrame, name: str, layout: Recording, source: str) -> Floats:
@@ -173,7 +169,7 @@ def _at_rate(
                 f'{source}: [recording] time has counter = "{clocks["counter"]}", which is no'
                 f" column; it has {', '.join(map(str, frame.columns))}"
             )
-        count = pd.to_numeric(frame[clocks["counter"]], errors="coerce").to_numpy(float)
+        count = numbers(frame[clocks["counter"]])
     else:
         order = frame.groupby(keys).cumcount() if keys else np.arange(len(frame))
         count = np.asarray(order, dtype=float)
@@ -212,19 +208,16 @@ def _bursts(
     if not rate > 0 or hair.mean() < 0.4 or not _moves_within(frame, layout, rows, hair):
         return None
     entry: dict[str, str | float] = {"rate": _round_rate(rate)}
+    written = f"rate = {entry['rate']:g}"
     if counters:
         entry["counter"] = str(counters[0])
-    written = ", ".join(
-        f'{key} = "{value}"' if isinstance(value, str) else f"{key} = {value:g}"
-        for key, value in entry.items()
-    )
-    message = (
+        written += f', counter = "{counters[0]}"'
+    return (
         f"the stamps come in bursts, {hair.mean():.0%} of them within"
         f" {np.abs(steps[hair]).max():.2g} s of the row before ({int((steps < 0).sum())} go back):"
         f" they say when rows arrived, not when they were measured; if rows are even,"
         f" [recording] time = {{ {written} }}"
-    )
-    return message, entry
+    ), entry
 
 
 def _moves_within(frame: pd.DataFrame, layout: Recording, rows: Ints, hair: Bools) -> bool:
@@ -232,19 +225,16 @@ def _moves_within(frame: pd.DataFrame, layout: Recording, rows: Ints, hair: Bool
 
     If not, the stamps are true, and rows are twice.
     """
-    for key, column in (*layout.columns, *((name, name) for name in STATE)):
-        name = column_of(column)
-        if key.rpartition(".")[2] in STATE and name in frame:
-            values = pd.to_numeric(frame[name].iloc[rows], errors="coerce").to_numpy(float)
-            change = np.abs(np.diff(values))
-            if np.nanmedian(change[hair]) > 0.5 * np.nanmedian(change[~hair]):
-                return True
+    for name in _present(frame, dict(layout.columns), STATE):
+        change = np.abs(np.diff(numbers(frame[name].iloc[rows])))
+        if np.nanmedian(change[hair]) > 0.5 * np.nanmedian(change[~hair]):
+            return True
     return False
 
 
 def _is_counter(column: pd.Series) -> bool:
     """Return whether a column counts the rows."""
-    values = pd.to_numeric(column, errors="coerce").to_numpy(float)
+    values = numbers(column)
     steps = np.diff(values)
     whole = np.isfinite(values).all() and (values == np.round(values)).all()
     return bool(whole and (steps >= 0).all() and (steps == 1).mean() > 0.8)
@@ -327,7 +317,7 @@ def command_stamps(commands: pd.DataFrame, layout: Recording, source: str = "his
             f"{source}: {layout.commands} has no column of times; say which it is: [recording]"
             f' time = {{ commands = "..." }}; it has {", ".join(plain)}'
         )
-    numeric = np.asarray(pd.to_numeric(commands[time], errors="coerce"), dtype=float)
+    numeric = numbers(commands[time])
     unit = stated_time_unit(commands, str(time)) or likely_unit(numeric)
     return np.asarray(numeric * TIME[unit] + float(clocks.get("offset", 0.0)))
 
@@ -341,13 +331,8 @@ def _with_commands(
     frame: pd.DataFrame, layout: Recording, commands: pd.DataFrame, source: str, say: Say
 ) -> pd.DataFrame:
     """Return a table with the commands of another file at its rows."""
-    columns, rows = dict(layout.columns), frame["time"].to_numpy(float)
-    stamps = command_stamps(commands, layout, source)
-    wanted = {
-        key: columns.get(key, key)
-        for key in dict.fromkeys((*columns, *WRENCH))
-        if key.rpartition(".")[2] in WRENCH and columns.get(key, key) in commands
-    }
+    rows, stamps = frame["time"].to_numpy(float), command_stamps(commands, layout, source)
+    wanted = _present(commands, dict(layout.columns), WRENCH)
     if not wanted:
         raise HistoryError(
             f"{source}: {layout.commands} has no column of a wrench; say which it is: columns ="
@@ -364,11 +349,25 @@ def _with_commands(
             f"{source}: its clock starts again, and commands in a file of their own need one clock"
             " throughout; write a file for each start"
         )
-    for name in dict.fromkeys(wanted.values()):
-        values = np.asarray(pd.to_numeric(commands[name], errors="coerce"), dtype=float)
+    for name in wanted:
+        values = numbers(commands[name])
         hold = _holds(layout, stamps, values)
-        frame = _brought(frame, str(name), stamps, values, say, hold=hold)
+        frame = _brought(frame, name, stamps, values, say, hold=hold)
     return frame
+
+
+def _present(frame: pd.DataFrame, columns: Mapping[str, object], names: Sequence[str]) -> list[str]:
+    """Return the columns of a table that are of these names of a history, each once."""
+    every = {key: column_of(columns.get(key, key)) for key in (*columns, *names)}
+    found = (column for key, column in every.items() if key.rpartition(".")[2] in names)
+    return [column for column in dict.fromkeys(found) if column in frame]
+
+
+def _falls_back(time: Floats, far: float) -> Bools:
+    """Return after which rows the clock falls back by more than so many rows' time."""
+    steps = np.diff(time)
+    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    return np.asarray(steps < -far * usual)
 
 
 def _command_rows(frame: pd.DataFrame, columns: Mapping[str, object]) -> Bools:
@@ -376,19 +375,16 @@ def _command_rows(frame: pd.DataFrame, columns: Mapping[str, object]) -> Bools:
 
     They have no state, but something that next to no row with a state has.
     """
-    named = {key: column_of(columns.get(key, key)) for key in (*columns, *STATE)}
-    states = [name for key, name in named.items() if key.rpartition(".")[2] in STATE]
-    states = [name for name in dict.fromkeys(states) if name in frame]
+    states = _present(frame, columns, STATE)
     posed = frame[states].notna().any(axis=1).to_numpy(dtype=bool)
-    sent = [name for key, name in named.items() if key.rpartition(".")[2] in WRENCH]
-    sent = [name for name in sent if name in frame] or [
-        str(name) for name in frame if name not in states
-    ]
+    named = {key: column for key, column in columns.items() if key.rpartition(".")[2] in WRENCH}
+    sent = [name for name in map(column_of, named.values()) if name in frame]
+    sent = sent or [str(name) for name in frame if name not in states]
     others = frame[sent].notna().to_numpy(dtype=bool)
-    if posed.all() or not posed.any():
-        return np.zeros(len(frame), dtype=bool)
+    if not posed.any():
+        return posed
     rare = others[posed].sum(axis=0) < 0.1 * others.sum(axis=0)
-    return np.asarray(~posed & others[:, rare].any(axis=1))
+    return ~posed & others[:, rare].any(axis=1)
 
 
 def _of_two_streams(
@@ -400,20 +396,15 @@ def _of_two_streams(
     say: Say,
 ) -> pd.DataFrame:
     """Return the rows that have a state, with the commands of the other rows at their times."""
-    steps = np.diff(time)
-    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
-    run = np.append(0, np.cumsum(steps < -50.0 * usual))  # where the clock starts again
-    named = {key: column_of(columns.get(key, key)) for key in (*columns, *WRENCH)}
-    sent = [name for key, name in named.items() if key.rpartition(".")[2] in WRENCH]
+    run = np.append(0, np.cumsum(_falls_back(time, 50.0)))
     brought = {}
-    for name in (name for name in dict.fromkeys(sent) if name in frame):
-        values = pd.to_numeric(frame[name], errors="coerce").to_numpy(float, copy=True)
+    for name in _present(frame, columns, WRENCH):
+        values = numbers(frame[name])
         hold, at_rows = _holds(layout, time, values), np.full(len(frame), np.nan)
         for number in np.unique(run[~alone]):
             here = run == number
-            at_rows[here & ~alone] = _at_times(
-                time[here & ~alone], time[here], values[here], hold=hold
-            )
+            rows = here & ~alone
+            at_rows[rows] = _at_times(time[rows], time[here], values[here], hold=hold)
         brought[name] = at_rows[~alone]
     say(f"{int(alone.sum())} rows hold commands and no state: read as a stream of their own")
     return frame[~alone].assign(**brought)
@@ -421,14 +412,10 @@ def _of_two_streams(
 
 def with_later_commands(frame: pd.DataFrame, offset: float) -> pd.DataFrame:
     """Return a history's table whose commands are so many seconds later than their rows."""
-    time = pd.to_numeric(frame["time"], errors="coerce").to_numpy(float)
-    moved: dict[str, Floats] = {}
+    time, moved = numbers(frame["time"]), {name: numbers(frame[name]) for name in WRENCH}
     for rows in frame.groupby(["trajectory", "body"], sort=False).indices.values():
-        for name in WRENCH:
-            values = pd.to_numeric(frame[name].iloc[rows], errors="coerce").to_numpy(float)
-            moved.setdefault(name, np.full(len(frame), np.nan))[rows] = _at_times(
-                time[rows], time[rows] + offset, values, hold=True
-            )
+        for values in moved.values():
+            values[rows] = _at_times(time[rows], time[rows] + offset, values[rows], hold=True)
     return frame.assign(**moved)
 
 
@@ -445,16 +432,14 @@ def in_order(frame: pd.DataFrame, say: Say, *, far: float = 5.0) -> pd.DataFrame
         A clock that falls back by more than so many rows' time starts again; rows that are out of
         order by less are sorted.
     """
-    time = pd.to_numeric(frame["time"], errors="coerce").to_numpy(float)
+    time = numbers(frame["time"])
     run = np.zeros(len(frame), dtype=int)
     groups = frame.groupby(["trajectory", "body"], sort=False, dropna=False).indices
     swapped, resets = 0, 0
     for rows in groups.values():
-        steps = np.diff(time[rows])
-        usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
-        starts = steps < -far * usual
-        run[rows] = np.concatenate([[0], np.cumsum(starts)])
-        swapped += int(((steps < 0) & ~starts).sum())
+        starts = _falls_back(time[rows], far)
+        run[rows] = np.append(0, np.cumsum(starts))
+        swapped += int(((np.diff(time[rows]) < 0) & ~starts).sum())
         resets += int(starts.sum())
     if resets:
         say(f"the clock falls back {resets} times: a new trajectory begins there each time")

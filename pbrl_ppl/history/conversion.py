@@ -22,6 +22,7 @@ from pbrl_ppl.history.files import COLUMNS
 from pbrl_ppl.history.guesses import with_derived
 from pbrl_ppl.history.measures import (
     in_si,
+    numbers,
     stated_units,
     unit_in_name,
     with_whole_counts,
@@ -168,7 +169,7 @@ def renamed(
     frame = with_clean_names(frame, source)
     bare = {unit_in_name(str(name))[0]: name for name in frame.columns}
     names = [body.name for body in scene.moving]
-    shared: dict[str, object] = {name: name for name in COLUMNS if name in frame}
+    shared: dict[str, object] = {name: frame[name] for name in COLUMNS if name in frame}
     by_body: dict[str, dict[str, object]] = {}
     for key, column in columns.items():
         body, dot, name = key.rpartition(".")
@@ -180,31 +181,33 @@ def renamed(
             )
         if dot and body not in names:
             raise HistoryError(f'columns: "{key}": the scene has {", ".join(names)}')
-        constant = isinstance(column, int | float) or (name == "body" and column in names)
-        if not constant:
-            title, _, _ = parts_of(column)
+        value = column  # a number, or a body's name, holds on all rows
+        if not (isinstance(column, int | float) or (name == "body" and column in names)):
+            title, sign, zero = parts_of(column)
             title = title if title in frame else bare.get(title, title)
             if title not in frame:
                 raise HistoryError(
                     f'{source}: it has no column "{title}" for {key}'
                     f"{nearest(title, list(frame.columns))} It has {', '.join(frame.columns)}"
                 )
-            column = title if column == title else (title, *parts_of(column)[1:])
-        (by_body.setdefault(body, {}) if dot else shared)[name] = column
+            value = frame[title]
+            if (sign, zero) != (1.0, 0.0):
+                value = sign * (numbers(value) - zero)
+        (by_body.setdefault(body, {}) if dot else shared)[name] = value
     shared.setdefault("trajectory", 0)
     if by_body:
         if lacking := [name for name in names if name not in by_body]:
             raise HistoryError(
                 f"columns: {lacking[0]} has none, and {next(iter(by_body))} has; name each body's"
             )
-        shared.pop("body", None)
-        parts = [_picked(frame, shared | by_body[name]).assign(body=name) for name in names]
+        picked = [shared | by_body[name] | {"body": name} for name in names]
+        parts = [pd.DataFrame(values, index=frame.index) for values in picked]
         # side by side in a row is one below the other in a history
         order = np.arange(len(frame) * len(parts)).reshape(len(parts), -1).T.ravel()
         return pd.concat(parts).iloc[order]
     if len(names) == 1:
         shared.setdefault("body", names[0])
-    return _picked(frame, shared)
+    return pd.DataFrame(shared, index=frame.index)
 
 
 def parts_of(column: object) -> tuple[str, float, float]:
@@ -220,21 +223,6 @@ def parts_of(column: object) -> tuple[str, float, float]:
     name, zero = str(table["column"]), table["zero"]
     sign = -1.0 if name.startswith("-") else 1.0
     return name.removeprefix("-"), sign, 0.0 if isinstance(zero, str) else float(zero)
-
-
-def _picked(frame: pd.DataFrame, columns: Mapping[str, object]) -> pd.DataFrame:
-    """Return the columns by their new names; other values are the same on all rows."""
-
-    def values(column: object) -> object:
-        if isinstance(column, tuple):
-            name, sign, zero = column
-            numbers = np.asarray(pd.to_numeric(frame[name].to_numpy(), errors="coerce"), float)
-            return sign * (numbers - zero)
-        return frame[column] if isinstance(column, str) and column in frame else column
-
-    return pd.DataFrame(
-        {name: values(column) for name, column in columns.items()}, index=frame.index
-    )
 
 
 def present_units(frame: pd.DataFrame, layout: Recording) -> dict[str, str]:
@@ -288,13 +276,8 @@ def _unseen_emptied(frame: pd.DataFrame, layout: Recording, source: str) -> pd.D
             )
     if not values:
         return frame
-    unseen = np.all(
-        [pd.to_numeric(frame[name], errors="coerce") == value for name, value in values.items()],
-        axis=0,
-    )
-    frame = frame.copy()
-    frame.loc[unseen, [name for name in STATE if name in frame]] = np.nan
-    return frame
+    unseen = np.all([numbers(frame[name]) == value for name, value in values.items()], axis=0)
+    return frame.assign(**{name: frame[name].mask(unseen) for name in STATE if name in frame})
 
 
 def _repaired(

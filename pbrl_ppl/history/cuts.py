@@ -14,13 +14,11 @@ from scipy.signal import find_peaks
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history.clocks import Say
 from pbrl_ppl.history.kinematics import column_noise, finest_step
+from pbrl_ppl.history.measures import numbers
 from pbrl_ppl.history.resampling import LONGEST
 from pbrl_ppl.history.rows import TIME_TOLERANCE
 from pbrl_ppl.scene import Recording, Scene
 from pbrl_ppl.state import STATE, WRENCH, Bools, Floats, Ints
-
-#: Rows on each side of a jump whose slope is the velocity there.
-_SIDE = 5
 
 
 def without_lost_rows(frame: pd.DataFrame, scene: Scene, say: Say) -> pd.DataFrame:
@@ -41,7 +39,7 @@ def without_lost_rows(frame: pd.DataFrame, scene: Scene, say: Say) -> pd.DataFra
     if not places or not {"trajectory", "body"} <= {*frame}:
         return frame
     poses = frame[places].apply(pd.to_numeric, errors="coerce").to_numpy(float, copy=True)
-    zero, frozen = (np.zeros(len(frame), dtype=bool) for _ in range(2))
+    zero, frozen = np.zeros((2, len(frame)), dtype=bool)
     follows = {body.name for body in scene.moving if body.kinematic}
     for rows in frame.groupby(["trajectory", "body"], sort=False).indices.values():
         if frame["body"].iloc[rows[0]] in follows:
@@ -132,8 +130,7 @@ def cut(frame: pd.DataFrame, cuts: Mapping[str, float], source: str) -> pd.DataF
         raise HistoryError(
             f"{source}: nothing is left between its cuts; make [recording] cut less strict"
         )
-    joined: pd.DataFrame = pd.concat(parts)
-    return joined
+    return pd.concat(parts)
 
 
 def _pieces(rows: pd.DataFrame, cuts: Mapping[str, float], least: int = 3) -> Ints:
@@ -146,11 +143,11 @@ def _pieces(rows: pd.DataFrame, cuts: Mapping[str, float], least: int = 3) -> In
     table = rows.assign(time=at)[["time", "body", *names]]
     places = table.set_index(["time", "body"])[names].apply(pd.to_numeric, errors="coerce")
     states = places.unstack("body").to_numpy(float)  # (time, name * body)
-    kept, begins = np.ones(len(times), dtype=bool), np.zeros(len(times), dtype=bool)
+    kept, begins = np.ones_like(times, dtype=bool), np.zeros_like(times, dtype=bool)
     if "gaps" in cuts:
         seen = np.flatnonzero(np.isfinite(states).any(axis=1))
-        kept[: seen[0] if len(seen) else len(times)] = False
-        kept[seen[-1] + 1 if len(seen) else 0 :] = False
+        within = np.arange(len(times))
+        kept &= (within >= seen.min(initial=len(times))) & (within <= seen.max(initial=-1))
         for first, last in pairwise(seen):
             if times[last] - times[first] > cuts["gaps"]:
                 kept[first + 1 : last] = False
@@ -162,7 +159,7 @@ def _pieces(rows: pd.DataFrame, cuts: Mapping[str, float], least: int = 3) -> In
         planar = [i for i, name in enumerate(names) if name in ("x", "y")]
         for body in range(bodies):
             kept &= ~_jumps(times, states[:, [i * bodies + body for i in planar]], cuts["jumps"])
-    begins |= kept & ~np.concatenate([[False], kept[:-1]])
+    begins |= kept & ~np.append(False, kept[:-1])
     piece = np.where(kept, np.cumsum(begins) - 1, -1)
     if "every" in cuts:
         piece = _every(times, piece, cuts["every"])
@@ -209,15 +206,15 @@ def _jumps(times: Floats, places: Floats, least: float) -> Bools:
     """Return the rows beside changes of the velocity by more than so many m/s, shape (time,)."""
     beside = np.zeros(len(times), dtype=bool)
     seen, changes = _velocity_changes(times, places)
-    for peak in _peaks(changes, least):
+    for peak in find_peaks(changes, height=least, distance=5)[0]:
         beside[seen[max(peak - 1, 0) : peak + 2]] = True
     return beside
 
 
-def _velocity_changes(times: Floats, places: Floats) -> tuple[Ints, Floats]:
+def _velocity_changes(times: Floats, places: Floats, side: int = 5) -> tuple[Ints, Floats]:
     """Return the rows with a position, and how much the velocity changes there (m/s).
 
-    The velocities before and after each are slopes of a few rows on that side, so that noise is
+    The velocities before and after each are slopes of so many rows on that side, so that noise is
     averaged; the change is zero near the ends.
 
     Parameters
@@ -230,20 +227,13 @@ def _velocity_changes(times: Floats, places: Floats) -> tuple[Ints, Floats]:
     seen = np.flatnonzero(np.isfinite(places).all(axis=1) & np.isfinite(times))
     times, places = times[seen], places[seen]
     changes = np.zeros(len(times))
-    if len(times) > 2 * _SIDE:
-        t = sliding_window_view(times, _SIDE)
-        p = sliding_window_view(places, _SIDE, axis=0)
+    if len(times) > 2 * side:
+        t = sliding_window_view(times, side)
+        p = sliding_window_view(places, side, axis=0)
         off = t - t.mean(axis=1, keepdims=True)
         slopes = np.einsum("kt,kct->kc", off, p) / (off**2).sum(axis=1)[:, None]
-        change = np.linalg.norm(slopes[_SIDE + 1 :] - slopes[: -_SIDE - 1], axis=1)
-        changes[_SIDE : len(times) - _SIDE] = change
+        changes[side:-side] = np.linalg.norm(slopes[side + 1 :] - slopes[: -side - 1], axis=1)
     return seen, changes
-
-
-def _peaks(changes: Floats, least: float) -> Ints:
-    """Return the rows of the largest changes above ``least``, each the only one nearby."""
-    peaks, _ = find_peaks(changes, height=least, distance=_SIDE)
-    return np.asarray(peaks)
 
 
 def propose(
@@ -277,7 +267,7 @@ def propose(
         Pieces that one trajectory is cut to.
     """
     said = []
-    times = pd.to_numeric(frame["time"], errors="coerce").to_numpy(float)
+    times = numbers(frame["time"])
     indices = frame.groupby(["trajectory", "body"], sort=False).indices.values()
     groups = [np.asarray(rows, dtype=np.int64) for rows in indices]
     names = [name for name in STATE[:3] if name in frame]
@@ -303,13 +293,9 @@ def propose(
                 "the velocity jumps, as at a wall, and none is declared: cut there"
                 f" (by more than {least:g} m/s)"
             )
-    long = [float(np.ptp(times[rows])) for rows in groups]
-    length = float(np.median(long))
-    if (
-        frame["trajectory"].nunique() < trajectories
-        and not cuts
-        and length >= 2 * shortest * time_step
-    ):
+    length = float(np.median([np.ptp(times[rows]) for rows in groups]))
+    few = frame["trajectory"].nunique() < trajectories
+    if few and not cuts and length >= 2 * shortest * time_step:
         slow = max(telling(times[rows], poses[rows]) for rows in groups)
         parts = np.clip(length / max(slow, shortest * time_step), min(trajectories, most), most)
         cuts["every"] = float(f"{length / int(parts):.2g}")
@@ -322,13 +308,14 @@ def propose(
 
 def slowest(times: Floats, poses: Floats) -> float:
     """Return the longest period of a coordinate (s): twice the time between means crossed."""
-    periods = [0.0]
-    for column in poses.T:
-        seen = column[np.isfinite(column)]
-        if len(seen) > 2 and np.ptp(seen) > 0:
-            crossed = int((np.diff(np.sign(seen - seen.mean())) != 0).sum())
-            periods.append(2.0 * float(np.ptp(times)) / max(crossed, 1))
-    return max(periods)
+    crossed = [int((np.diff(np.sign(off)) != 0).sum()) for off in _moving(poses)]
+    return 2.0 * float(np.ptp(times)) / max(min(crossed), 1) if crossed else 0.0
+
+
+def _moving(poses: Floats) -> list[Floats]:
+    """Return the columns that move, of the rows that were seen, less their means."""
+    columns = [column[np.isfinite(column)] for column in poses.T]
+    return [seen - seen.mean() for seen in columns if len(seen) > 2 and np.ptp(seen) > 0]
 
 
 def telling(times: Floats, poses: Floats, *, periods: float = 8.0, constants: float = 3.0) -> float:
@@ -356,14 +343,11 @@ def telling(times: Floats, poses: Floats, *, periods: float = 8.0, constants: fl
     if 4.0 * period <= np.ptp(times):
         return periods * period
     longest = 0.0
-    for column in poses.T:
-        seen = column[np.isfinite(column)]
-        if len(seen) > 2 and np.ptp(seen) > 0:
-            off = seen - seen.mean()
-            power = np.abs(np.fft.rfft(off, 2 * len(off))) ** 2
-            near = np.fft.irfft(power)[: len(off)] > np.exp(-1.0) * float(off @ off)
-            fallen = int(near.argmin()) if not near.all() else len(off)
-            longest = max(longest, fallen / len(seen) * float(np.ptp(times)))
+    for off in _moving(poses):
+        power = np.abs(np.fft.rfft(off, 2 * len(off))) ** 2
+        near = np.fft.irfft(power)[: len(off)] > np.exp(-1.0) * float(off @ off)
+        fallen = int(near.argmin()) if not near.all() else len(off)
+        longest = max(longest, fallen / len(off) * float(np.ptp(times)))
     return constants * longest
 
 
@@ -381,5 +365,6 @@ def _jump(tracks: list[tuple[Floats, Floats]], abrupt: float = 10.0, rare: float
     changes = [_velocity_changes(times, places)[1] for times, places in tracks]
     every = np.concatenate([np.zeros(0), *changes])
     least = abrupt * float(np.median(every)) if len(every) else 0.0
-    jumps = sum(len(_peaks(one, least)) for one in changes) if least > 0 else 0
+    peaks = [find_peaks(one, height=least, distance=5)[0] for one in changes if least > 0]
+    jumps = sum(map(len, peaks))
     return float(f"{least:.2g}") if 0 < jumps <= rare * len(every) else 0.0

@@ -1,4 +1,4 @@
-"""Files of histories: formats that are read, text tables, Parquet and NetCDF; and writing.
+"""Files of histories: text tables, Parquet, NetCDF, logs of SysId and MATLAB; and writing.
 
 A format is one function that :func:`reads` declares, in any module of this room.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import importlib
 import io
+import json
 import pkgutil
 import re
 from collections import Counter
@@ -21,8 +22,16 @@ import numpy.typing as npt
 import pandas as pd
 import xarray as xr
 
-from pbrl_ppl.errors import HistoryError, OutputError
-from pbrl_ppl.files import check_hdf5, check_regular, is_as_sealed, reason, seal, write_atomically
+from pbrl_ppl.errors import HistoryError, OutputError, printable
+from pbrl_ppl.files import (
+    check_hdf5,
+    check_regular,
+    check_survives,
+    is_as_sealed,
+    reason,
+    seal,
+    write_atomically,
+)
 from pbrl_ppl.scene import SEPARATORS, Recording
 from pbrl_ppl.state import STATE, WRENCH, Floats
 
@@ -33,8 +42,8 @@ SUFFIXES = (".csv", ".parquet", ".nc")
 _PANDAS = tuple(int(part) for part in pd.__version__.split(".")[:2])
 _EXACT: dict[str, Any] = {} if _PANDAS >= (3, 1) else {"float_precision": "round_trip"}
 _MISSING = ["", "nan", "NaN", "NAN", "NA", "N/A", "null", "NULL", "None"]
-#: Rows that show what the columns hold, and lines that may be above them.
-_SAMPLE, _HEAD = 200, 30
+#: Rows that show what the columns hold.
+_SAMPLE = 200
 _NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?|[-+]?(nan|inf|infinity)", re.I)
 #: In place of the suffix of a folder.
 FOLDER = "a folder"
@@ -171,21 +180,14 @@ def _table_of(text: str, path: Path, layout: Recording) -> pd.DataFrame:
     named = [column for _, column in layout.columns if isinstance(column, str)]
     numbers = ["step", "time", *STATE, *WRENCH, *named]
     decimal = "," if separator != "," and _has_commas(lines[first:]) else "."
+    missing = dict.fromkeys((*numbers, *(columns if names is None else ())), _MISSING)
     try:
         frame: pd.DataFrame = pd.read_csv(
-            io.StringIO("\n".join(lines[first:])),
-            sep=separator,
-            names=columns,
-            header=None,
-            decimal=decimal,
-            dtype={"trajectory": "str", "body": "str"},
-            keep_default_na=False,
-            na_values=dict.fromkeys((*numbers, *(columns if names is None else ())), _MISSING),
-            skipinitialspace=True,
-            skip_blank_lines=False,
-            low_memory=False,
+            io.StringIO("\n".join(lines[first:])), sep=separator, names=columns, header=None,
+            decimal=decimal, dtype={"trajectory": "str", "body": "str"}, keep_default_na=False,
+            na_values=missing, skipinitialspace=True, skip_blank_lines=False, low_memory=False,
             **_EXACT,
-        )
+        )  # fmt: skip
     except (ValueError, pd.errors.ParserError) as error:
         raise HistoryError(f"history {path}: not a CSV table: {error}") from None
     if not isinstance(frame.index, pd.RangeIndex):
@@ -242,9 +244,12 @@ def _cells(line: str, separator: str) -> list[str]:
 
 
 def _head(
-    lines: list[str], separator: str, header: bool | None
+    lines: list[str], separator: str, header: bool | None, most: int = 30
 ) -> tuple[int, list[str] | None, dict[str, str]]:
-    """Return the first line of data, the columns' names (None without), and units of columns."""
+    """Return the first line of data, the columns' names (None without), and units of columns.
+
+    At most so many lines are above.
+    """
     filled = [i for i, line in enumerate(lines) if line.strip()]
     body = [_cells(lines[i], separator) for i in filled[1:][-_SAMPLE:]]
     width = Counter(map(len, body)).most_common(1)[0][0] if body else 0
@@ -254,32 +259,28 @@ def _head(
         for i in range(width)
     ]  # fmt: skip
 
-    def is_data(cells: list[str]) -> bool:
-        """Return whether a line fits below: no words where others have numbers."""
-        fits = not any(_is_word(cell) and n for cell, n in zip(cells, numeric, strict=False))
-        return fits and any(map(_is_number, cells))
+    def is_data(cells: list[str], below: list[str]) -> bool:
+        """Return whether a line has numbers where others have, or a name that the next one has."""
+        both = zip(cells, [*below, *[""] * len(cells)], numeric, strict=False)
+        wrong = any(number and _is_word(cell) and cell != after for cell, after, number in both)
+        return not wrong and any(map(_is_number, cells))
 
-    above: list[int] = []
+    cells = [_cells(lines[i].lstrip("#% "), separator) for i in filled[: most + 1]]
+    above = int(header is not False)  # if no line looks like data, the first names the columns
     if header is None:
-        for i in filled[:_HEAD]:
-            if is_data(_cells(lines[i].lstrip("#% "), separator)):
-                break
-            above.append(i)
-        else:
-            above = filled[:1]  # no line looks like data: the first one names the columns
-    elif header:
-        above = filled[:1]
+        pairs = zip(cells[:most], [*cells[1:], []], strict=False)
+        above = next((k for k, pair in enumerate(pairs) if is_data(*pair)), 1)
     if not above:
         return filled[0], None, {}
-    heads = [_cells(lines[i].lstrip("#% "), separator) for i in above]
-    full = [sum(cell != "" for cell in cells) for cells in heads]
+    heads = cells[:above]
+    full = [sum(cell != "" for cell in each) for each in heads]
     at = full.index(max(full))
     names, units = heads[at], {}
     under = heads[at + 1] if at + 1 < len(heads) else []
     if len(under) == len(names):
         units = {n: unit.strip("[]() ") for n, unit in zip(names, under, strict=True) if unit}
     # the last line of a head is the last that is left out
-    return above[-1] + 1, names, units
+    return filled[above - 1] + 1, names, units
 
 
 def _is_number(cell: str) -> bool:
@@ -319,19 +320,105 @@ def read_netcdf(path: Path, layout: Recording) -> pd.DataFrame:
             dataset = stored.load()
     except Exception as error:  # HDF5 raises many kinds on a damaged file
         raise HistoryError(f"history {path}: not a NetCDF file: {reason(error)}") from None
-    for name, last in (
-        ("observed", ("body", "state")),
-        ("action", ("body", "wrench")),
-        ("clock", ()),
-    ):
-        expected = ("trajectory", "time", *last)
+    of_body = {"observed": ("body", "state"), "action": ("body", "wrench")}
+    for name, last in (of_body | {"clock": ()}).items():
         got = dataset[name].dims if name in dataset else None
-        if got != expected:
+        if got != (expected := ("trajectory", "time", *last)):
             raise HistoryError(
                 f"history {path}: variable {name!r} has dimensions {got}, expected {expected}; "
                 "write the file with History.save"
             )
     return to_table(dataset)
+
+
+#: Columns of SysId's rows by their number: one mechanism, and a drivetrain.
+_SYSID = {
+    4: ("time", "voltage", "position", "velocity"),
+    9: ("time", "left voltage", "right voltage", "left position", "right position",
+        "left velocity", "right velocity", "angle", "angular rate"),
+}  # fmt: skip
+_SYSID_UNITS = {"meters": "m", "feet": "ft", "inches": "in", "radians": "rad", "degrees": "deg",
+                "rotations": "rev"}  # fmt: skip
+
+
+@reads(".json")
+def read_sysid(path: Path, layout: Recording) -> pd.DataFrame:
+    """Return the rows of a WPILib SysId log, with the name of each test as ``trajectory``.
+
+    Columns are ``time``, ``voltage``, ``position`` and ``velocity``, or those of a drivetrain's two
+    sides with ``angle`` and ``angular rate``. The log's units are kept.
+
+    Raises
+    ------
+    HistoryError
+        If the file is no such log.
+    """
+    try:
+        log: dict[str, object] = json.loads(path.read_bytes())
+        tests = {k: np.array(v, float) for k, v in log.items() if isinstance(v, list) and v}
+        (width,) = {rows.shape[1] for rows in tests.values()}
+        names = _SYSID[width]
+        if any(printable(k) != k for k in tests):
+            raise ValueError
+    except (ValueError, KeyError, AttributeError, IndexError, TypeError, RecursionError):
+        raise HistoryError(
+            f"history {path}: not a log of WPILib's SysId; expected an object with rows of 4 or 9"
+            ' numbers for each test, such as "fast-forward"; save other JSON as CSV'
+        ) from None
+    parts = [pd.DataFrame(rows, columns=names).assign(trajectory=k) for k, rows in tests.items()]
+    frame: pd.DataFrame = pd.concat(parts, ignore_index=True)
+    unit = _SYSID_UNITS.get(str(log.get("units", "")).lower(), "")
+    of_rates = {"voltage": "V", "rate": "rad/s", "angle": "rad"}
+    units = {name: of_rates.get(name.split()[-1], unit) for name in names[1:]}
+    units |= {name: f"{unit}/s" for name in names if name.endswith("velocity") and unit}
+    frame.attrs["units"] = {name: text for name, text in units.items() if text}
+    return frame
+
+
+@reads(".mat")
+def read_mat(path: Path, layout: Recording) -> pd.DataFrame:
+    """Return the vectors of a MATLAB file that are as long as most, a column each.
+
+    Fields of structures have their path as names, ``log.theta``; columns of matrices their number,
+    ``pos[0]``.
+
+    Raises
+    ------
+    HistoryError
+        If the file cannot be read, or has no vectors.
+    """
+    from scipy.io import loadmat
+
+    with path.open("rb") as file:
+        try:
+            check_survives(path, "import sys, scipy.io; scipy.io.loadmat(sys.argv[1])")
+            content = loadmat(file, squeeze_me=True, simplify_cells=True)
+        except Exception as error:  # damaged files raise errors of many kinds
+            cure = 'save it from MATLAB with "-v7", or as CSV'
+            why = reason(error)
+            raise HistoryError(f"history {path}: not a MATLAB file ({why}); {cure}") from None
+    columns: dict[str, Floats] = {}
+    for name, value in content.items():
+        if not name.startswith("__"):
+            _add_vectors(columns, name, value)
+    lengths = [len(column) for column in columns.values()]
+    if not lengths:
+        raise HistoryError(f"history {path}: it has no vectors of numbers; save each as a column")
+    longest = max(set(lengths), key=lambda length: (lengths.count(length), length))
+    return pd.DataFrame({k: column for k, column in columns.items() if len(column) == longest})
+
+
+def _add_vectors(columns: dict[str, Floats], name: str, value: object) -> None:
+    """Add the vectors of a MATLAB value under their names."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            _add_vectors(columns, f"{name}.{key}", item)
+    elif isinstance(value, np.ndarray) and value.dtype.kind in "iufb" and value.size > 1:
+        if value.ndim == 1:
+            columns[name] = value.astype(float)
+        elif value.ndim == 2:
+            tall = value if value.shape[0] >= value.shape[1] else value.T
+            columns |= {f"{name}[{i}]": column.astype(float) for i, column in enumerate(tall.T)}
 
 
 def to_table(dataset: xr.Dataset) -> pd.DataFrame:
@@ -367,12 +454,9 @@ def table_of_arrays(
     """
     which, step = np.nonzero(~np.isnan(clock))
     k = len(bodies)
-    columns = {
-        "trajectory": np.repeat(trajectory[which], k),
-        "step": np.repeat(step, k),
-        "time": np.repeat(clock[which, step], k),
-        "body": np.tile(np.array(bodies, dtype=object), len(step)),
-    }
+    each = {"trajectory": trajectory[which], "step": step, "time": clock[which, step]}
+    columns = {name: np.repeat(values, k) for name, values in each.items()}
+    columns["body"] = np.tile(np.array(bodies, dtype=object), len(step))
     for names, values in ((STATE, states), (WRENCH, wrenches)):
         rows = values[which, step].reshape(len(step) * k, -1)
         columns |= zip(names, rows.T, strict=True)

@@ -134,12 +134,10 @@ def planar_yaw(quaternions: Floats, flat: float = 0.2) -> tuple[Floats, str]:
     # a turn about x reads as one about z with w first: w begins near 1
     axes = [("x y z w", 2), ("w x y z", 2), ("x y z w", 0), ("x y z w", 1)]
     axes = axes if abs(seen[0, 0]) > abs(seen[0, 3]) else [axes[i] for i in (0, 2, 3, 1)]
-    off = {
-        (order, axis): float(
-            np.sqrt((np.delete(seen[:, orders[order][:3]], axis, axis=1) ** 2).mean())
-        )
-        for order, axis in axes
-    }
+    off = {}
+    for order, axis in axes:
+        others = np.delete(seen[:, orders[order][:3]], axis, axis=1)
+        off[order, axis] = float(np.sqrt((others**2).mean()))
     least = min(off.values())
     order, axis = axes[0]
     if off[axes[0]] > flat and least < off[axes[0]] / 3:
@@ -234,21 +232,16 @@ def check_states(frame: pd.DataFrame, layout: Recording, source: str) -> None:
     if {*STATE} & {*frame.columns, *(key.rpartition(".")[2] for key, _ in layout.columns)}:
         return
     numbers = frame.apply(pd.to_numeric, errors="coerce")
-    listed = []
-    for name, column in numbers.items():
-        unit = stated_unit(frame, str(name))
-        spread = f"{column.min():.6g}..{column.max():.6g}" if column.notna().any() else "text"
-        listed.append(f"{name} {spread} {unit}".strip())
+    ends = numbers.agg(["min", "max"]).T.itertuples()
+    spread = {n: "text" if np.isnan(low) else f"{low:.6g}..{high:.6g}" for n, low, high in ends}
+    listed = [f"{name} {spread[name]} {stated_unit(frame, str(name))}".strip() for name in numbers]
     guess = {key: str(column) for key, column in layout.columns}
     rising = [str(name) for name, column in numbers.items() if (column.diff() > 0).mean() > 0.9]
     if rising and not {"time", "duration"} & {*guess, *frame.columns}:
         guess["time"] = rising[0]
     used = {*guess.values(), *rising[:1]}
-    moving = [
-        name
-        for name in unused_columns(frame, layout)
-        if name not in used and numbers[name].notna().any() and not _actuator_kind(name)
-    ] or ["COLUMN"]
+    moving = [name for name in unused_columns(frame, layout) if name not in used]
+    moving = [n for n in moving if spread[n] != "text" and not _actuator_kind(n)] or ["COLUMN"]
     guess |= zip(("x", "y"), moving, strict=False) if len(moving) > 1 else {"theta": moving[0]}
     words = ",".join(f"{key}={column}" for key, column in guess.items())
     raise HistoryError(
@@ -276,12 +269,10 @@ _ACTUATORS = {
 }
 #: Words in names of a pose or a speed that is wanted, not measured.
 _WANTED = r"goal|target|setpoint|desired|cmd|command"
-#: A command that exceeds this is no share of a full one.
-_COUNTS = 2.0
 
 
 def guessed_actuators(
-    frame: pd.DataFrame, layout: Recording, shape: Shape, hung: bool
+    frame: pd.DataFrame, layout: Recording, shape: Shape, hung: bool, *, counts: float = 2.0
 ) -> Actuators:
     """Return actuators of the one body that unused columns' names give away.
 
@@ -297,13 +288,15 @@ def guessed_actuators(
         Outline of the body: a fan on the left or right is at its edge.
     hung : bool
         Whether it hangs on a hinge, which a motor or a servo needs.
+    counts : float
+        A command that exceeds this is no share of a full one.
     """
     if any(name in WRENCH for name in (*dict(layout.columns), *frame.columns)):
         return ()
     found = []
     for column in unused_columns(frame, layout):
         text, kind = column.lower(), _actuator_kind(column)
-        if kind is None or not (hung or kind != "servo"):
+        if kind is None or (kind == "servo" and not hung):
             continue
         side = float("left" in text) - float("right" in text)
         *_, low, high = shape.bounds
@@ -318,7 +311,7 @@ def guessed_actuators(
                 name=name if name.isidentifier() else f"command_{name}",
                 kind=kind, body="body", column="" if name == column else column,
                 at=place if kind == "thruster" else (0.0, 0.0),
-                full=most if kind != "servo" and most > _COUNTS else 1.0,
+                full=most if kind != "servo" and most > counts else 1.0,
             )
         )  # fmt: skip
     return tuple(found) if len(found) <= len(WRENCH) else ()

@@ -140,17 +140,11 @@ class History:
         given = scene.recording or Recording()
         layout = given.with_entries(columns=reading.get("columns") or {})
         logs = logs_in(path, layout)
-        parts = [
-            _rows(
-                read_table(log, layout),
-                scene,
-                scene.recording,
-                read_commands(log, scene.recording),
-                f"history {log}",
-                **reading,
-            )
-            for log in logs
-        ]
+        parts = []
+        for log in logs:
+            table, commands = read_table(log, layout), read_commands(log, scene.recording)
+            source = f"history {log}"
+            parts += [_rows(table, scene, scene.recording, commands, source, **reading)]
         estimated = estimate_velocities or given.velocities == "estimate"
         return cls._of_rows(parts, scene, logs=logs, estimate_velocities=estimated)
 
@@ -250,10 +244,9 @@ class History:
         start, assumed = complete_start(state, scene)
         if estimate_velocities:  # of positions that were measured, or that hinges give
             assumed[:, 3:] &= assumed[:, :3]
-        n, k = len(n_rows), len(scene.moving)
         dims = ("trajectory", "time", "body")
         states, wrenches = ({"units": ", ".join(units)} for units in (STATE_UNITS, WRENCH_UNITS))
-        before = np.zeros((n, k, len(WRENCH)))
+        before = np.zeros_like(action[:, 0])
         dataset = xr.Dataset(
             {
                 "observed": ((*dims, "state"), state, states),
@@ -263,7 +256,7 @@ class History:
                 "clock": (("trajectory", "time"), clock, {"units": "s"}),
                 "began": ("trajectory", clock[:, 0], {"units": "s"}),
                 "n_rows": ("trajectory", n_rows),
-                "number": ("trajectory", np.arange(float(n))),
+                "number": ("trajectory", np.arange(float(len(n_rows)))),
                 "before": (("trajectory", "body", "wrench"), before, wrenches),
             },
             coords={
@@ -305,16 +298,16 @@ class History:
         HistoryError
             If the horizon is not a whole number from 1 up, or no piece is left.
         """
-        if isinstance(horizon, bool) or not isinstance(horizon, int | np.integer) or horizon < 1:
+        if horizon < 1 or horizon != int(horizon):
             raise HistoryError(f"horizon is {horizon!r}, expected a whole number from 1 up")
         intervals = self.dataset["n_rows"].to_numpy() - 1
-        start = self.dataset["start"].to_numpy()
         trajectory, step = _cut(self.complete, intervals, int(horizon))
         if not len(step):
             raise HistoryError(
                 f"no segment of {horizon} intervals starts from a complete state; use another "
                 "horizon, or measure the states there"
             )
+        start = self.dataset["start"].to_numpy()
         return self._segments(start, trajectory, step, int(horizon))
 
     def pieces(self, states: Floats, horizon: int, breaks: Bools | None = None) -> Segments:
@@ -368,11 +361,10 @@ class History:
             Shape (trajectory, time, body, 6), SI units, without gaps.
         """
         intervals = self.dataset["n_rows"].to_numpy() - 1
-        trajectory = np.repeat(np.arange(len(intervals)), intervals)
-        step = np.concatenate([np.arange(n) for n in intervals])
+        within = np.arange(states.shape[1]) < intervals[:, None]
         observed = self.dataset["observed"].copy(data=states)
         between = History(self.dataset.assign(observed=observed))
-        return between._segments(states, trajectory, step, 1)
+        return between._segments(states, *np.nonzero(within), 1)
 
     def _inputs(self) -> Floats:
         """Return all that acts in each interval, shape (trajectory, interval, body, input)."""
@@ -419,11 +411,8 @@ class History:
                 " the test data in a file of their own"
             )
         n_test = min(max(round(test_fraction * n), 1), n - 1)
-        shuffled = np.random.default_rng(seed).permutation(n)
-        return (
-            self.select(sorted(shuffled[n_test:].tolist())),
-            self.select(sorted(shuffled[:n_test].tolist())),
-        )
+        shuffled = np.random.default_rng(seed).permutation(n).tolist()
+        return self.select(sorted(shuffled[n_test:])), self.select(sorted(shuffled[:n_test]))
 
     def numbered(self, first: float) -> History:
         """Return the same trajectories, numbered from ``first``: recorded after others."""
@@ -496,12 +485,10 @@ def _rows(
 
 def _stacked(arrays: Sequence[Floats], length: int) -> Floats:
     """Return arrays of trajectories one after the other, with NaN up to this number of steps."""
-    stacked = np.full((sum(map(len, arrays)), length, *arrays[0].shape[2:]), np.nan)
-    begin = 0
-    for array in arrays:
-        stacked[begin : begin + len(array), : array.shape[1]] = array
-        begin += len(array)
-    return stacked
+    whole = [np.full((len(one), length, *one.shape[2:]), np.nan) for one in arrays]
+    for padded_one, one in zip(whole, arrays, strict=True):
+        padded_one[:, : one.shape[1]] = one
+    return np.concatenate(whole)
 
 
 def unseen(history: History) -> Bools:
@@ -600,8 +587,8 @@ def _cut(complete: Bools, intervals: Ints, horizon: int) -> tuple[Ints, Ints]:
             if step >= free and (step + horizon <= count or not free):
                 pieces.append((trajectory, step))
                 free = step + horizon
-    places = np.array(pieces, dtype=np.int64).reshape(-1, 2)
-    return places[:, 0], places[:, 1]
+    trajectories, steps = np.array(pieces, dtype=np.int64).reshape(-1, 2).T
+    return trajectories, steps
 
 
 def with_paths(scene: Scene, states: Floats, wrenches: Floats) -> tuple[Floats, Floats]:

@@ -1,6 +1,7 @@
 """Kinematics of a history: angles, noise, recorded paths, joints, and complete initial states."""
 
 from collections.abc import Iterable
+from itertools import product
 from math import comb
 
 import numpy as np
@@ -31,8 +32,7 @@ def unwrapped(time: Floats, angle: Floats, rate: Floats) -> Floats:
     """
     if not np.isfinite(rate).all():
         return np.asarray(np.unwrap(angle))
-    turned = np.cumsum(0.5 * np.diff(time) * (rate[1:] + rate[:-1]))
-    turned = np.concatenate([np.zeros(1), turned])
+    turned = np.append(0.0, np.cumsum(0.5 * np.diff(time) * (rate[1:] + rate[:-1])))
     return np.asarray(np.unwrap(angle - turned) + turned)
 
 
@@ -97,8 +97,7 @@ def finest_step(column: Floats, *, rounding: float = 1e-9) -> float:
         return np.inf
     least = rounding * float(max(np.abs(values).max(), values[-1] - values[0]))
     steps = np.diff(values)
-    steps = steps[steps > least]
-    return max(least, float(steps.min()) if len(steps) else 0.0)
+    return float(steps[steps > least].min()) if (steps > least).any() else least
 
 
 def kinematic_bodies(scene: Scene) -> Bools:
@@ -255,8 +254,7 @@ def hung_bodies(scene: Scene) -> list[str]:
 def lever(state: Floats, anchor: Point) -> tuple[Floats, Floats]:
     """Return an anchor's offset from its body's origin in the world, and that offset's rate."""
     cos, sin = np.cos(state[..., 2]), np.sin(state[..., 2])
-    x = cos * anchor[0] - sin * anchor[1]
-    y = sin * anchor[0] + cos * anchor[1]
+    x, y = cos * anchor[0] - sin * anchor[1], sin * anchor[0] + cos * anchor[1]
     return np.stack([x, y], -1), np.stack([-y, x], -1) * state[..., 5:6]
 
 
@@ -290,10 +288,8 @@ def estimate_rates(start: Floats, dt: float, columns: tuple[int, ...] = (3, 4, 5
     columns : tuple of int
         Velocities to fill.
     """
-    for body in range(start.shape[2]):
-        for column in columns:
-            if not np.isnan(start[:, :, body, column]).all():
-                continue
+    for body, column in product(range(start.shape[2]), columns):
+        if np.isnan(start[:, :, body, column]).all():
             for states in start[:, :, body]:
                 states[:, column] = _derivative(states[:, column - 3], dt, angle=column == 5)
 

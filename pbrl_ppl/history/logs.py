@@ -124,15 +124,11 @@ def joined(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
     """Return the rows of all tables; trajectories of several are different ones."""
     if len(tables) == 1:
         return tables[0]
-    frame: pd.DataFrame = pd.concat(
-        [
-            table.assign(trajectory=f"{i}." + table["trajectory"].astype(str))
-            if "trajectory" in table
-            else table
-            for i, table in enumerate(tables)
-        ],
-        ignore_index=True,
-    )
+    parts = list(tables)
+    for i, table in enumerate(tables):
+        if "trajectory" in table:
+            parts[i] = table.assign(trajectory=f"{i}." + table["trajectory"].astype(str))
+    frame: pd.DataFrame = pd.concat(parts, ignore_index=True)
     frame.attrs = tables[0].attrs
     return frame
 

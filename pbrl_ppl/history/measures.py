@@ -53,6 +53,11 @@ _UNITS: Mapping[str, Mapping[str, float]] = {
 }
 
 
+def numbers(column: pd.Series) -> Floats:
+    """Return the numbers of a column, a copy; NaN where a cell is none."""
+    return np.array(pd.to_numeric(column, errors="coerce"), dtype=float)
+
+
 def unit_in_name(name: str) -> tuple[str, str]:
     """Return a column's name without its unit, and the unit: of ``angle [deg]`` both.
 
@@ -194,19 +199,18 @@ def with_whole_counts(frame: pd.DataFrame, say: Callable[[str], None]) -> pd.Dat
     theta is a counter of 16 bits that overflows 1 time, first in row 2: it goes on
     [32700.0, 32760.0, 32820.0, 32880.0]
     """
-    bodies = frame["body"].to_numpy() if "body" in frame else np.zeros(len(frame))
-    time = pd.to_numeric(frame["time"], errors="coerce") if "time" in frame else None
+    none = np.zeros(len(frame))
+    bodies = frame["body"].to_numpy() if "body" in frame else none
+    time = numbers(frame["time"]) if "time" in frame else none
     frame = frame.copy()
     for name in (name for name in STATE if name in frame):
-        values = pd.to_numeric(frame[name], errors="coerce").to_numpy(float, copy=True)
+        values = numbers(frame[name])
         found = list[tuple[int, int]]()
         for body in pd.unique(bodies):
             rows = np.flatnonzero((bodies == body) & np.isfinite(values))
-            every, clock = values[rows], np.zeros(len(rows))
-            clock = clock if time is None else time.to_numpy()[rows]
-            for run in np.split(rows, np.flatnonzero(np.diff(clock) < 0.0) + 1):
-                bits = _overflows(values[run], every)
-                if bits:
+            every = values[rows]
+            for run in np.split(rows, np.flatnonzero(np.diff(time[rows]) < 0.0) + 1):
+                if bits := _overflows(values[run], every):
                     jumps = np.abs(np.diff(values[run])) > 0.5 * 2.0**bits
                     found += [(bits, int(row)) for row in run[1:][jumps]]
                     values[run] = np.unwrap(values[run], period=2.0**bits)

@@ -116,30 +116,18 @@ def from_mujoco(
     n, rows = positions.shape[:2]
     every = _rows_in_a_step(model, scene, time_step)
     axes = PLANES[plane]
-    reach = [body.shape.bounding_radius for body in scene.moving]
-    joints = {
-        body.name: _joints(model, body.name, axes, size)
-        for body, size in zip(scene.moving, reach, strict=True)
-    }
+    reach = {body.name: body.shape.bounding_radius for body in scene.moving}
+    joints = {name: _joints(model, name, axes, size) for name, size in reach.items()}
     k = len(joints)
     state = np.full((n, rows, k, len(STATE)), np.nan)
     for i, (name, body_joints) in enumerate(joints.items()):
         origin = axes[:2] @ np.asarray(model.body(name).pos)
-        if not _fill(state[:, :, i], body_joints, positions, velocities, origin, axes, reach[i]):
+        if not _fill(state[:, :, i], body_joints, positions, velocities, origin, axes, reach[name]):
             raise HistoryError(
                 f'body "{name}" leaves the plane; expected one that moves in it alone'
             )
     _add_parents_angles(model, state, joints)
-    if ctrl is not None and wrench is not None:
-        raise HistoryError("ctrl and wrench are both given; expected one of them")
-    action = np.zeros((n, rows, k, len(WRENCH)))
-    if ctrl is not None:
-        action = _motor_wrenches(model, joints, _batched(ctrl, model.nu, "ctrl", "nu"))
-    elif wrench is not None:
-        flat = np.asarray(wrench, dtype=float)
-        flat = flat.reshape(*flat.shape[:-2], -1) if flat.ndim > 2 else flat
-        action = _batched(flat, k * len(WRENCH), "wrench", "3 a body")
-        action = action.reshape(*action.shape[:2], k, len(WRENCH))
+    action = _wrenches(model, joints, ctrl, wrench, (n, rows))
     if action.shape[0] != n or action.shape[1] not in (rows, rows - 1):
         raise HistoryError(
             f"ctrl or wrench has {action.shape[:2]} trajectories and rows, expected {(n, rows)}, as"
@@ -153,6 +141,30 @@ def from_mujoco(
     return History.of_arrays(
         state[:, : kept * every + 1 : every], scene, mean, estimate_velocities=estimate_velocities
     )
+
+
+def _wrenches(
+    model: mujoco.MjModel,
+    joints: dict[str, list[_Joint]],
+    ctrl: npt.ArrayLike | None,
+    wrench: npt.ArrayLike | None,
+    shape: tuple[int, int],
+) -> Floats:
+    """Return what acts on each body, shape (trajectory, row, body, 3); zero where nothing is given.
+
+    Parameters and errors are those of :func:`from_mujoco`.
+    """
+    k = len(joints)
+    if ctrl is not None and wrench is not None:
+        raise HistoryError("ctrl and wrench are both given; expected one of them")
+    if ctrl is not None:
+        return _motor_wrenches(model, joints, _batched(ctrl, model.nu, "ctrl", "nu"))
+    if wrench is None:
+        return np.zeros((*shape, k, len(WRENCH)))
+    flat = np.asarray(wrench, dtype=float)
+    flat = flat.reshape(*flat.shape[:-2], -1) if flat.ndim > 2 else flat
+    action = _batched(flat, k * len(WRENCH), "wrench", "3 a body")
+    return action.reshape(*action.shape[:2], k, len(WRENCH))
 
 
 def _rows_in_a_step(model: mujoco.MjModel, scene: Scene, time_step: float | None) -> int:
@@ -279,11 +291,8 @@ def _add_parents_angles(
 
 def _motor_wrenches(model: mujoco.MjModel, joints: dict[str, list[_Joint]], ctrl: Floats) -> Floats:
     """Return the wrenches of motors at joints, shape (trajectory, row, body, 3)."""
-    holder = {
-        joint.number: (i, joint)
-        for i, body_joints in enumerate(joints.values())
-        for joint in body_joints
-    }
+    every = enumerate(joints.values())
+    holder = {joint.number: (i, joint) for i, of_body in every for joint in of_body}
     wrench = np.zeros((*ctrl.shape[:2], len(joints), len(WRENCH)))
     # a motor has a fixed gain, no bias, no dynamics, and acts on a joint
     kinds = (model.actuator_gaintype, model.actuator_biastype, model.actuator_dyntype)

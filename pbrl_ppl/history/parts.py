@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from itertools import pairwise
 from math import comb
@@ -16,20 +16,13 @@ from pbrl_ppl.history.history import History, hashed
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats
 
-#: Transitions of a recording that is finer than its motion needs.
-_ENOUGH = 1000
 #: Transitions that a law is searched in. They show one of a hundredth of the motion, and a search's
 #: time grows faster than they do.
 MOST_TRANSITIONS = 3000
-#: A spline through the rows that are kept passes others by so many times their noise, or by such a
-#: share of the motion, at most.
-_NOISY, _SMOOTH = 2.0, 1e-3
-#: Transitions of a piece, at least.
-_SHORTEST = 100
 
 
 def drawn_pieces(
-    history: History, most: int, seed: int = 0, *, pieces: int = 12
+    history: History, most: int, seed: int = 0, *, pieces: int = 12, shortest: int = 100
 ) -> tuple[History, tuple[str, ...]]:
     """Return pieces of a history with at most so many transitions in all, and a sentence on them.
 
@@ -47,13 +40,13 @@ def drawn_pieces(
         Transitions of the result, at most; at least 4.
     seed : int
         The same seed gives the same pieces.
-    pieces : int
-        Pieces that are drawn, at least.
+    pieces, shortest : int
+        Pieces that are drawn, and transitions of a piece, at least.
     """
     if history.n_transitions <= most:
         return history, ()
     slow = int(_slowest_motion(history) / history.dataset.attrs["time_step"])
-    longest = max(min(max(slow, _SHORTEST), most // pieces), 1)
+    longest = max(min(max(slow, shortest), most // pieces), 1)
     parts: list[tuple[int, int, int]] = []
     complete = history.complete
     for trajectory, n in enumerate(history.dataset["n_rows"].to_numpy() - 1):
@@ -69,12 +62,7 @@ def drawn_pieces(
         order = np.argsort(np.random.default_rng(seed).exponential(size=len(parts)) / moves)
     sizes = np.array([b - a for _, a, b in parts])[order]
     chosen = np.sort(order[np.cumsum(sizes) <= most])
-    joined = xr.concat(
-        [_piece(history.dataset, *parts[i]) for i in chosen],
-        "trajectory", data_vars="minimal", coords="minimal", compat="override", join="outer",
-    )  # fmt: skip
-    labels = [str(label) for label in joined["trajectory"].to_numpy()]
-    drawn = History(hashed(joined.assign_coords(trajectory=labels)))
+    drawn = joined_pieces(history.dataset, (parts[i] for i in chosen))
     said = (
         f"{drawn.n_transitions} of {history.n_transitions} transitions are used, in"
         f" {drawn.n_trajectories} pieces drawn by the seed"
@@ -82,8 +70,18 @@ def drawn_pieces(
     return drawn, (said,)
 
 
+def joined_pieces(data: xr.Dataset, pieces: Iterable[tuple[int, int, int]]) -> History:
+    """Return pieces of trajectories: which one, its first row and its last one."""
+    joined = xr.concat(
+        [_piece(data, *piece) for piece in pieces],
+        "trajectory", data_vars="minimal", coords="minimal", compat="override", join="outer",
+    )  # fmt: skip
+    labels = [str(label) for label in joined["trajectory"].to_numpy()]
+    return History(hashed(joined.assign_coords(trajectory=labels)))
+
+
 def thinned(
-    scene: Scene, *histories: History, most: int = _ENOUGH
+    scene: Scene, *histories: History, most: int = 1000
 ) -> tuple[Scene, tuple[History, ...], tuple[str, ...]]:
     """Return a scene and histories with a longer time step, if the first is finer than it moves.
 
@@ -115,7 +113,8 @@ def thinned(
     if still or not alone or any(body.kinematic for body in scene.moving):
         return scene, histories, ()
     observed, step = train.dataset["observed"].to_numpy(), 1
-    limit = np.maximum(_NOISY * _noise(observed), _SMOOTH * _over_rows(np.nanstd, observed))
+    # twice the noise of the rows that are passed by, or a thousandth of the motion
+    limit = np.maximum(2.0 * _noise(observed), 1e-3 * _over_rows(np.nanstd, observed))
     while step < train.n_transitions // most and (_passed_by(observed, step + 1) <= limit).all():
         step += 1
     if step < 2:

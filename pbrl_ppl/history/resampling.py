@@ -15,8 +15,6 @@ from pbrl_ppl.state import STATE, THETA, VELOCITY, WRENCH, Bools, Floats, Ints
 LONGEST = 5.0
 #: A sample this near to a row's time (in time steps) is taken as it is.
 _SAME = 1e-6
-#: Samples this near to the one before (in time steps) are the same: their difference is noise.
-_NEAR = 0.05
 
 
 @dataclass(frozen=True)
@@ -68,33 +66,32 @@ def resampled(rows: Rows, scene: Scene, source: str, *, reach: float = 1.9) -> R
         return rows
     _check_spacing(rows, tracks, dt)
     quotients = np.array([_quotients(samples) for samples in zip(*tracks, strict=True)])
-    grids = []
-    for bodies in tracks:
+    kept = []
+    for label, bodies in zip(rows.labels, tracks, strict=True):
         begin = max(track.time[0] for track in bodies)
-        end = min(track.time[-1] for track in bodies)
-        n = int((end - begin) / dt + _SAME) + 1
-        grids.append(begin + dt * np.arange(max(n, 0)))
-    long = [i for i, grid in enumerate(grids) if len(grid) > 1]
-    short = len(grids) - len(long)
-    if not long:
+        steps = int((min(track.time[-1] for track in bodies) - begin) / dt + _SAME)
+        if steps > 0:
+            kept.append((label, begin + dt * np.arange(steps + 1), bodies))
+    if not kept:
         raise HistoryError(
             f"{source}: no trajectory is as long as a time step of {dt:g} s; give a shorter one"
         )
-    labels, grids, tracks = (
-        [list(parts)[i] for i in long] for parts in (rows.labels, grids, tracks)
-    )
+    labels, grids, _ = zip(*kept, strict=True)
     shape = (len(grids), max(map(len, grids)), len(scene.moving))
     state, action = (np.full((*shape, len(names)), np.nan) for names in (STATE, WRENCH))
     clock = np.full(shape[:2], np.nan)
     weights, empty = [], 0
-    for i, (grid, bodies) in enumerate(zip(grids, tracks, strict=True)):
+    for i, (_, grid, bodies) in enumerate(kept):
         clock[i, : len(grid)] = grid
         for body, track in enumerate(bodies):
-            state[i, : len(grid), body] = _states(track, grid, reach * dt, _SAME * dt)
-            action[i, : len(grid), body] = _mean_wrenches(track, grid)
+            states = _states(track, grid, reach * dt, _SAME * dt)
+            state[i, : len(grid), body] = states
+            # the last wrench acts in an interval that was not measured
+            for d, column in enumerate(track.action[:-1].T):
+                action[i, : len(grid) - 1, body, d] = held_means(grid, track.time[:-1], column)
             weights.append(_weights(track.time, grid, dt))
             measured = ~np.isnan(track.state).all(axis=0)
-            empty += int((np.isnan(state[i, : len(grid), body]) & measured).any(axis=1).sum())
+            empty += int((np.isnan(states) & measured).any(axis=1).sum())
     state[:, :, quotients] = np.nan
     result = rows_of_arrays(state, scene, action, clock, labels)
     message = (
@@ -102,24 +99,25 @@ def resampled(rows: Rows, scene: Scene, source: str, *, reach: float = 1.9) -> R
         f" {np.median(spacing):.4g} s), not {dt:g} s: {len(rows.time)} rows were resampled to"
         f" {len(result.time)}{_noise_in_words(weights)}"
     )
-    if short:
+    if short := len(tracks) - len(kept):
         message += f"; {short} trajectories shorter than a time step are left out"
     if empty:
         message += f"; {empty} rows have empty cells, in gaps of more than {reach * dt:.4g} s"
     if quotients.any():
-        lost = ", ".join(
-            f"{STATE[d]} of {scene.moving[body].name}" for body, d in np.argwhere(quotients)
-        )
+        lost = [f"{STATE[d]} of {scene.moving[body].name}" for body, d in np.argwhere(quotients)]
         message += (
-            f"; {lost}: difference quotients of the positions, no measurements, and left empty"
-            " (estimate_velocities, --estimate-velocities)"
+            f"; {', '.join(lost)}: difference quotients of the positions, no measurements, and left"
+            " empty (estimate_velocities, --estimate-velocities)"
         )
     warn(message, ResamplingWarning)
     return result
 
 
-def _tracks(rows: Rows, label: int, scene: Scene) -> list[_Track]:
-    """Return the rows of a trajectory by body, each with times that rise."""
+def _tracks(rows: Rows, label: int, scene: Scene, near: float = 0.05) -> list[_Track]:
+    """Return the rows of a trajectory by body, each with times that rise.
+
+    A sample ``near`` to the one before (in time steps) is the same: their difference is noise.
+    """
     tracks = []
     for position, body in enumerate(scene.moving):
         row = np.flatnonzero((rows.trajectory == label) & (rows.body == position))
@@ -136,7 +134,7 @@ def _tracks(rows: Rows, label: int, scene: Scene) -> list[_Track]:
                 f"time does not rise in {rows.trajectory_of(at)}: {rows.time[at]:.6g} s after"
                 f" {time[back]:.6g} s; sort the rows, drop duplicates",
             )
-        row = row[np.append(True, np.diff(time) >= _NEAR * scene.time_step)]
+        row = row[np.append(True, np.diff(time) >= near * scene.time_step)]
         time, action = rows.time[row], rows.action[row]
         missing = np.isnan(action[:-1]).any(axis=1)
         if missing.any() and not body.kinematic:
@@ -209,9 +207,7 @@ def _states(track: _Track, grid: Floats, gap: float, same: float) -> Floats:
     for d in range(len(STATE)):
         finite = np.flatnonzero(np.isfinite(track.state[:, d]))
         wide = np.flatnonzero(np.diff(track.time[finite]) > gap) + 1
-        for run in np.split(finite, wide):
-            if not run.size:
-                continue
+        for run in np.split(finite, wide) if finite.size else ():
             time, values = track.time[run], track.state[run, d]
             inside = (grid >= time[0] - same) & (grid <= time[-1] + same)
             rate = track.state[run, d + VELOCITY] if d < VELOCITY else None
@@ -234,13 +230,6 @@ def _interpolated(time: Floats, values: Floats, rate: Floats | None, grid: Float
     low, high = (pick(values[:-1], values[1:])[part] for pick in (np.minimum, np.maximum))
     cubic = CubicHermiteSpline(time, values, rate)(grid)
     return np.asarray(np.clip(cubic, low - beyond[part], high + beyond[part]))
-
-
-def _mean_wrenches(track: _Track, grid: Floats) -> Floats:
-    """Return the mean wrench of each step, shape (step, 3); NaN on the last."""
-    # the last wrench acts in an interval that was not measured
-    means = [held_means(grid, track.time[:-1], column) for column in track.action[:-1].T]
-    return np.append(np.stack(means, axis=1), np.full((1, len(WRENCH)), np.nan), axis=0)
 
 
 def held_means(times: Floats, stamps: Floats, values: Floats) -> Floats:
@@ -272,8 +261,8 @@ def _weights(time: Floats, grid: Floats, dt: float) -> tuple[Floats, Ints]:
     after = np.minimum(before + 1, len(time) - 1)
     width = np.where(after > before, time[after] - time[before], 1.0)
     share = np.clip((grid - time[before]) / width, 0.0, 1.0)
-    share = np.where(np.abs(grid - time[before]) < _SAME * dt, 0.0, share)
-    share = np.where(np.abs(grid - time[after]) < _SAME * dt, 1.0, share)
+    share[np.abs(grid - time[before]) < _SAME * dt] = 0.0
+    share[np.abs(grid - time[after]) < _SAME * dt] = 1.0
     return share, before.astype(np.int64)
 
 
@@ -282,20 +271,17 @@ def _noise_in_words(weights: list[tuple[Floats, Ints]]) -> str:
     share = np.concatenate([later for later, _ in weights])
     between = (share > 0) & (share < 1)
     remaining = np.sqrt(((1 - share) ** 2 + share**2).mean())
-    shared, pairs = 0, 0
-    for later, before in weights:
-        first, last = before + (later == 1), before + (later > 0)
-        shared += int((last[:-1] >= first[1:]).sum())
-        pairs += len(before) - 1
+    pairs = [(i + (later > 0))[:-1] >= (i + (later == 1))[1:] for later, i in weights]
+    shared = np.concatenate(pairs)
     text = ""
     if between.any():
         text += (
             f"; {between.mean():.0%} are interpolated (positions by cubics, velocities linearly;"
             f" wrenches are means), which leaves {remaining:.0%} of the velocities' noise"
         )
-    if shared:
+    if shared.any():
         text += (
-            f"; {shared / pairs:.0%} of neighbouring rows share a sample: their errors are less"
+            f"; {shared.mean():.0%} of neighbouring rows share a sample: their errors are less"
             " independent than they look, and intervals come out too narrow"
         )
     return text

@@ -16,8 +16,6 @@ from pbrl_ppl.state import STATE, WRENCH, Bools, Floats, Ints
 
 #: How far an interval may be from the scene's time step, as a share of it.
 TIME_TOLERANCE = 0.01
-#: Largest absolute value of a state or wrench, in SI units.
-_LARGEST = 1e18
 
 #: Labels of trajectories.
 Labels = list[int | str]
@@ -77,8 +75,7 @@ def rows_of_arrays(
     labels: Sequence[int | str] | None = None,
 ) -> Rows:
     """Return the rows of arrays; arguments and errors as of :meth:`History.of_arrays`."""
-    state = np.array(states, dtype=np.float64)
-    k = len(scene.moving)
+    state, k = np.array(states, dtype=np.float64), len(scene.moving)
     if state.ndim != 4 or state.shape[2:] != (k, len(STATE)):
         raise HistoryError(
             f"history: states have shape {state.shape}, expected (trajectory, time, {k},"
@@ -90,7 +87,7 @@ def rows_of_arrays(
     action = np.zeros((n, length, k, len(WRENCH)))
     if actions is not None:
         wrenches = np.array(actions, dtype=np.float64)
-        whole, intervals = action.shape, (n, length - 1, *action.shape[2:])
+        whole, intervals = action.shape, action[:, 1:].shape
         if wrenches.shape not in (whole, intervals):
             raise HistoryError(
                 f"history: actions have shape {wrenches.shape}, expected {whole}, as the states"
@@ -103,18 +100,19 @@ def rows_of_arrays(
             f"history: times have shape {clock.shape}, expected {(n, length)} or {(length,)}: one"
             " for each row of a trajectory (s), NaN after its end"
         )
+    clock = np.broadcast_to(clock, (n, length))
     names = list(range(n) if labels is None else labels)
     if len({*map(str, names)}) != n:
         raise HistoryError(
             f"history: labels are {names}, expected {n} different ones, one for each trajectory"
         )
-    trajectory, step = np.nonzero(~np.isnan(np.broadcast_to(clock, (n, length))))
+    trajectory, step = np.nonzero(~np.isnan(clock))
     rows = Rows(
         names,
         np.repeat(trajectory, k),
         np.tile(np.arange(k), len(step)),
         np.repeat(step, k),
-        np.repeat(np.broadcast_to(clock, (n, length))[trajectory, step], k),
+        np.repeat(clock[trajectory, step], k),
         state[trajectory, step].reshape(-1, len(STATE)),
         action[trajectory, step].reshape(-1, len(WRENCH)),
     )
@@ -126,16 +124,15 @@ def rows_of_arrays(
     return rows
 
 
-def _check_size(rows: Rows, scene: Scene) -> None:
-    """Refuse states and wrenches of arrays that are infinite or too large."""
+def _check_size(rows: Rows, scene: Scene, largest: float = 1e18) -> None:
+    """Refuse states and wrenches that are infinite or too large."""
     for values, columns in ((rows.state, STATE), (rows.action, WRENCH)):
-        for row, column in np.argwhere(np.abs(values) > _LARGEST):
-            body = scene.moving[rows.body[row]].name
+        for row, column in np.argwhere(np.abs(values) > largest):
+            name = f'{columns[column]} of body "{scene.moving[rows.body[row]].name}"'
             raise rows.error(
                 row,
-                f'{columns[column]} of body "{body}" is {values[row, column]} in'
-                f" {rows.trajectory_of(row)}; expected a finite number of at most {_LARGEST:g}; NaN"
-                " if it was not measured",
+                f"{name} is {values[row, column]} in {rows.trajectory_of(row)}; expected a finite"
+                f" number of at most {largest:g}; NaN or an empty cell if it was not measured",
             )
 
 
@@ -204,19 +201,20 @@ def rows_of_table(frame: pd.DataFrame, scene: Scene, source: str, *, cut: bool =
         for name in frame.columns.difference(["trajectory", "body"], sort=False)
     }
     for name in ("time", "step"):
-        if np.isnan(number.get(name, 0.0)).any():
-            row = int(np.isnan(number[name]).argmax())
+        for row in np.flatnonzero(~np.isfinite(number.get(name, np.zeros(0)))):
+            value = number[name][row]
             raise HistoryError(
-                f"{at[row]}: {name} is empty {where[row]}; expected a number; fill it"
-                " in or drop the row"
+                f"{at[row]}: {name} is {'empty' if np.isnan(value) else value} {where[row]};"
+                " expected a number; fill it in or drop the row"
             )
-    step = number.get("step")
-    if step is not None and (broken := (step != np.round(step)) | (np.abs(step) > 2**53)).any():
-        row = int(broken.argmax())
+    step = number.get("step", np.zeros(0))
+    for row in np.flatnonzero((step != np.round(step)) | (np.abs(step) > 2**53)):
         raise HistoryError(f"{at[row]}: step is {step[row]} {where[row]}; expected a whole number")
-    whole = None if step is None else step.astype(np.int64)
+    whole = step.astype(np.int64) if "step" in number else None
     state, action = (np.stack([number[name] for name in names], 1) for names in (STATE, WRENCH))
-    return Rows(labels, trajectory, body, whole, number["time"], state, action, line, source, cut)
+    rows = Rows(labels, trajectory, body, whole, number["time"], state, action, line, source, cut)
+    _check_size(rows, scene)
+    return rows
 
 
 def _trajectories(column: pd.Series, at: list[str]) -> tuple[Labels, Ints]:
@@ -274,12 +272,6 @@ def _numbers(column: pd.Series, at: list[str], where: list[str]) -> Floats:
                 f"{at[row]}: {column.name} is {str(column[row])!r} {where[row]};"
                 " expected a number or an empty cell; correct it"
             )
-    limit = np.inf if column.name in ("time", "step") else _LARGEST
-    for row in np.flatnonzero(np.isinf(values) | (np.abs(values) > limit)):
-        raise HistoryError(
-            f"{at[row]}: {column.name} is {values[row]} {where[row]}; expected a"
-            f" finite number of at most {_LARGEST:g}; empty the cell if it was not measured"
-        )
     return values
 
 
@@ -324,68 +316,53 @@ def padded(rows: Rows, scene: Scene) -> tuple[Ints, Floats, Floats, Floats]:
 
 def _steps(rows: Rows, order: Ints, scene: Scene) -> tuple[Bools, Ints]:
     """Return where a step begins (in ``order``), and each row's step counted from 0."""
-    dt = scene.time_step
+    dt, k = scene.time_step, len(scene.moving)
     tolerance = TIME_TOLERANCE * dt
-    time, trajectory = rows.time[order], rows.trajectory[order]
-    inside = np.diff(trajectory, prepend=-1) == 0
+    inside = np.diff(rows.trajectory[order], prepend=-1) == 0
+    time = rows.time[order]
     change = np.diff(time, prepend=time[0])
-    if rows.step is None:
-        first = ~inside | (np.abs(change) > tolerance)
-        jump = first.astype(np.int64)
-    else:
-        jump = np.diff(rows.step[order], prepend=rows.step[order[0]])
-        first = ~inside | (jump != 0)
+    apart = ~inside | (np.abs(change) > tolerance)
+    step = np.cumsum(apart) if rows.step is None else rows.step[order]
+    jump = np.diff(step, prepend=step[0])
+    first = ~inside | (jump != 0)
     group = np.cumsum(first) - 1
-    again = pd.Series(group * len(scene.moving) + rows.body[order]).duplicated().to_numpy()
-
-    def first_of(broken: Bools) -> int:
-        """Return the first of these places in the file; -1 if there is none."""
-        places = np.flatnonzero(broken)
-        return int(places[np.argmin(order[places])]) if len(places) else -1
-
-    def error(place: int, message: str, cure: str) -> HistoryError:
-        row = int(order[place])
-        return rows.error(row, f"{message} in {rows.trajectory_of(row)}; {cure}")
-
-    def counted(place: int) -> tuple[int, int]:
-        """Return a step as counted in the recording, and the one before."""
-        step = 0 if rows.step is None else int(rows.step[order[place]])
-        return step, step - int(jump[place])
-
-    # In the order of the cures: rows out of order or twice look like gaps further on.
-    back = change < np.where(first, 0.0, -tolerance)
-    if (i := first_of(inside & back)) >= 0:
-        goes_back = f"time goes back by {-change[i]:.6g} s"
-        raise error(i, goes_back, "sort the rows or drop the duplicate")
-    if (i := first_of(again)) >= 0:
-        body = scene.moving[rows.body[order[i]]].name
-        moment = f"time {time[i]:.6g} s" if rows.step is None else f"step {counted(i)[0]}"
-        second = f'a second row of body "{body}" at {moment}'
-        raise error(i, second, "expected one; drop the duplicate")
-    if (i := first_of(inside & (jump < 0))) >= 0:
-        step, before = counted(i)
-        raise error(i, f"step goes back from {before} to {step}", "sort the rows")
-    if (i := first_of(inside & (jump > 1))) >= 0:
-        step, before = counted(i)
-        raise error(
-            i,
-            f"step skips from {before} to {step}",
-            f"expected {before + 1}; record every step, or give the rows after the gap a trajectory"
-            " of their own",
-        )
-    if (i := first_of(inside & ~first & (change > tolerance))) >= 0:
-        raise error(
-            i,
-            f"step {counted(i)[0]} has two times, {change[i]:.6g} s apart,",
+    again = pd.Series(group * k + rows.body[order]).duplicated().to_numpy()
+    moment = "time {time:.6g} s" if rows.step is None else "step {step}"
+    # in the order of the cures: rows out of order or twice look like gaps further on
+    for broken, message, cure in (
+        (
+            inside & (change < np.where(first, 0.0, -tolerance)),
+            "time goes back by {back:.6g} s",
+            "sort the rows or drop the duplicate",
+        ),
+        (again, f'a second row of body "{{body}}" at {moment}', "expected one; drop the duplicate"),
+        (inside & (jump < 0), "step goes back from {before} to {step}", "sort the rows"),
+        (
+            inside & (jump > 1),
+            "step skips from {before} to {step}",
+            "expected {after}; record every step, or give the rows after the gap a trajectory of"
+            " their own",
+        ),
+        (
+            inside & ~first & (change > tolerance),
+            "step {step} has two times, {change:.6g} s apart,",
             "expected one; give every body the same time at a step",
-        )
-    if (i := first_of(inside & first & (np.abs(change - dt) > tolerance))) >= 0:
-        raise error(
-            i,
-            f"{change[i]:.6g} s since the step before",
+        ),
+        (
+            inside & first & (np.abs(change - dt) > tolerance),
+            "{change:.6g} s since the step before",
             f"expected {dt:.6g} s, the scene's time_step, within 1 %; correct time_step, or have"
             " the history resampled (resample, --time-step)",
-        )
+        ),
+    ):
+        if broken.any():
+            i = min(np.flatnonzero(broken), key=order.__getitem__)  # the first in the file
+            row, before = int(order[i]), step[i] - jump[i]
+            words = {"time": time[i], "change": change[i], "back": -change[i]}
+            words |= {"step": step[i], "before": before, "after": before + 1}
+            words |= {"body": scene.moving[rows.body[row]].name}
+            said, cure = message.format(**words), cure.format(**words)
+            raise rows.error(row, f"{said} in {rows.trajectory_of(row)}; {cure}")
     position = np.empty(len(order), dtype=np.int64)
     position[order] = group - np.maximum.accumulate(np.where(inside, 0, group))
     return first, position

@@ -10,10 +10,7 @@ from scipy.stats import linregress
 from pbrl_ppl.history.history import History
 from pbrl_ppl.history.kinematics import hung_bodies
 from pbrl_ppl.scene import MASS_PRIOR, Scene, units_of
-from pbrl_ppl.state import STATE, THETA, VELOCITY, WRENCH, Floats, wrapped
-
-#: A body that moves turns at least by this share of its way over its length, for its units.
-_TURNS = 0.01
+from pbrl_ppl.state import STATE, THETA, VELOCITY, Floats, wrapped
 
 
 def with_units(scene: Scene, history: History) -> Scene:
@@ -45,7 +42,8 @@ def with_units(scene: Scene, history: History) -> Scene:
             wrench = data["action"].sel(body=body.name).to_numpy()
             if scene.actuators_of(body.name):  # commands are no forces
                 wrench = np.zeros_like(wrench)
-            units = {**vars(units_of(scene, body.name)), "time": _duration(history, scene)}
+            duration = float(data["n_rows"].max() - 1) * scene.time_step
+            units = {**vars(units_of(scene, body.name)), "time": duration}
             moment = body.shape.unit_moment
             seen = _measured(units, states[..., :3], wrench, moment, scene.time_step)
             if data["assumed"].sel(body=body.name)[THETA]:  # an angle that nobody saw may turn
@@ -54,11 +52,6 @@ def with_units(scene: Scene, history: History) -> Scene:
             body = replace(body, typical=tuple(typical.items()))
         bodies.append(body)
     return scene.replace(bodies=tuple(bodies))
-
-
-def _duration(history: History, scene: Scene) -> float:
-    """Return the duration of the longest trajectory (s)."""
-    return float(history.dataset["n_rows"].max() - 1) * scene.time_step
 
 
 def _measured(
@@ -73,16 +66,11 @@ def _measured(
     reach = float(np.nanmax(np.linalg.norm(places - centre, axis=-1), initial=0.0))
     speed, acceleration = _rates(places, dt)
     turn_rate, spin_up = _rates(np.unwrap(np.nan_to_num(poses[..., THETA:]), axis=1), dt)
-    force = max(
-        units["force"], units["mass"] * acceleration, _size(wrench[..., : WRENCH.index("torque")])
-    )
-    torque = max(
-        force * units["length"],
-        units["mass"] * unit_moment * spin_up,
-        _size(wrench[..., WRENCH.index("torque") :]),
-    )
-    # the noise of an angle that never changes is no turning
-    turn_rate = max(turn_rate, _TURNS * speed / units["length"])
+    force = max(units["force"], units["mass"] * acceleration, _size(wrench[..., :THETA]))
+    twist = units["mass"] * unit_moment * spin_up
+    torque = max(force * units["length"], twist, _size(wrench[..., THETA:]))
+    # it turns a little: the noise of an angle that never changes is no turning
+    turn_rate = max(turn_rate, 0.01 * speed / units["length"])
     rates = dict(speed=speed, turn_rate=turn_rate)
     return {
         "force": force,
@@ -140,12 +128,10 @@ def shown_mass(
     pose = data["start"].sel(body=name).to_numpy()[..., :3].copy()
     pose[..., THETA] = np.unwrap(np.nan_to_num(pose[..., THETA]), axis=1)
     wrench = data["action"].sel(body=name).to_numpy()
-    columns, moment = slice(0, 2), 1.0
+    columns, moment = [0, 1], 1.0
     if name in hung_bodies(scene):
-        columns = slice(2, 3)
-        moment = body.shape.unit_moment + units_of(scene, name).length ** 2
-    rate = np.diff(pose[..., columns], axis=1) / scene.time_step
-    response = np.diff(rate, axis=1).ravel() / scene.time_step
+        columns, moment = [THETA], body.shape.unit_moment + units_of(scene, name).length ** 2
+    response = np.diff(pose[..., columns], 2, axis=1).ravel() / scene.time_step**2
     # between the middles of two intervals each command acts for half of the time
     push = (0.5 * (wrench[:, :-2, columns] + wrench[:, 1:-1, columns])).ravel() / moment
     seen = np.isfinite(response) & np.isfinite(push)
@@ -193,18 +179,21 @@ def unit_mismatches(history: History) -> tuple[str, ...]:
     tuple of str
         Empty where all agree.
     """
-    every = (unit_mismatch(history, i, d) for i in range(len(history.bodies)) for d in range(3))
-    return tuple(sentence for sentence, _ in every if sentence)
+    return tuple(sentence for sentence, _ in units_that_differ(history).values())
 
 
-def unit_mismatch(history: History, body: int, d: int) -> tuple[str, dict[str, str]]:
-    """Return why a position and its velocity are in units that differ, and the units that cure it.
+def units_that_differ(history: History) -> dict[tuple[int, int], tuple[str, dict[str, str]]]:
+    """Return why positions and velocities are in units that differ, and the units that cure it.
 
-    Both are empty where no unit is near the factor between them.
+    By body and position; those without a unit near the factor between them are left out.
     """
-    observed = history.dataset["observed"].to_numpy()[:, :, body]
-    factor = rate_factor(observed, d, float(history.dataset.attrs["time_step"]))
-    return ("", {}) if factor is None else _unit_words(history.bodies[body], d, factor)
+    observed, dt = history.dataset["observed"].to_numpy(), float(history.dataset.attrs["time_step"])
+    every = {
+        (body, d): _unit_words(name, d, rate_factor(observed[:, :, body], d, dt) or 1.0)
+        for body, name in enumerate(history.bodies)
+        for d in range(VELOCITY)
+    }
+    return {key: said for key, said in every.items() if said[0]}
 
 
 def rate_factor(
@@ -236,12 +225,10 @@ def rate_factor(
         change = np.diff(position[:, : n * span + 1 : span], axis=1).ravel()
         mean = ((rate[:, 1:] + rate[:, :-1]) / 2)[:, : n * span].reshape(len(rate), n, span)
         integral = dt * span * mean.mean(axis=2).ravel()
-        seen = np.isfinite(change) & np.isfinite(integral)
-        change, integral = change[seen], integral[seen]
-        if len(integral) < few:
-            continue
-        size = np.abs(integral)
-        fast = (size > 0) & (size >= np.quantile(size, 0.9) / 2)  # where noise counts least
+        size = np.abs(np.where(np.isfinite(change), integral, np.nan))
+        seen = np.isfinite(size).sum() >= few
+        # where noise counts least
+        fast = (size > 0) & (size >= np.nanquantile(size, 0.9) / 2) if seen else size > np.inf
         change, integral = change[fast], integral[fast]
         if len(integral) < few:
             continue

@@ -5,17 +5,45 @@ from dataclasses import dataclass
 from math import comb
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.stats import f as f_distribution
 from scipy.stats import t as t_distribution
 
-from pbrl_ppl.history.contradictions import Contradiction, contradiction
 from pbrl_ppl.history.history import History
 from pbrl_ppl.history.kinematics import column_noise, finest_step, unwrapped
-from pbrl_ppl.history.units import unit_mismatch
-from pbrl_ppl.state import STATE, THETA, VELOCITY, Floats
+from pbrl_ppl.history.units import units_that_differ
+from pbrl_ppl.state import STATE, THETA, VELOCITY, Bools, Floats, wrapped
 
 #: Positions and velocities of rows without gaps, m and m/s or rad and rad/s.
 Runs = list[tuple[Floats, Floats]]
+
+
+@dataclass(frozen=True)
+class Contradiction:
+    """What is wrong with a velocity column, and where.
+
+    Attributes
+    ----------
+    kind : str
+        What it does: "wraps every 1.2", "is clipped at 0.5", ...
+    share : float
+        Share of the rows in which it does not agree with the changes of its position.
+    trajectory, row : int
+        The first such row, from 0.
+    factor : float
+        What the column is to be multiplied by, where that is all; else 0.
+    """
+
+    kind: str
+    share: float
+    trajectory: int
+    row: int
+    factor: float = 0.0
+
+    @property
+    def impossible(self) -> bool:
+        """Return whether the position is faster there than the column can say."""
+        return self.kind.startswith(("wraps", "is clipped"))
 
 
 @dataclass(frozen=True)
@@ -115,7 +143,7 @@ def unused_velocities(history: History) -> tuple[UnusedVelocity, ...]:
     vx of puck was computed from x and is not used
     """
     dt, observed = float(history.dataset.attrs["time_step"]), history.dataset["observed"].to_numpy()
-    unused: list[UnusedVelocity] = []
+    unused, differ = list[UnusedVelocity](), units_that_differ(history)
     for body in np.flatnonzero(~history.dataset["kinematic"].to_numpy()):
         for d in range(3):
             runs = _runs(history, int(body), d)
@@ -130,7 +158,7 @@ def unused_velocities(history: History) -> tuple[UnusedVelocity, ...]:
                 unused.append(UnusedVelocity(*names, True, late if abs(late) > 0.05 * dt else 0.0))
             elif lag := velocity_lag(runs, dt):
                 unused.append(UnusedVelocity(*names, False, lag))
-            elif fault and not unit_mismatch(history, int(body), d)[0]:
+            elif fault and (body, d) not in differ:
                 unused.append(UnusedVelocity(*names, False, 0.0, fault=fault))
     return tuple(unused)
 
@@ -148,11 +176,10 @@ def measured_alone(history: History, unused: Sequence[UnusedVelocity] | None = N
     unused = unused_velocities(history) if unused is None else unused
     if not unused:
         return history
-    columns = np.zeros((len(history.bodies), len(STATE)), dtype=bool)
+    observed = history.dataset["observed"].copy(deep=True)
     for velocity in unused:
-        columns[history.bodies.index(velocity.body), STATE.index(velocity.state)] = True
-    observed = history.dataset["observed"]
-    return History(history.dataset.assign(observed=observed.where(~columns)))
+        observed.loc[{"body": velocity.body, "state": velocity.state}] = np.nan
+    return History(history.dataset.assign(observed=observed))
 
 
 def velocity_lag(runs: Runs, dt: float, *, material: float = 0.05) -> float:
@@ -310,44 +337,25 @@ def position_noise(runs: Runs, dt: float) -> tuple[float, float]:
     >>> float(np.sqrt(position_noise([(x, v)], 0.01)[0]).round(4))
     0.002
     """
-    square = product = 0.0
-    n = m = 0
-    for position, rate in runs:
-        off = np.diff(np.diff(position) / dt - (rate[1:] + rate[:-1]) / 2, 2)
-        square, n = square + float(off @ off), n + len(off)
-        product, m = product + float(off[1:] @ off[:-1]), m + max(len(off) - 1, 0)
-    place = max(0.0, -(square / max(n, 1) + 4 * product / max(m, 1)) / 40)
-    return place * dt**2, max(0.0, square / max(n, 1) - 20 * place)
-
-
-#: Regressions of a velocity: rows before and after of its positions, whether the weights of rows
-#: at equal distances are opposite, and rows of other velocities, those of a tuple with one weight.
-REGRESSIONS: tuple[tuple[int, int, bool, tuple[tuple[int, ...], ...]], ...] = (
-    (1, 1, False, ()),
-    (2, 2, False, ()),
-    (5, 5, True, ()),
-    (10, 10, True, ()),
-    (4, 0, False, ()),
-    (10, 0, False, ()),
-    (2, 1, False, ((-1,),)),
-    (2, 2, False, ((-1, 1),)),
-    (3, 1, False, ((-1,), (-2,))),
-    (3, 3, False, ((-1, 1), (-2, 2))),
-    (8, 8, False, ()),
-)
+    off = [np.diff(np.diff(x) / dt - (v[1:] + v[:-1]) / 2, 2) for x, v in runs]
+    n, m = max(sum(map(len, off)), 1), max(sum(max(len(one) - 1, 0) for one in off), 1)
+    square = sum(float(one @ one) for one in off) / n
+    product = sum(float(one[1:] @ one[:-1]) for one in off) / m
+    place = max(0.0, -(square + 4 * product) / 40)
+    return place * dt**2, max(0.0, square - 20 * place)
 
 
 def computed_lag(
-    runs: Runs, dt: float, *, alarm: float = 1e-5, most: float = 0.25, pole: float = 0.1
+    runs: Runs, dt: float, *, alarm: float = 1e-5, most: float = 0.25, widest: int = 20
 ) -> float | None:
     """Return by how much (s) velocities computed from positions are late; None for measured ones.
 
-    Velocities are regressed on positions of neighbouring rows, and on neighbouring velocities as in
-    a low-pass. A velocity with independent noise differs from any sum of noisy positions with
-    weights ``w`` by a variance of at least ``|w|^2 s^2``, ``s`` being the positions' noise. A
-    computed velocity does not. The ratio of the residual variance to that bound is compared with
-    the lower tail of the F distribution, degrees of freedom corrected for serial correlation. The
-    lag is the group delay of the weights at low frequency.
+    Velocities are regressed on the positions of rows before and after. A velocity with independent
+    noise differs from any sum of noisy positions with weights ``w`` by a variance of at least
+    ``|w|^2 s^2``, ``s`` being the positions' noise. A computed velocity does not. The ratio of the
+    residual variance to that bound is compared with the lower tail of the F distribution, degrees
+    of freedom corrected for serial correlation. The lag is the group delay of the weights at low
+    frequency.
 
     Parameters
     ----------
@@ -356,13 +364,11 @@ def computed_lag(
     dt : float
         Time step (s).
     alarm : float
-        Size of the test of each regression.
+        Size of the test.
     most : float
         Largest ratio of the variances, however many rows there are.
-    pole : float
-        Least denominator of a low-pass at half the sampling rate: it is zero in a relation that
-        holds of noiseless measurements too, that the mean of two velocities is the difference
-        quotient.
+    widest : int
+        Rows before and after, at most; in short logs fewer, for two windows a weight.
 
     Examples
     --------
@@ -370,48 +376,36 @@ def computed_lag(
     >>> computed_lag([(x[1:], np.diff(x) / 0.1)], 0.1)
     0.05
     """
-    total = float(np.concatenate([np.zeros(0), *(rate for _, rate in runs)]).var()) if runs else 0.0
-    if not total > 0:
+    lengths = np.array([len(position) for position, _ in runs])
+    reaches = (n for n in range(widest, 0, -1) if np.maximum(lengths - 2 * n, 0).sum() >= 4 * n)
+    reach = next(reaches, 0)
+    if not reach or not any(rate.any() for _, rate in runs):
         return None
-    noise, found = _noise(runs, dt), []
-    shown = sum(max(len(position) - 3, 0) for position, _ in runs) / _correlation([-1, 3, -3, 1])
-    for before, after, odd, groups in REGRESSIONS:
-        place = np.arange(-before, after + 1)
-        windows = [
-            np.lib.stride_tricks.sliding_window_view(np.stack(run), len(place), axis=1)
-            for run in runs
-            if len(run[0]) >= len(place)
-        ]
-        if not windows:
-            continue
-        x, rates = np.concatenate(windows, axis=1)
-        one, y = np.eye(len(place)), rates[:, before]
-        sums = one - one[::-1] if odd else one - one[before]
-        sums = sums[before + 1 :] if odd else np.delete(sums, before, axis=0)
-        v = [rates[:, np.add(group, before)].sum(axis=1) for group in groups]
-        design = np.column_stack([*v, (x - x[:, [before]]) @ sums.T])
-        dof = len(y) - design.shape[1]
-        if dof < 3:
-            continue
-        inverse = np.linalg.pinv(design, rcond=1e-9)
-        errors = sums.T @ inverse[len(v) :]
-        a, b = inverse[: len(v)] @ y, errors @ y
-        if not b.any():  # positions that never change give no velocity
-            continue
-        count = np.array([len(group) for group in groups], dtype=np.float64)
-        gain = 1 - float(a @ count)
-        if 1 - float(a @ (count * [(-1.0) ** group[0] for group in groups])) < pole:
-            continue
-        variance = float(((y - design @ (inverse @ y)) ** 2).sum()) / dof
-        square = float(b @ b) - variance * float((errors**2).sum())  # less the weights' errors
-        share = min(most, float(f_distribution.ppf(alarm, dof / _correlation(b), max(shown, 1.0))))
-        slope, curve = float(b @ place), float(b @ place**2)
-        exact = len(y) > 4 * design.shape[1] and abs(slope * dt - gain) < 1e-6 * abs(gain)
-        if variance < max(share * square * noise, 1e-12 * total * exact) and slope * gain > 0:
-            lag = -curve / (2 * slope) - float(a @ [sum(group) for group in groups]) / gain
-            found.append((variance / square, round(lag, 6) * dt + 0.0))
-    late = min(found, default=(0.0, np.inf))[1]
-    return late if abs(late) < 100 * dt else None
+    place = np.arange(-reach, reach + 1)
+    windows = [
+        sliding_window_view(np.stack(run), len(place), axis=1)
+        for run in runs
+        if len(run[0]) >= len(place)
+    ]
+    x, rates = np.concatenate(windows, axis=1)
+    y = rates[:, reach]
+    inverse = np.linalg.pinv(np.delete(x - x[:, [reach]], reach, axis=1), rcond=1e-9)
+    # the weights of all rows add up to none
+    inverse = np.insert(inverse, reach, -inverse.sum(axis=0), axis=0)
+    b = inverse @ y
+    slope, curve = float(b @ place), float(b @ place**2)
+    if not slope > 0:  # positions that never change give no velocity
+        return None
+    dof = len(y) - 2 * reach
+    variance = float(((y - x @ b) ** 2).sum()) / dof
+    square = float(b @ b) - variance * float((inverse**2).sum())  # less the weights' errors
+    shown = sum(np.maximum(lengths - 3, 0)) / _correlation([-1, 3, -3, 1])
+    tail = f_distribution.ppf(alarm, dof / _correlation(b), max(shown, 1.0))
+    bound = min(most, float(tail)) * square * _noise(runs, dt)
+    exact = len(y) > 8 * reach and abs(slope * dt - 1) < 1e-6
+    total = float(np.concatenate([rate for _, rate in runs]).var())
+    lag = round(-curve / (2 * slope), 6) * dt + 0.0
+    return lag if variance < max(bound, 1e-12 * total * exact) and abs(lag) < 100 * dt else None
 
 
 def _noise(runs: Runs, dt: float, floor: float = 1e-3) -> float:
@@ -425,13 +419,125 @@ def _noise(runs: Runs, dt: float, floor: float = 1e-3) -> float:
     positions = [position for position, _ in runs]
     eighth, ninth = (column_noise(positions, order) ** 2 for order in (8, 9))
     white = ninth * comb(18, 9) > 2.0 * eighth * comb(16, 8)
-    least = floor * eighth * white
-    return float(
-        np.clip(position_noise(runs, dt)[0], least, column_noise(positions, 8, robust=True) ** 2)
-    )
+    most = column_noise(positions, 8, robust=True) ** 2
+    return float(np.clip(position_noise(runs, dt)[0], floor * eighth * white, most))
 
 
 def _correlation(weights: Floats | list[int]) -> float:
     """Return how many squares of filtered white noise count as one independent square."""
     product = np.correlate(weights, weights, "full")
     return float(product @ product / product.max() ** 2)
+
+
+def contradiction(
+    position: Floats, rate: Floats, dt: float, *, angle: bool = False,
+    least: float = 0.03, few: int = 10, material: float = 0.3,
+) -> Contradiction | None:  # fmt: skip
+    """Return how measured velocities contradict the changes of their position; None if they agree.
+
+    A velocity lies between the difference quotients before and after its row, an impact's as well,
+    but for noise and a constant, which is the law ``sensor_bias``. A column that moves as its
+    position does, at nearly the same rate, is no contradiction either: sensors have such laws.
+
+    Parameters
+    ----------
+    position, rate : ndarray
+        Shape (trajectory, time), NaN where missing.
+    dt : float
+        Time step (s).
+    angle : bool
+        Whether the position may have been wrapped at a turn (rad).
+    least, few : float, int
+        Fewer rows, as a share and in number, are no contradiction.
+    material : float
+        What differs by a smaller share of the typical speed is none, unless it is impossible.
+
+    Examples
+    --------
+    >>> t = np.arange(0.0, 9.0, 0.02)
+    >>> said = contradiction(np.sin(t)[None], np.clip(np.cos(t), -0.8, 0.8)[None], 0.02)
+    >>> said.kind, round(said.share, 2), said.row
+    ('is clipped at 0.8', 0.32, 1)
+    """
+    if position.shape[1] < 3:
+        return None
+    mean = (rate[:, 1:] + rate[:, :-1]) / 2
+    change = np.diff(position, axis=1)
+    quotient = (mean + wrapped(change - mean * dt) / dt) if angle else change / dt
+    middle, found, tolerance = _wrong(quotient, rate, position, dt)
+    seen = np.isfinite(middle)
+    share = float(found.sum()) / max(int(seen.sum()), 1)
+    if share < least or found.sum() < few:
+        return None
+    inner = rate[:, 1:-1]
+    kind, factor = _kind(middle, inner, found, tolerance), 0.0
+    if not kind:
+        bias = np.median((middle - inner)[seen])
+        found = _wrong(quotient, rate + bias, position, dt)[1]
+        off = np.sqrt(np.mean((middle - inner - bias)[found] ** 2)) if found.sum() >= few else 0.0
+        if off < material * np.sqrt(np.mean(middle[seen] ** 2)):
+            return None
+        share = float(found.sum()) / float(seen.sum())
+        factor = _factor(middle[seen], inner[seen])
+        rest = _wrong(quotient, factor * rate, position, dt)[1].sum()
+        if not factor or rest > 0.05 * found.sum():
+            turned = _wrong(quotient, -rate, position, dt)[1].sum() < 0.05 * found.sum()
+            factor, kind = 0.0, "has the other sign" if turned else "is another quantity"
+        else:
+            kind = f"is {1 / factor:.3g} times the rate of its position, as in another unit"
+    trajectory, row = (int(one) for one in np.argwhere(found)[0])
+    return Contradiction(kind, share, trajectory, row + 1, factor)
+
+
+def _wrong(
+    quotient: Floats, rate: Floats, position: Floats, dt: float
+) -> tuple[Floats, Bools, float]:
+    """Return mean quotients beside the inner rows, the rows that do not agree, and the tolerance.
+
+    The noise is what differences show in whichever order shows least, as none is that of a motion,
+    or the quarter of the rows that agree best, if that is less: of single rows that are wrong
+    differences have their share.
+    """
+    before, after, inner = quotient[:, :-1], quotient[:, 1:], rate[:, 1:-1]
+    middle = np.where(np.isfinite(inner), (before + after) / 2, np.nan)
+    seen = np.isfinite(middle)
+    outside = np.maximum(inner - np.maximum(before, after), np.minimum(before, after) - inner)
+    # where a force turns round a speed leaves both, and its means with the next ones neither
+    off = np.abs((rate[:, 1:] + rate[:, :-1]) - 2.0 * quotient)
+    outside = np.fmin(outside, np.fmin(off[:, :-1], off[:, 1:]))
+    if not seen.any():
+        return middle, np.zeros(middle.shape, dtype=bool), 0.0
+    places, rates = (
+        min(column_noise(column, order, robust=True) for order in (3, 5, 8))
+        for column in (dt * np.cumsum(quotient, axis=1), rate)
+    )
+    step = finest_step(position) / dt
+    agree = float(np.quantile(np.abs(inner - middle)[seen], 0.25)) / 0.3186  # of a Gaussian
+    noise = min(float(np.hypot(rates, places / dt)), agree)
+    fast = float(np.quantile(np.abs(middle[seen]), 0.9))
+    tolerance = 6.0 * noise + (step if np.isfinite(step) else 0.0) + 0.05 * fast
+    return middle, np.asarray(np.where(seen, outside, 0.0) > tolerance), tolerance
+
+
+def _factor(middle: Floats, inner: Floats) -> float:
+    """Return the factor from velocities to quotients in rows that move; 0 if it is near one."""
+    moves = np.abs(inner) > 0.3 * np.abs(inner).max(initial=0.0)
+    factor = float(np.median(middle[moves] / inner[moves])) if moves.any() else 0.0
+    return factor if factor > 0 and abs(np.log(factor)) > np.log(1.25) else 0.0
+
+
+def _kind(middle: Floats, inner: Floats, found: Bools, tolerance: float) -> str:
+    """Return how a column fails that its position leaves the range of, or that stands still."""
+    true, shown = middle[found], inner[found]
+    low, high = float(np.nanmin(inner)), float(np.nanmax(inner))
+    beyond = (true > high) | (true < low)
+    if beyond.mean() > 0.9:
+        end = np.where(true > high, high, low)
+        if np.mean(np.abs(shown - end) <= 1e-3 * (high - low)) > 0.9:
+            return f"is clipped at {max(abs(end.min()), abs(end.max())):.3g}"
+        size = np.abs(true - shown)
+        size = np.median(size[size < 1.5 * np.quantile(size, 0.1)])
+        off = np.abs(true - shown - size * np.round((true - shown) / size))
+        if high - low < 1.1 * size and np.quantile(off, 0.8) < min(tolerance, 0.2 * size):
+            return f"wraps every {size:.3g}, as a counter that overflows"
+    return "is 0" if np.mean(shown == 0.0) > 0.9 else ""

@@ -18,7 +18,7 @@ from pbrl_ppl.history import (
     unused_velocities,
     wrong_clock,
 )
-from pbrl_ppl.history.contradictions import contradiction
+from pbrl_ppl.history.velocities import contradiction
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Body, Joint, Recording, Scene, Shape

@@ -438,8 +438,11 @@ def swapped(frame: pd.DataFrame, i: int, j: int) -> pd.DataFrame:
         (changed(step=0.5), "row 3: step is 0.5 in trajectory 0; expected a whole number"),
         (changed(step=1e300), r"row 3: step is 1e\+300"),
         (changed(x="abc"), "row 3: x is 'abc' in trajectory 0; expected a number or an empty"),
-        (changed(x=math.inf), "row 3: x is inf in trajectory 0; expected a finite number"),
-        (changed(torque=-math.inf), "row 3: torque is -inf"),
+        (
+            changed(x=math.inf),
+            'row 3: x of body "cart" is inf in trajectory 0; expected a finite number',
+        ),
+        (changed(torque=-math.inf), 'row 3: torque of body "cart" is -inf'),
         (changed(torque=None), 'row 3: torque of body "cart" is empty in trajectory 0.*write 0'),
         (table().assign(x=True), "row 2: x is 'True'"),
         (table().assign(time=pd.Timestamp("2020-01-01")), "row 2: time is '2020"),

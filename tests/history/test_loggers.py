@@ -472,6 +472,17 @@ def test_declared_units_go_before_those_of_the_file(tmp_path: Path) -> None:
         History.load(tmp_path / "b.csv", PUCK.replace(recording=Recording(columns={"time": "t"})))
 
 
+@pytest.mark.parametrize("labels", [("X", "0", "7"), ("0", "X", "7"), ("0", "7", "X")])
+def test_trajectories_of_words_and_numbers_are_all_read(labels, tmp_path: Path) -> None:
+    """A word in a column of numbers makes no title of a row: the next row has it, too."""
+    head = "trajectory,time,body,x,y,theta,vx,vy,omega,force_x,force_y,torque"
+    rows = [f"{label},{0.1 * i},puck,{i},0,0,0,0,0,0,0,0" for label in labels for i in range(20)]
+    (tmp_path / "a.csv").write_text("\n".join([head, *rows, ""]))
+    history = History.load(tmp_path / "a.csv", PUCK)
+    assert tuple(history.dataset["trajectory"].to_numpy()) == labels
+    assert history.n_transitions == 57
+
+
 @pytest.mark.parametrize(
     ("column", "unit", "factor"),
     [("omega", "rpm", 2 * np.pi / 60), ("omega", "deg/s", np.pi / 180), ("vx", "km/h", 1 / 3.6),
@@ -502,7 +513,7 @@ def test_messages_name_rows_of_the_file_and_no_piece(tmp_path: Path) -> None:
     frame.loc[70, "x"] = np.inf
     frame.to_csv(tmp_path / "a.csv", index=False)
     layout = Recording(columns={"time": "t"}, cut={"every": 2.0})
-    with pytest.raises(HistoryError, match=r"a.csv row 72: x is inf") as it:
+    with pytest.raises(HistoryError, match=r'a.csv row 72: x of body "puck" is inf') as it:
         History.load(tmp_path / "a.csv", PUCK.replace(recording=layout))
     assert not re.search(r"trajectory \d", str(it.value))
 
