@@ -25,9 +25,6 @@ from .history import History as History
 from .history import Segments as Segments
 from .history.bags import bag_topics as bag_topics
 from .history.bags import read_bag as read_bag
-from .history.mujoco import from_mujoco as from_mujoco
-from .mjcf import mjcf_ranges as mjcf_ranges
-from .mjcf import scene_from_mjcf as scene_from_mjcf
 from .model import SimulatorOp as SimulatorOp
 from .oomdp import LWR as LWR
 from .oomdp import OOLWR as OOLWR

@@ -125,10 +125,6 @@ class ResamplingWarning(PbrlWarning):
     """A history whose samples were not evenly spaced, and were interpolated."""
 
 
-class ConversionWarning(PbrlWarning):
-    """A scene of another simulator's model that leaves out what scenes do not have."""
-
-
 class FitError(PbrlError, ValueError):
     """A model that cannot be fitted as asked."""
 

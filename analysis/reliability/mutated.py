@@ -76,7 +76,8 @@ LAUGHS = '<!DOCTYPE m [<!ENTITY a0 "ha">' + "".join(
 
 def library(argv: list[str]) -> int:
     """Read a MuJoCo model in place of a command."""
-    from pbrl_ppl import scene_from_mjcf
+    sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
+    from mujoco_bridge import scene_from_mjcf
 
     try:
         scene_from_mjcf(argv[1])

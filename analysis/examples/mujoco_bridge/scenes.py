@@ -1,7 +1,7 @@
 """Planar scenes of MuJoCo models, in MJCF or URDF.
 
-MuJoCo reads the models: ``pip install 'pbrl_ppl[mujoco]'``. Nothing here is needed to read the
-arrays of its rollouts, see :func:`pbrl_ppl.from_mujoco`.
+MuJoCo reads the models: ``pip install mujoco``. Nothing here is needed to read the arrays of its
+rollouts, see :func:`from_mujoco`.
 """
 
 from __future__ import annotations
@@ -14,13 +14,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pbrl_ppl.errors import ConversionWarning, SceneError, warn
-from pbrl_ppl.history.mujoco import FLAT, FREE, HINGE, PLANES, SLIDE
+from mujoco_bridge.rollouts import FLAT, FREE, HINGE, PLANES, SLIDE
+from pbrl_ppl.errors import PbrlWarning, SceneError, warn
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene, Shape, Wall
 from pbrl_ppl.state import Floats, Ints
 
 if TYPE_CHECKING:
     import mujoco
+
+
+class ConversionWarning(PbrlWarning):
+    """A scene of another simulator's model that leaves out what scenes do not have."""
+
 
 #: mjtJoint in words.
 _JOINTS = ("a free joint", "a ball joint", "a slide", "a hinge")
@@ -79,7 +84,7 @@ def scene_from_mjcf(
     --------
     ::
 
-        scene = pp.scene_from_mjcf("arm.xml", plane="xz", time_step=0.02)
+        scene = scene_from_mjcf("arm.xml", plane="xz", time_step=0.02)
         Path("scene.toml").write_text(scene.to_toml())
     """
     if plane not in PLANES:
@@ -115,9 +120,7 @@ def _compiled(source: str | Path | mujoco.MjModel) -> mujoco.MjModel:
     try:
         import mujoco
     except ImportError:
-        raise SceneError(
-            "a scene of a MuJoCo model needs MuJoCo: pip install 'pbrl_ppl[mujoco]'"
-        ) from None
+        raise SceneError("a scene of a MuJoCo model needs MuJoCo: pip install mujoco") from None
     if not isinstance(source, str | Path):
         if not isinstance(source, mujoco.MjModel):
             raise SceneError(f"{source!r} is no MuJoCo model; expected a path, XML text or MjModel")

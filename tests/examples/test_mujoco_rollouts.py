@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from mujoco_bridge import from_mujoco
 
 from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.history.mujoco import from_mujoco
 from pbrl_ppl.scene import Body, Joint, Scene, Shape
 
 pytestmark = pytest.mark.one_stack

@@ -9,10 +9,10 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mujoco_bridge.rollouts import PLANES
+from mujoco_bridge.scenes import ConversionWarning, rotation, rounded
 from pbrl_ppl.effects import Effect, catalogue
-from pbrl_ppl.errors import ConversionWarning, SceneError, warn
-from pbrl_ppl.history.mujoco import PLANES
-from pbrl_ppl.mjcf.reading import rotation, rounded
+from pbrl_ppl.errors import SceneError, warn
 from pbrl_ppl.posterior import Idata, labelled_draws, layout_of, scene_of
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene
 from pbrl_ppl.state import Floats
@@ -78,7 +78,7 @@ def mjcf_ranges(
     --------
     ::
 
-        text, ranges = pp.mjcf_ranges(pp.load_posterior("report/after.nc"))
+        text, ranges = mjcf_ranges(pp.load_posterior("report/after.nc"))
         Path("cart.xml").write_text(text)
         ranges["cart"]["mass"]  # [2.31, 2.38]
     """

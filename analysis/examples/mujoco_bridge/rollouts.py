@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.history.history import History
+from pbrl_ppl.history import History
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE, WRENCH, Floats
 
@@ -102,7 +102,7 @@ def from_mujoco(
         state, _ = mujoco.rollout.rollout(model, data, start, ctrl)
         # the first column is time
         qpos, qvel = state[..., 1 : 1 + model.nq], state[..., 1 + model.nq :]
-        history = pp.from_mujoco(model, scene, qpos[:, :-1], qvel[:, :-1], ctrl=ctrl[:, 1:])
+        history = from_mujoco(model, scene, qpos[:, :-1], qvel[:, :-1], ctrl=ctrl[:, 1:])
     """
     if plane not in PLANES:
         raise HistoryError(f"plane is {plane!r}, expected xy (a top view) or xz (a side view)")
