@@ -13,7 +13,6 @@ import numpy as np
 from task import LIBRARY_FILE, SCENE, TRUTH
 
 import pbrl_ppl as pp
-from pbrl_ppl.history import from_segments
 
 #: Transitions of each trial, and the noise of what is measured (m, rad, m/s, rad/s).
 COUNT, SIGMA = 60, 0.005
@@ -68,7 +67,7 @@ def trial(number: int, name: str, copy: int) -> tuple[pp.Scene, pp.History]:
     true = pp.Dynamics.known(alone, known, threads=1)
     after = true.step(start[None], actions)[0]
     after += rng.normal(0, SIGMA, after.shape)
-    return alone, from_segments(alone, start, actions[:, None], after[:, None])
+    return alone, pp.History.of_arrays(np.stack([start, after], axis=1), alone, actions[:, None])
 
 
 def main() -> None:
