@@ -309,7 +309,8 @@ def propose(
 def slowest(times: Floats, poses: Floats) -> float:
     """Return the longest period of a coordinate (s): twice the time between means crossed."""
     crossed = [int((np.diff(np.sign(off)) != 0).sum()) for off in _moving(poses)]
-    return 2.0 * float(np.ptp(times)) / max(min(crossed), 1) if crossed else 0.0
+    seconds = float(np.ptp(times))  # of a trajectory that ends before others it is unknown
+    return 2.0 * seconds / max(min(crossed), 1) if crossed and np.isfinite(seconds) else 0.0
 
 
 def _moving(poses: Floats) -> list[Floats]:
