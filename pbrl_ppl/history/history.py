@@ -298,7 +298,7 @@ class History:
         HistoryError
             If the horizon is not a whole number from 1 up, or no piece is left.
         """
-        if horizon < 1 or horizon != int(horizon):
+        if isinstance(horizon, bool) or horizon < 1 or horizon != int(horizon):
             raise HistoryError(f"horizon is {horizon!r}, expected a whole number from 1 up")
         intervals = self.dataset["n_rows"].to_numpy() - 1
         trajectory, step = _cut(self.complete, intervals, int(horizon))
