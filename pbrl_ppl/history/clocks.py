@@ -118,8 +118,8 @@ def on_one_clock(
 def _seconds(frame: pd.DataFrame, name: str, layout: Recording, source: str) -> Floats:
     """Return a column of stamps in s: in its unit, or of dates."""
     column, units = frame[name], dict(layout.units)
-    numeric = pd.to_numeric(column, errors="coerce")
-    if numeric.isna().all() and column.notna().any():
+    stamps = numbers(column)
+    if np.isnan(stamps).all() and column.notna().any():
         try:
             dates = pd.to_datetime(column, utc=True, format="ISO8601")
         except (ValueError, TypeError):
@@ -130,7 +130,6 @@ def _seconds(frame: pd.DataFrame, name: str, layout: Recording, source: str) -> 
         since = (dates - pd.Timestamp(0, tz="UTC")) / pd.Timedelta(seconds=1)
         return np.array(since, dtype=float)
     unit = units.get("time", stated_time_unit(frame, name))
-    stamps = np.array(numeric, dtype=np.float64)
     if not unit:
         unit = likely_unit(stamps)
         if unit != "s":
@@ -171,8 +170,7 @@ def _at_rate(
             )
         count = numbers(frame[clocks["counter"]])
     else:
-        order = frame.groupby(keys).cumcount() if keys else np.arange(len(frame))
-        count = np.asarray(order, dtype=float)
+        count = np.arange(len(frame)) if not keys else frame.groupby(keys).cumcount().to_numpy()
     time = count / float(clocks["rate"])
     off = (time - stamps) - np.nanmedian(time - stamps)
     if np.isfinite(off).any() and np.ptp(stamps) > 0 and not keys:

@@ -218,9 +218,8 @@ def parts_of(column: object) -> tuple[str, float, float]:
     >>> parts_of("-heading"), parts_of((("column", "knee"), ("zero", 90.0)))
     (('heading', -1.0, 0.0), ('knee', 1.0, 90.0))
     """
-    table: dict[str, str | float] = {"column": str(column), "zero": 0.0}
-    table |= dict(column) if isinstance(column, tuple) else {}
-    name, zero = str(table["column"]), table["zero"]
+    table = dict(column) if isinstance(column, tuple) else {"column": column}
+    name, zero = str(table["column"]), table.get("zero", 0.0)
     sign = -1.0 if name.startswith("-") else 1.0
     return name.removeprefix("-"), sign, 0.0 if isinstance(zero, str) else float(zero)
 
@@ -307,8 +306,8 @@ def _repaired(
     if not {*by_body} <= {*frame} or frame[by_body].isna().any(axis=None):
         return frame  # which is an error, and said where rows are read
     if "duration" in frame:
-        duration = pd.to_numeric(frame.pop("duration"), errors="coerce").fillna(0.0)
-        frame["time"] = duration.groupby([frame[name] for name in by_body]).cumsum()
+        frame["time"] = np.nan_to_num(numbers(frame.pop("duration")))
+        frame["time"] = frame.groupby(by_body)["time"].cumsum()
     elif "time" not in frame:
         frame["time"] = frame.groupby(by_body).cumcount() * scene.time_step
     if layout.velocities == "computed":

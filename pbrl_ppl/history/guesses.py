@@ -13,7 +13,7 @@ import pandas as pd
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history.clocks import TIMES, Say
 from pbrl_ppl.history.files import COLUMNS
-from pbrl_ppl.history.measures import stated_unit, unit_in_name, unit_size
+from pbrl_ppl.history.measures import numbers, stated_unit, unit_in_name, unit_size
 from pbrl_ppl.scene import Actuator, Recording, Shape, column_of
 from pbrl_ppl.state import STATE, WRENCH, Floats
 
@@ -60,11 +60,11 @@ def with_derived(frame: pd.DataFrame, say: Say) -> pd.DataFrame:
     """
     added = {}
     for name, parts in derived_columns(frame).items():
-        numbers = _numbers(frame, parts)
+        values = np.stack([numbers(frame[part]) for part in parts], axis=1)
         if len(parts) == 2:
-            added[name] = numbers @ [1.0, 1e-9]
+            added[name] = values @ [1.0, 1e-9]
             continue
-        yaw, order = planar_yaw(numbers)
+        yaw, order = planar_yaw(values)
         if order:
             say(f"{', '.join(parts)} are not x, y, z, w: yaw is of their order {order}")
         if np.isfinite(yaw).any():
@@ -93,10 +93,6 @@ def _groups(frame: pd.DataFrame, names: tuple[str, ...] | list[str]) -> list[tup
     prefixes = [match[1] for match in found if match]
     groups = [(prefix, [lower.get(prefix + name, "") for name in names]) for prefix in prefixes]
     return [(prefix, parts) for prefix, parts in groups if all(parts)]
-
-
-def _numbers(frame: pd.DataFrame, columns: list[str]) -> Floats:
-    return np.asarray(frame[columns].apply(pd.to_numeric, errors="coerce"), dtype=float)
 
 
 def planar_yaw(quaternions: Floats, flat: float = 0.2) -> tuple[Floats, str]:
@@ -231,12 +227,12 @@ def check_states(frame: pd.DataFrame, layout: Recording, source: str) -> None:
     """
     if {*STATE} & {*frame.columns, *(key.rpartition(".")[2] for key, _ in layout.columns)}:
         return
-    numbers = frame.apply(pd.to_numeric, errors="coerce")
-    ends = numbers.agg(["min", "max"]).T.itertuples()
+    table = frame.apply(pd.to_numeric, errors="coerce")
+    ends = table.agg(["min", "max"]).T.itertuples()
     spread = {n: "text" if np.isnan(low) else f"{low:.6g}..{high:.6g}" for n, low, high in ends}
-    listed = [f"{name} {spread[name]} {stated_unit(frame, str(name))}".strip() for name in numbers]
+    listed = [f"{name} {spread[name]} {stated_unit(frame, str(name))}".strip() for name in table]
     guess = {key: str(column) for key, column in layout.columns}
-    rising = [str(name) for name, column in numbers.items() if (column.diff() > 0).mean() > 0.9]
+    rising = [str(name) for name, column in table.items() if (column.diff() > 0).mean() > 0.9]
     if rising and not {"time", "duration"} & {*guess, *frame.columns}:
         guess["time"] = rising[0]
     used = {*guess.values(), *rising[:1]}

@@ -510,11 +510,8 @@ def longest_gap(history: History) -> int:
     A recording is sparse if more than half of the steps from one such row to the next skip rows: a
     block that is seen before and after a push, say.
     """
-    complete = np.asarray(~unseen(history).any(axis=-1))
-    rows = history.dataset["n_rows"].to_numpy()
-    gaps = np.concatenate(
-        [np.diff(np.flatnonzero(seen[:n])) for seen, n in zip(complete, rows, strict=True)]
-    )
+    both = zip(~unseen(history).any(axis=-1), history.dataset["n_rows"].to_numpy(), strict=True)
+    gaps = np.concatenate([np.diff(np.flatnonzero(seen[:n])) for seen, n in both])
     return int(gaps.max()) if len(gaps) and np.median(gaps) > 1 else 1
 
 

@@ -233,9 +233,8 @@ def _overflows(run: Floats, every: Floats, *, full: float = 0.75) -> int:
         return 0
     for bits in (8, 16, 32):
         size = 2.0**bits
-        fits = any(low <= every.min() and every.max() < low + size for low in (-size / 2, 0.0))
-        if fits:
-            return bits if (np.abs(np.diff(run)) > full * size).any() else 0
+        if any(low <= every.min() and every.max() < low + size for low in (-size / 2, 0.0)):
+            return bits * bool((np.abs(np.diff(run)) > full * size).any())
     return 0
 
 
