@@ -173,8 +173,7 @@ def without_bad_frames(history: History, *, most: float = 0.05) -> tuple[History
     """
     off, dataset = _deviations(history), history.dataset
     bad: Bools = np.isfinite(off)
-    count = bad.sum(axis=(0, 1))
-    rows = int(dataset["n_rows"].sum())
+    count, rows = bad.sum(axis=(0, 1)), int(dataset["n_rows"].sum())
     many = (count > 1) & (count > most * rows)
     for body, d in np.argwhere(many):
         warn(

@@ -11,7 +11,7 @@ import numpy as np
 
 from pbrl_ppl.errors import warn
 from pbrl_ppl.history.bad_frames import trimmed, unmodelled_ends
-from pbrl_ppl.history.conversion import Reading
+from pbrl_ppl.history.conversion import TableReading
 from pbrl_ppl.history.history import History
 from pbrl_ppl.history.kinematics import GAUSSIAN, column_noise, hung_bodies
 from pbrl_ppl.history.logs import Paths, in_words
@@ -45,7 +45,7 @@ def read_recording(
     trim: bool = False,
     estimate_velocities: bool = False,
     most_ends: int = 4,
-    **reading: Unpack[Reading],
+    **reading: Unpack[TableReading],
 ) -> History:
     """Return the history of files as `History.load` does, and warn of what looks wrong.
 

@@ -33,7 +33,7 @@ from pbrl_ppl.scene import Recording, Scene, column_of, nearest
 from pbrl_ppl.state import STATE, WRENCH
 
 
-class Reading(TypedDict, total=False):
+class TableReading(TypedDict, total=False):
     """Options of :meth:`History.load` for tables of other programs.
 
     Attributes
@@ -61,7 +61,7 @@ def as_history(
     layout: Recording | None = None,
     *,
     commands: pd.DataFrame | None = None,
-    **reading: Unpack[Reading],
+    **reading: Unpack[TableReading],
 ) -> pd.DataFrame:
     """Return a table with a history's column names, in SI units, one step after the other.
 
