@@ -154,7 +154,8 @@ def unused_velocities(history: History) -> tuple[UnusedVelocity, ...]:
             elif fault and fault.impossible:
                 unused.append(replace(one, fault=fault))
             elif (late := computed_lag(runs, dt)) is not None:
-                unused.append(replace(one, computed=True, lag=late * (abs(late) > 0.05 * dt)))
+                late = late if abs(late) > 0.05 * dt else 0.0
+                unused.append(replace(one, computed=True, lag=late))
             elif lag := velocity_lag(runs, dt):
                 unused.append(replace(one, lag=lag))
             elif fault and (body, d) not in differ:
