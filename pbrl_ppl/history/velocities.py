@@ -149,7 +149,7 @@ def unused_velocities(history: History) -> tuple[UnusedVelocity, ...]:
             one = UnusedVelocity(history.bodies[body], STATE[d + VELOCITY], STATE[d], False, 0.0)
             pair = (observed[:, :, body, d], observed[:, :, body, d + VELOCITY])
             fault = contradiction(*pair, dt, angle=d == THETA)
-            if _is_zero(runs):
+            if fault and not np.nan_to_num(pair[1]).any():
                 unused.append(replace(one, zero=True))
             elif fault and fault.impossible:
                 unused.append(replace(one, fault=fault))
@@ -246,9 +246,8 @@ def _shifted(
     lag = float(z @ y) / slope
     rest = y - np.copysign(material, lag) * x
     residual = rest - float(z @ rest) / square * z
-    spread = max(  # the second in collisions
-        float(residual @ residual) / dof * square, float((z * residual) @ (z * residual))
-    )
+    # the second in collisions
+    spread = max(float(residual @ residual) / dof * square, float(((z * residual) ** 2).sum()))
     bound = float(t_distribution.isf(alarm / 2, dof)) * np.sqrt(2 * spread)
     # rounding alone leaves a millionth of a row, without any noise
     differs = abs(lag) > material and abs(float(z @ rest)) > max(bound, 1e-6 * slope)
@@ -297,18 +296,6 @@ def _runs(history: History, body: int, d: int, shortest: int = 5) -> Runs:
                 position = unwrapped(dt * rows, position, rate)
             runs += [(position, rate)] if len(rows) >= shortest else []
     return runs
-
-
-def _is_zero(runs: Runs, *, moves: float = 8.0) -> bool:
-    """Return whether velocities are 0 in all rows and a position moves.
-
-    ``moves``: by more than so many of its noises and finest steps.
-    """
-    if not runs or np.concatenate([rate for _, rate in runs]).any():
-        return False
-    places = [position for position, _ in runs]
-    noise = max(column_noise(places, 2, robust=True), finest_step(np.concatenate(places)))
-    return max(float(np.ptp(place)) for place in places) > moves * noise
 
 
 def position_noise(runs: Runs, dt: float) -> tuple[float, float]:
