@@ -168,10 +168,9 @@ def with_guesses(
     plain = {str(name): _plain(str(name)) for table in tables for name in table.columns}
     known = dict(layout.columns)
     found: dict[str, str] = {}
+    there = {*known, *plain} | ({"time"} if "duration" in known else set())
     for key, guesses in _GUESSES.items():
-        if key in known or key in plain or (key == "time" and "duration" in known):
-            continue
-        if hit := _named(plain, guesses):
+        if key not in there and (hit := _named(plain, guesses)):
             found[key] = hit
     found |= _found_by_unit(frame, plain, {*found, *known, *plain})
     columns = {**found, **known}
@@ -292,15 +291,14 @@ def guessed_actuators(
     found = []
     for column in unused_columns(frame, layout):
         text, kind = column.lower(), _actuator_kind(column)
-        if kind is None or (kind == "servo" and not hung):
+        is_number = pd.api.types.is_numeric_dtype(frame[column])
+        if kind is None or (kind == "servo" and not hung) or not is_number:
             continue
         side = float("left" in text) - float("right" in text)
         *_, low, high = shape.bounds
         place = (0.0, round(side * 0.4 * (high - low), 6))
         name = re.sub(r"\W+", "_", column).strip("_") or "command"
         kind = "thruster" if kind == "motor" and not hung else kind
-        if not pd.api.types.is_numeric_dtype(frame[column]):
-            continue
         most = float(f"{frame[column].abs().max():.3g}")
         found.append(
             Actuator(
