@@ -81,13 +81,13 @@ def on_one_clock(
                 f'{source}: [recording] time has {name} = "{column}", and the file has no such'
                 f" column, or none of {name}; it has {', '.join(map(str, frame.columns))}"
             )
-    states = [column for key, column in own.items() if key.rpartition(".")[2] in STATE]
-    name = columns.get("time", "time")
-    name = name if name in frame else next(iter(states), name)
+    states = [str(column) for key, column in own.items() if key.rpartition(".")[2] in STATE]
+    name = str(columns.get("time", "time"))
+    name = name if name in frame else [*states, name][0]
     if name in frame:
         if own:  # of a longer column with a clock of its own the rows below are no rows
             frame = frame[frame[name].notna()]
-        time = _seconds(frame, str(name), layout, source)
+        time = _seconds(frame, name, layout, source)
         if not own and (alone := _command_rows(frame, columns)).any():
             frame = _of_two_streams(frame, columns, time, alone, layout, say)
             time = time[~alone]
@@ -170,7 +170,8 @@ def _at_rate(
             )
         count = numbers(frame[clocks["counter"]])
     else:
-        count = np.arange(len(frame)) if not keys else frame.groupby(keys).cumcount().to_numpy()
+        order = frame.groupby(keys).cumcount() if keys else np.arange(len(frame))
+        count = np.asarray(order, dtype=float)
     time = count / float(clocks["rate"])
     off = (time - stamps) - np.nanmedian(time - stamps)
     if np.isfinite(off).any() and np.ptp(stamps) > 0 and not keys:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TypedDict, Unpack
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 import pandas as pd
@@ -218,7 +218,7 @@ def parts_of(column: object) -> tuple[str, float, float]:
     >>> parts_of("-heading"), parts_of((("column", "knee"), ("zero", 90.0)))
     (('heading', -1.0, 0.0), ('knee', 1.0, 90.0))
     """
-    table = dict(column) if isinstance(column, tuple) else {"column": column}
+    table: dict[str, Any] = dict(column) if isinstance(column, tuple) else {"column": column}
     name, zero = str(table["column"]), table.get("zero", 0.0)
     sign = -1.0 if name.startswith("-") else 1.0
     return name.removeprefix("-"), sign, 0.0 if isinstance(zero, str) else float(zero)

@@ -127,7 +127,8 @@ def cut(frame: pd.DataFrame, cuts: Mapping[str, float], source: str) -> pd.DataF
         raise HistoryError(
             f"{source}: nothing is left between its cuts; make [recording] cut less strict"
         )
-    return pd.concat(parts)
+    joined: pd.DataFrame = pd.concat(parts)
+    return joined
 
 
 def _pieces(rows: pd.DataFrame, cuts: Mapping[str, float], least: int = 3) -> Ints:

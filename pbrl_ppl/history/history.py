@@ -363,7 +363,8 @@ class History:
         within = np.arange(states.shape[1]) < intervals[:, None]
         observed = self.dataset["observed"].copy(data=states)
         between = History(self.dataset.assign(observed=observed))
-        return between._segments(states, *np.nonzero(within), 1)
+        trajectory, step = np.nonzero(within)
+        return between._segments(states, trajectory, step, 1)
 
     def _inputs(self) -> Floats:
         """Return all that acts in each interval, shape (trajectory, interval, body, input)."""
@@ -509,7 +510,8 @@ def longest_gap(history: History) -> int:
     A recording is sparse if more than half of the steps from one such row to the next skip rows: a
     block that is seen before and after a push, say.
     """
-    both = zip(~unseen(history).any(axis=-1), history.dataset["n_rows"].to_numpy(), strict=True)
+    complete = np.asarray(~unseen(history).any(axis=-1))
+    both = zip(complete, history.dataset["n_rows"].to_numpy(), strict=True)
     gaps = np.concatenate([np.diff(np.flatnonzero(seen[:n])) for seen, n in both])
     return int(gaps.max()) if len(gaps) and np.median(gaps) > 1 else 1
 

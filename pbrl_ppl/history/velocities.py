@@ -158,7 +158,7 @@ def unused_velocities(history: History) -> tuple[UnusedVelocity, ...]:
                 unused.append(replace(one, computed=True, lag=late))
             elif lag := velocity_lag(runs, dt):
                 unused.append(replace(one, lag=lag))
-            elif fault and (body, d) not in differ:
+            elif fault and (int(body), d) not in differ:
                 unused.append(replace(one, fault=fault))
     return tuple(unused)
 
@@ -293,7 +293,7 @@ def _runs(history: History, body: int, d: int, shortest: int = 5) -> Runs:
         for rows in np.split(seen, np.flatnonzero(np.diff(seen) > 1) + 1):
             position, rate = both[rows].T
             if d == THETA:
-                position = unwrapped(dt * rows, position, rate)
+                position = unwrapped(dt * rows.astype(float), position, rate)
             runs += [(position, rate)] if len(rows) >= shortest else []
     return runs
 
