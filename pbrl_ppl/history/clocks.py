@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from pbrl_ppl.errors import HistoryError, LayoutError
-from pbrl_ppl.history.measures import TIME, numbers, stated_unit, unit_in_name, unit_size
+from pbrl_ppl.history.measures import TIME, known_size, numbers, stated_unit, unit_in_name
 from pbrl_ppl.history.resampling import held_means
 from pbrl_ppl.scene import Recording, column_of
 from pbrl_ppl.state import STATE, WRENCH, Bools, Floats, Ints
@@ -140,13 +140,7 @@ def _seconds(frame: pd.DataFrame, name: str, layout: Recording, source: str) -> 
                 ' or units = { time = "s" }',
                 units={"time": unit},
             )
-    size = unit_size("time", unit)
-    if size is None:
-        raise HistoryError(
-            f'units: "{unit}" is none of time; expected one of {", ".join(TIME)}, or a number to'
-            ' one, "240/s"'
-        )
-    return np.array(stamps * size)
+    return stamps * known_size("time", unit)
 
 
 def stated_time_unit(frame: pd.DataFrame, name: str) -> str:
