@@ -31,11 +31,9 @@ def read_scene(
 ) -> Scene:
     """Return the scene of a file, with other settings where they are given."""
     scene = Scene.load(path)
-    return scene.replace(
-        noise=dict(scene.noise) | dict(noise or {}),
-        substeps=scene.substeps if substeps is None else substeps,
-        time_step=scene.time_step if time_step is None else time_step,
-    )
+    given = {"substeps": substeps, "time_step": time_step}
+    others = {name: value for name, value in given.items() if value is not None}
+    return scene.replace(noise=dict(scene.noise) | dict(noise or {}), **others)
 
 
 def read_recording(
