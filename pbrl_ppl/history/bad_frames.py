@@ -173,8 +173,7 @@ def without_bad_frames(history: History, *, most: float = 0.05) -> tuple[History
     """
     off, dataset = _deviations(history), history.dataset
     bad: Bools = np.isfinite(off)
-    count = bad.sum(axis=(0, 1))
-    rows = int(dataset["n_rows"].sum())
+    count, rows = bad.sum(axis=(0, 1)), int(dataset["n_rows"].sum())
     many = (count > 1) & (count > most * rows)
     for body, d in np.argwhere(many):
         warn(
@@ -281,9 +280,8 @@ def _off(
     """
     result, ragged = np.full((*column.shape, gap), np.nan), np.zeros(column.shape, dtype=bool)
     span, end = 2 * width + gap, width + gap
-    if column.shape[1] < span:
-        return result, ragged
-    windows = np.lib.stride_tricks.sliding_window_view(column, span, axis=1)
+    wide = np.pad(column, ((0, 0), (0, span)), constant_values=np.nan)
+    windows = np.lib.stride_tricks.sliding_window_view(wide, span, axis=1)
     trajectory, first = np.nonzero(np.isfinite(windows).all(axis=-1))
     if not len(first):
         return result, ragged
@@ -579,11 +577,10 @@ def _near(scene: Scene, body: int, states: Floats, row: int, slack: float = 0.25
     # a body is a wall without length, with a radius
     others = [(places[:, i], other) for i, other in enumerate(moving) if i != body]
     others += [(np.array(other.pose)[:2], other) for other in scene.bodies if other.static]
-    obstacles = [
-        (np.array(wall.start), np.subtract(wall.end, wall.start), 0.0) for wall in scene.walls
-    ]
-    obstacles += [(place, np.zeros(2), other.shape.bounding_radius) for place, other in others]
-    for start, way, radius in obstacles:
+    obstacles = [(place, place, other.shape.bounding_radius) for place, other in others]
+    obstacles += [(np.array(wall.start), np.array(wall.end), 0.0) for wall in scene.walls]
+    for start, end, radius in obstacles:
+        way = (end - start).reshape(-1, 2)[0]
         along = np.clip((values - start) @ way / max(way @ way, np.finfo(float).tiny), 0.0, 1.0)
         far = np.linalg.norm(values - start - along[:, None] * way, axis=1) - (1 + slack) * radius
         if not (far > reach).all():

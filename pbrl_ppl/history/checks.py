@@ -11,7 +11,7 @@ import numpy as np
 
 from pbrl_ppl.errors import warn
 from pbrl_ppl.history.bad_frames import trimmed, unmodelled_ends
-from pbrl_ppl.history.conversion import Reading
+from pbrl_ppl.history.conversion import TableReading
 from pbrl_ppl.history.history import History
 from pbrl_ppl.history.kinematics import GAUSSIAN, column_noise, hung_bodies
 from pbrl_ppl.history.logs import Paths, in_words
@@ -31,11 +31,9 @@ def read_scene(
 ) -> Scene:
     """Return the scene of a file, with other settings where they are given."""
     scene = Scene.load(path)
-    return scene.replace(
-        noise=dict(scene.noise) | dict(noise or {}),
-        substeps=scene.substeps if substeps is None else substeps,
-        time_step=scene.time_step if time_step is None else time_step,
-    )
+    given = {"substeps": substeps, "time_step": time_step}
+    others = {name: value for name, value in given.items() if value is not None}
+    return scene.replace(noise=dict(scene.noise) | dict(noise or {}), **others)
 
 
 def read_recording(
@@ -45,7 +43,7 @@ def read_recording(
     trim: bool = False,
     estimate_velocities: bool = False,
     most_ends: int = 4,
-    **reading: Unpack[Reading],
+    **reading: Unpack[TableReading],
 ) -> History:
     """Return the history of files as `History.load` does, and warn of what looks wrong.
 

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from pbrl_ppl.errors import HistoryError, LayoutError
-from pbrl_ppl.history.measures import TIME, numbers, stated_unit, unit_in_name, unit_size
+from pbrl_ppl.history.measures import TIME, known_size, numbers, stated_unit, unit_in_name
 from pbrl_ppl.history.resampling import held_means
 from pbrl_ppl.scene import Recording, column_of
 from pbrl_ppl.state import STATE, WRENCH, Bools, Floats, Ints
@@ -81,13 +81,13 @@ def on_one_clock(
                 f'{source}: [recording] time has {name} = "{column}", and the file has no such'
                 f" column, or none of {name}; it has {', '.join(map(str, frame.columns))}"
             )
-    states = [column for key, column in own.items() if key.rpartition(".")[2] in STATE]
-    name = columns.get("time", "time")
-    name = name if name in frame else next(iter(states), name)
+    states = [str(column) for key, column in own.items() if key.rpartition(".")[2] in STATE]
+    name = str(columns.get("time", "time"))
+    name = name if name in frame else [*states, name][0]
     if name in frame:
         if own:  # of a longer column with a clock of its own the rows below are no rows
             frame = frame[frame[name].notna()]
-        time = _seconds(frame, str(name), layout, source)
+        time = _seconds(frame, name, layout, source)
         if not own and (alone := _command_rows(frame, columns)).any():
             frame = _of_two_streams(frame, columns, time, alone, layout, say)
             time = time[~alone]
@@ -118,8 +118,8 @@ def on_one_clock(
 def _seconds(frame: pd.DataFrame, name: str, layout: Recording, source: str) -> Floats:
     """Return a column of stamps in s: in its unit, or of dates."""
     column, units = frame[name], dict(layout.units)
-    numeric = pd.to_numeric(column, errors="coerce")
-    if numeric.isna().all() and column.notna().any():
+    stamps = numbers(column)
+    if np.isnan(stamps).all() and column.notna().any():
         try:
             dates = pd.to_datetime(column, utc=True, format="ISO8601")
         except (ValueError, TypeError):
@@ -130,7 +130,6 @@ def _seconds(frame: pd.DataFrame, name: str, layout: Recording, source: str) -> 
         since = (dates - pd.Timestamp(0, tz="UTC")) / pd.Timedelta(seconds=1)
         return np.array(since, dtype=float)
     unit = units.get("time", stated_time_unit(frame, name))
-    stamps = np.array(numeric, dtype=np.float64)
     if not unit:
         unit = likely_unit(stamps)
         if unit != "s":
@@ -141,13 +140,7 @@ def _seconds(frame: pd.DataFrame, name: str, layout: Recording, source: str) -> 
                 ' or units = { time = "s" }',
                 units={"time": unit},
             )
-    size = unit_size("time", unit)
-    if size is None:
-        raise HistoryError(
-            f'units: "{unit}" is none of time; expected one of {", ".join(TIME)}, or a number to'
-            ' one, "240/s"'
-        )
-    return np.array(stamps * size)
+    return stamps * known_size("time", unit)
 
 
 def stated_time_unit(frame: pd.DataFrame, name: str) -> str:

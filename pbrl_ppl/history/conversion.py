@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TypedDict, Unpack
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 import pandas as pd
@@ -33,7 +33,7 @@ from pbrl_ppl.scene import Recording, Scene, column_of, nearest
 from pbrl_ppl.state import STATE, WRENCH
 
 
-class Reading(TypedDict, total=False):
+class TableReading(TypedDict, total=False):
     """Options of :meth:`History.load` for tables of other programs.
 
     Attributes
@@ -61,7 +61,7 @@ def as_history(
     layout: Recording | None = None,
     *,
     commands: pd.DataFrame | None = None,
-    **reading: Unpack[Reading],
+    **reading: Unpack[TableReading],
 ) -> pd.DataFrame:
     """Return a table with a history's column names, in SI units, one step after the other.
 
@@ -218,9 +218,8 @@ def parts_of(column: object) -> tuple[str, float, float]:
     >>> parts_of("-heading"), parts_of((("column", "knee"), ("zero", 90.0)))
     (('heading', -1.0, 0.0), ('knee', 1.0, 90.0))
     """
-    table: dict[str, str | float] = {"column": str(column), "zero": 0.0}
-    table |= dict(column) if isinstance(column, tuple) else {}
-    name, zero = str(table["column"]), table["zero"]
+    table: dict[str, Any] = dict(column) if isinstance(column, tuple) else {"column": column}
+    name, zero = str(table["column"]), table.get("zero", 0.0)
     sign = -1.0 if name.startswith("-") else 1.0
     return name.removeprefix("-"), sign, 0.0 if isinstance(zero, str) else float(zero)
 
@@ -307,8 +306,8 @@ def _repaired(
     if not {*by_body} <= {*frame} or frame[by_body].isna().any(axis=None):
         return frame  # which is an error, and said where rows are read
     if "duration" in frame:
-        duration = pd.to_numeric(frame.pop("duration"), errors="coerce").fillna(0.0)
-        frame["time"] = duration.groupby([frame[name] for name in by_body]).cumsum()
+        frame["time"] = np.nan_to_num(numbers(frame.pop("duration")))
+        frame["time"] = frame.groupby(by_body)["time"].cumsum()
     elif "time" not in frame:
         frame["time"] = frame.groupby(by_body).cumcount() * scene.time_step
     if layout.velocities == "computed":

@@ -56,11 +56,8 @@ def without_lost_rows(frame: pd.DataFrame, scene: Scene, say: Say) -> pd.DataFra
             f"{int(frozen.sum())} rows repeat the pose before and the next is as far as if the body"
             " had moved on: read as not seen"
         )
-    lost = zero | frozen
-    if not lost.any():
-        return frame
-    states = [name for name in STATE if name in frame]
-    return frame.assign(**{name: frame[name].mask(lost) for name in states})
+    lost, states = zero | frozen, [name for name in STATE if name in frame]
+    return frame.assign(**{name: frame[name].mask(lost) for name in states if lost.any()})
 
 
 def zero_poses(poses: Floats, far: float = 5.0) -> Bools:
@@ -130,7 +127,8 @@ def cut(frame: pd.DataFrame, cuts: Mapping[str, float], source: str) -> pd.DataF
         raise HistoryError(
             f"{source}: nothing is left between its cuts; make [recording] cut less strict"
         )
-    return pd.concat(parts)
+    joined: pd.DataFrame = pd.concat(parts)
+    return joined
 
 
 def _pieces(rows: pd.DataFrame, cuts: Mapping[str, float], least: int = 3) -> Ints:
@@ -194,11 +192,9 @@ def _at_rest(times: Floats, states: Floats, seconds: float, still: float = 8.0) 
     for column in states.T:
         tolerance = max(still * column_noise([column], 2, robust=True), finest_step(column))
         windows = pd.Series(column).rolling(n)
-        constant = (windows.max() - windows.min() <= tolerance).to_numpy()
-        rest = np.zeros(len(times), dtype=bool)
-        for end in np.flatnonzero(constant):
-            rest[end - n + 1 : end + 1] = True
-        rests &= rest
+        constant = (windows.max() - windows.min() <= tolerance).astype(float)[::-1]
+        # of each row, whether one of the windows that it is in is constant
+        rests &= constant.rolling(n, min_periods=1).max().to_numpy()[::-1] > 0
     return rests
 
 
@@ -309,7 +305,8 @@ def propose(
 def slowest(times: Floats, poses: Floats) -> float:
     """Return the longest period of a coordinate (s): twice the time between means crossed."""
     crossed = [int((np.diff(np.sign(off)) != 0).sum()) for off in _moving(poses)]
-    return 2.0 * float(np.ptp(times)) / max(min(crossed), 1) if crossed else 0.0
+    seconds = float(np.ptp(times))  # of a trajectory that ends before others it is unknown
+    return 2.0 * seconds / max(min(crossed), 1) if crossed and np.isfinite(seconds) else 0.0
 
 
 def _moving(poses: Floats) -> list[Floats]:

@@ -13,7 +13,7 @@ import pandas as pd
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history.clocks import TIMES, Say
 from pbrl_ppl.history.files import COLUMNS
-from pbrl_ppl.history.measures import stated_unit, unit_in_name, unit_size
+from pbrl_ppl.history.measures import numbers, stated_unit, unit_in_name, unit_size
 from pbrl_ppl.scene import Actuator, Recording, Shape, column_of
 from pbrl_ppl.state import STATE, WRENCH, Floats
 
@@ -60,11 +60,11 @@ def with_derived(frame: pd.DataFrame, say: Say) -> pd.DataFrame:
     """
     added = {}
     for name, parts in derived_columns(frame).items():
-        numbers = _numbers(frame, parts)
+        values = np.stack([numbers(frame[part]) for part in parts], axis=1)
         if len(parts) == 2:
-            added[name] = numbers @ [1.0, 1e-9]
+            added[name] = values @ [1.0, 1e-9]
             continue
-        yaw, order = planar_yaw(numbers)
+        yaw, order = planar_yaw(values)
         if order:
             say(f"{', '.join(parts)} are not x, y, z, w: yaw is of their order {order}")
         if np.isfinite(yaw).any():
@@ -93,10 +93,6 @@ def _groups(frame: pd.DataFrame, names: tuple[str, ...] | list[str]) -> list[tup
     prefixes = [match[1] for match in found if match]
     groups = [(prefix, [lower.get(prefix + name, "") for name in names]) for prefix in prefixes]
     return [(prefix, parts) for prefix, parts in groups if all(parts)]
-
-
-def _numbers(frame: pd.DataFrame, columns: list[str]) -> Floats:
-    return np.asarray(frame[columns].apply(pd.to_numeric, errors="coerce"), dtype=float)
 
 
 def planar_yaw(quaternions: Floats, flat: float = 0.2) -> tuple[Floats, str]:
@@ -172,10 +168,9 @@ def with_guesses(
     plain = {str(name): _plain(str(name)) for table in tables for name in table.columns}
     known = dict(layout.columns)
     found: dict[str, str] = {}
+    there = {*known, *plain} | ({"time"} if "duration" in known else set())
     for key, guesses in _GUESSES.items():
-        if key in known or key in plain or (key == "time" and "duration" in known):
-            continue
-        if hit := _named(plain, guesses):
+        if key not in there and (hit := _named(plain, guesses)):
             found[key] = hit
     found |= _found_by_unit(frame, plain, {*found, *known, *plain})
     columns = {**found, **known}
@@ -231,12 +226,12 @@ def check_states(frame: pd.DataFrame, layout: Recording, source: str) -> None:
     """
     if {*STATE} & {*frame.columns, *(key.rpartition(".")[2] for key, _ in layout.columns)}:
         return
-    numbers = frame.apply(pd.to_numeric, errors="coerce")
-    ends = numbers.agg(["min", "max"]).T.itertuples()
+    table = frame.apply(pd.to_numeric, errors="coerce")
+    ends = table.agg(["min", "max"]).T.itertuples()
     spread = {n: "text" if np.isnan(low) else f"{low:.6g}..{high:.6g}" for n, low, high in ends}
-    listed = [f"{name} {spread[name]} {stated_unit(frame, str(name))}".strip() for name in numbers]
+    listed = [f"{name} {spread[name]} {stated_unit(frame, str(name))}".strip() for name in table]
     guess = {key: str(column) for key, column in layout.columns}
-    rising = [str(name) for name, column in numbers.items() if (column.diff() > 0).mean() > 0.9]
+    rising = [str(name) for name, column in table.items() if (column.diff() > 0).mean() > 0.9]
     if rising and not {"time", "duration"} & {*guess, *frame.columns}:
         guess["time"] = rising[0]
     used = {*guess.values(), *rising[:1]}
@@ -296,15 +291,14 @@ def guessed_actuators(
     found = []
     for column in unused_columns(frame, layout):
         text, kind = column.lower(), _actuator_kind(column)
-        if kind is None or (kind == "servo" and not hung):
+        is_number = pd.api.types.is_numeric_dtype(frame[column])
+        if kind is None or (kind == "servo" and not hung) or not is_number:
             continue
         side = float("left" in text) - float("right" in text)
         *_, low, high = shape.bounds
         place = (0.0, round(side * 0.4 * (high - low), 6))
         name = re.sub(r"\W+", "_", column).strip("_") or "command"
         kind = "thruster" if kind == "motor" and not hung else kind
-        if not pd.api.types.is_numeric_dtype(frame[column]):
-            continue
         most = float(f"{frame[column].abs().max():.3g}")
         found.append(
             Actuator(

@@ -24,7 +24,7 @@ from pbrl_ppl.scene import Recording, Scene
 from pbrl_ppl.state import STATE, STATE_UNITS, WRENCH, WRENCH_UNITS, Bools, Floats, Ints
 
 if TYPE_CHECKING:
-    from pbrl_ppl.history.conversion import Reading
+    from pbrl_ppl.history.conversion import TableReading
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +112,7 @@ class History:
         scene: Scene,
         *,
         estimate_velocities: bool = False,
-        **reading: Unpack[Reading],
+        **reading: Unpack[TableReading],
     ) -> History:
         """Read a history from a file, by suffix, or from several.
 
@@ -129,8 +129,8 @@ class History:
             Whether single transitions (Eq. 11) may start from velocities that were never measured,
             as estimated from positions by a local polynomial. Whole trajectories need no estimate.
         **reading
-            For tables of others, as of `Reading`: ``columns={"x": "pos_x", "force_x": 0.0}`` (their
-            names, or numbers), ``units={"x": "mm"}``, ``resample=True`` for uneven samples.
+            For tables of others, as of `TableReading`: ``columns={"x": "pos_x", "force_x": 0.0}``
+            (their names, or numbers), ``units={"x": "mm"}``, ``resample=True`` for uneven samples.
 
         Raises
         ------
@@ -157,8 +157,7 @@ class History:
         estimate_velocities: bool = False,
         layout: Recording | None = None,
         commands: pd.DataFrame | None = None,
-        source: str = "history",
-        **reading: Unpack[Reading],
+        **reading: Unpack[TableReading],
     ) -> History:
         """Build a history from a table; arguments, errors and row numbers as `load` of a file.
 
@@ -166,8 +165,8 @@ class History:
         ``commands`` is the table of commands with times of their own.
         """
         if not isinstance(frame, pd.DataFrame):
-            raise HistoryError(f"{source}: got {type(frame).__name__}, expected a pandas.DataFrame")
-        rows = _rows(frame, scene, layout, commands, source, **reading)
+            raise HistoryError(f"history: got {type(frame).__name__}, expected a pandas.DataFrame")
+        rows = _rows(frame, scene, layout, commands, "history", **reading)
         estimated = layout is not None and layout.velocities == "estimate"
         return cls._of_rows([rows], scene, estimate_velocities=estimate_velocities or estimated)
 
@@ -298,7 +297,7 @@ class History:
         HistoryError
             If the horizon is not a whole number from 1 up, or no piece is left.
         """
-        if horizon < 1 or horizon != int(horizon):
+        if isinstance(horizon, bool) or horizon < 1 or horizon != int(horizon):
             raise HistoryError(f"horizon is {horizon!r}, expected a whole number from 1 up")
         intervals = self.dataset["n_rows"].to_numpy() - 1
         trajectory, step = _cut(self.complete, intervals, int(horizon))
@@ -364,7 +363,8 @@ class History:
         within = np.arange(states.shape[1]) < intervals[:, None]
         observed = self.dataset["observed"].copy(data=states)
         between = History(self.dataset.assign(observed=observed))
-        return between._segments(states, *np.nonzero(within), 1)
+        trajectory, step = np.nonzero(within)
+        return between._segments(states, trajectory, step, 1)
 
     def _inputs(self) -> Floats:
         """Return all that acts in each interval, shape (trajectory, interval, body, input)."""
@@ -470,7 +470,7 @@ def _rows(
     layout: Recording | None,
     commands: pd.DataFrame | None,
     source: str,
-    **reading: Unpack[Reading],
+    **reading: Unpack[TableReading],
 ) -> Rows:
     """Return a table's rows as its layout says, resampled where that is declared."""
     from pbrl_ppl.history.conversion import as_history
@@ -511,10 +511,8 @@ def longest_gap(history: History) -> int:
     block that is seen before and after a push, say.
     """
     complete = np.asarray(~unseen(history).any(axis=-1))
-    rows = history.dataset["n_rows"].to_numpy()
-    gaps = np.concatenate(
-        [np.diff(np.flatnonzero(seen[:n])) for seen, n in zip(complete, rows, strict=True)]
-    )
+    both = zip(complete, history.dataset["n_rows"].to_numpy(), strict=True)
+    gaps = np.concatenate([np.diff(np.flatnonzero(seen[:n])) for seen, n in both])
     return int(gaps.max()) if len(gaps) and np.median(gaps) > 1 else 1
 
 

@@ -233,15 +233,13 @@ def joint_coordinates(scene: Scene) -> dict[str, int]:
     reached = {WORLD, *(body.name for body in scene.bodies if body.static)}
     columns: dict[str, int] = {}
     for parent, child, _, _, joint in joint_order(scene):
+        slides = joint.traits.slides
         if parent not in reached or child not in moving or child in reached:
             continue
-        if not joint.traits.slides:
-            columns[child] = THETA
-        elif columns.get(parent) != THETA:
-            angle = scene.direction(joint)
-            columns[child] = int(abs(np.sin(angle)) > abs(np.cos(angle)))
-        else:
+        if slides and columns.get(parent) == THETA:
             continue
+        angle = scene.direction(joint) if slides else 0.0
+        columns[child] = int(abs(np.sin(angle)) > abs(np.cos(angle))) if slides else THETA
         reached.add(child)
     return columns
 
@@ -298,11 +296,8 @@ def _derivative(values: Floats, dt: float, *, angle: bool) -> Floats:
     """Return the rate of a series where it is finite; NaN elsewhere."""
     rate = np.full(values.shape, np.nan)
     finite = np.flatnonzero(np.isfinite(values))
-    if len(finite) < 2:
-        rate[finite] = 0.0
-        return rate
     level = np.unwrap(values[finite]) if angle else values[finite]
-    rate[finite] = np.gradient(level, dt * finite)
+    rate[finite] = np.gradient(level, dt * finite) if len(finite) > 1 else 0.0
     for run in np.split(np.arange(len(finite)), np.flatnonzero(np.diff(finite) > 1) + 1):
         if len(run) > 2:
             # An even window would give the rate between samples.

@@ -49,12 +49,9 @@ def logs_in(paths: Paths, layout: Recording | None = None) -> list[Path]:
 def _logs_of(folder: Path, layout: Recording | None) -> list[Path]:
     """Return the files and bags in a folder that can be read."""
     endings = [suffix for suffix in readers() if suffix != FOLDER]
-    logs = [
-        path
-        for path in folder.iterdir()
-        if (path.suffix.lower() in endings and path.is_file() and path.name[0] not in ".~")
-        or _is_bag(path)
-    ]
+    seen = [path for path in folder.iterdir() if path.name[0] not in ".~"]
+    logs = [path for path in seen if path.suffix.lower() in endings and path.is_file()]
+    logs += filter(_is_bag, folder.iterdir())
     if layout is not None and layout.commands:
         beside = {_commands_of(path, layout) for path in logs}
         logs = [path for path in logs if path not in beside]

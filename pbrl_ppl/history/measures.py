@@ -106,12 +106,27 @@ def stated_units(frame: pd.DataFrame, columns: Mapping[str, object]) -> dict[str
         if unit in _UNITS[name]:
             units[key] = unit
         elif row.get(whole) and unit not in ("-", "1"):
-            raise HistoryError(_no_unit(key, name, text) + "; the file's row of units says so")
+            raise HistoryError(_no_unit(key, text) + "; the file's row of units says so")
     return units
 
 
-def _no_unit(key: str, name: str, unit: str) -> str:
-    known = [known for known in _UNITS[name] if not {"*", ".", "\u00b7"} & {*known}]
+def known_size(key: str, unit: str) -> float:
+    """Return a unit of a history's column in SI units, as of :func:`unit_size`.
+
+    Raises
+    ------
+    HistoryError
+        If the column has no such unit.
+    """
+    size = unit_size(key.rpartition(".")[2], unit)
+    if size is None:
+        raise HistoryError(_no_unit(key, unit))
+    return size
+
+
+def _no_unit(key: str, unit: str) -> str:
+    units = _UNITS[key.rpartition(".")[2]]
+    known = [known for known in units if not {"*", ".", "\u00b7"} & {*known}]
     return (
         f'units: "{unit}" is none of {key}; expected one of'
         f' {", ".join(known[:12])}, or a number of counts to one, "8192/{known[-1]}":'
@@ -170,9 +185,7 @@ def in_si(frame: pd.DataFrame, units: Mapping[str, str]) -> pd.DataFrame:
         body, _, name = key.rpartition(".")
         if name not in _UNITS:
             raise HistoryError(f'units: "{key}" has none{nearest(name, _UNITS)}')
-        size = unit_size(name, text)
-        if size is None:
-            raise HistoryError(_no_unit(key, name, text))
+        size = known_size(key, text)
         if name not in frame:
             raise HistoryError(f'units: "{name}" is in {text}, and the table has no such column')
         values = pd.to_numeric(frame[name], errors="coerce")
@@ -233,9 +246,8 @@ def _overflows(run: Floats, every: Floats, *, full: float = 0.75) -> int:
         return 0
     for bits in (8, 16, 32):
         size = 2.0**bits
-        fits = any(low <= every.min() and every.max() < low + size for low in (-size / 2, 0.0))
-        if fits:
-            return bits if (np.abs(np.diff(run)) > full * size).any() else 0
+        if any(low <= every.min() and every.max() < low + size for low in (-size / 2, 0.0)):
+            return bits * bool((np.abs(np.diff(run)) > full * size).any())
     return 0
 
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from itertools import pairwise
-from math import comb
 
 import numpy as np
 import xarray as xr
@@ -13,6 +12,7 @@ from scipy.interpolate import CubicSpline
 
 from pbrl_ppl.history.cuts import slowest
 from pbrl_ppl.history.history import History, hashed
+from pbrl_ppl.history.kinematics import column_noise
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats
 
@@ -113,8 +113,7 @@ def thinned(
     if still or not alone or any(body.kinematic for body in scene.moving):
         return scene, histories, ()
     observed, step = train.dataset["observed"].to_numpy(), 1
-    # twice the noise of the rows that are passed by, or a thousandth of the motion
-    limit = np.maximum(2.0 * _noise(observed), 1e-3 * _over_rows(np.nanstd, observed))
+    limit = _limits(observed)
     while step < train.n_transitions // most and (_passed_by(observed, step + 1) <= limit).all():
         step += 1
     if step < 2:
@@ -131,18 +130,18 @@ def thinned(
     )
 
 
-def _noise(observed: Floats, *, order: int = 6) -> Floats:
-    """Return the noise of single rows by their differences, (body, state)."""
-    rough = np.diff(observed, order, axis=1) ** 2 / comb(2 * order, order)
-    return np.sqrt(_over_rows(np.nanmean, rough))
+def _limits(observed: Floats, *, noisy: float = 2.0, smooth: float = 1e-3) -> Floats:
+    """Return by how much rows may be passed by, (body, state): by a few times their noise, or so.
 
-
-def _over_rows(statistic: Callable[..., Floats], values: Floats) -> Floats:
-    """Return a statistic over all rows of each column, 0 where none is seen, (body, state)."""
-    seen = np.isfinite(values).any(axis=(0, 1))
-    result = np.zeros(values.shape[2:])
-    result[seen] = statistic(values[:, :, seen], axis=(0, 1))
-    return result
+    ``noisy``: times the noise; ``smooth``: share of the motion, which may be more.
+    """
+    limits = np.zeros(observed.shape[2:])
+    for place in np.ndindex(limits.shape):
+        column = observed[(slice(None), slice(None), *place)]
+        seen = column[np.isfinite(column)]
+        motion = float(seen.std()) if len(seen) else 0.0
+        limits[place] = max(noisy * column_noise(column, 6), smooth * motion)
+    return limits
 
 
 def _passed_by(observed: Floats, step: int) -> Floats:

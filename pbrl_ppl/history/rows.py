@@ -231,9 +231,7 @@ def _trajectories(column: pd.Series, at: list[str]) -> tuple[Labels, Ints]:
                 " characters; rename it"
             )
     whole = [re.fullmatch(r"(-?(?:0|[1-9]\d{0,17}))(?:\.0*)?", label) for label in text]
-    labels: Labels = [*text]
-    if all(whole):
-        labels = [int(match[1]) for match in whole if match]
+    labels: Labels = [int(match[1]) for match in whole if match] if all(whole) else [*text]
     codes, unique = pd.factorize(np.array(labels, dtype=object))
     return unique.tolist(), codes.astype(np.int64)
 
@@ -244,10 +242,9 @@ def _bodies(column: pd.Series, at: list[str], scene: Scene) -> Ints:
     names = [str(name).strip() for name in column.astype(object).where(column.notna(), "")]
     for row, name in enumerate(names):
         if name not in known:
+            cure = f"the scene has {', '.join(known)}{nearest(name, known)}"
             if name in [body.name for body in scene.bodies]:
                 cure = "it is static there; drop its rows or set static = false"
-            else:
-                cure = f"the scene has {', '.join(known)}{nearest(name, known)}"
             raise HistoryError(f'{at[row]}: body "{name}" does not move in the scene; {cure}')
     for name in known:
         if name not in names:
@@ -378,8 +375,7 @@ def _check_complete(rows: Rows, scene: Scene, position: Ints, n_rows: Ints) -> N
             f"{rows.trajectory_of(row)} has 1 step; expected at least 2, a state and the one after"
             " it; drop the trajectory",
         )
-    offset = np.cumsum(n_rows) - n_rows
-    moment = offset[rows.trajectory] + position
+    moment = (np.cumsum(n_rows) - n_rows)[rows.trajectory] + position
     cell = moment * len(names) + rows.body
     for gap in np.setdiff1d(np.arange(n_rows.sum() * len(names)), cell):
         row = int((moment == gap // len(names)).argmax())

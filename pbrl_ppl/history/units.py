@@ -219,12 +219,11 @@ def rate_factor(
         Negative where the position changes against its rate.
     """
     position, rate = states[..., d], states[..., d + VELOCITY]
-    best, least = None, spread
+    best, least, middle = None, spread, (rate[:, 1:] + rate[:, :-1]) / 2
     for span in (1, 4, 16):
         n = (position.shape[1] - 1) // span
         change = np.diff(position[:, : n * span + 1 : span], axis=1).ravel()
-        mean = ((rate[:, 1:] + rate[:, :-1]) / 2)[:, : n * span].reshape(len(rate), n, span)
-        integral = dt * span * mean.mean(axis=2).ravel()
+        integral = dt * middle[:, : n * span].reshape(len(rate), n, span).sum(axis=2).ravel()
         size = np.abs(np.where(np.isfinite(change), integral, np.nan))
         seen = np.isfinite(size).sum() >= few
         # where noise counts least

@@ -1,7 +1,7 @@
 """Velocity columns that were computed from positions of the log, lag or contradict them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import comb
 
 import numpy as np
@@ -86,7 +86,7 @@ class UnusedVelocity:
     @property
     def sentence(self) -> str:
         """Sentence: the column, how it was computed, what is wrong or by how much it lags."""
-        name, late = f"{self.state} of {self.body}", f"{abs(self.lag):.3g} s"
+        name, size = f"{self.state} of {self.body}", abs(self.lag)
         if self.fault:
             cure = 'velocities = "computed"'
             if self.fault.factor:
@@ -98,12 +98,11 @@ class UnusedVelocity:
             )
         if self.zero:
             return f"{name} is 0 in all rows while {self.position} moves, and is not used"
-        if 1e-3 <= abs(self.lag) < 1.0:
-            late = f"{1e3 * abs(self.lag):.3g} ms"
+        late = f"{1e3 * size:.3g} ms" if 1e-3 <= size < 1.0 else f"{size:.3g} s"
+        verb, word = ("lags", "late") if self.lag > 0 else ("leads", "early")
         if not self.computed:
-            verb = "lags" if self.lag > 0 else "leads"
             return f"{name} {verb} {self.position} by {late} and is not used"
-        lag = f", {late} {'late' if self.lag > 0 else 'early'}," if self.lag else ""
+        lag = f", {late} {word}," if self.lag else ""
         return f"{name} was computed from {self.position}{lag} and is not used"
 
     def unit(self, present: float = 1.0) -> str:
@@ -147,19 +146,20 @@ def unused_velocities(history: History) -> tuple[UnusedVelocity, ...]:
     for body in np.flatnonzero(~history.dataset["kinematic"].to_numpy()):
         for d in range(3):
             runs = _runs(history, int(body), d)
-            names = (history.bodies[body], STATE[d + VELOCITY], STATE[d])
+            one = UnusedVelocity(history.bodies[body], STATE[d + VELOCITY], STATE[d], False, 0.0)
             pair = (observed[:, :, body, d], observed[:, :, body, d + VELOCITY])
             fault = contradiction(*pair, dt, angle=d == THETA)
-            if _is_zero(runs):
-                unused.append(UnusedVelocity(*names, False, 0.0, zero=True))
+            if fault and not np.nan_to_num(pair[1]).any():
+                unused.append(replace(one, zero=True))
             elif fault and fault.impossible:
-                unused.append(UnusedVelocity(*names, False, 0.0, fault=fault))
+                unused.append(replace(one, fault=fault))
             elif (late := computed_lag(runs, dt)) is not None:
-                unused.append(UnusedVelocity(*names, True, late if abs(late) > 0.05 * dt else 0.0))
+                late = late if abs(late) > 0.05 * dt else 0.0
+                unused.append(replace(one, computed=True, lag=late))
             elif lag := velocity_lag(runs, dt):
-                unused.append(UnusedVelocity(*names, False, lag))
-            elif fault and (body, d) not in differ:
-                unused.append(UnusedVelocity(*names, False, 0.0, fault=fault))
+                unused.append(replace(one, lag=lag))
+            elif fault and (int(body), d) not in differ:
+                unused.append(replace(one, fault=fault))
     return tuple(unused)
 
 
@@ -208,15 +208,13 @@ def velocity_lag(runs: Runs, dt: float, *, material: float = 0.05) -> float:
     >>> velocity_lag([(np.sin(5 * t), 5 * np.cos(5 * t))], 0.02)
     0.0
     """
-    lag, differs = _shifted(runs, dt, 0, material)
+    (lag, differs), shift = _shifted(runs, dt, 0, material), 0
     if not differs:
         return 0.0
-    shift = 0
     for _ in range(20):  # it is linear in the lag only near it
-        if not np.isfinite(lag) or abs(lag - shift) <= 0.5:
-            break
-        shift = int(np.clip(round(lag), shift - 1, shift + 1))
-        lag = _shifted(runs, dt, shift, material)[0]
+        if np.isfinite(lag) and abs(lag - shift) > 0.5:
+            shift = int(np.clip(round(lag), shift - 1, shift + 1))
+            lag = _shifted(runs, dt, shift, material)[0]
     return float(lag) * dt if np.isfinite(lag) else 0.0
 
 
@@ -248,9 +246,8 @@ def _shifted(
     lag = float(z @ y) / slope
     rest = y - np.copysign(material, lag) * x
     residual = rest - float(z @ rest) / square * z
-    spread = max(  # the second in collisions
-        float(residual @ residual) / dof * square, float((z * residual) @ (z * residual))
-    )
+    # the second in collisions
+    spread = max(float(residual @ residual) / dof * square, float(((z * residual) ** 2).sum()))
     bound = float(t_distribution.isf(alarm / 2, dof)) * np.sqrt(2 * spread)
     # rounding alone leaves a millionth of a row, without any noise
     differs = abs(lag) > material and abs(float(z @ rest)) > max(bound, 1e-6 * slope)
@@ -294,25 +291,11 @@ def _runs(history: History, body: int, d: int, shortest: int = 5) -> Runs:
         both = trajectory[:n, [d, d + VELOCITY]]
         seen = np.flatnonzero(np.isfinite(both).all(axis=1))
         for rows in np.split(seen, np.flatnonzero(np.diff(seen) > 1) + 1):
-            if len(rows) < shortest:
-                continue
-            position, rate = np.asarray(both[rows].T, dtype=np.float64)
+            position, rate = both[rows].T
             if d == THETA:
-                position = unwrapped(dt * np.arange(float(len(rows))), position, rate)
-            runs.append((position, rate))
+                position = unwrapped(dt * rows.astype(float), position, rate)
+            runs += [(position, rate)] if len(rows) >= shortest else []
     return runs
-
-
-def _is_zero(runs: Runs, *, moves: float = 8.0) -> bool:
-    """Return whether velocities are 0 in all rows and a position moves.
-
-    ``moves``: by more than so many of its noises and finest steps.
-    """
-    if not runs or any(rate.any() for _, rate in runs):
-        return False
-    places = [position for position, _ in runs]
-    noise = max(column_noise(places, 2, robust=True), finest_step(np.concatenate(places)))
-    return max(float(np.ptp(place)) for place in places) > moves * noise
 
 
 def position_noise(runs: Runs, dt: float) -> tuple[float, float]:

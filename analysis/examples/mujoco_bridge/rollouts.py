@@ -113,9 +113,8 @@ def from_mujoco(
             f"qpos has {positions.shape[:2]} trajectories and rows, qvel {velocities.shape[:2]};"
             " expected the same"
         )
-    n, rows = positions.shape[:2]
+    (n, rows), axes = positions.shape[:2], PLANES[plane]
     every = _rows_in_a_step(model, scene, time_step)
-    axes = PLANES[plane]
     reach = {body.name: body.shape.bounding_radius for body in scene.moving}
     joints = {name: _joints(model, name, axes, size) for name, size in reach.items()}
     k = len(joints)
@@ -276,17 +275,15 @@ def _add_parents_angles(
 ) -> None:
     """Add to angles and rates in a chain of hinges those of the bodies above, in place."""
     order = list(joints)
-    for name in sorted(order, key=lambda each: int(model.body(each).id)):  # parents come first
-        for joint in joints[name]:
-            if joint.parent is None:
-                continue
-            if joint.parent not in joints:
-                raise HistoryError(
-                    f'body "{name}" hangs on body "{joint.parent}" of the MuJoCo model, which does'
-                    " not move in the scene; add that body to the scene"
-                )
-            body, above = state[:, :, order.index(name)], state[:, :, order.index(joint.parent)]
-            body[..., [2, 5]] += above[..., [2, 5]]
+    hanging = [(name, one.parent) for name, every in joints.items() for one in every if one.parent]
+    for name, parent in sorted(hanging, key=lambda pair: int(model.body(pair[0]).id)):
+        if parent not in joints:
+            raise HistoryError(
+                f'body "{name}" hangs on body "{parent}" of the MuJoCo model, which does not move'
+                " in the scene; add that body to the scene"
+            )
+        # parents come first
+        state[:, :, order.index(name), 2::3] += state[:, :, order.index(parent), 2::3]
 
 
 def _motor_wrenches(model: mujoco.MjModel, joints: dict[str, list[_Joint]], ctrl: Floats) -> Floats:
