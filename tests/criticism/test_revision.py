@@ -65,7 +65,7 @@ def clean(make_history):
 
 @pytest.fixture(scope="module")
 def adequate(clean):
-    return loop(clean, method="metropolis", draws=DRAWS)
+    return loop(clean, method="importance", draws=DRAWS)
 
 
 @pytest.mark.slow
@@ -228,7 +228,7 @@ def test_wrong_units_are_told_before_the_fit(clean) -> None:
 
 @pytest.mark.slow
 def test_too_few_draws_give_no_verdict(clean) -> None:
-    found = loop(clean, method="metropolis", draws=5, catalogue=DRAGS)
+    found = loop(clean, method="importance", draws=5, catalogue=DRAGS)
     assert found.verdict == "not-converged"
     assert found.unexplained is None  # the tests are of the mode, and passed
 
@@ -392,7 +392,7 @@ class _Mode:
     problem: Any
 
 
-@pytest.mark.parametrize(("method", "said"), [("laplace", 0), ("metropolis", 1)])
+@pytest.mark.parametrize(("method", "said"), [("laplace", 0), ("smc", 1)])
 def test_only_chains_are_said_not_to_converge(method, said, monkeypatch) -> None:
     """Independent draws have an R-hat too, and nothing to converge."""
 
