@@ -44,7 +44,7 @@ from pbrl_ppl.posterior import (
     stored_mode,
 )
 from pbrl_ppl.progress import Progress
-from pbrl_ppl.sampling.methods import METHODS, OVER_LIBRARY, SamplerRun, posterior_dataset
+from pbrl_ppl.sampling.methods import METHODS, SamplerRun, posterior_dataset
 from pbrl_ppl.sampling.mixture import mix, most_frequent, most_probable, summed
 from pbrl_ppl.state import STATE, Floats
 from pbrl_ppl.threads import Say, one_blas_thread, silent
@@ -199,8 +199,10 @@ def sample(
     _check(problem, method, start, resume)
     library = problem.library
     # with one set there is no choice to walk over
-    walks = library is not None and method in OVER_LIBRARY and len(library.names) > 1
-    chosen = OVER_LIBRARY[method] if walks else METHODS[method]
+    walks = library is not None and method == "metropolis" and len(library.names) > 1
+    chosen = METHODS[method]
+    if walks:  # Table 2's schedule for the apartment: one chain of 5,000 iterations
+        chosen = replace(chosen, draws=400, chains=1)
     if method != "map":
         asked: dict[str, Any] = {key: n for key, n in schedule.items() if n is not None}
         chosen = replace(chosen, **asked)
@@ -316,36 +318,34 @@ def _check(problem: Problem, method: str, start: object, resume: Idata | None) -
         raise FitError("fit: the method 'paper' is now called 'metropolis'")
     if method not in METHODS:
         raise FitError(f"fit: method is {method!r}, expected one of {', '.join(METHODS)}")
-    if start is not None and resume is not None:
+    given = [name for name, one in (("start", start), ("resume", resume)) if one is not None]
+    if len(given) > 1:
         raise FitError("fit: start and resume are given, but chains begin at one: leave one out")
     if start is not None and not isinstance(start, Mode):
         raise FitError(
             f"fit: start is a {type(start).__name__}, expected a Mode; pass a posterior to go on"
             " with as resume"
         )
-    names: list[str] = (
-        [] if start is None else [other.likelihood.name for other in (start.problem, problem)]
-    )
-    if "simulation" in names and names[0] != names[1]:
+    kind, of_start = problem.likelihood.name, (start.problem if start else problem).likelihood.name
+    if kind != of_start and "simulation" in (kind, of_start):
         raise FitError(
-            f"fit: start is a mode of the likelihood {names[0]}, the model's is {names[1]}; leave"
+            f"fit: start is a mode of the likelihood {of_start}, the model's is {kind}; leave"
             " out start"
         )
-    argument = "start" if start is not None else "resume" if resume is not None else None
-    if problem.library is not None and (method not in (DEFAULT, "metropolis") or argument):
+    if problem.library is not None and (method not in (DEFAULT, "metropolis") or given):
         raise FitError(
             "fit: a model with a library is summed over exactly, or walked over by the method"
             " 'metropolis'; leave out method or use that, and leave out start and resume"
         )
-    if argument and problem.layout.discrete.any():
+    if given and problem.layout.discrete.any():
         raise FitError(
-            f"fit: {argument} was given and which bodies a joint joins is unknown; a fit cannot"
-            f" go on from one choice of bodies to all of them; leave {argument} out and raise draws"
+            f"fit: {given[0]} was given and which bodies a joint joins is unknown; a fit cannot"
+            f" go on from one choice of bodies to all of them; leave {given[0]} out and raise draws"
         )
 
 
 def joined_at(
-    problem: Problem, phi: Floats, sigma: Floats, most: int = 50, *, same: float = 0.01
+    problem: Problem, phi: Floats, sigma: Floats, *, most: int = 50, same: float = 0.01
 ) -> Problem:
     """Return the problem with bodies that meet at these draws in one part; itself if none do.
 

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Method:
+class SamplingMethod:
     """A sampler and its default schedule.
 
     Parameters
@@ -70,7 +70,7 @@ class SamplerRun:
     ----------
     problem : Problem
         What is sampled.
-    method : Method
+    method : SamplingMethod
         The sampler, with the schedule that was asked for.
     mode : Mode, optional
         Where draws begin, unless they go on from a posterior or walk over a library.
@@ -83,7 +83,7 @@ class SamplerRun:
     """
 
     problem: Problem
-    method: Method
+    method: SamplingMethod
     mode: Mode | None
     resume: Idata | None
     seed: int
@@ -358,15 +358,10 @@ def labelled(
 #: The samplers by name. The paper's schedule is that of Table 2 for the cart: 30 chains of 20,000
 #: iterations, of which the first 1,000 are burnt in and each tenth of the others is kept. (PyMC 2
 #: counted the burn-in among the iterations.)
-METHODS: Mapping[str, Method] = {
-    "importance": Method(_importance, draws=250),
-    "smc": Method(_smc, draws=300),
-    "metropolis": Method(_metropolis, draws=1900, tune=1000, thin=10, chains=30),
-    "laplace": Method(_laplace, draws=250),
-    "map": Method(_map, draws=1, chains=1),
-}
-
-#: Table 2's schedule for the apartment, whose prior is a library: one chain of 5,000 iterations.
-OVER_LIBRARY: Mapping[str, Method] = {
-    "metropolis": Method(_metropolis, draws=400, tune=1000, thin=10, chains=1),
+METHODS: Mapping[str, SamplingMethod] = {
+    "importance": SamplingMethod(_importance, draws=250),
+    "smc": SamplingMethod(_smc, draws=300),
+    "metropolis": SamplingMethod(_metropolis, draws=1900, tune=1000, thin=10, chains=30),
+    "laplace": SamplingMethod(_laplace, draws=250),
+    "map": SamplingMethod(_map, draws=1, chains=1),
 }
