@@ -73,7 +73,7 @@ class Reference:
     origin : ndarray
         The first mode, shape (d,).
     mixtures : tuple of Mixture
-        Of the coordinates that the data inform: those of the space's parts, then of the noise.
+        Of the space's blocks.
     wider : float
         Variance of a Gaussian that draws are proposed from over that of what it stands for.
     """
@@ -90,8 +90,7 @@ class Reference:
         Gaussians whose means are within each other's width are one.
         """
         mixtures = []
-        blocks = (*(part.places for part in space.parts), *space.noise_blocks)
-        for places in (block for block in blocks if len(block)):
+        for places in space.blocks:
             modes: list[Any] = []
             for mean, covariance in gaussians:
                 one = _gaussian(mean[places], cls.wider * covariance[np.ix_(places, places)])

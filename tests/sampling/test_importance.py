@@ -115,7 +115,7 @@ def grid_moments(problem, mode) -> tuple[np.ndarray, np.ndarray, float]:
     second = np.log(mode.sigma[0]) + steps / np.sqrt(2.0 * cells)
     residual = problem.residual(constrain(prior, first)[:, None])
     q = np.stack(np.meshgrid(first, second, indexing="ij"), axis=-1)
-    density = space.log_priors(q).sum(axis=-1)
+    density = space.log_prior(q)
     for i, row in enumerate(residual):
         phi, sigma = space.split(q[i])
         density[i] += problem.log_density(np.repeat(row[None], 161, axis=0), sigma, phi).sum(-1)

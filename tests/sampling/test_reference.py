@@ -7,7 +7,6 @@ import pytest
 from scipy import stats
 
 from pbrl_ppl.modes import systematic
-from pbrl_ppl.modes.space import Independent
 from pbrl_ppl.sampling.importance import Reference
 
 pytestmark = pytest.mark.one_stack
@@ -18,11 +17,10 @@ NARROW, WIDE = (0.0, 0.3), (8.0, 1.2)
 BOUND = float(stats.norm.isf(0.5e-5))
 
 
-def space_of(parts, noise=()) -> SimpleNamespace:
+def space_of(*blocks) -> SimpleNamespace:
     """Return a space with these coordinates of its independent parts and its noise."""
     return SimpleNamespace(
-        parts=[Independent(np.array(own, dtype=int), np.array([i])) for i, own in enumerate(parts)],
-        noise_blocks=[np.array(own) for own in noise],
+        blocks=[np.array(own) for own in blocks],
         prior_draws=lambda q, rng: q,
         log_density=lambda q: stats.norm.logpdf(q).sum(axis=1),
     )
@@ -33,7 +31,7 @@ def test_a_reference_draws_from_its_density() -> None:
 
     Its draws' mean of q / p for a known density q has the expectation 1: false alarm 1e-5.
     """
-    space, rng = space_of([[0, 1]], [[2]]), np.random.default_rng(20)
+    space, rng = space_of([0, 1], [2]), np.random.default_rng(20)
     modes = [(np.full(3, mean), sd**2 * np.eye(3)) for mean, sd in (NARROW, WIDE)]
     reference = Reference.of(space, modes)
     q = reference.draw(5000, rng)
@@ -53,17 +51,17 @@ def test_gaussians_within_each_other_s_width_are_one() -> None:
     """Of each part by itself; and several modes learn nothing, for points may be of any."""
     near, far = np.array([0.1, 0.0]), np.array([0.1, 9.0])
     gaussians = [(mean, np.eye(2)) for mean in (np.zeros(2), near, far)]
-    reference = Reference.of(space_of([[0], [1]]), gaussians)
+    reference = Reference.of(space_of([0], [1]), gaussians)
     assert [len(mixture.modes) for mixture in reference.mixtures] == [1, 2]
     learned = reference.learned(np.random.default_rng(1).normal(5.0, 1.0, (100, 2)))
     assert learned.mixtures[0].modes[0].mean > 4.0
     assert learned.mixtures[1] is reference.mixtures[1]
 
 
-def test_a_part_without_coordinates_and_arguments_stay_as_they_are() -> None:
-    """The data may inform no parameter of a body; and nothing is changed that was passed in."""
+def test_what_is_learned_keeps_a_share_of_the_covariance() -> None:
+    """And nothing is changed that was passed in."""
     q = np.random.default_rng(10).normal([1.0, -2.0], [0.5, 3.0], (2000, 2))
-    reference = Reference.of_draws(space_of([[0], []], [[1]]), q[:3])
+    reference = Reference.of_draws(space_of([0], [1]), q[:3])
     before = [mixture.modes[0].mean.copy() for mixture in reference.mixtures]
     learned = reference.learned(q, retained=0.25)
     for mixture, mean, x in zip(reference.mixtures, before, q.T, strict=True):
@@ -76,7 +74,7 @@ def test_a_part_without_coordinates_and_arguments_stay_as_they_are() -> None:
 
 def test_weights_are_those_of_the_informed_coordinates() -> None:
     """A coordinate in the middle is not informed, and stays where the origin is."""
-    space, rng = space_of([[0]], [[2]]), np.random.default_rng(11)
+    space, rng = space_of([0], [2]), np.random.default_rng(11)
     reference = Reference.of(space, [(np.array([0.5, 7.0, -0.5]), np.eye(3))])
     q = reference.draw(50, rng)
     assert (q[:, 1] == 7.0).all()
