@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import logsumexp
+from scipy.special import logsumexp, ndtr
 from scipy.stats import Covariance, multivariate_normal
 
 from pbrl_ppl.modes import Mode, Space, WeightedPoints, adaptive_importance, systematic
@@ -32,12 +32,18 @@ class Mixture:
     places: Ints
     modes: tuple[Any, ...]
 
-    def draw(self, n: int, rng: np.random.Generator) -> Floats:
-        """Draw n points, shape (n, d)."""
-        which = rng.integers(len(self.modes), size=n)
-        noise = rng.standard_normal((n, len(self.places)))
+    @property
+    def normals(self) -> int:
+        """How many standard normal numbers make a point: one of them chooses among modes."""
+        return len(self.places) + (len(self.modes) > 1)
+
+    def at(self, z: Floats) -> Floats:
+        """Return the points (n, d) that standard normal numbers (n, normals) make."""
+        several = len(self.modes)
+        which = np.minimum((ndtr(z[:, -1]) * several).astype(int), several - 1)
+        noise = z[:, : len(self.places)]
         of_each = [mode.mean + mode.cov_object.colorize(noise) for mode in self.modes]
-        return np.asarray(np.stack(of_each)[which, np.arange(n)])
+        return np.asarray(np.stack(of_each)[which, np.arange(len(z))])
 
     def log_density(self, x: Floats) -> Floats:
         """Return the log-density at points (n, d), shape (n,)."""
@@ -115,31 +121,35 @@ class Reference:
         """Return the product of Gaussians of a posterior's draws (n, d)."""
         return cls.of(space, [(q.mean(axis=0), np.atleast_2d(np.cov(q, rowvar=False)))])
 
+    @property
+    def normals(self) -> int:
+        """How many standard normal numbers make a point."""
+        return sum(mixture.normals for mixture in self.mixtures)
+
+    def at(self, z: Floats) -> Floats:
+        """Return the points (n, d) that standard normal numbers (n, normals) make.
+
+        Uninformed parameters are those of the origin.
+        """
+        q, first = np.tile(self.origin, (len(z), 1)), 0
+        for mixture in self.mixtures:
+            q[:, mixture.places] = mixture.at(z[:, first : first + mixture.normals])
+            first += mixture.normals
+        return q
+
     def draw(self, n: int, rng: np.random.Generator) -> Floats:
         """Draw n points, uninformed parameters from their prior, shape (n, d)."""
-        x = np.concatenate([mixture.draw(n, rng) for mixture in self.mixtures], axis=1)
-        return self.space.prior_draws(self.completed(x), rng)
-
-    def completed(self, x: Floats) -> Floats:
-        """Return the points (n, d) of the mixtures' coordinates (n, c); the others of the origin.
-
-        The coordinates are in the order of the mixtures.
-        """
-        q = np.tile(self.origin, (len(x), 1))
-        q[:, np.concatenate([mixture.places for mixture in self.mixtures])] = x
-        return q
+        z = [rng.standard_normal((n, mixture.normals)) for mixture in self.mixtures]
+        return self.space.prior_draws(self.at(np.concatenate(z, axis=1)), rng)
 
     def log_density(self, q: Floats) -> Floats:
         """Return the log-density at points (n, d), shape (n,)."""
         densities = (mixture.log_density(q[:, mixture.places]) for mixture in self.mixtures)
         return sum(densities, np.zeros(len(q)))
 
-    def log_weight(self, x: Floats) -> Floats:
-        """Return the logarithm of the posterior over this density, as :meth:`completed` has points.
-
-        Shape (n,).
-        """
-        q = self.completed(x)
+    def log_weight(self, z: Floats) -> Floats:
+        """Return the logarithm of the posterior over this density at :meth:`at`, shape (n,)."""
+        q = self.at(z)
         return self.space.log_density(q) - self.log_density(q)
 
     def learned(self, q: Floats, retained: float = 0.0) -> Reference:

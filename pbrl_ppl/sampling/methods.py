@@ -6,7 +6,6 @@ import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from itertools import count
-from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
@@ -33,12 +32,9 @@ from pbrl_ppl.posterior import (
     groups,
     parameter_draws,
 )
-from pbrl_ppl.sampling.importance import Mixture, Reference, draw_proposals, resample
+from pbrl_ppl.sampling.importance import Reference, draw_proposals, resample
 from pbrl_ppl.state import Floats, Ints
 from pbrl_ppl.threads import Say, Work
-
-if TYPE_CHECKING:
-    from pytensor.tensor.variable import TensorVariable
 
 
 @dataclass(frozen=True)
@@ -182,9 +178,10 @@ def _importance(job: SamplerRun, *, proposals: float = 1.4) -> Idata:
 def _smc(job: SamplerRun, learned: Reference | None = None) -> Idata:
     """Run PyMC's sequential Monte Carlo from Gaussians to the posterior, once a chain.
 
-    Its prior are the Gaussians ``learned``, or those about the modes or of the posterior to go on
-    from, and its likelihood is the posterior over them: so no particle begins where the posterior
-    is not, and they are corrected as a prior's draws are.
+    The prior is the standard normal one of numbers that make draws of the Gaussians, ``learned`` or
+    those about the modes or of the posterior to go on from; the likelihood is the posterior over
+    the Gaussians' density. So no particle begins where the posterior is not, all modes have the
+    same width, and what the Gaussians have wrong is corrected, as a prior is.
     """
     import pymc as pm  # takes seconds to load
 
@@ -193,17 +190,18 @@ def _smc(job: SamplerRun, learned: Reference | None = None) -> Idata:
     reference, rng = learned or job.reference(), np.random.default_rng(job.stream())
     one_thread = reference.space.problem.with_physics(threads=1)  # particles come one by one
     reference = replace(reference, space=reference.space.on(one_thread))
-    job.progress(f"sequential Monte Carlo of {job.chains} times {job.method.draws} particles")
+    told = f"moving {job.chains} times {job.method.draws} particles from Gaussians to the posterior"
+    job.progress(Work(told, 0, 1))
     with pm.Model():
-        blocks = [_block(f"block{i}", each) for i, each in enumerate(reference.mixtures)]
-        pm.Potential("weight", DensityOp(reference.log_weight)(pm.math.concatenate(blocks)))
+        z = pm.Normal("z", shape=reference.normals)
+        pm.Potential("weight", DensityOp(reference.log_weight)(z))
         particles = pm.sample_smc(
             draws=job.method.draws, chains=job.chains, cores=min(job.cores, job.chains),
             random_seed=rng, progressbar=False, compute_convergence_checks=False,
             return_inferencedata=False,
         )  # fmt: skip
-    x = np.concatenate([particles.get_values(block.name) for block in blocks], axis=1)
-    q = reference.space.prior_draws(reference.completed(x), rng)
+    job.progress(Work(told, 1, 1))
+    q = reference.space.prior_draws(reference.at(particles.get_values("z")), rng)
     report = particles.report  # a number a stage, in a list for each of several chains
     accept, log_z = (
         np.array([stages[-1] for stages in (of if job.chains > 1 else [of])])
@@ -213,17 +211,6 @@ def _smc(job: SamplerRun, learned: Reference | None = None) -> Idata:
     trace = job.trace(phi, sigma, accept=np.repeat(accept, job.method.draws))
     trace.attrs["log_evidence"] = float(logsumexp(log_z) - np.log(job.chains))
     return trace
-
-
-def _block(name: str, mixture: Mixture) -> TensorVariable:
-    """Declare a mixture of Gaussians in the PyMC model of the context."""
-    import pymc as pm
-
-    if len(mixture.modes) == 1:
-        return pm.MvNormal(name, mixture.modes[0].mean, mixture.modes[0].cov)
-    weights = np.full(len(mixture.modes), 1.0 / len(mixture.modes))
-    modes = [pm.MvNormal.dist(mode.mean, mode.cov) for mode in mixture.modes]
-    return pm.Mixture(name, weights, modes)
 
 
 def _metropolis(job: SamplerRun) -> Idata:
