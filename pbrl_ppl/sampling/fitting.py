@@ -428,15 +428,10 @@ def _appended(earlier: Idata, trace: Idata) -> Idata:
             old, new = old[shared], new[shared]
         both = xr.concat([old, new], dim="draw")
         data[name] = both.assign_coords(draw=np.arange(both.sizes["draw"]))
-    attributes = {}
-    if SIZE in earlier.attrs or SIZE in trace.attrs:
-        runs = (earlier, trace)
-        attributes[PARETO_K] = max(run.attrs.get(PARETO_K, -np.inf) for run in runs)
-        attributes[SIZE] = sum(map(_size, runs))
-    return from_groups(data, attributes)
-
-
-def _size(idata: Idata) -> float:
-    """Return the effective sample size of a posterior's or a trace's draws."""
-    size = idata.attrs.get(SIZE)
-    return min(convergence(idata)[1].values()) if size is None else float(size)
+    runs = (earlier, trace)
+    if not any(SIZE in run.attrs for run in runs):
+        return from_groups(data, {})
+    least = (min(convergence(run)[1].values()) for run in runs)
+    size = sum(run.attrs.get(SIZE, ess) for run, ess in zip(runs, least, strict=True))
+    k = max(run.attrs.get(PARETO_K, -np.inf) for run in runs)
+    return from_groups(data, {PARETO_K: k, SIZE: float(size)})

@@ -74,13 +74,9 @@ def mix(
     counts = allocate(np.where(fitted, probability, 0.0), chains * draws)
     label = rng.permutation(np.repeat(np.arange(len(weighed)), counts)).reshape(chains, draws)
     values = _values(problem, weighed, traces, label, rng)
-    rest = groups(next(iter(traces.values())))
-    data = {
-        "posterior": posterior_dataset(problem, values),
-        "sample_stats": _stats(traces, label),
-        "observed_data": rest["observed_data"],
-        "constant_data": rest["constant_data"],
-    }
+    data = groups(next(iter(traces.values()))) | {
+        "posterior": posterior_dataset(problem, values), "sample_stats": _stats(traces, label)
+    }  # fmt: skip
     return from_groups(data, {"configurations": stored(weighed)})
 
 

@@ -160,10 +160,9 @@ def _check_posterior(idata: Idata, history: History) -> PosteriorRecord:
     for name in ("log_likelihood", "posterior_predictive", "observed_data", "constant_data"):
         group(idata, name)
     record = PosteriorRecord.of(idata)
-    known = [record.data_sha256]
-    for entry in record.updates or ():
-        known += [entry["data_sha256"], entry["before_sha256"]]
-    if history.data_sha256 in known:
+    names = ("data_sha256", "before_sha256")
+    known = {entry[name] for entry in record.updates or () for name in names}
+    if history.data_sha256 in known | {record.data_sha256}:
         raise PosteriorError(
             "update: these data are in the posterior already, and would count twice; pass only"
             " what was recorded since"
