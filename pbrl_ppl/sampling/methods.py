@@ -175,13 +175,15 @@ def _importance(job: SamplerRun, *, proposals: float = 1.4) -> Idata:
     return trace
 
 
-def _smc(job: SamplerRun, learned: Reference | None = None) -> Idata:
+def _smc(job: SamplerRun, learned: Reference | None = None, *, least: int = 100) -> Idata:
     """Run PyMC's sequential Monte Carlo from Gaussians to the posterior, once a chain.
 
     The prior is the standard normal one of numbers that make draws of the Gaussians, ``learned`` or
     those about the modes or of the posterior to go on from; the likelihood is the posterior over
     the Gaussians' density. So no particle begins where the posterior is not, all modes have the
     same width, and what the Gaussians have wrong is corrected, as a prior is.
+
+    ``least``: particles whose covariance can be told; of more than there are draws some are kept.
     """
     import pymc as pm  # takes seconds to load
 
@@ -190,23 +192,25 @@ def _smc(job: SamplerRun, learned: Reference | None = None) -> Idata:
     reference, rng = learned or job.reference(), np.random.default_rng(job.stream())
     one_thread = reference.space.problem.with_physics(threads=1)  # particles come one by one
     reference = replace(reference, space=reference.space.on(one_thread))
-    told = f"moving {job.chains} times {job.method.draws} particles from Gaussians to the posterior"
+    n = max(job.method.draws, least)
+    told = f"moving {job.chains} times {n} particles from Gaussians to the posterior"
     job.progress(Work(told, 0, 1))
     with pm.Model():
-        z = pm.Normal("z", shape=reference.normals)
-        pm.Potential("weight", DensityOp(reference.log_weight)(z))
+        normal = pm.Normal("z", shape=reference.normals)
+        pm.Potential("weight", DensityOp(reference.log_weight)(normal))
         particles = pm.sample_smc(
-            draws=job.method.draws, chains=job.chains, cores=min(job.cores, job.chains),
-            random_seed=rng, progressbar=False, compute_convergence_checks=False,
-            return_inferencedata=False,
+            draws=n, chains=job.chains, cores=min(job.cores, job.chains), random_seed=rng,
+            progressbar=False, compute_convergence_checks=False, return_inferencedata=False,
         )  # fmt: skip
     job.progress(Work(told, 1, 1))
-    q = reference.space.prior_draws(reference.at(particles.get_values("z")), rng)
+    kept = np.arange(job.method.draws) * n // job.method.draws
+    z = particles.get_values("z").reshape(job.chains, n, -1)[:, kept]
     report = particles.report  # a number a stage, in a list for each of several chains
     accept, log_z = (
         np.array([stages[-1] for stages in (of if job.chains > 1 else [of])])
         for of in (report.accept_rate, report.log_marginal_likelihood)
     )
+    q = reference.space.prior_draws(reference.at(np.concatenate(z)), rng)
     phi, sigma = reference.space.split(q)
     trace = job.trace(phi, sigma, accept=np.repeat(accept, job.method.draws))
     trace.attrs["log_evidence"] = float(logsumexp(log_z) - np.log(job.chains))

@@ -433,7 +433,7 @@ def test_a_parameter_that_the_data_say_nothing_about_is_named(model) -> None:
     [
         # 1.4 proposals a draw, of which half are to be effective
         ("importance", "weighing proposals until 70 are effective", 70),
-        ("smc", "moving 2 times 50 particles from Gaussians to the posterior", 1),
+        ("smc", "moving 2 times 100 particles from Gaussians to the posterior", 1),
         ("metropolis", "sampling chains", 2 * (20 + 50 * 4)),
     ],
 )
