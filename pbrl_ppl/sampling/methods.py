@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -193,6 +194,7 @@ def _smc(job: SamplerRun, learned: Reference | None = None, *, least: int = 100)
     one_thread = reference.space.problem.with_physics(threads=1)  # particles come one by one
     reference = replace(reference, space=reference.space.on(one_thread))
     n = max(job.method.draws, least)
+    logging.getLogger("pymc.smc").setLevel(logging.WARNING)  # it says how many jobs it has
     told = f"moving {job.chains} times {n} particles from Gaussians to the posterior"
     job.progress(Work(told, 0, 1))
     with pm.Model():
