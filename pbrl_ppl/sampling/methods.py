@@ -312,16 +312,8 @@ def as_trace(
     stats : mapping of str to ndarray
         The sampler's statistics of each draw, shape (chain, draw).
     """
-    posterior = posterior_dataset(problem, draws)
+    posterior, data = posterior_dataset(problem, draws), data_of(problem)
     per_draw = {name: (("chain", "draw"), value) for name, value in stats.items()}
-    data = labelled(
-        problem,
-        {
-            "start": (START_DIMS, problem.segments.start),
-            "actions": (ACTION_DIMS, problem.inputs),
-            "next_state": (NEXT_STATE_DIMS, problem.observations.values),
-        },
-    )
     of_trace = {
         "posterior": posterior,
         "sample_stats": xr.Dataset(per_draw, {d: posterior[d] for d in ("chain", "draw")}),
@@ -329,6 +321,16 @@ def as_trace(
         "constant_data": data[["start", "actions"]],
     }
     return from_groups(of_trace, {})
+
+
+def data_of(problem: Problem) -> xr.Dataset:
+    """Return initial states, actions and measured states, with their coordinates."""
+    data: dict[str, tuple[tuple[str, ...], Floats]] = {
+        "start": (START_DIMS, problem.segments.start),
+        "actions": (ACTION_DIMS, problem.inputs),
+        "next_state": (NEXT_STATE_DIMS, problem.measured),
+    }
+    return labelled(problem, data)
 
 
 def posterior_dataset(problem: Problem, values: Mapping[str, Floats | Ints]) -> xr.Dataset:
