@@ -178,6 +178,7 @@ def sample(
     start: Mode | None = None,
     resume: Idata | None = None,
     progress: bool | Say = False,
+    rescue: bool = True,
     **schedule: int | None,
 ) -> Fit:
     """Sample the posterior of a problem; see :func:`pbrl_ppl.fit`, which takes its pm.Model.
@@ -188,6 +189,9 @@ def sample(
         What is fitted. Of whole trajectories it is linearised at the mode.
     method, seed, cores, start, resume, progress
         As of :func:`pbrl_ppl.fit`.
+    rescue : bool
+        Whether ``smc`` runs where importance weights do not suffice: in minutes, if friction has
+        kinks and transitions are few.
     **schedule : int, optional
         ``draws``, ``tune``, ``chains`` and ``thin``, as of :func:`pbrl_ppl.fit`.
 
@@ -195,6 +199,11 @@ def sample(
     -------
     Fit
         The problem that was sampled, and the posterior.
+
+    Raises
+    ------
+    WeightsError
+        If importance weights do not suffice, without ``rescue``.
     """
     _check(problem, method, start, resume)
     library = problem.library
@@ -211,6 +220,7 @@ def sample(
         job = SamplerRun(
             problem=_as_in(problem, resume), method=chosen, mode=None, resume=resume, seed=seed,
             cores=os.cpu_count() or 1 if cores is None else cores, progress=say,
+            rescue=rescue,
         )  # fmt: skip
         while True:
             job, trace, point = _drawn(job, start, walks)

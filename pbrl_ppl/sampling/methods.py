@@ -38,6 +38,10 @@ from pbrl_ppl.state import Floats, Ints
 from pbrl_ppl.threads import Say, Work
 
 
+class WeightsError(FitError):
+    """Importance weights do not suffice, and no other sampler was to run."""
+
+
 @dataclass(frozen=True)
 class SamplingMethod:
     """A sampler and its default schedule.
@@ -77,6 +81,8 @@ class SamplerRun:
         As of :func:`pbrl_ppl.fit`, with defaults filled in.
     progress : callable
         Called with counted work.
+    rescue : bool
+        Whether `smc` runs where importance weights do not suffice.
     """
 
     problem: Problem
@@ -86,6 +92,7 @@ class SamplerRun:
     seed: int
     cores: int
     progress: Say
+    rescue: bool = True
 
     @property
     def chains(self) -> int:
@@ -151,6 +158,8 @@ class SamplerRun:
 def _importance(job: SamplerRun, *, proposals: float = 1.4) -> Idata:
     """Weight proposals from Gaussians; see `importance`. Where weights do not suffice, `_smc`.
 
+    Or an error, if the job is not to be rescued.
+
     ``proposals``: weighted proposals a draw.
     """
     seed, n = job.stream(), job.chains * job.method.draws
@@ -163,8 +172,10 @@ def _importance(job: SamplerRun, *, proposals: float = 1.4) -> Idata:
             " from another mode, or use the method 'laplace'"
         )
     if not points.good:
-        trace = _smc(job, learned)
         why = f"{points.ess:.0f} of {len(points.q)} effective, Pareto k {k:.2g}"
+        if not job.rescue:
+            raise WeightsError(f"fit: importance weights do not suffice ({why})")
+        trace = _smc(job, learned)
         trace.attrs["proposals"] = f"none: smc, for weights do not suffice ({why})"
         return trace
     phi, sigma = reference.space.split(points.q[chosen])
