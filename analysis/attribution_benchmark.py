@@ -154,7 +154,7 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--draws", type=int, help="posterior draws a chain; the loop's by default")
     parser.add_argument(
         "--method", choices=METHODS,
-        help="of all cases; by default metropolis of each tenth, and laplace (no chains, intervals"
+        help="of all cases; by default importance of each tenth, and laplace (no chains, intervals"
         " from the modes' Gaussians) of the others",
     )  # fmt: skip
     parser.add_argument(

@@ -51,7 +51,7 @@ _CATALOGUED = {
     "slope": "constant_force",
     "thrust_bias": "body_force",
 }
-_METHODS = ("laplace", "importance", "metropolis")
+_METHODS = ("laplace", "importance", "smc")
 #: Seconds on the clock for each of the processor: a process that sleeps has to end, too.
 _PATIENCE = 10
 

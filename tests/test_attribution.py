@@ -109,7 +109,7 @@ def test_scores_by_hand(attribution, row) -> None:
         row("outside", "adequate"),  # missed
         row("outside", "effects-added", "quadratic_drag", seen=False),
         row("outside", "effects-added", "quadratic_drag", excess=0.005),  # equivalent
-        row("clean", "adequate", method="metropolis"),
+        row("clean", "adequate", method="importance"),
         row("clean", "adequate"),
         row("clean", "effects-added", "linear_drag", after=2.5),  # worse
         row("clean", "unexplained", remains=True),
@@ -137,7 +137,7 @@ def test_scores_by_hand(attribution, row) -> None:
         "small": 1,
         "failed": 1,
         "not_converged": 2,
-        "method_metropolis": 1,
+        "method_importance": 1,
         "method_laplace": 26,
         "seconds": 270.0,
     }
@@ -225,7 +225,7 @@ def test_cases_are_as_announced(attribution) -> None:
     assert kinds.count("clean") >= 60
     assert 190 <= len(cases) <= 205
     methods = [case.method for case in cases if not case.draws]
-    assert 0.08 < methods.count("metropolis") / len(methods) < 0.12
+    assert 0.08 < methods.count("importance") / len(methods) < 0.12
     tenth = attribution.cases.a_tenth(cases)
     assert 0.09 < len(tenth) / len(cases) < 0.12
     assert {case.kind for case in tenth} == set(attribution.cases.KINDS)
@@ -448,7 +448,7 @@ def test_what_is_kept_is_not_made_again(attribution, row, monkeypatch, tmp_path)
         assert made == [cases[0].name, cases[1].name, cases[1].name]
         assert benchmark.kept(cases[1], settings(tmp_path)).error == "why"
         list(benchmark.results(cases[:1], executor, settings(tmp_path, seed=1)))
-        chains = [replace(cases[0], method="metropolis")]
+        chains = [replace(cases[0], method="importance")]
         list(benchmark.results(chains, executor, settings(tmp_path)))
     assert len(made) == 5
 

@@ -49,8 +49,8 @@ _STRENGTHS = (0.15, 1.0)
 #: Draws a chain with which no chains converge.
 _TOO_FEW = 5
 #: The samplers: each tenth case has the loop's own, which takes longer.
-METROPOLIS, LAPLACE = "metropolis", "laplace"
-METHODS = (METROPOLIS, LAPLACE)
+IMPORTANCE, LAPLACE = "importance", "laplace"
+METHODS = (IMPORTANCE, LAPLACE)
 _TENTH = 10
 
 
@@ -185,14 +185,14 @@ def all_cases(seed: int = 0, method: str | None = None) -> list[Case]:
     # without the cutoff, what is called a dead zone is the cutoff
     names -= set() if "force_cutoff" in names else {"dead_zone"}
     return [
-        replace(case, method=METROPOLIS if case.draws else method or _usual(number))
+        replace(case, method=IMPORTANCE if case.draws else method or _usual(number))
         for number, case in enumerate(cases)
         if case.kind not in (CATALOGUED, LEFT_OUT) or case.effect in names
     ]
 
 
 def _usual(number: int) -> str:
-    return METROPOLIS if number % _TENTH == _TENTH // 2 else LAPLACE
+    return IMPORTANCE if number % _TENTH == _TENTH // 2 else LAPLACE
 
 
 def _rng(seed: int, name: str) -> Rng:

@@ -75,7 +75,7 @@ def score(rows: Sequence[Row]) -> dict[str, float | int | None]:
         ``baseline_naming``: the best of the usual ways' shares of names among those of one body,
         each beside it; an indistinguishable effect is right. ``nonsense_adequate``: number of
         nonsense cases called adequate. ``detected``, ``cases``, ``failed``, ``not_converged``,
-        ``method_laplace``, ``method_metropolis``: numbers. ``seconds``: sum.
+        ``method_laplace``, ``method_importance``: numbers. ``seconds``: sum.
     """
     detected = [row for row in rows if row.kind in (CATALOGUED, LEFT_OUT, OUTSIDE) and row.detected]
     hidden = [row for row in detected if outcome(row) not in (NEGLIGIBLE, EQUIVALENT, SMALL)]

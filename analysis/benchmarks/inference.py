@@ -323,7 +323,7 @@ def measure_ratio() -> Iterator[Row]:
 #: Wall-clock seconds that each method is given, the mode apart: the effort is the same for all.
 EFFORT = 60.0
 #: Draws a chain of a first run, and twice as many of a second: their difference is a draw's cost.
-PILOT = {"metropolis": 400, "paper": 20}
+PILOT = {"smc": 100, "metropolis": 20}
 _CHAINS, _MOST_DRAWS = 4, 200_000
 
 

@@ -5,8 +5,8 @@
 
 The cart recordings in FOLDER under Eq. 11, and the first trajectories of some as whole ones; most
 with the effect of their truth. Stored are means and standard deviations of all parameters and their
-Monte Carlo standard errors, no measured rows. ``--check`` compares what is stored with long
-Metropolis chains and with short default fits, and stores nothing. Some minutes.
+Monte Carlo standard errors, no measured rows. ``--check`` compares what is stored with
+sequential Monte Carlo and with short default fits, and stores nothing. Some minutes.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ MODEL_SEED = 0
 FALSE_ALARM = 2 * float(norm.sf(4.0))
 #: The long runs.
 LONG: dict[str, Any] = {"method": "importance", "draws": 2500, "chains": 4, "seed": 1}
-CHAINS: dict[str, Any] = {"method": "metropolis", "draws": 800, "chains": 4, "seed": 2}
+PARTICLES: dict[str, Any] = {"method": "smc", "draws": 1000, "chains": 4, "seed": 2}
 #: Seeds of the short fits that check whether effective sample sizes are true.
 SEEDS = range(11, 15)
 
@@ -180,13 +180,13 @@ def write(stored: dict[str, dict[str, Any]]) -> None:
 
 
 def check(folder: Path, cases: list[str], kinds: list[str]) -> None:
-    """Compare what is stored with Metropolis chains, and with short fits of several seeds."""
+    """Compare what is stored with particles, and with short fits of several seeds."""
     stored = load_reference()
     for case in cases:
         for kind in kinds:
             reference = stored[f"{case} {kind}"]["moments"]
             model, mode = declared(folder, case, kind)
-            found, how = fitted(model, start=mode, **CHAINS)
+            found, how = fitted(model, start=mode, **PARTICLES)
             print(f"{case} {kind}\n  {how}: {worst(differences(found, reference))}", flush=True)
             every = []
             for seed in SEEDS:

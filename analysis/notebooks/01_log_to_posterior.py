@@ -25,7 +25,7 @@ CART = ROOT / "models" / "shopping_cart"
 
 # %% tags=["parameters"]
 TRAJECTORIES = 12  # of the recording, at most 12
-METHOD, DRAWS, TUNE = "metropolis", 500, 500  # sampler; draws and tuning draws of each chain
+METHOD, DRAWS = "importance", 500  # sampler; draws of each chain
 OUT = ROOT / "out" / "notebooks"
 
 # %%
@@ -108,8 +108,7 @@ figure
 warnings.simplefilter("ignore", UninformedWarning)
 warnings.simplefilter("ignore", ConvergenceWarning)  # short runs; R-hat and ESS are looked at below
 idata = pp.fit(
-    model, method=METHOD, draws=DRAWS, tune=TUNE if METHOD != "laplace" else None, seed=1,
-    progress=False,
+    model, method=METHOD, draws=DRAWS, seed=1, progress=False,
 )  # fmt: skip
 print(idata.attrs["warnings"])
 

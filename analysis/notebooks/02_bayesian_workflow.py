@@ -33,7 +33,7 @@ COLOURS = {"declared": "#D55E00", "with drag": "#0072B2"}
 
 # %% tags=["parameters"]
 TRAJECTORIES = 12  # of the recording, at most 12
-METHOD, DRAWS, TUNE = "metropolis", 500, 500  # sampler; draws and tuning draws of each chain
+METHOD, DRAWS = "importance", 500  # sampler; draws of each chain
 OUT = ROOT / "out" / "notebooks"
 
 # %%
@@ -74,8 +74,7 @@ figure
 # %%
 posteriors = {
     name: pp.fit(
-        model, method=METHOD, draws=DRAWS, tune=TUNE if METHOD != "laplace" else None, seed=1,
-        progress=False,
+        model, method=METHOD, draws=DRAWS, seed=1, progress=False,
     )
     for name, model in models.items()
 }  # fmt: skip

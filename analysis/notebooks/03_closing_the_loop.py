@@ -26,7 +26,7 @@ CART = ROOT / "models" / "shopping_cart"
 
 # %% tags=["parameters"]
 TRAJECTORIES = 12  # of the cart's recording, at most 12
-METHOD = "metropolis"  # of the cart's posteriors before and after
+METHOD = "importance"  # of the cart's posteriors before and after
 PENDULUM = ROOT.parent / "shared" / "data" / "real" / "pendulum-swing"  # a measured pendulum
 BLOCK = ROOT.parent / "shared" / "contact" / "planar-push"  # a measured block that is pushed
 PUSHES = 8  # of the block's recording, at most 30: 3 minutes, all of them 15

@@ -24,7 +24,7 @@ ROOT = next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "pyproject.toml
 
 # %% tags=["parameters"]
 TRAJECTORIES, INTERVALS = 12, 20  # of the simulated recording
-METHOD = "metropolis"  # of the posteriors; "laplace" is quick
+METHOD = "importance"  # of the posteriors; "laplace" is quick
 OUT = ROOT / "out" / "notebooks"
 
 # %%

@@ -23,7 +23,7 @@ CART = ROOT / "models" / "shopping_cart"
 
 # %% tags=["parameters"]
 TRAJECTORIES = 12  # of the recording, at most 12
-METHOD, DRAWS, TUNE = "metropolis", 500, 500  # sampler; draws and tuning draws of each chain
+METHOD, DRAWS = "importance", 500  # sampler; draws of each chain
 PLANNED = 8  # posterior draws that one plan must do for
 OUT = ROOT / "out" / "notebooks"
 
@@ -43,8 +43,8 @@ scene = pp.Scene.load(CART / "scene.toml")
 history = pp.History.load(CART / "recorded" / "train.csv", scene).select(range(TRAJECTORIES))
 drag = next(effect for effect in pp.catalogue if effect.name == "angular_drag")
 fitted = pp.fit(
-    pp.physics_model(scene, history, [drag]), method=METHOD, draws=DRAWS,
-    tune=TUNE if METHOD != "laplace" else None, seed=1, progress=False,
+    pp.physics_model(scene, history, [drag]), method=METHOD, draws=DRAWS, seed=1,
+    progress=False,
 )  # fmt: skip
 pp.save_posterior(fitted, OUT / "05_cart.nc")
 del scene, history, fitted

@@ -22,7 +22,7 @@ ROOT = next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "pyproject.toml
 
 # %% [markdown]
 # The constants below set how long this takes. Posteriors are Gaussians at the modes (`laplace`);
-# `METHOD = "metropolis"` takes minutes per robot.
+# `METHOD = "importance"` takes minutes per robot.
 
 # %% tags=["parameters"]
 ROBOTS, TRAJECTORIES, INTERVALS = 6, 8, 15  # how many, and of each one's recording

@@ -37,6 +37,7 @@ COMMANDS = {
     "laplace": (8, f"{FIT} --method laplace"),
     "importance": (8, f"{FIT} --method importance"),
     "metropolis": (8, f"{FIT} --method metropolis --tune 100 --chains 2"),
+    "smc": (8, f"{FIT} --method smc"),
     "close-loop": (16, "close-loop scene.toml train.csv -o out --test test.csv --method laplace"),
     "many": (
         8,

@@ -382,9 +382,9 @@ class LibraryAgent(PhysicsAgent):
     moving body. Each body has its noise; given the noise, bodies apart are independent. Bodies of
     one class with equal attributes share parameters, and so the choice and the noise. The paper
     samples the choices by Metropolis; here the sum over them is exact and as many draws are taken,
-    or with ``method="paper"`` PyMC samples on the schedule of Table 2, which takes seconds a body.
-    The agent plans with the most frequent choice (MAP); a body without data has a set drawn from
-    the prior.
+    or with ``method="metropolis"`` PyMC samples on the schedule of Table 2, which takes seconds a
+    body. The agent plans with the most frequent choice (MAP); a body without data has a set drawn
+    from the prior.
 
     Parameters
     ----------
@@ -393,7 +393,7 @@ class LibraryAgent(PhysicsAgent):
     library : ParameterLibrary
         The sets, and their probabilities.
     method : str
-        ``exact``: the sum over the sets; ``paper``: Metropolis, see :func:`pbrl_ppl.fit`.
+        ``exact``: the sum over the sets; ``metropolis``: PyMC, see :func:`pbrl_ppl.fit`.
     **options
         Options of :class:`Agent`.
 
@@ -421,8 +421,8 @@ class LibraryAgent(PhysicsAgent):
     def __init__(
         self, task: Task, library: ParameterLibrary, *, method: str = "exact", **options: Any
     ) -> None:
-        if method not in ("exact", "paper"):
-            raise ValueError(f"method is {method!r}, expected 'exact' or 'paper'")
+        if method not in ("exact", "metropolis"):
+            raise ValueError(f"method is {method!r}, expected 'exact' or 'metropolis'")
         super().__init__(task, **options)
         self.method, scene = method, task.scene
         if any(body.effects or body.kinematic for body in scene.bodies):
@@ -496,10 +496,10 @@ class LibraryAgent(PhysicsAgent):
         among = ParameterLibrary(sets, {label: prior[label] for label in sets})
         noise = TransitionLikelihood(scalar=True)
         problem = Problem.of(Physics(scene), history, likelihood=noise, library=among)
-        if self.method == "paper":
+        if self.method == "metropolis":
             with warnings.catch_warnings():  # one chain, as in the paper
                 warnings.simplefilter("ignore", ConvergenceWarning)
-                posterior = sample(problem, method="paper", seed=self.seed).posterior
+                posterior = sample(problem, method="metropolis", seed=self.seed).posterior
             index = group(posterior, "posterior")["library_index"].to_numpy()
         else:
             # as many draws as the paper's schedule gives

@@ -33,7 +33,7 @@ class Method(StrEnum):
     """Samplers of the loop's posteriors."""
 
     IMPORTANCE = "importance"
-    METROPOLIS = "metropolis"
+    SMC = "smc"
     LAPLACE = "laplace"
 
 
@@ -53,7 +53,7 @@ class Sampler:
     draws
         Posterior draws of each chain.
     method
-        importance weights proposals by the engine; metropolis runs chains; laplace takes Gaussians
+        importance weights proposals by the engine; smc moves particles; laplace takes Gaussians
         at the modes, on which the verdict then stands.
     most_transitions
         Of a longer recording pieces are used, drawn by the seed; more take more time.
@@ -305,7 +305,7 @@ def demo(
     output
         Folder for the results.
     method
-        laplace takes seconds; importance and metropolis draw from the posterior itself, in minutes.
+        laplace takes seconds; importance and smc draw from the posterior itself, in minutes.
     overwrite
         Write to a folder that is not empty.
     """

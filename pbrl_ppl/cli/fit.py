@@ -61,7 +61,7 @@ class Sampler:
     Parameters
     ----------
     method
-        importance, metropolis, paper, laplace or map.
+        importance, smc, metropolis, laplace or map.
     draws
         Posterior draws of each chain.
     tune
@@ -119,7 +119,7 @@ def fit(
         )  # fmt: skip
     except ValueError as error:  # an option that the model refuses
         raise errors.FitError(f"fit: {error}") from None
-    if sampler.method not in ("importance", "laplace", "map"):
+    if sampler.method == "metropolis":
         interrupts.keep()  # the draws of chains so far
     progress("looking for the mode, then sampling")
     with terminal.noted_warnings("was interrupted") as caught:

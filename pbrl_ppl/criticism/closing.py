@@ -83,7 +83,7 @@ from pbrl_ppl.posterior import (
     versions,
 )
 from pbrl_ppl.posterior import draws as posterior_draws
-from pbrl_ppl.sampling import sample
+from pbrl_ppl.sampling import WeightsError, sample
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.threads import one_blas_thread
 
@@ -395,10 +395,16 @@ def _fit(task: _Task, mode: Mode) -> tuple[Fit, list[Warning]]:
     for n in _DRAWS.get(method, _CHAIN_DRAWS) if task.draws is None else (task.draws,):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            fitted = sample(
-                mode.problem, method=method, seed=task.seed, draws=n, tune=max(100, 5 * n // 8),
-                start=mode, progress=task.say,
+            draw = partial(
+                sample, mode.problem, seed=task.seed, draws=n, tune=max(100, 5 * n // 8),
+                start=mode, progress=task.say, rescue=False,
             )  # fmt: skip
+            try:
+                fitted = draw(method=method)
+            except WeightsError as error:  # particles may take minutes
+                fitted = draw(method="laplace")
+                instead = "the draws are from the Gaussian at the mode instead"
+                warn(f"{error}; {instead}", ConvergenceWarning)
         if fitted.record.interrupted:  # half a posterior gives no verdict
             raise KeyboardInterrupt
         if _converged(fitted, task.criteria):

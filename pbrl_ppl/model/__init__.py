@@ -2,5 +2,6 @@
 
 from .declaration import build_model as build_model
 from .declaration import problem_in as problem_in
+from .op import DensityOp as DensityOp
 from .op import LogLikelihoodOp as LogLikelihoodOp
 from .op import SimulatorOp as SimulatorOp

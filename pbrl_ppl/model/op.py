@@ -91,6 +91,30 @@ def _in_object_mode(op: Op, node: Apply | None = None, **kwargs: object) -> obje
         return generate_fallback_impl(op, node=node, **kwargs)
 
 
+class DensityOp(_BlackBoxOp):
+    """Log-density of a point (d,), for samplers that need no derivative.
+
+    Parameters
+    ----------
+    function : callable
+        Returns log-densities of points (n, d), shape (n,).
+    """
+
+    __props__ = ("function",)
+    differentiable, reason = (), "no derivative of it is known"
+
+    def __init__(self, function: Callable[[Floats], Floats]) -> None:
+        self.function = function
+
+    def make_node(self, point: Variable) -> Apply:
+        """Return the node of a point, shape (d,)."""
+        return Apply(self, [pt.as_tensor_variable(point)], [pt.dscalar()])
+
+    def evaluate(self, point: Floats) -> Floats:
+        """Return the log-density, a number."""
+        return np.asarray(self.function(point[None])[0])
+
+
 class SimulatorOp(_BlackBoxOp):
     """``next_states = f(phi, start, actions)``, the deterministic part of Eq. 7.
 

@@ -43,7 +43,7 @@ class _Combinations:
             raise FitError(
                 f"fit: {', '.join(bodies)} meet in this history, so that {count} combinations of"
                 f" parameter sets are to be summed over; give some probability 0 for some bodies,"
-                " record the bodies apart, or walk among them with the method 'paper'"
+                " record the bodies apart, or walk among them with the method 'metropolis'"
             )
         self.likelihood = problem.likelihood
         self.observations = Observations(measured, problem.observations.columns)

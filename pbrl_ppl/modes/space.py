@@ -40,20 +40,6 @@ def constrain(prior: Prior, u: Floats) -> Floats:
 
 
 @dataclass(frozen=True, eq=False)
-class Independent:
-    """Parameters and bodies that given the noise are independent of all others.
-
-    Parameters
-    ----------
-    places, bodies : ndarray of int
-        Places of the informed parameters in phi, and of the bodies, shapes (entry,) and (body,).
-    """
-
-    places: Ints
-    bodies: Ints
-
-
-@dataclass(frozen=True, eq=False)
 class Space:
     """Space of a problem: its transformed parameters, then the noise; a point has shape (d,).
 
@@ -128,17 +114,6 @@ class Space:
         """Number of coordinates, d."""
         return self.phi_size + len(self.roots)
 
-    @cached_property
-    def parts(self) -> tuple[Independent, ...]:
-        """Independent parts; one where the likelihood mixes the bodies' residuals."""
-        parts = self.problem.physics.simulator.parts
-        if not is_independent(self.problem):
-            bodies = np.arange(len(self.problem.scene.moving))
-            return (Independent(np.flatnonzero(~self.uninformed), bodies),)
-        return tuple(
-            Independent(part.places[~self.uninformed[part.places]], part.bodies) for part in parts
-        )
-
     @property
     def informed(self) -> Ints:
         """The coordinates that the data inform, shape (informed,)."""
@@ -147,10 +122,17 @@ class Space:
         )
 
     @cached_property
-    def noise_blocks(self) -> tuple[Ints, ...]:
-        """Coordinates of the noise that are moved together; errors of measuring come first."""
-        entries = self.phi_size + np.arange(len(self.roots))
-        blocks = (entries[~self.roots], entries[self.roots])
+    def blocks(self) -> tuple[Ints, ...]:
+        """Informed coordinates of independent parts, given the noise; then those of the noise.
+
+        One part where the likelihood mixes the bodies' residuals.
+        """
+        parts = [np.flatnonzero(~self.uninformed)]
+        if is_independent(self.problem):
+            places = [part.places for part in self.problem.physics.simulator.parts]
+            parts = [place[~self.uninformed[place]] for place in places]
+        noise = self.phi_size + np.arange(len(self.roots))
+        blocks = (*parts, noise[~self.roots], noise[self.roots])
         return tuple(block for block in blocks if len(block))
 
     def at(self, phi: Floats, sigma: Floats) -> Floats:
@@ -186,14 +168,13 @@ class Space:
         priors = self.problem.layout.priors
         return [i for i, prior in enumerate(priors) if prior.family == "von_mises"]
 
-    def log_priors(self, q: Floats) -> Floats:
-        """Return the log-prior of each part, then of the noise, shape (..., part + 1).
+    def log_prior(self, q: Floats) -> Floats:
+        """Return the log-prior at points (..., d) without the uninformed parameters, shape (...).
 
-        Minus infinity outside; without the uninformed parameters.
+        Minus infinity outside.
         """
-        log_prior, noise = self._of_parameters(q), self._of_noise(q)
-        sums = [log_prior[..., part.places].sum(axis=-1) for part in self.parts]
-        total = np.stack([*sums, noise], axis=-1)
+        informed = self._of_parameters(q)[..., ~self.uninformed]
+        total = informed.sum(axis=-1) + self._of_noise(q)
         return np.where(np.isfinite(total), total, -np.inf)
 
     def _of_parameters(self, q: Floats) -> Floats:
@@ -226,22 +207,6 @@ class Space:
             value = self.problem.log_density(residual, sigma, phi)
         return np.where(np.isnan(value), -np.inf, value)
 
-    def log_likelihoods(self, q: Floats, residual: Floats) -> Floats:
-        """Return the log-likelihood of each part at residuals, shape (n, part)."""
-        if len(self.parts) == 1:
-            return np.asarray(self.each(q, residual).sum(axis=-1)[:, None])
-        problem = self.problem
-        phi, sigma = self.split(q)
-        measured, nu = problem.observations.measured, problem.nu(phi)
-        value = np.empty((len(q), len(self.parts)))
-        with np.errstate(all="ignore"):
-            for j, part in enumerate(self.parts):
-                nu_of = nu[..., part.bodies, :] if isinstance(nu, np.ndarray) else nu
-                some, seen = residual[..., part.bodies, :], measured[..., part.bodies, :]
-                log_density = problem.likelihood.log_density(some, sigma, seen, nu_of)
-                value[:, j] = log_density.sum(axis=-1)
-        return np.where(np.isnan(value), -np.inf, value)
-
     def residual(self, q: Floats) -> Floats:
         """Return the engine's residuals, shape (n, transition, H, body, state)."""
         return self.problem.residual(self.possible(q))
@@ -251,21 +216,6 @@ class Space:
         phi = self.split(q)[0]
         there = np.isfinite(phi).all(axis=-1, keepdims=True)
         return inside(self.problem.layout.priors, np.where(there, phi, self.centre))
-
-    def evaluate(self, q: Floats) -> Floats:
-        """Return residuals, which do not depend on the noise, as an array of their own."""
-        return np.array(self.residual(q), dtype=float)
-
-    def columns(self, q: Floats, residual: Floats) -> Floats:
-        """Return the log-posterior of each part and of the noise at residuals, (n, part + 1).
-
-        Up to the evidence; see :meth:`evaluate`.
-        """
-        total = self.log_priors(q)
-        there = np.isfinite(total).all(axis=1, keepdims=True)
-        likelihood = self.log_likelihoods(q, residual)
-        total[:, :-1] = np.where(there, total[:, :-1] + likelihood, -np.inf)
-        return total
 
     def log_densities(self, q: Floats, *, numbers: int = 4_000_000) -> tuple[Floats, Floats]:
         """Return the log-posterior up to the evidence at points (n, d), and the log-likelihoods.
@@ -277,7 +227,7 @@ class Space:
         width = max(1, numbers // max(self.problem.measured.size, 1))
         parts = (q[first : first + width] for first in range(0, len(q), width))
         each = np.concatenate([self.each(some, self.residual(some)) for some in parts])
-        return self.log_priors(q).sum(axis=-1) + each.sum(axis=1), each
+        return self.log_prior(q) + each.sum(axis=1), each
 
     def log_density(self, q: Floats) -> Floats:
         """Return the log-posterior up to the evidence at points (n, d), shape (n,)."""

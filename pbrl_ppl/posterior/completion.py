@@ -379,7 +379,7 @@ def _of_approximations(record: PosteriorRecord) -> Iterator[_Warned]:
     if k is not None and not k <= MAX_PARETO_K:
         text = (
             f"Pareto k of the proposals' weights is {k:.2g} (want <= {MAX_PARETO_K}): they may miss"
-            " a part of the posterior; raise draws, or compare with the method 'metropolis'"
+            " a part of the posterior; raise draws, or compare with the method 'smc'"
         )
         yield ConvergenceWarning, text
     if warning := evidence_warning(record.configurations or ()):

@@ -155,7 +155,7 @@ class PosteriorRecord:
         sample size of the resampled draws, which limits every parameter's ESS.
     proposals : str, optional
         The density that was weighted: Gaussians at the modes; of older posteriors also that of few
-        engine steps. Why chains were run where weights did not suffice.
+        engine steps. Why other draws were taken where weights did not suffice.
     log_evidence : float, optional
         Of the model, about the modes that were found.
     tolerance : float, optional

@@ -5,4 +5,5 @@ from .declaration import try_own_effects as try_own_effects
 from .fitting import DEFAULT as DEFAULT
 from .fitting import fit as fit
 from .fitting import sample as sample
+from .methods import WeightsError as WeightsError
 from .updating import update as update

@@ -27,6 +27,7 @@ from pbrl_ppl.modes import (
 )
 from pbrl_ppl.parameters import inside, prior_slopes
 from pbrl_ppl.posterior import (
+    LIKELIHOOD,
     PARETO_K,
     SIZE,
     Fit,
@@ -43,7 +44,7 @@ from pbrl_ppl.posterior import (
     stored_mode,
 )
 from pbrl_ppl.progress import Progress
-from pbrl_ppl.sampling.methods import METHODS, OVER_LIBRARY, SamplerRun
+from pbrl_ppl.sampling.methods import METHODS, SamplerRun, posterior_dataset
 from pbrl_ppl.sampling.mixture import mix, most_frequent, most_probable, summed
 from pbrl_ppl.state import STATE, Floats
 from pbrl_ppl.threads import Say, one_blas_thread, silent
@@ -81,7 +82,7 @@ def fit(
     least squares finds if the model holds none. Where the scene does
     not say which bodies a joint joins, every choice is fitted by itself, and their draws are mixed
     by their evidences (:func:`pbrl_ppl.joint_probabilities`). A model with a ``library`` needs no
-    chain: all choices are summed over, unless ``method="paper"`` walks among them.
+    chain: all choices are summed over, unless ``method="metropolis"`` walks among them.
 
     The mode is kept in ``attrs["mode"]`` as JSON: ``parameters`` and ``noise`` by label, and
     ``log_posterior``. With a library it is the most probable choice of each body (of bodies that
@@ -94,31 +95,31 @@ def fit(
         As made by ``physics_model``.
     method : str
         ``importance``: proposals from Gaussians about the modes, weighted by the engine in batches
-        of which each teaches the next, and resampled; where the weights do not suffice, the chains
-        of ``metropolis`` from what was learned; ``metropolis``: chains, each of which is many
-        walkers, one after another; ``paper``: one random walk a variable, by default on the
-        schedule of the paper's Table 2 for the cart (30 chains of 20,000 iterations, 1,000 of them
-        burn-in, each tenth kept); with a library, on that for the apartment (``draws=400,
-        tune=1000, thin=10, chains=1``), each body's set proposed uniformly; ``laplace``:
-        independent draws from the Gaussian at the mode, which no chain has checked; ``map``: the
-        mode alone, as one draw. For PyMC's samplers, give the model to ``pm.sample``.
+        of which each teaches the next, and resampled; where the weights do not suffice, ``smc``
+        from what was learned; ``smc``: sequential Monte Carlo by ``pm.sample_smc``, from the
+        Gaussians to the posterior, a run a chain; ``metropolis``: one random walk a variable, by
+        default on the schedule of the paper's Table 2 for the cart (30 chains of 20,000 iterations,
+        1,000 of them burn-in, each tenth kept); with a library, on that for the apartment
+        (``draws=400, tune=1000, thin=10, chains=1``), each body's set proposed uniformly;
+        ``laplace``: independent draws from the Gaussian at the mode, which no chain has checked;
+        ``map``: the mode alone, as one draw. For PyMC's samplers, give the model to ``pm.sample``.
     seed : int
         The same seed gives the same posterior.
     draws, tune : int, optional
-        Draws kept and tuning draws of each chain; each method has its own default. Draws by
-        importance sampling are independent, and divided among chains for ArviZ.
+        Draws kept of each chain, and tuning draws of ``metropolis``; each method has its own
+        default. Draws by importance sampling are independent, and divided among chains for ArviZ.
     chains : int, optional
-        Chains; 4 by default, 30 for ``paper``, 1 for ``paper`` with a library.
+        Chains; 4 by default, 30 for ``metropolis``, 1 for it with a library.
     thin : int, optional
-        Steps a draw; sweeps for ``metropolis``.
+        Steps a draw of ``metropolis``.
     cores : int, optional
         Processes, at most one a chain, or the engine's threads; as many as there are processors by
         default.
     start : Mode, optional
         A mode found before, in place of the search for one.
     resume : InferenceData or DataTree, optional
-        A posterior of the same model. Its chains go on as chains where they ended, and draws by
-        importance sampling get more; the new draws stand after the old. Whole trajectories are
+        A posterior of the same model. ``metropolis`` goes on where its chains ended, and the other
+        methods draw more about it; the new draws stand after the old. Whole trajectories are
         linearised as they are in it.
     progress : bool or callable
         Whether to show a progress bar; or what is called with counted work
@@ -132,9 +133,8 @@ def fit(
         ``attrs`` the scene, effects, method, versions, seed, the hash of the data and the
         convergence. Of importance sampling there are ``pareto_k``, the shape of the weights' tail
         (at most 0.7), ``importance_ess``, the effective sample size of the draws by their weights,
-        which limits that of each parameter, ``proposals`` (what was weighted, or why chains were
-        run) and ``log_evidence``.
-        Interrupted chains keep the draws so far.
+        which limits that of each parameter, ``proposals`` (what was weighted, or why ``smc``
+        was run) and ``log_evidence``. Interrupted chains of ``metropolis`` keep the draws so far.
 
     Raises
     ------
@@ -178,6 +178,7 @@ def sample(
     start: Mode | None = None,
     resume: Idata | None = None,
     progress: bool | Say = False,
+    rescue: bool = True,
     **schedule: int | None,
 ) -> Fit:
     """Sample the posterior of a problem; see :func:`pbrl_ppl.fit`, which takes its pm.Model.
@@ -188,6 +189,9 @@ def sample(
         What is fitted. Of whole trajectories it is linearised at the mode.
     method, seed, cores, start, resume, progress
         As of :func:`pbrl_ppl.fit`.
+    rescue : bool
+        Whether ``smc`` runs where importance weights do not suffice: in minutes, if friction has
+        kinks and transitions are few.
     **schedule : int, optional
         ``draws``, ``tune``, ``chains`` and ``thin``, as of :func:`pbrl_ppl.fit`.
 
@@ -195,12 +199,19 @@ def sample(
     -------
     Fit
         The problem that was sampled, and the posterior.
+
+    Raises
+    ------
+    WeightsError
+        If importance weights do not suffice, without ``rescue``.
     """
     _check(problem, method, start, resume)
     library = problem.library
     # with one set there is no choice to walk over
-    walks = library is not None and method in OVER_LIBRARY and len(library.names) > 1
-    chosen = OVER_LIBRARY[method] if walks else METHODS[method]
+    walks = library is not None and method == "metropolis" and len(library.names) > 1
+    chosen = METHODS[method]
+    if walks:  # Table 2's schedule for the apartment: one chain of 5,000 iterations
+        chosen = replace(chosen, draws=400, chains=1)
     if method != "map":
         asked: dict[str, Any] = {key: n for key, n in schedule.items() if n is not None}
         chosen = replace(chosen, **asked)
@@ -209,6 +220,7 @@ def sample(
         job = SamplerRun(
             problem=_as_in(problem, resume), method=chosen, mode=None, resume=resume, seed=seed,
             cores=os.cpu_count() or 1 if cores is None else cores, progress=say,
+            rescue=rescue,
         )  # fmt: skip
         while True:
             job, trace, point = _drawn(job, start, walks)
@@ -260,11 +272,11 @@ def _drawn(
     if job.resume is not None:
         return job, _run(job), stored_mode(problem, job.resume)
     job = _at_mode(job, start)
-    trace = _run(job)
+    mode, trace = job.at_mode, _run(job)
     gaussian = (METHODS["laplace"].run, METHODS["map"].run)
-    if is_simulated(problem) and method.run not in gaussian:
-        trace = _with_robust_width(job, trace)
-    return job, trace, ParameterPoint(job.at_mode.phi, job.at_mode.sigma)
+    if is_simulated(problem) and problem.layout.priors and method.run not in gaussian:
+        trace = _with_robust_width(mode, trace)
+    return job, trace, ParameterPoint(mode.phi, mode.sigma)
 
 
 def _at_mode(job: SamplerRun, start: Mode | None) -> SamplerRun:
@@ -282,28 +294,24 @@ def _at_mode(job: SamplerRun, start: Mode | None) -> SamplerRun:
         job, start = replace(job, problem=joined), start and carried_mode(mode, joined)
 
 
-def _with_robust_width(job: SamplerRun, trace: Idata) -> Idata:
+def _with_robust_width(mode: Mode, trace: Idata) -> Idata:
     """Return draws about their mean with the mode's robust covariance in place of the Laplace one.
 
     Tempering keeps a correlated residual from counting as many measurements, and not exactly (the
     open-faced sandwich: B. A. Shaby, Journal of Computational and Graphical Statistics 23, 2014).
     """
-    problem, mode = job.problem, job.at_mode
-    priors = problem.layout.priors
-    if not priors:
-        return trace
+    problem, priors = mode.problem, mode.problem.layout.priors
     precision = mode.jacobian.T @ mode.jacobian + np.diag(prior_slopes(priors, mode.phi) ** 2)
     plain = replace(mode, covariance=covariance_of(precision))
-    posterior = group(trace, "posterior")
     phi, sigma = parameter_draws(problem, trace)
-    off = np.linalg.solve(plain.factor, (phi - phi.mean(axis=0)).T)
-    wider = inside(priors, phi.mean(axis=0) + (mode.factor @ off).T)
-    values = problem.named(wider, sigma)
-    held = {
-        name: posterior[name].copy(data=np.reshape(values[name], posterior[name].shape))
-        for name in values.keys() & set(posterior.data_vars)
-    }
-    return from_groups(groups(trace) | {"posterior": posterior.assign(held)}, trace.attrs)
+    centre = phi.mean(axis=0)
+    wider = centre + (phi - centre) @ np.linalg.solve(plain.factor.T, mode.factor.T)
+    sizes = group(trace, "posterior").sizes
+    shape = (sizes["chain"], sizes["draw"], -1)
+    values = problem.named(inside(priors, wider).reshape(shape), sigma.reshape(shape))
+    attributes = {name: value for name, value in trace.attrs.items() if name != LIKELIHOOD}
+    moved = groups(trace) | {"posterior": posterior_dataset(problem, values)}
+    return from_groups(moved, attributes)
 
 
 @one_blas_thread
@@ -316,38 +324,38 @@ def _run(job: SamplerRun) -> Idata:
 
 def _check(problem: Problem, method: str, start: object, resume: Idata | None) -> None:
     """Refuse arguments of `fit` that do not go with a problem."""
+    if method == "paper":
+        raise FitError("fit: the method 'paper' is now called 'metropolis'")
     if method not in METHODS:
         raise FitError(f"fit: method is {method!r}, expected one of {', '.join(METHODS)}")
-    if start is not None and resume is not None:
+    given = [name for name, one in (("start", start), ("resume", resume)) if one is not None]
+    if len(given) > 1:
         raise FitError("fit: start and resume are given, but chains begin at one: leave one out")
     if start is not None and not isinstance(start, Mode):
         raise FitError(
             f"fit: start is a {type(start).__name__}, expected a Mode; pass a posterior to go on"
             " with as resume"
         )
-    names: list[str] = (
-        [] if start is None else [other.likelihood.name for other in (start.problem, problem)]
-    )
-    if "simulation" in names and names[0] != names[1]:
+    kind, of_start = problem.likelihood.name, (start.problem if start else problem).likelihood.name
+    if kind != of_start and "simulation" in (kind, of_start):
         raise FitError(
-            f"fit: start is a mode of the likelihood {names[0]}, the model's is {names[1]}; leave"
+            f"fit: start is a mode of the likelihood {of_start}, the model's is {kind}; leave"
             " out start"
         )
-    argument = "start" if start is not None else "resume" if resume is not None else None
-    if problem.library is not None and (method not in (DEFAULT, "paper") or argument):
+    if problem.library is not None and (method not in (DEFAULT, "metropolis") or given):
         raise FitError(
             "fit: a model with a library is summed over exactly, or walked over by the method"
-            " 'paper'; leave out method or use that, and leave out start and resume"
+            " 'metropolis'; leave out method or use that, and leave out start and resume"
         )
-    if argument and problem.layout.discrete.any():
+    if given and problem.layout.discrete.any():
         raise FitError(
-            f"fit: {argument} was given and which bodies a joint joins is unknown; a fit cannot"
-            f" go on from one choice of bodies to all of them; leave {argument} out and raise draws"
+            f"fit: {given[0]} was given and which bodies a joint joins is unknown; a fit cannot"
+            f" go on from one choice of bodies to all of them; leave {given[0]} out and raise draws"
         )
 
 
 def joined_at(
-    problem: Problem, phi: Floats, sigma: Floats, most: int = 50, *, same: float = 0.01
+    problem: Problem, phi: Floats, sigma: Floats, *, most: int = 50, same: float = 0.01
 ) -> Problem:
     """Return the problem with bodies that meet at these draws in one part; itself if none do.
 
@@ -430,15 +438,10 @@ def _appended(earlier: Idata, trace: Idata) -> Idata:
             old, new = old[shared], new[shared]
         both = xr.concat([old, new], dim="draw")
         data[name] = both.assign_coords(draw=np.arange(both.sizes["draw"]))
-    attributes = {}
-    if SIZE in earlier.attrs or SIZE in trace.attrs:
-        runs = (earlier, trace)
-        attributes[PARETO_K] = max(run.attrs.get(PARETO_K, -np.inf) for run in runs)
-        attributes[SIZE] = sum(map(_size, runs))
-    return from_groups(data, attributes)
-
-
-def _size(idata: Idata) -> float:
-    """Return the effective sample size of a posterior's or a trace's draws."""
-    size = idata.attrs.get(SIZE)
-    return min(convergence(idata)[1].values()) if size is None else float(size)
+    runs = (earlier, trace)
+    if not any(SIZE in run.attrs for run in runs):
+        return from_groups(data, {})
+    least = (min(convergence(run)[1].values()) for run in runs)
+    size = sum(run.attrs.get(SIZE, ess) for run, ess in zip(runs, least, strict=True))
+    k = max(run.attrs.get(PARETO_K, -np.inf) for run in runs)
+    return from_groups(data, {PARETO_K: k, SIZE: float(size)})

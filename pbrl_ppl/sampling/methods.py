@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import logging
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from itertools import count
 
 import numpy as np
 import xarray as xr
+from scipy.special import logsumexp
 
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import (
@@ -19,7 +22,7 @@ from pbrl_ppl.likelihood import (
     variable_dims,
 )
 from pbrl_ppl.modes import Mode, Space, library_of
-from pbrl_ppl.parameters import covariance_factor, nearest
+from pbrl_ppl.parameters import covariance_factor
 from pbrl_ppl.posterior import (
     LIKELIHOOD,
     PARETO_K,
@@ -30,14 +33,17 @@ from pbrl_ppl.posterior import (
     groups,
     parameter_draws,
 )
-from pbrl_ppl.sampling.ensemble import Ensemble, Reference
-from pbrl_ppl.sampling.importance import draw_proposals, resample, stream
+from pbrl_ppl.sampling.importance import Reference, draw_proposals, resample
 from pbrl_ppl.state import Floats, Ints
 from pbrl_ppl.threads import Say, Work
 
 
+class WeightsError(FitError):
+    """Importance weights do not suffice, and no other sampler was to run."""
+
+
 @dataclass(frozen=True)
-class Method:
+class SamplingMethod:
     """A sampler and its default schedule.
 
     Parameters
@@ -52,8 +58,8 @@ class Method:
 
     run: Callable[[SamplerRun], Idata]
     draws: int
-    tune: int
-    thin: int
+    tune: int = 0
+    thin: int = 1
     chains: int = 4
 
 
@@ -65,7 +71,7 @@ class SamplerRun:
     ----------
     problem : Problem
         What is sampled.
-    method : Method
+    method : SamplingMethod
         The sampler, with the schedule that was asked for.
     mode : Mode, optional
         Where draws begin, unless they go on from a posterior or walk over a library.
@@ -75,15 +81,18 @@ class SamplerRun:
         As of :func:`pbrl_ppl.fit`, with defaults filled in.
     progress : callable
         Called with counted work.
+    rescue : bool
+        Whether `smc` runs where importance weights do not suffice.
     """
 
     problem: Problem
-    method: Method
+    method: SamplingMethod
     mode: Mode | None
     resume: Idata | None
     seed: int
     cores: int
     progress: Say
+    rescue: bool = True
 
     @property
     def chains(self) -> int:
@@ -96,11 +105,19 @@ class SamplerRun:
         """Return starts of PyMC's chains, and of the stream of random numbers."""
         rng = np.random.default_rng(self.seed)
         if self.resume is not None:
-            draws = zip(*last_draws(self.problem, self.resume), strict=True)
-            return [self.problem.named(*draw) for draw in draws]
+            each = group(self.resume, "posterior").sizes["draw"]
+            last = (draws[each - 1 :: each] for draws in parameter_draws(self.problem, self.resume))
+            return [self.problem.named(*draw) for draw in zip(*last, strict=True)]
         if self.mode is None:
             return prior_starts(self.problem, rng, self.method.chains)
         return dispersed(self.mode, rng, self.method.chains)
+
+    def stream(self) -> list[int]:
+        """Return a seed that also depends on where chains begin, as those of a resumed fit do."""
+        begin = b"".join(
+            np.asarray(start[name]).tobytes() for start in self.starts() for name in sorted(start)
+        )
+        return [self.seed, zlib.crc32(begin)]
 
     def reference(self) -> Reference:
         """Return Gaussians about the modes, or of the draws of the posterior to go on from."""
@@ -111,6 +128,18 @@ class SamplerRun:
         phi, sigma = parameter_draws(self.problem, self.resume)
         problem = self.problem.with_physics(threads=self.cores)
         return Reference.of_draws(*Space.of_draws(problem, phi, sigma))
+
+    def trace(self, phi: Floats, sigma: Floats, **stats: Floats) -> Idata:
+        """Return the trace of draws (n, p) and (n, parameter), a chain after another.
+
+        With statistics of each draw, shape (n,).
+        """
+
+        def chained(values: Floats) -> Floats:
+            return values.reshape(self.chains, len(values) // self.chains, *values.shape[1:])
+
+        values = self.problem.named(chained(phi), chained(sigma))
+        return as_trace(self.problem, values, {name: chained(x) for name, x in stats.items()})
 
     @property
     def at_mode(self) -> Mode:
@@ -126,15 +155,14 @@ class SamplerRun:
         return self.mode
 
 
-def _importance(
-    job: SamplerRun, *, proposals: float = 1.4, tune: int = 125, thin: int = 16
-) -> Idata:
-    """Weight proposals from Gaussians; see `importance`. Chains, where weights do not suffice.
+def _importance(job: SamplerRun, *, proposals: float = 1.4) -> Idata:
+    """Weight proposals from Gaussians; see `importance`. Where weights do not suffice, `_smc`.
 
-    ``proposals``: weighted proposals a draw; ``tune``, ``thin``: of the chains.
+    Or an error, if the job is not to be rescued.
+
+    ``proposals``: weighted proposals a draw.
     """
-    shape, seed = (job.chains, job.method.draws), stream(job.seed, job.starts())
-    n = job.chains * job.method.draws
+    seed, n = job.stream(), job.chains * job.method.draws
     reference = job.reference()
     points, learned = draw_proposals(reference, int(proposals * n), seed, say=job.progress)
     chosen, k, size = resample(points.log_weight, n, np.random.default_rng([*seed, 1]))
@@ -144,15 +172,14 @@ def _importance(
             " from another mode, or use the method 'laplace'"
         )
     if not points.good:
-        chains = replace(job, method=replace(job.method, tune=tune, thin=thin))
-        trace = _metropolis(chains, learned)
         why = f"{points.ess:.0f} of {len(points.q)} effective, Pareto k {k:.2g}"
-        trace.attrs["proposals"] = f"none: chains, for weights do not suffice ({why})"
+        if not job.rescue:
+            raise WeightsError(f"fit: importance weights do not suffice ({why})")
+        trace = _smc(job, learned)
+        trace.attrs["proposals"] = f"none: smc, for weights do not suffice ({why})"
         return trace
     phi, sigma = reference.space.split(points.q[chosen])
-    values = job.problem.named(phi.reshape(*shape, -1), sigma.reshape(*shape, -1))
-    log_weight = points.log_weight[chosen].reshape(shape)
-    trace = as_trace(job.problem, values, {"log_weight": log_weight})
+    trace = job.trace(phi, sigma, log_weight=points.log_weight[chosen])
     trace.attrs |= {
         PARETO_K: k, SIZE: size, LIKELIHOOD: points.values[chosen],
         "proposals": "Gaussians at the modes", "log_evidence": points.log_z,
@@ -160,57 +187,50 @@ def _importance(
     return trace
 
 
-def _metropolis(
-    job: SamplerRun, learned: Reference | None = None, *, most_walkers: int = 20
-) -> Idata:
-    """Run the ensemble as chains; see `ensemble`. A chain is its walkers, one after another.
+def _smc(job: SamplerRun, learned: Reference | None = None, *, least: int = 100) -> Idata:
+    """Run PyMC's sequential Monte Carlo from Gaussians to the posterior, once a chain.
 
-    They begin at draws of ``learned``, or where it is not given at the modes' Gaussians or where
-    the posterior to go on from ends.
+    The prior is the standard normal one of numbers that make draws of the Gaussians, ``learned`` or
+    those about the modes or of the posterior to go on from; the likelihood is the posterior over
+    the Gaussians' density. So no particle begins where the posterior is not, all modes have the
+    same width, and what the Gaussians have wrong is corrected, as a prior is.
 
-    ``most_walkers``: walkers of a chain of the ensemble.
+    ``least``: particles whose covariance can be told; of more than there are draws some are kept.
     """
-    reference = learned or job.reference()
-    rng = np.random.default_rng(stream(job.seed, job.starts()))
-    method, chains = job.method, job.chains
-    walkers = min(most_walkers, method.draws)
-    per_walker = -(-method.draws // walkers)
-    if job.resume is None or learned:
-        q = reference.draw(chains * walkers, rng)
-    else:
-        phi, sigma = last_draws(job.problem, job.resume, walkers)
-        q = reference.space.at(nearest(job.problem.layout, phi, any_prior=True), sigma)
-    ensemble = Ensemble(reference, q, rng)
-    tune = -(-method.tune // walkers) * method.thin
-    retained, rates = [], []
-    done, total = 0, tune + per_walker * method.thin
-    try:
-        for i in range(tune + per_walker):
-            sweeps = 1 if i < tune else method.thin
-            rate = ensemble.move(reference.space, sweeps, adapt=i < tune)
-            done += sweeps
-            job.progress(Work(f"sampling chains of {total} sweeps", done, total))
-            ensemble.q = reference.space.prior_draws(ensemble.q, rng)
-            if i < tune:
-                ensemble.learn()
-                continue
-            retained.append(ensemble.q.copy())
-            rates.append(rate)
-    except KeyboardInterrupt:
-        if len(retained) < 2:
-            raise
-    phi, sigma = reference.space.split(np.array(retained))  # (draw, walker of all chains, ...)
+    import pymc as pm  # takes seconds to load
 
-    def chained(values: Floats) -> Floats:
-        values = np.moveaxis(values, 0, 1).reshape(chains, walkers * len(retained), -1)
-        return values[:, -method.draws :]
+    from pbrl_ppl.model import DensityOp
 
-    values = job.problem.named(chained(phi), chained(sigma))
-    accept = np.repeat(np.array(rates)[:, None], chains * walkers, axis=1)
-    return as_trace(job.problem, values, {"accept": chained(accept[..., None])[..., 0]})
+    reference, rng = learned or job.reference(), np.random.default_rng(job.stream())
+    one_thread = reference.space.problem.with_physics(threads=1)  # particles come one by one
+    reference = replace(reference, space=reference.space.on(one_thread))
+    n = max(job.method.draws, least)
+    logging.getLogger("pymc.smc").setLevel(logging.WARNING)  # it says how many jobs it has
+    told = f"moving {job.chains} times {n} particles from Gaussians to the posterior"
+    job.progress(Work(told, 0, 1))
+    with pm.Model():
+        normal = pm.Normal("z", shape=reference.normals)
+        pm.Potential("weight", DensityOp(reference.log_weight)(normal))
+        particles = pm.sample_smc(
+            draws=n, chains=job.chains, cores=min(job.cores, job.chains), random_seed=rng,
+            progressbar=False, compute_convergence_checks=False, return_inferencedata=False,
+        )  # fmt: skip
+    job.progress(Work(told, 1, 1))
+    kept = np.arange(job.method.draws) * n // job.method.draws
+    z = particles.get_values("z").reshape(job.chains, n, -1)[:, kept]
+    report = particles.report  # a number a stage, in a list for each of several chains
+    accept, log_z = (
+        np.array([stages[-1] for stages in (of if job.chains > 1 else [of])])
+        for of in (report.accept_rate, report.log_marginal_likelihood)
+    )
+    q = reference.space.prior_draws(reference.at(np.concatenate(z)), rng)
+    phi, sigma = reference.space.split(q)
+    trace = job.trace(phi, sigma, accept=np.repeat(accept, job.method.draws))
+    trace.attrs["log_evidence"] = float(logsumexp(log_z) - np.log(job.chains))
+    return trace
 
 
-def _paper(job: SamplerRun) -> Idata:
+def _metropolis(job: SamplerRun) -> Idata:
     """Run one random-walk Metropolis step a variable, as PyMC 2 did, and keep each n-th draw.
 
     The set of a library that each body has is proposed uniformly, body by body. PyMC's checks of
@@ -249,20 +269,16 @@ def _paper(job: SamplerRun) -> Idata:
 def _map(job: SamplerRun) -> Idata:
     """Return the mode alone, as a posterior of one draw."""
     mode = job.at_mode
-    values = mode.problem.named(mode.phi[None, None], mode.sigma[None, None])
-    return as_trace(job.problem, values, {"lp": np.array([[mode.log_posterior]])})
+    return job.trace(mode.phi[None], mode.sigma[None], lp=np.array([mode.log_posterior]))
 
 
 def _laplace(job: SamplerRun) -> Idata:
     """Draw independently from the Gaussian at the mode; that of the noise is of its logarithm."""
     rng, mode = np.random.default_rng(job.seed), job.at_mode
-    shape = job.chains, job.method.draws
-    phi = mode.draws(rng, shape[0] * shape[1])
+    phi = mode.draws(rng, job.chains * job.method.draws)
     centre, covariance = mode.noise_gaussian()
     noise = rng.standard_normal((len(phi), len(centre))) @ covariance_factor(covariance).T
-    sigma = np.exp(centre + noise)
-    values = mode.problem.named(phi.reshape(*shape, -1), sigma.reshape(*shape, -1))
-    return as_trace(job.problem, values, {"accept": np.ones(shape)})
+    return job.trace(phi, np.exp(centre + noise), accept=np.ones(len(phi)))
 
 
 def dispersed(
@@ -277,18 +293,6 @@ def dispersed(
     factor = covariance_factor(covariance)
     q = mean + away * rng.standard_normal((chains, len(mean))) @ factor.T
     return [mode.problem.named(space.possible(one), space.split(one)[1]) for one in q]
-
-
-def last_draws(problem: Problem, idata: Idata, walkers: int = 1) -> tuple[Floats, Floats]:
-    """Return the last draws of each chain's walkers, which stand one after another in it.
-
-    Shapes (chain * walker, p) and (chain * walker, parameter).
-    """
-    sizes = group(idata, "posterior").sizes
-    last = np.arange(1, walkers + 1) * sizes["draw"] // walkers - 1
-    chosen = (np.arange(sizes["chain"])[:, None] * sizes["draw"] + last).ravel()
-    phi, sigma = parameter_draws(problem, idata)
-    return phi[chosen], sigma[chosen]
 
 
 def prior_starts(
@@ -319,22 +323,25 @@ def as_trace(
     stats : mapping of str to ndarray
         The sampler's statistics of each draw, shape (chain, draw).
     """
-    posterior = posterior_dataset(problem, draws)
+    posterior, data = posterior_dataset(problem, draws), data_of(problem)
     per_draw = {name: (("chain", "draw"), value) for name, value in stats.items()}
-    data = {
+    of_trace = {
+        "posterior": posterior,
+        "sample_stats": xr.Dataset(per_draw, {d: posterior[d] for d in ("chain", "draw")}),
+        "observed_data": data[["next_state"]],
+        "constant_data": data[["start", "actions"]],
+    }
+    return from_groups(of_trace, {})
+
+
+def data_of(problem: Problem) -> xr.Dataset:
+    """Return initial states, actions and measured states, with their coordinates."""
+    data: dict[str, tuple[tuple[str, ...], Floats]] = {
         "start": (START_DIMS, problem.segments.start),
         "actions": (ACTION_DIMS, problem.inputs),
+        "next_state": (NEXT_STATE_DIMS, problem.measured),
     }
-    observed = {"next_state": (NEXT_STATE_DIMS, problem.observations.values)}
-    return from_groups(
-        {
-            "posterior": posterior,
-            "sample_stats": xr.Dataset(per_draw, {d: posterior[d] for d in ("chain", "draw")}),
-            "observed_data": labelled(problem, observed),
-            "constant_data": labelled(problem, data),
-        },
-        {},
-    )
+    return labelled(problem, data)
 
 
 def posterior_dataset(problem: Problem, values: Mapping[str, Floats | Ints]) -> xr.Dataset:
@@ -357,15 +364,10 @@ def labelled(
 #: The samplers by name. The paper's schedule is that of Table 2 for the cart: 30 chains of 20,000
 #: iterations, of which the first 1,000 are burnt in and each tenth of the others is kept. (PyMC 2
 #: counted the burn-in among the iterations.)
-METHODS: Mapping[str, Method] = {
-    "importance": Method(_importance, draws=250, tune=0, thin=1),
-    "metropolis": Method(_metropolis, draws=800, tune=500, thin=4),
-    "paper": Method(_paper, draws=1900, tune=1000, thin=10, chains=30),
-    "laplace": Method(_laplace, draws=250, tune=0, thin=1),
-    "map": Method(_map, draws=1, tune=0, thin=1, chains=1),
-}
-
-#: Table 2's schedule for the apartment, whose prior is a library: one chain of 5,000 iterations.
-OVER_LIBRARY: Mapping[str, Method] = {
-    "paper": Method(_paper, draws=400, tune=1000, thin=10, chains=1),
+METHODS: Mapping[str, SamplingMethod] = {
+    "importance": SamplingMethod(_importance, draws=250),
+    "smc": SamplingMethod(_smc, draws=300),
+    "metropolis": SamplingMethod(_metropolis, draws=1900, tune=1000, thin=10, chains=30),
+    "laplace": SamplingMethod(_laplace, draws=250),
+    "map": SamplingMethod(_map, draws=1, chains=1),
 }

@@ -20,12 +20,9 @@ from pbrl_ppl.modes import (
     stored,
 )
 from pbrl_ppl.parameters import JOINT_ANCHORS, JOINT_INDICES
-from pbrl_ppl.posterior import Idata, ParameterPoint, from_groups, group, groups
+from pbrl_ppl.posterior import Idata, ParameterPoint, from_groups, group, groups, parameter_draws
 from pbrl_ppl.sampling.methods import as_trace, posterior_dataset
 from pbrl_ppl.state import Bools, Floats, Ints
-
-#: Configurations less probable than this share of the best get no draws.
-NEGLIGIBLE = 1e-3
 
 
 def mix(
@@ -77,13 +74,9 @@ def mix(
     counts = allocate(np.where(fitted, probability, 0.0), chains * draws)
     label = rng.permutation(np.repeat(np.arange(len(weighed)), counts)).reshape(chains, draws)
     values = _values(problem, weighed, traces, label, rng)
-    rest = groups(next(iter(traces.values())))
-    data = {
-        "posterior": posterior_dataset(problem, values),
-        "sample_stats": _stats(traces, label),
-        "observed_data": rest["observed_data"],
-        "constant_data": rest["constant_data"],
-    }
+    data = groups(next(iter(traces.values()))) | {
+        "posterior": posterior_dataset(problem, values), "sample_stats": _stats(traces, label)
+    }  # fmt: skip
     return from_groups(data, {"configurations": stored(weighed)})
 
 
@@ -110,15 +103,17 @@ def most_probable(problem: Problem, weighed: Sequence[Weighed]) -> ParameterPoin
     return ParameterPoint(phi[0], best.mode.sigma)
 
 
-def allocate(probability: Floats, n: int) -> Ints:
+def allocate(probability: Floats, n: int, *, negligible: float = 1e-3) -> Ints:
     """Share ``n`` draws out by probability, to within one draw each (largest remainders).
+
+    What is less probable than the share ``negligible`` of the best gets no draws.
 
     Examples
     --------
     >>> allocate(np.array([0.7, 0.2995, 0.0005]), 1000)
     array([700, 300,   0])
     """
-    kept = np.where(probability < NEGLIGIBLE * probability.max(), 0.0, probability)
+    kept = np.where(probability < negligible * probability.max(), 0.0, probability)
     ideal = n * kept / kept.sum()
     counts = np.floor(ideal).astype(np.int64)
     rest = n - int(counts.sum())
@@ -136,32 +131,28 @@ def _values(
     """Return the whole model's variables, shape (chain, draw, ...), from the traces."""
     layout = problem.layout
     phi = np.full((*label.shape, layout.size), np.nan)
-    drawn = {i: group(t, "posterior").isel(draw=slice(label.shape[1])) for i, t in traces.items()}
-    noise = {
-        name: next(iter(drawn.values()))[name].to_numpy().copy() for name in problem.noise_variables
-    }
-    for i, posterior in drawn.items():
-        here = label == i
-        for name, sigma in noise.items():
-            one = posterior[name].to_numpy() if name in posterior else np.zeros(0)
-            if one.shape != sigma.shape:
-                raise FitError(
-                    "fit: choices of the bodies that a joint joins have different coordinates;"
-                    " take --likelihood transitions, or name the bodies in the scene"
-                )
-            sigma[here] = one[here]
-        for block in weighed[i].configuration.problem(problem).layout.blocks:
-            values = posterior[block.name].to_numpy()
-            for j, owner in enumerate(block.owners):
-                phi[here, layout.index(block.name, owner)] = values[here, j]
+    sigma = np.empty((*label.shape, len(problem.noise_labels)))
+    for i, trace in traces.items():
+        own, here = weighed[i].mode.problem, label == i
+        if own.noise_labels != problem.noise_labels:
+            raise FitError(
+                "fit: choices of the bodies that a joint joins have different coordinates;"
+                " take --likelihood transitions, or name the bodies in the scene"
+            )
+        sizes = group(trace, "posterior").sizes
+        rows = np.arange(sizes["chain"] * sizes["draw"]).reshape(sizes["chain"], sizes["draw"])
+        rows = rows[:, : label.shape[1]][here]
+        of_phi, of_sigma = parameter_draws(own, trace)
+        sigma[here] = of_sigma[rows]
+        for name, values in zip(own.layout.labels, of_phi[rows].T, strict=True):
+            phi[here, layout.labels.index(name)] = values
         for joint, pair in weighed[i].configuration.pairs:
             law = _index_law(problem, joint, pair)
             drawn_pairs = rng.choice(law.size, size=int(here.sum()), p=law.ravel())
             _put_indices(problem, phi, here, joint, drawn_pairs)
     _fill_anchors(problem, phi, rng)
-    named = layout.to_dict(phi)
-    indices = {name: named[name].astype(int) for name in JOINT_INDICES}
-    return named | indices | noise
+    named = problem.named(phi, sigma)
+    return named | {name: named[name].astype(int) for name in JOINT_INDICES}
 
 
 def _index_law(problem: Problem, joint: str, pair: Pair) -> Floats:
@@ -203,21 +194,18 @@ def _fill_anchors(problem: Problem, phi: Floats, rng: np.random.Generator | None
 
 
 def _stats(traces: Mapping[int, Idata], label: Ints) -> xr.Dataset:
-    """Return the samplers' statistics of the draws; those that differ in shape are left out."""
-    records = {
-        i: group(t, "sample_stats").isel(draw=slice(label.shape[1])) for i, t in traces.items()
-    }
-    first = next(iter(records.values()))
-    mixed = {}
-    for name, variable in first.data_vars.items():
-        sizes = [record[name].sizes for record in records.values() if name in record]
-        if sizes != [variable.sizes] * len(records) or variable.dims[:2] != ("chain", "draw"):
-            continue
-        values = variable.to_numpy().copy()
-        for i, record in records.items():
-            values[label == i] = record[name].to_numpy()[label == i]
-        mixed[str(name)] = (variable.dims, values)
-    return xr.Dataset(mixed, first.coords)
+    """Return the samplers' statistics of each draw; NaN for one that a sampler does not have."""
+    mixed: dict[str, Floats] = {}
+    for i, trace in traces.items():
+        of_trace = group(trace, "sample_stats").isel(draw=slice(label.shape[1]))
+        for name, variable in of_trace.data_vars.items():
+            if variable.dims == ("chain", "draw"):
+                values = mixed.setdefault(str(name), np.full(label.shape, np.nan))
+                values[label == i] = variable.to_numpy()[label == i]
+    return xr.Dataset(
+        {name: (("chain", "draw"), values) for name, values in mixed.items()},
+        {dim: np.arange(n) for dim, n in zip(("chain", "draw"), label.shape, strict=True)},
+    )
 
 
 def summed(problem: Problem, draws: int, chains: int, seed: int) -> tuple[Idata, ParameterPoint]:

@@ -26,6 +26,7 @@ from pbrl_ppl.likelihood import (
 from pbrl_ppl.modes import systematic
 from pbrl_ppl.posterior import Idata, PosteriorRecord, from_groups, group, groups, parameter_draws
 from pbrl_ppl.sampling.fitting import DEFAULT, joined_at, sample
+from pbrl_ppl.sampling.methods import data_of
 from pbrl_ppl.state import STATE, Floats
 
 
@@ -160,10 +161,9 @@ def _check_posterior(idata: Idata, history: History) -> PosteriorRecord:
     for name in ("log_likelihood", "posterior_predictive", "observed_data", "constant_data"):
         group(idata, name)
     record = PosteriorRecord.of(idata)
-    known = [record.data_sha256]
-    for entry in record.updates or ():
-        known += [entry["data_sha256"], entry["before_sha256"]]
-    if history.data_sha256 in known:
+    names = ("data_sha256", "before_sha256")
+    known = {entry[name] for entry in record.updates or () for name in names}
+    if history.data_sha256 in known | {record.data_sha256}:
         raise PosteriorError(
             "update: these data are in the posterior already, and would count twice; pass only"
             " what was recorded since"
@@ -402,22 +402,15 @@ def _reweighted(idata: Idata, record: PosteriorRecord, new: _Weighted, seed: int
 
 def _with_data(idata: Idata, problem: Problem) -> dict[str, xr.Dataset]:
     """Return the stored data and, after them, the problem's."""
-    segments, result = problem.segments, {}
-    new = {"start": segments.start, "actions": problem.inputs, "next_state": problem.measured}
+    new, result = data_of(problem).drop_vars("transition"), {}
     for name in ("observed_data", "constant_data"):
         earlier = group(idata, name)
-        old = earlier[[key for key in earlier.data_vars if key in new]].transpose("transition", ...)
-        total = old.sizes["transition"] + segments.n
-        both = {
-            str(key): (
-                variable.dims,
-                np.concatenate([variable.to_numpy(), new[str(key)]]),
-                variable.attrs,
-            )
-            for key, variable in old.data_vars.items()
-        }
-        coords = dict(old.drop_dims("transition").coords) | files.both_places(old, segments)
-        result[name] = xr.Dataset(both, coords | {"transition": np.arange(total)}, earlier.attrs)
+        old = earlier[[key for key in new.data_vars if key in earlier]]
+        places = files.both_places(old, problem.segments)
+        parts = (old.drop_vars(["transition", *places]), new[list(old.data_vars)])
+        both = xr.concat(parts, "transition", combine_attrs="override").transpose("transition", ...)
+        numbers = np.arange(both.sizes["transition"])
+        result[name] = both.assign_coords(places | {"transition": numbers})
     more = files.both_recordings(group(idata, "constant_data"), files.recording(problem))
     result["constant_data"] = result["constant_data"].merge(more)
     return result

@@ -103,7 +103,7 @@ def test_the_paper_s_walk_finds_the_same() -> None:
     Of 400 draws of which 100 count, at least: false alarm below 1e-3 over the three sets.
     """
     found = []
-    for method in ("exact", "paper"):
+    for method in ("exact", "metropolis"):
         agent = LibraryAgent(TASK, LIBRARY, method=method, seed=1)
         world = World(TASK, TRUTH, sigma=1.0)
         state = world.reset(1)
@@ -113,7 +113,7 @@ def test_the_paper_s_walk_finds_the_same() -> None:
         found.append(agent.probabilities.loc["cart"].to_numpy())
     exact, paper = found
     assert (abs(paper - exact) < 4 * np.sqrt(exact * (1 - exact) * (1 / 100 + 1 / 400))).all()
-    with pytest.raises(ValueError, match="method is 'sum', expected 'exact' or 'paper'"):
+    with pytest.raises(ValueError, match="method is 'sum', expected 'exact' or 'metropolis'"):
         LibraryAgent(TASK, LIBRARY, method="sum")
 
 

@@ -129,7 +129,7 @@ def test_close_loop_options(calls: list[Any], capsys: pytest.CaptureFixture[str]
     assert len(calls) == 1
     assert main([*argv, "--overwrite"]) == 0
     assert main([*argv, "--overwrite", "--method", "nuts"]) == 2
-    assert "'importance', 'metropolis', 'laplace'" in capsys.readouterr().err
+    assert "'importance', 'smc', 'laplace'" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("files")

@@ -363,9 +363,7 @@ def test_fit_without_convergence_exits_with_3(capsys: pytest.CaptureFixture[str]
     fit = ("fit", "scene.toml", "train.csv", "-o", "puck.nc", "--draws", "4", "--method", "laplace")
     assert answer(capsys, *fit, "-q", code=3)["converged"] is False
     assert Path("puck.nc").exists()  # it may be looked at, and gone on with
-    assert "one of importance, metropolis" in message(
-        capsys, *fit[:4], "a.nc", "--method", "metropols"
-    )
+    assert "one of importance, smc" in message(capsys, *fit[:4], "a.nc", "--method", "metropols")
     said = message(capsys, *fit[:4], "a.nc", "--horizon", "3")
     assert "--likelihood transitions" in said
 
@@ -474,7 +472,7 @@ def test_an_interrupt_that_a_sampler_swallowed_is_none_the_less_one(
 
     monkeypatch.setattr(sampling, "fit", swallowed)
     fit = ["fit", "scene.toml", "train.csv", "-o", "puck.nc", "-q", "--method", "metropolis"]
-    assert main([*fit, "--draws", "40", "--tune", "40", "--chains", "2"]) == 130
+    assert main([*fit, "--draws", "40", "--tune", "40", "--thin", "1", "--chains", "2"]) == 130
     assert "40 draws of each of 2 chains are kept in puck.nc" in capsys.readouterr().err
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 

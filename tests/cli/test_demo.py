@@ -84,12 +84,12 @@ def test_the_demo_takes_the_files_of_the_package(
     monkeypatch.setattr(criticism, "close_loop", close_loop)
     monkeypatch.setattr("pbrl_ppl.reporting.render", lambda *args, **options: "a page")
     monkeypatch.chdir(tmp_path)
-    assert main(["demo", "-o", "here", "--method", "metropolis", "--json"]) == 0
+    assert main(["demo", "-o", "here", "--method", "smc", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["report"] == str(Path("here", "report.html"))
     ((scene, train, test, options),) = seen
     assert [body.name for body in scene.moving] == ["cart"] and "angular_drag" not in str(scene)
     assert train.n_trajectories > 1 and test.n_trajectories > 1
-    assert options["method"] == "metropolis" and options["seed"] == 1
+    assert options["method"] == "smc" and options["seed"] == 1
     assert main(["demo", "-o", "again", "--quiet"]) == 0
     assert seen[1][3]["method"] == "laplace"
     said = capsys.readouterr()

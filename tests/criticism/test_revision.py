@@ -27,6 +27,7 @@ from pbrl_ppl.errors import (
     RefitWarning,
 )
 from pbrl_ppl.modes import filtered_mode
+from pbrl_ppl.sampling import WeightsError
 from pbrl_ppl.state import STATE, WRENCH
 from tests.helpers.free_puck import BOX, DISC, MASS, Disc, box2d, fitted, searched
 from tests.helpers.places import load
@@ -65,7 +66,7 @@ def clean(make_history):
 
 @pytest.fixture(scope="module")
 def adequate(clean):
-    return loop(clean, method="metropolis", draws=DRAWS)
+    return loop(clean, method="importance", draws=DRAWS)
 
 
 @pytest.mark.slow
@@ -227,7 +228,7 @@ def test_wrong_units_are_told_before_the_fit(clean) -> None:
 
 @pytest.mark.slow
 def test_too_few_draws_give_no_verdict(clean) -> None:
-    found = loop(clean, method="metropolis", draws=5, catalogue=DRAGS)
+    found = loop(clean, method="importance", draws=5, catalogue=DRAGS)
     assert found.verdict == "not-converged"
     assert found.unexplained is None  # the tests are of the mode, and passed
 
@@ -391,7 +392,24 @@ class _Mode:
     problem: Any
 
 
-@pytest.mark.parametrize(("method", "said"), [("laplace", 0), ("metropolis", 1)])
+def test_weights_that_do_not_suffice_leave_gaussians(monkeypatch) -> None:
+    """The verdict then relies on the mode, which is said: particles could take minutes."""
+
+    def weighted(problem: Any, *, method: str, **options: Any) -> Any:
+        if method == "importance":
+            raise WeightsError("fit: importance weights do not suffice")
+        held = {"method": method, "interrupted": None, "pareto_k": None}
+        return SimpleNamespace(record=SimpleNamespace(**held, max_rhat=1.02, min_ess=350.0))
+
+    monkeypatch.setattr("pbrl_ppl.criticism.closing.sample", weighted)
+    mode = _Mode(SimpleNamespace(likelihood=None))
+    task = SimpleNamespace(method="importance", seed=1, draws=None, criteria=DEFAULT, say=print)
+    with pytest.warns(ConvergenceWarning, match="do not suffice; the draws are from the Gaussian"):
+        (fitted,) = loop_module._fits(task, [mode])
+    assert fitted.record.method == "laplace"
+
+
+@pytest.mark.parametrize(("method", "said"), [("laplace", 0), ("smc", 1)])
 def test_only_chains_are_said_not_to_converge(method, said, monkeypatch) -> None:
     """Independent draws have an R-hat too, and nothing to converge."""
 

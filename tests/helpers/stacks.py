@@ -33,11 +33,10 @@ def file(generation: str) -> Path:
     return DATA / f"puck-pymc{generation}.nc"
 
 
-def fitted(draws: int = 500, tune: int = 500) -> Any:
+def fitted(draws: int = 500) -> Any:
     """Return the puck's posterior on the running generation."""
     model = physics_model(SCENE, history(1))
-    settings = {"draws": draws, "tune": tune, "chains": 2, "progress": False}
-    return fit(model, method="metropolis", seed=3, **settings)
+    return fit(model, seed=3, draws=draws, chains=2, progress=False)
 
 
 if __name__ == "__main__":

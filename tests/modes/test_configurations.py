@@ -587,7 +587,7 @@ def test_no_joint_is_found_where_there_is_none(loose, found_loose, monkeypatch) 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", [pytest.param("paper", marks=pytest.mark.long), "metropolis"])
+@pytest.mark.parametrize("method", [pytest.param("metropolis", marks=pytest.mark.long), "smc"])
 @FORK
 @SHORT
 @pytest.mark.usefixtures("known_weights")

@@ -134,7 +134,7 @@ def test_a_circle_is_cut_opposite_to_the_centre(mode) -> None:
     np.testing.assert_allclose(space.log_density(q), one.log_density(one.at(phi, sigma)))
     for beyond in (3.0 + np.pi + 1e-6, 3.0 - np.pi - 1e-6):
         q[:, place] = beyond
-        assert (space.log_priors(q).sum(axis=1) == -np.inf).all()
+        assert (space.log_prior(q) == -np.inf).all()
 
 
 # -- the density -----------------------------------------------------------------------------------
@@ -168,10 +168,8 @@ def test_the_density_is_pymc_s(likelihood) -> None:
     phi, sigma = space.split(q)
     # the density of a cube root is 3 / root times that of the logarithm, half of it at either sign
     roots = np.log(1.5 / q[:, layout.size :][:, space.roots]).sum(axis=-1)
-    priors, likelihoods = space.log_priors(q), space.log_likelihoods(q, space.residual(q))
-    assert priors.shape == (5, 2) and likelihoods.shape == (5, 1)
-    ours = priors.sum(axis=1) + likelihoods.sum(axis=1)
-    np.testing.assert_allclose(space.log_density(q), ours)
+    ours, likelihoods = space.log_densities(q)
+    np.testing.assert_allclose(space.log_prior(q) + likelihoods.sum(axis=1), ours)
     function, theirs = model.compile_logp(mode="FAST_COMPILE"), []
     for point, x, noise in zip(q, phi, sigma, strict=True):
         named = layout.to_dict(point[: layout.size])
@@ -189,27 +187,6 @@ def test_the_density_is_pymc_s(likelihood) -> None:
 
 
 @pytest.mark.one_stack
-def test_each_part_has_its_own_density() -> None:
-    """With a change of one body's mass its column changes, and no other; their sum is the whole."""
-    scene = pucks("ab", known={"r": 0.0, "mu_c": 0.0})
-    history = simulated_history(scene, {"mass": [2.0, 3.0]}, seed=3, trajectories=4, intervals=2)
-    problem = Problem.of(Physics.declare(scene), history)
-    space = Space(problem, np.array([2.0, 3.0]))
-    q = np.tile(space.at(space.centre, problem.noise_prior[0]), (2, 1))
-    q[1, 1] += 0.1
-    each = space.log_likelihoods(q, space.residual(q))
-    assert each.shape == (2, 2)
-    assert each[0, 0] == each[1, 0]
-    assert each[0, 1] != each[1, 1]
-    phi, sigma = space.split(q)
-    whole = problem.log_density(problem.residual(phi), sigma, phi).sum(axis=1)
-    np.testing.assert_allclose(each.sum(axis=1), whole)
-    priors = space.log_priors(q)
-    assert priors.shape == (2, 3)
-    assert (priors[0] == priors[1]).tolist() == [True, False, True]
-
-
-@pytest.mark.one_stack
 def test_trajectories_mix_the_parts() -> None:
     """All parameters are one block, and the noise is by blocks of either transform."""
     scene = pucks("ab", effects=("linear_drag",))
@@ -218,14 +195,12 @@ def test_trajectories_mix_the_parts() -> None:
     problem = Problem.of(Physics.declare(scene), history)
     phi = problem.layout.to_vector(truth)
     noisy = along_trajectories(problem, phi)
-    assert len(Space(problem, phi).parts) == 2
+    assert len(Space(problem, phi).blocks) == 3
     space = Space(noisy, phi)
-    (whole,) = space.parts
-    np.testing.assert_array_equal(whole.places, np.arange(problem.layout.size))
-    np.testing.assert_array_equal(whole.bodies, [0, 1])
-    assert len(space.noise_blocks) == 2
-    noise = np.concatenate(space.noise_blocks)
-    assert sorted(noise) == list(range(space.phi_size, space.size))
+    whole, *noises = space.blocks
+    np.testing.assert_array_equal(whole, np.arange(problem.layout.size))
+    assert len(noises) == 2
+    assert sorted(np.concatenate(noises)) == list(range(space.phi_size, space.size))
 
 
 @pytest.mark.one_stack

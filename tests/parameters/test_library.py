@@ -296,9 +296,9 @@ def test_refused_fits(apartment, monkeypatch) -> None:
     history = simulated_history(scene, {"mass": 2.0}, seed=1, trajectories=2, intervals=1)
     library = ParameterLibrary({"x": {"mass": 1.0}, "y": {"mass": 2.0}})
     model = physics_model(scene, history, library=library)
-    for options in ({"method": "metropolis"}, {"resume": object()}):
+    for options in ({"method": "smc"}, {"resume": object()}):
         with pytest.raises(
-            FitError, match="summed over exactly, or walked over by the method 'paper'; leave out"
+            FitError, match="summed over exactly, or walked over by the method 'metropolis'; leave"
         ):
             quick(model, **options)
     monkeypatch.setattr("pbrl_ppl.modes.library_choice._Combinations.most", 10)

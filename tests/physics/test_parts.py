@@ -191,11 +191,9 @@ def test_each_parameter_is_in_one_block_of_the_sampler() -> None:
     model = physics_model(scene, history_of(scene, places))
     layout = problem_in(model).layout
     phi = inside(layout.priors, np.array([prior.centre for prior in layout.priors]))
-    space = Space(problem_in(model), phi)
-    blocks = [part.places for part in space.parts] + list(space.noise_blocks)
+    blocks = Space(problem_in(model), phi).blocks
     assert len(blocks) == 4  # a and b, c, d, the noise
     assert sorted(np.concatenate(blocks)) == list(range(len(phi) + 6))
-    assert [list(part.bodies) for part in space.parts] == [[0, 1], [2], [3]]
 
 
 def test_labels_of_joints_survive() -> None:

@@ -37,7 +37,7 @@ def test_both_stacks_plan_alike(generation: str) -> None:
 
 @pytest.mark.filterwarnings("ignore:the chains have not converged")  # few draws, on purpose
 def test_a_fresh_process_with_the_file_plans_as_memory_does(tmp_path: Path) -> None:
-    idata = fitted(draws=100, tune=100)
+    idata = fitted(draws=100)
     here = planned(idata)
     save_posterior(idata, tmp_path / "puck.nc")
     arguments = [str(tmp_path / "puck.nc"), *COMMAND, "--draws", "8", "-o", str(tmp_path / "p.csv")]

@@ -83,8 +83,8 @@ def test_an_update_numbers_its_trajectories_on(idata, monkeypatch) -> None:
     problem = problem_of(idata, history=since)
     assert problem.inputs[..., 6].min() == 8.0
     # few draws, also where the update refits
-    few = replace(fitting.METHODS["metropolis"], draws=60, tune=20)
-    monkeypatch.setattr(fitting, "METHODS", {**fitting.METHODS, "metropolis": few})
+    few = replace(fitting.METHODS["importance"], draws=60)
+    monkeypatch.setattr(fitting, "METHODS", {**fitting.METHODS, "importance": few})
     with pytest.warns(UserWarning):
         result = update(idata, since, seed=1)
     assert json.loads(result.attrs["updates"])[-1]["transitions"] == since.n_transitions

@@ -33,7 +33,6 @@ from pbrl_ppl.posterior import (
 from pbrl_ppl.posterior import save_posterior as save
 from pbrl_ppl.posterior.completion import MAX_RHAT, MIN_ESS, complete
 from pbrl_ppl.sampling import physics_model
-from pbrl_ppl.sampling.ensemble import Ensemble
 from pbrl_ppl.sampling.fitting import METHODS, fit
 from pbrl_ppl.scene import Shape, Wall
 from tests.helpers.carts import CART, cart_scene
@@ -48,7 +47,6 @@ UNITS = ("kg", "m", "m", "rad", "1", "1")
 FORK = pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 QUICK = {"draws": 200, "tune": 200, "chains": 2, "cores": 1, "progress": False}
 SHORT = QUICK | {"draws": 100, "tune": 100}
-CHAINS = QUICK | {"method": "metropolis", "thin": 1}
 
 
 @pytest.fixture(scope="module")
@@ -287,56 +285,48 @@ def test_an_early_interrupt_leaves_nothing(puck, monkeypatch):
 
     monkeypatch.setattr(pm, "sample", nothing)
     with pytest.raises(KeyboardInterrupt):
-        fit(puck, method="paper", draws=10, tune=10, progress=False)
+        fit(puck, method="metropolis", draws=10, tune=10, progress=False)
 
 
-def interrupt_at(patch: pytest.MonkeyPatch, number: int) -> None:
-    """Press Ctrl-C at this move of the ensemble."""
-    move, calls = Ensemble.move, []
+def test_an_interrupt_of_particles_leaves_nothing(puck, monkeypatch) -> None:
+    """They are no draws of the posterior before the last stage."""
 
-    def pressed(self, *arguments, **options):
-        calls.append(1)
-        if len(calls) == number:
-            raise KeyboardInterrupt
-        return move(self, *arguments, **options)
+    def pressed(**options):
+        raise KeyboardInterrupt
 
-    patch.setattr(Ensemble, "move", pressed)
-
-
-@pytest.mark.parametrize("number", [1, 5, 12])
-def test_an_interrupt_before_there_are_draws_leaves_nothing(model, mode, monkeypatch, number):
-    """In tuning, or at the second draw of each walker."""
-    interrupt_at(monkeypatch, number)
+    monkeypatch.setattr(pm, "sample_smc", pressed)
     with pytest.raises(KeyboardInterrupt):
-        fit(model, seed=4, start=mode, **(CHAINS | {"draws": 60}))
+        fit(puck, method="smc", progress=False)
 
 
 @pytest.fixture(scope="module")
-def interrupted(model, mode):
-    """Twenty walkers a chain, 10 moves of tuning, then 2 draws of 3 each: 40 draws of 50."""
+def interrupted(puck):
+    """Of each chain 40 draws of 50, as PyMC ends an interrupted run."""
+    sample = pm.sample
+    options = QUICK | {"method": "metropolis", "draws": 50, "tune": 20, "thin": 1}
     with pytest.MonkeyPatch.context() as patch:
-        interrupt_at(patch, 13)
+        patch.setattr(pm, "sample", lambda **given: sample(**(given | {"draws": 40})))
         with (
             pytest.warns(ConvergenceWarning, match="have not converged"),
             pytest.warns(
                 ConvergenceWarning, match="after 40 of 50 draws in 2 of 2 chains.*resume this"
             ),
         ):
-            return fit(model, seed=4, start=mode, **(CHAINS | {"draws": 50}))
+            return fit(puck, seed=4, **options)
 
 
 def test_an_interrupt_keeps_the_draws(interrupted) -> None:
     assert group(interrupted, "posterior").sizes["draw"] == 40
     assert interrupted.attrs["interrupted"] == 1
     assert "interrupted" in json.loads(interrupted.attrs["warnings"])[0]
-    assert group(interrupted, "log_likelihood").sizes["draw"] == 40
-    assert group(interrupted, "sample_stats")["accept"].sizes["draw"] == 40
+    for name in ("log_likelihood", "sample_stats"):
+        assert group(interrupted, name).sizes["draw"] == 40
 
 
 def test_chains_that_an_interrupt_left_out_are_missed(puck, monkeypatch):
     """PyMC keeps the chains that had most draws, all of them, and says nothing."""
     sample = pm.sample
-    options = QUICK | {"method": "paper", "draws": 30, "tune": 0, "thin": 1, "chains": 3}
+    options = QUICK | {"method": "metropolis", "draws": 30, "tune": 0, "thin": 1, "chains": 3}
 
     def fewer(chains):
         return lambda **given: sample(
@@ -361,22 +351,21 @@ def test_too_few_draws_for_r_hat_have_not_converged(model, mode) -> None:
     fit(model, seed=4, start=mode, method="map")  # warns of nothing
 
 
-def test_an_interrupted_fit_goes_on(model, interrupted) -> None:
+def test_an_interrupted_fit_goes_on(puck, interrupted) -> None:
     """New draws follow the old ones, which stay."""
+    options = QUICK | {"method": "metropolis", "draws": 160, "tune": 0, "thin": 1}
     with pytest.warns(ConvergenceWarning, match="not converged"):
-        whole = fit(model, seed=5, resume=interrupted, **(CHAINS | {"draws": 160, "tune": 0}))
+        whole = fit(puck, seed=5, resume=interrupted, **options)
     assert "interrupted" not in whole.attrs
-    posterior = group(whole, "posterior")
-    assert dict(posterior.sizes) == {"chain": 2, "draw": 200, "body": 1, "state": 6}
-    for name in PARAMETERS:
-        before = group(interrupted, "posterior")[name].values
-        np.testing.assert_array_equal(posterior[name].values[:, :40], before)
+    mass = group(whole, "posterior")["mass"].values
+    assert mass.shape == (2, 200, 1)
+    np.testing.assert_array_equal(mass[:, :40], group(interrupted, "posterior")["mass"].values)
 
 
-def test_a_start_of_another_model_is_refused(model, interrupted) -> None:
-    scene = cart_scene()  # r and mu_c are unknown here
-    other = physics_model(scene, problem_in(model).data.history)
-    with pytest.raises(PosteriorError, match="has no r, mu_c"):
+def test_a_start_of_another_model_is_refused(puck, interrupted) -> None:
+    scene = cart_scene(known={name: CART[name] for name in CART if name not in ("mass", "w_x")})
+    other = physics_model(scene, problem_in(puck).data.history, substeps=4)
+    with pytest.raises(PosteriorError, match="has no w_x"):
         fit(other, resume=interrupted, progress=False)
 
 
@@ -444,9 +433,8 @@ def test_a_parameter_that_the_data_say_nothing_about_is_named(model) -> None:
     [
         # 1.4 proposals a draw, of which half are to be effective
         ("importance", "weighing proposals until 70 are effective", 70),
-        # 4 to tune, then 3 draws of each of 20 walkers, 4 sweeps a draw
-        ("metropolis", "sampling chains of 16 sweeps", 4 + 3 * 4),
-        ("paper", "sampling chains", 2 * (20 + 50 * 4)),
+        ("smc", "moving 2 times 100 particles from Gaussians to the posterior", 1),
+        ("metropolis", "sampling chains", 2 * (20 + 50 * 4)),
     ],
 )
 def test_draws_are_counted(puck, method, sentence, total) -> None:
@@ -459,8 +447,10 @@ def test_draws_are_counted(puck, method, sentence, total) -> None:
 
 
 def test_unknown_method(model) -> None:
-    with pytest.raises(FitError, match="method is 'gibbs', expected one of importance, metropolis"):
+    with pytest.raises(FitError, match="method is 'gibbs', expected one of importance, smc"):
         fit(model, method="gibbs")
+    with pytest.raises(FitError, match="'paper' is now called 'metropolis'"):
+        fit(model, method="paper")
 
 
 def test_the_mode_alone(model, mode) -> None:
@@ -485,7 +475,7 @@ def test_methods_agree(puck, method) -> None:
     mode = find_mode(problem_in(puck), seed=1)
     deviation = float(np.sqrt(mode.covariance[0, 0]))
     options = {"draws": 300, "chains": 2, "cores": 1, "progress": False}
-    if method == "paper":
+    if method == "metropolis":
         options |= {"tune": 500, "thin": 4}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)

@@ -1,4 +1,4 @@
-"""Importance sampling: draws, weights, diagnostics, and chains where weights do not suffice."""
+"""Importance sampling: draws, weights, diagnostics, and particles where weights do not suffice."""
 
 import json
 import warnings
@@ -37,8 +37,7 @@ from pbrl_ppl.posterior import (
     smoothed,
 )
 from pbrl_ppl.sampling import fit, physics_model, update
-from pbrl_ppl.sampling.ensemble import Reference
-from pbrl_ppl.sampling.importance import draw_proposals, resample
+from pbrl_ppl.sampling.importance import Reference, draw_proposals, resample
 from pbrl_ppl.scene import Body, Scene, Shape, Wall
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
@@ -116,7 +115,7 @@ def grid_moments(problem, mode) -> tuple[np.ndarray, np.ndarray, float]:
     second = np.log(mode.sigma[0]) + steps / np.sqrt(2.0 * cells)
     residual = problem.residual(constrain(prior, first)[:, None])
     q = np.stack(np.meshgrid(first, second, indexing="ij"), axis=-1)
-    density = space.log_priors(q).sum(axis=-1)
+    density = space.log_prior(q)
     for i, row in enumerate(residual):
         phi, sigma = space.split(q[i])
         density[i] += problem.log_density(np.repeat(row[None], 161, axis=0), sigma, phi).sum(-1)
@@ -164,10 +163,10 @@ def test_draws_have_the_moments_of_the_posterior(simple) -> None:
     assert abs(np.mean(evidences) - log_evidence) < 5 * error + 1e-3
 
 
-def agree(weighted, chains) -> None:
+def agree(weighted, particles) -> None:
     """Means of two fits within 4 Monte Carlo errors, sds within 4 of theirs."""
-    sizes = [convergence(each)[1] for each in (weighted, chains)]
-    flat = [scalars(each) for each in (weighted, chains)]
+    sizes = [convergence(each)[1] for each in (weighted, particles)]
+    flat = [scalars(each) for each in (weighted, particles)]
     for name in flat[0].data_vars:
         # logarithms where a parameter is positive: ``r`` and the noises have long tails
         a, b = (each[name].to_numpy().ravel() for each in flat)
@@ -178,7 +177,7 @@ def agree(weighted, chains) -> None:
         assert abs(np.log(a.std() / b.std())) < 4 * error, (name, a.std(), b.std())
 
 
-def test_a_cart_s_posterior_is_that_of_chains() -> None:
+def test_a_cart_s_posterior_is_that_of_particles() -> None:
     """Means of 12 parameters within 4 Monte Carlo errors, sds within 4 of theirs: false alarm 2e-3.
 
     Nothing touches the cart: the data do not inform ``r``, whose draws follow the prior.
@@ -190,10 +189,12 @@ def test_a_cart_s_posterior_is_that_of_chains() -> None:
     start = find_mode(problem_in(model), seed=1)
     quick = QUICK | {"start": start, "chains": 2}
     weighted = quiet(fit, model, seed=1, **(quick | {"draws": 1000}))
-    chains = quiet(fit, model, seed=2, method="metropolis", tune=300, **(quick | {"draws": 700}))
+    particles = quiet(fit, model, seed=2, method="smc", **(quick | {"draws": 400}))
     assert weighted.attrs["method"] == "importance"
     assert weighted.attrs[PARETO_K] < MAX_PARETO_K
-    agree(weighted, chains)
+    agree(weighted, particles)
+    # of two estimates, whose errors are below 0.1
+    assert abs(weighted.attrs["log_evidence"] - particles.attrs["log_evidence"]) < 0.5
 
 
 # -- several parts, several modes ------------------------------------------------------------------
@@ -201,7 +202,7 @@ def test_a_cart_s_posterior_is_that_of_chains() -> None:
 
 @pytest.mark.one_stack
 def test_independent_parts_share_the_noise_alone() -> None:
-    """Two pucks with drag and masses, as by chains: 10 numbers, false alarm 2e-3."""
+    """Two pucks with drag and masses, as by particles: 10 numbers, false alarm 2e-3."""
     scene = pucks("ab")
     model = physics_model(scene, pushed(scene, trajectories=20))
     assert len(problem_in(model).physics.simulator.parts) == 2
@@ -210,9 +211,7 @@ def test_independent_parts_share_the_noise_alone() -> None:
     assert weighted.attrs["method"] == "importance"
     assert weighted.attrs[PARETO_K] < MAX_PARETO_K
     assert weighted.attrs[SIZE] > 400
-    options = QUICK | {"draws": 1000, "tune": 1000}
-    chains = quiet(fit, model, seed=2, start=start, method="metropolis", **options)
-    agree(weighted, chains)
+    agree(weighted, quiet(fit, model, seed=2, start=start, method="smc", **QUICK))
     # given the noise, which the data inform well, they are independent
     a, b = (draws(weighted)["mass"][:, i] for i in (0, 1))
     assert abs(np.corrcoef(a, b)[0, 1]) < 5 / np.sqrt(weighted.attrs[SIZE])
@@ -272,24 +271,14 @@ def test_two_modes_have_their_shares(twofold) -> None:
         assert kstwobign.sf(distance * np.sqrt(worth)) > 1e-5
 
 
-def test_chains_see_both_modes(twofold) -> None:
-    """Within 4 standard errors of the prior's share, by 80 walkers: false alarm 6e-5."""
-    model, mode = twofold
-    options = QUICK | {"draws": 500, "tune": 200, "method": "metropolis"}
-    idata = quiet(fit, model, seed=1, start=mode, **options)
-    root = draws(idata)["breeze_root"].ravel()
-    found, expected, error = shares(root, convergence(idata)[1]["breeze_root[a]"])
-    assert abs(found - expected) < 4 * error, (found, expected, error)
-
-
 @pytest.mark.usefixtures("without_weights")
-def test_chains_after_weights_see_both_modes(twofold) -> None:
+def test_particles_after_weights_see_both_modes(twofold) -> None:
     """Within 4 standard errors of the prior's share: false alarm 6e-5; and they are told of."""
     model, mode = twofold
     idata = quiet(fit, model, seed=1, start=mode, **QUICK)
     assert idata.attrs["method"] == "importance"
-    assert "chains" in idata.attrs["proposals"]
-    assert not {SIZE, PARETO_K, "log_evidence"} & set(idata.attrs)
+    assert idata.attrs["proposals"].startswith("none: smc, for weights do not suffice")
+    assert not {SIZE, PARETO_K} & set(idata.attrs)
     assert idata.attrs["max_rhat"] < 1.05
     root = draws(idata)["breeze_root"].ravel()
     found, expected, error = shares(root, convergence(idata)[1]["breeze_root[a]"])
@@ -299,19 +288,19 @@ def test_chains_after_weights_see_both_modes(twofold) -> None:
 
 
 @pytest.mark.usefixtures("without_weights")
-def test_chains_after_weights_along_trajectories(monkeypatch) -> None:
+def test_particles_after_weights_along_trajectories(monkeypatch) -> None:
     """They have the moments of weighted draws, with two noises."""
     scene = pucks()
     model = physics_model(
         scene, pushed(scene, trajectories=3, intervals=8), substeps=4, likelihood="trajectories"
     )
     mode = trajectory_mode(problem_in(model), problem_in(model).layout.to_vector(TRUTH))
-    chains = quiet(fit, model, seed=1, start=mode, **QUICK)
-    assert "chains" in chains.attrs["proposals"]
+    particles = quiet(fit, model, seed=1, start=mode, **QUICK)
+    assert "smc" in particles.attrs["proposals"]
     monkeypatch.setattr("pbrl_ppl.sampling.importance.adaptive_importance", adaptive_importance)
     weighted = quiet(fit, model, seed=2, start=mode, **QUICK)
     assert weighted.attrs[PARETO_K] < MAX_PARETO_K
-    agree(weighted, chains)
+    agree(weighted, particles)
 
 
 def test_proposals_without_density_are_an_error(model, mode, monkeypatch) -> None:
@@ -336,7 +325,7 @@ def test_more_draws_keep_both_modes(twofold) -> None:
         assert abs(found - expected) < 4 * error, (seed, found, expected, error)
 
 
-@pytest.mark.parametrize("method", ["importance", "metropolis"])
+@pytest.mark.parametrize("method", ["importance", "smc"])
 def test_an_angle_that_the_data_hardly_inform(method) -> None:
     """Its Gaussian reaches where there is no density, which makes no NaN and no warning."""
     known = {name: CART[name] for name in CART if name not in ("w_theta", "mu_x", "mu_y")}
@@ -344,7 +333,7 @@ def test_an_angle_that_the_data_hardly_inform(method) -> None:
     history = simulated_history(
         scene, CART, seed=7, trajectories=2, intervals=3, substeps=4, noise=0.3
     )
-    idata = quiet(fit, physics_model(scene, history), seed=1, method=method, tune=200, **QUICK)
+    idata = quiet(fit, physics_model(scene, history), seed=1, method=method, **QUICK)
     angle = draws(idata)["w_theta"].ravel()
     assert np.isfinite(angle).all()
     assert np.ptp(angle) > 1.0
@@ -423,25 +412,34 @@ def test_a_resumed_fit_adds_new_draws(model, fitted) -> None:
     assert fitted.attrs[PARETO_K] <= whole.attrs[PARETO_K] < MAX_PARETO_K
 
 
-def test_a_resumed_fit_may_go_on_by_chains(model, fitted) -> None:
-    options = QUICK | {"draws": 40, "tune": 20, "method": "metropolis"}
+def test_a_resumed_fit_may_go_on_by_particles(model, fitted) -> None:
+    options = QUICK | {"draws": 100, "method": "smc"}
     whole = quiet(fit, model, seed=1, resume=fitted, **options)
-    assert whole.attrs["method"] == "metropolis"
+    assert whole.attrs["method"] == "smc"
     stats = group(whole, "sample_stats")
-    assert stats.sizes["draw"] == group(whole, "posterior").sizes["draw"] == 290
+    assert stats.sizes["draw"] == group(whole, "posterior").sizes["draw"] == 350
     assert np.isfinite(stats["log_weight"][:, :250]).all()
     assert np.isnan(stats["log_weight"][:, 250:]).all()
     assert np.isfinite(stats["accept"][:, 250:]).all()
-    assert fitted.attrs[SIZE] < whole.attrs[SIZE] < fitted.attrs[SIZE] + 4 * 40 * 2
+    assert fitted.attrs[SIZE] < whole.attrs[SIZE] < fitted.attrs[SIZE] + 4 * 100 * 2
 
 
-def test_chains_go_on_as_chains(model, mode) -> None:
-    options = QUICK | {"draws": 20, "tune": 20, "chains": 2, "method": "metropolis"}
+def test_particles_in_one_process_or_two(model, mode) -> None:
+    """The same seed gives the same draws, and other ones go on from these."""
+    options = QUICK | {"draws": 100, "chains": 2, "method": "smc"}
     first = quiet(fit, model, seed=1, start=mode, **options)
+    again = quiet(fit, model, seed=1, start=mode, **(options | {"cores": 2}))
+    np.testing.assert_array_equal(draws(again)["mass"], draws(first)["mass"])
     whole = quiet(fit, model, seed=1, resume=first, **options)
-    assert whole.attrs["method"] == "metropolis"
     assert "accept" in group(whole, "sample_stats")
-    assert not {SIZE, PARETO_K, "proposals", "log_evidence"} & set(whole.attrs)
+    assert not {SIZE, PARETO_K, "proposals"} & set(whole.attrs)
+    assert len(np.unique(draws(whole)["mass"])) > 300
+
+
+def test_one_run_of_particles(model, mode) -> None:
+    idata = quiet(fit, model, seed=1, start=mode, **(QUICK | {"chains": 1, "method": "smc"}))
+    assert group(idata, "posterior").sizes["chain"] == 1
+    assert np.isfinite(idata.attrs["log_evidence"])
 
 
 # -- weights ---------------------------------------------------------------------------------------
@@ -521,7 +519,7 @@ def test_no_parameter_is_worth_more_than_the_weights(fitted) -> None:
 
 def test_weights_with_a_heavy_tail_are_warned_of(model, mode, monkeypatch) -> None:
     monkeypatch.setattr("pbrl_ppl.posterior.completion.MAX_PARETO_K", -10.0)
-    says = r"Pareto k of the proposals' weights is .* \(want <= -10.0\): .*'metropolis'"
+    says = r"Pareto k of the proposals' weights is .* \(want <= -10.0\): .*'smc'"
     with pytest.warns(ConvergenceWarning, match=says):
         idata = fit(model, seed=1, start=mode, **QUICK)
     assert any("Pareto k" in each for each in json.loads(idata.attrs["warnings"]))

@@ -1,4 +1,4 @@
-"""`fit(method="paper")`: the schedule of the paper's Table 2."""
+"""`fit(method="metropolis")`: the schedule of the paper's Table 2."""
 
 import numpy as np
 import pymc as pm
@@ -44,7 +44,7 @@ def test_it_is_table_2(puck, mode, monkeypatch, options, row) -> None:
 
     monkeypatch.setattr(pm, "sample", record)
     with pytest.raises(AskedFor) as caught:
-        fit(puck, method="paper", start=mode, progress=False, **options)
+        fit(puck, method="metropolis", start=mode, progress=False, **options)
     (asked,) = caught.value.args
     iterations, burn_in, thin, chains = row
     assert asked["draws"] + asked["tune"] == iterations
@@ -59,10 +59,10 @@ def test_each_thin_th_draw_is_kept(puck, mode, chains) -> None:
     options = {"draws": 12, "tune": 20, "thin": 3, "chains": chains, "cores": 1}
     said = "one chain alone cannot show" if chains == 1 else "chains have not converged"
     with pytest.warns(ConvergenceWarning, match=said):
-        idata = fit(puck, method="paper", seed=2, start=mode, progress=False, **options)
+        idata = fit(puck, method="metropolis", seed=2, start=mode, progress=False, **options)
     mass = group(idata, "posterior")["mass"]
     assert mass.shape == (chains, 12, 1)
-    assert idata.attrs["method"] == "paper"
+    assert idata.attrs["method"] == "metropolis"
     assert np.isfinite(mass.values).all()
     assert np.isfinite(idata.attrs["min_ess"])
     assert np.isfinite(idata.attrs["max_rhat"]) == (chains > 1)

@@ -167,3 +167,15 @@ def test_the_command_fits_what_python_fits(idata, tmp_path, monkeypatch, capsys)
     assert main(simulate) == 0
     assert main([*fit[:4], "other.nc", "-q", "--likelihood", "innovations"]) == 2
     assert "expected one of transitions, trajectories, simulation" in capsys.readouterr().err
+
+
+@pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning")
+def test_stored_likelihoods_are_those_of_the_widened_draws() -> None:
+    """Or an update refuses the posterior, as if it were of another engine."""
+    model = physics_model(SCENE, history(0, 3), likelihood="simulation")
+    idata = pp.fit(model, seed=1, draws=50, progress=False)
+    problem = problem_of(idata)
+    phi, sigma = parameter_draws(problem, idata)
+    expected = problem.log_density(problem.residual(phi), sigma, phi)
+    stored = group(idata, "log_likelihood")["next_state"].to_numpy()
+    np.testing.assert_allclose(stored.reshape(expected.shape), expected)

@@ -11,7 +11,7 @@ from pbrl_ppl.parameters import ParameterLibrary
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.posterior import parameter_draws
 from pbrl_ppl.sampling import fit, physics_model
-from pbrl_ppl.sampling.methods import dispersed, last_draws, prior_starts
+from pbrl_ppl.sampling.methods import METHODS, SamplerRun, dispersed, prior_starts
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
 
@@ -43,17 +43,16 @@ def test_chains_begin_two_standard_deviations_from_the_mode(mode) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:the chains have not converged")
-def test_walkers_go_on_at_their_last_draws(mode) -> None:
-    """A chain is its walkers, one after another, each of as many draws."""
-    history = mode.problem.data.history
-    model = physics_model(mode.problem.scene, history)
+def test_chains_go_on_at_their_last_draws(mode) -> None:
+    model = physics_model(mode.problem.scene, mode.problem.data.history)
     idata = fit(model, start=mode, method="laplace", draws=12, chains=2, progress=False)
     problem = problem_in(model)
-    phi, sigma = (each.reshape(2, 12, -1) for each in parameter_draws(problem, idata))
-    for walkers, last in ((1, [11]), (3, [3, 7, 11])):
-        found = last_draws(problem, idata, walkers)
-        np.testing.assert_array_equal(found[0], phi[:, last].reshape(2 * walkers, -1))
-        np.testing.assert_array_equal(found[1], sigma[:, last].reshape(2 * walkers, -1))
+    phi, sigma = (each.reshape(2, 12, -1)[:, -1] for each in parameter_draws(problem, idata))
+    method = METHODS["metropolis"]
+    job = SamplerRun(problem, method, None, resume=idata, seed=1, cores=1, progress=print)
+    for start, last in zip(job.starts(), zip(phi, sigma, strict=True), strict=True):
+        for name, value in problem.named(*last).items():
+            np.testing.assert_array_equal(start[name], value)
 
 
 def test_chains_over_a_library_begin_anywhere_in_the_prior(mode) -> None:
