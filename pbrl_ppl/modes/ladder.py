@@ -23,9 +23,8 @@ from pbrl_ppl.likelihood import (
     with_defect,
     without,
 )
-from pbrl_ppl.modes.laplace import Mode, SimulatedMode, covariance_of, sandwich
 from pbrl_ppl.modes.noise import finite
-from pbrl_ppl.modes.search import find_mode
+from pbrl_ppl.modes.search import Mode, SimulatedMode, covariance_of, near_mode, sandwich
 from pbrl_ppl.parameters import box, inside, prior_residual, prior_slopes, stepped
 from pbrl_ppl.state import Floats
 from pbrl_ppl.threads import one_blas_thread
@@ -284,7 +283,7 @@ def fit_pieces_closely(
     """
     mode = fit_pieces(problem, phi, rounds, tolerance)
     for _ in range(repeats):
-        climbed = find_mode(mode.problem, initial=mode.phi, rounds=5)
+        climbed = near_mode(mode.problem, mode.phi)
         better = fit_pieces(mode.problem, climbed.phi, rounds, tolerance)
         if better.log_posterior < mode.log_posterior + worth:
             break

@@ -16,8 +16,6 @@ from pbrl_ppl.posterior.data import SMOOTHED
 from pbrl_ppl.posterior.store import DATATREE, Idata, arviz, from_groups, group, groups, smoothed
 from pbrl_ppl.state import STATE, THETA, Floats, Ints, wrapped
 
-#: Fewest draws: with fewer, the Pareto distribution is fitted to a tail of fewer than twenty.
-_LEAST_DRAWS = 100
 #: The dimension over which measured numbers are joined.
 _NUMBER = "number"
 
@@ -80,7 +78,7 @@ class Comparison:
         return vars(self) | {"before": vars(self.before), "after": vars(self.after)}
 
 
-def compare(before: Idata, after: Idata) -> Comparison | None:
+def compare(before: Idata, after: Idata, *, least_draws: int = 100) -> Comparison | None:
     """Compare two posteriors of the same data by leave-one-out cross-validation.
 
     For whole trajectories, one trajectory is left out at a time, see :func:`by_trajectory`.
@@ -89,11 +87,13 @@ def compare(before: Idata, after: Idata) -> Comparison | None:
     ----------
     before, after : InferenceData or DataTree
         With a group ``log_likelihood``; the same object twice is one model.
+    least_draws : int
+        With fewer, the Pareto distribution is fitted to a tail of fewer than twenty.
 
     Returns
     -------
     Comparison or None
-        None with fewer than 100 draws, or where a likelihood is not finite.
+        None with fewer draws, or where a likelihood is not finite.
 
     Raises
     ------
@@ -108,7 +108,7 @@ def compare(before: Idata, after: Idata) -> Comparison | None:
         )
     for posterior in (before, after):
         sizes = group(posterior, "posterior").sizes
-        if sizes["chain"] * sizes["draw"] < _LEAST_DRAWS:
+        if sizes["chain"] * sizes["draw"] < least_draws:
             return None
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         # warnings about Pareto k, which is in the result

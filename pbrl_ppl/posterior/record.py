@@ -20,7 +20,7 @@ from pbrl_ppl.likelihood import (
     log_posterior,
     noise_labels,
 )
-from pbrl_ppl.modes import find_mode
+from pbrl_ppl.modes import near_mode
 from pbrl_ppl.parameters import Layout, ParameterLibrary, nearest
 from pbrl_ppl.physics import Physics, build_layout
 from pbrl_ppl.posterior.store import SCHEMA, Idata, check_schema, draws
@@ -29,8 +29,6 @@ from pbrl_ppl.state import Floats, Ints
 
 #: A JSON object.
 JsonObject = Mapping[str, Any]
-#: Rounds of a climb that starts near the mode.
-_CLIMB = 5
 
 
 @dataclass(frozen=True)
@@ -75,7 +73,7 @@ class ParameterPoint:
 
 
 @dataclass(frozen=True)
-class Linearisation:
+class LinearisationCheck:
     """Check of the smoothed states' linearisation, at some draws.
 
     Parameters
@@ -138,7 +136,7 @@ class PosteriorRecord:
         Which noise parameter each coordinate is subject to, where the fit is of whole trajectories.
     mode : StoredMode, optional
         The posterior's mode.
-    linearisation : Linearisation, optional
+    linearisation : LinearisationCheck, optional
         Check of the smoothed states' linearisation.
     configurations : tuple of mapping, optional
         Which bodies the joints may join, and the probability of each choice.
@@ -182,7 +180,7 @@ class PosteriorRecord:
     library: ParameterLibrary | None = None
     cells: Coordinates | None = None
     mode: StoredMode | None = None
-    linearisation: Linearisation | None = None
+    linearisation: LinearisationCheck | None = None
     configurations: tuple[JsonObject, ...] | None = None
     updates: tuple[JsonObject, ...] | None = None
     max_rhat: float | None = None
@@ -313,7 +311,7 @@ def packed_mode(
         draws = log_posterior(problem, phi, sigma, log_likelihood=likelihood)
         best = int(np.argmax(draws))
         if draws[best] > value + 0.1:
-            climbed = find_mode(problem, initial=phi[best], rounds=_CLIMB)
+            climbed = near_mode(problem, phi[best])
             if climbed.log_posterior > value:
                 mode, value = ParameterPoint(climbed.phi, climbed.sigma), climbed.log_posterior
     return _packed(problem, mode, value, phi)
@@ -344,7 +342,7 @@ def updated_mode(
     """
     phi, sigma, choice = draws
     if problem.library is None and not problem.layout.discrete.any():
-        mode = find_mode(problem, initial=earlier.phi, rounds=_CLIMB)
+        mode = near_mode(problem, earlier.phi)
         return _packed(problem, ParameterPoint(mode.phi, mode.sigma), mode.log_posterior, phi)
     value = log_posterior(problem, phi, sigma, choice, log_likelihood=likelihood)
     i = int(np.argmax(value))

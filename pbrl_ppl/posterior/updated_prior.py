@@ -21,9 +21,6 @@ from pbrl_ppl.posterior.store import Idata, group, labelled_draws, scalars
 from pbrl_ppl.scene import Body, Joint, Scene
 from pbrl_ppl.state import Floats
 
-#: Limits of a truncated normal: it is exponential with mu this many sigmas outside its support, and
-#: uniform with sigma this many times the width of what it covers.
-_OUTSIDE, _LEVEL = 5.0, 5.0
 #: Variables of a posterior that are not parameters.
 _OTHERS = ("library_index", "sigma")
 
@@ -223,14 +220,20 @@ def _concentration(resultant: float, *, limits: tuple[float, ...] = (1e-3, 1e6))
     return float(np.exp(brentq(excess, low, high)))
 
 
-def _parent(mean: float, sd: float, lower: float, upper: float) -> tuple[float, float]:
-    """Return mu and sigma of the normal that has this mean and sd once it is truncated."""
+def _parent(
+    mean: float, sd: float, lower: float, upper: float, *, outside: float = 5.0, level: float = 5.0
+) -> tuple[float, float]:
+    """Return mu and sigma of the normal that has this mean and sd once it is truncated.
+
+    ``outside``: sigmas that mu is outside the support at most; there it is exponential.
+    ``level``: sigma at most, as a multiple of the width of what it covers; there it is uniform.
+    """
     reach = min(upper - lower, mean - lower + sd, upper - mean + sd)
     reach = reach if np.isfinite(upper - lower) else 10 * reach
 
     def hyper(point: Floats) -> tuple[float, float]:
         sigma = float(np.exp(point[1]))
-        mu = np.clip(mean + sd * point[0], lower - _OUTSIDE * sigma, upper + _OUTSIDE * sigma)
+        mu = np.clip(mean + sd * point[0], lower - outside * sigma, upper + outside * sigma)
         return float(mu), sigma
 
     def error(point: Floats) -> Floats:
@@ -239,9 +242,9 @@ def _parent(mean: float, sd: float, lower: float, upper: float) -> tuple[float, 
         return np.array([(law.mean() - mean) / sd, np.log(law.std() / sd)])
 
     # far from the bounds, the moments are those of the normal itself
-    begin = np.array([0.0, np.log(min(sd, 0.9 * _LEVEL * reach))])
-    far = _LEVEL * reach / sd * (_OUTSIDE + 1)
-    limits = ([-far, np.log(0.5 * sd)], [far, np.log(_LEVEL * reach)])
+    begin = np.array([0.0, np.log(min(sd, 0.9 * level * reach))])
+    far = level * reach / sd * (outside + 1)
+    limits = ([-far, np.log(0.5 * sd)], [far, np.log(level * reach)])
     return hyper(least_squares(error, begin, bounds=limits, x_scale="jac").x)
 
 

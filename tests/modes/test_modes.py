@@ -12,8 +12,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, TransitionLikelihood
 from pbrl_ppl.modes import mode_of_more, search, trajectory_mode
-from pbrl_ppl.modes.laplace import climb, covariance_of, sandwich
-from pbrl_ppl.modes.search import find_mode, find_modes
+from pbrl_ppl.modes.search import climb, covariance_of, find_mode, find_modes, sandwich
 from pbrl_ppl.parameters import by_prior, covariance_factor, differentiate
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Body, Scene, Shape
