@@ -96,21 +96,17 @@ def complete(
     likelihood, predictive = evaluate(problem, phi, sigma, rows.ravel(), rng, known)
     data = groups(trace)
     posterior = _with_units(problem, posterior)
-    coords = {dim: data["observed_data"][dim].values for dim in NEXT_STATE_DIMS}
-    per_draw = {"chain": posterior["chain"], "draw": posterior["draw"]}
-    predicted = {"chain": posterior["chain"], "draw": posterior["draw"][rows[0]], **coords}
+    coords: dict[str, object] = {dim: posterior[dim] for dim in ("chain", "draw")}
+    coords |= {dim: data["observed_data"][dim].values for dim in NEXT_STATE_DIMS}
+    predicted = coords | {"draw": posterior["draw"][rows[0]]}
+    likelihoods = likelihood.reshape(chains, n, -1)
+    predictions = predictive.reshape(*rows.shape, *predictive.shape[1:])
     result = {
         "posterior": posterior,
         "sample_stats": data["sample_stats"],
-        "log_likelihood": _next_state(
-            ("chain", "draw", "transition"),
-            likelihood.reshape(chains, n, -1),
-            per_draw | {"transition": coords["transition"]},
-        ),
+        "log_likelihood": _next_state(("chain", "draw", "transition"), likelihoods, coords),
         "posterior_predictive": _next_state(
-            ("chain", "draw", *NEXT_STATE_DIMS),
-            predictive.reshape(*rows.shape, *predictive.shape[1:]),
-            predicted,
+            ("chain", "draw", *NEXT_STATE_DIMS), predictions, predicted
         ),
         **prior_groups(problem, posterior, phi, sigma, seed),
         "observed_data": _next_state(NEXT_STATE_DIMS, problem.measured, coords),
@@ -128,7 +124,7 @@ def complete(
 
 
 def _next_state(dims: tuple[str, ...], values: Floats, coords: Mapping[str, object]) -> xr.Dataset:
-    return xr.Dataset({"next_state": (dims, values)}, coords)
+    return xr.Dataset({"next_state": (dims, values)}, {dim: coords[dim] for dim in dims})
 
 
 def evaluate(
@@ -265,11 +261,9 @@ def prior_groups(
     density = np.where(steps, -np.log(scale) - sigma[:, : len(scale)] / scale, density)
 
     def shaped(like: xr.Dataset, of_phi: Floats, of_noise: Floats) -> xr.Dataset:
+        named = problem.named(of_phi, of_noise)
         return xr.Dataset(
-            {
-                name: like[name].copy(data=values.reshape(like[name].shape))
-                for name, values in problem.named(of_phi, of_noise).items()
-            }
+            {x: like[x].copy(data=v.reshape(like[x].shape)) for x, v in named.items()}
         )
 
     return {
@@ -477,8 +471,8 @@ def _folded(problem: Problem, trace: Idata, seed: int | None) -> xr.Dataset:
 def _with_units(problem: Problem, posterior: xr.Dataset) -> xr.Dataset:
     units = {block.name: block.unit for block in problem.layout.blocks}
     units["sigma"] = "the unit of each state dimension"
-    if is_filtered(problem):
-        units |= dict.fromkeys((ACCELERATION, CONTACT), "m/s^2, of omega rad/s^2")
-    for name in units.keys() & set(posterior.data_vars):
-        posterior[str(name)].attrs["units"] = units[str(name)]
+    units |= dict.fromkeys((ACCELERATION, CONTACT), "m/s^2, of omega rad/s^2")
+    for name, variable in posterior.data_vars.items():
+        if name in units:
+            variable.attrs["units"] = units[str(name)]
     return posterior

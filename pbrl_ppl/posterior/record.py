@@ -347,20 +347,17 @@ def updated_mode(
     value = log_posterior(problem, phi, sigma, choice, log_likelihood=likelihood)
     i = int(np.argmax(value))
     best = ParameterPoint(phi[i], sigma[i], None if choice is None else choice[i])
-    return _packed(problem, best, float(value[i]))
+    return _packed(problem, best, float(value[i]), phi)
 
 
-def _packed(
-    problem: Problem, mode: ParameterPoint, value: float, draws: Floats | None = None
-) -> StoredMode:
+def _packed(problem: Problem, mode: ParameterPoint, value: float, draws: Floats) -> StoredMode:
     """Return a point for a record, its wheels described as in draws (draw, p)."""
     layout, point, sets = problem.layout, mode.phi, None
-    if problem.library is None and draws is not None:
+    if problem.library is None:
         point = nearest(layout, point[None], draws)[0]
-    if problem.library is not None and mode.choice is not None:
-        names = problem.library.names
-        chosen = zip(problem.scene.owners, mode.choice.tolist(), strict=True)
-        sets = {owner: names[i] for owner, i in chosen}
+    elif mode.choice is not None:
+        chosen = (problem.library.names[i] for i in mode.choice)
+        sets = dict(zip(problem.scene.owners, chosen, strict=True))
     return StoredMode(
         dict(zip(layout.labels, point.tolist(), strict=True)),
         dict(zip(problem.noise_labels, mode.sigma.tolist(), strict=False)),  # a scalar is repeated
@@ -401,10 +398,9 @@ def scene_of(idata: Idata) -> Scene:
     PosteriorError
         If there is none.
     """
-    fields = stored_fields(idata, ("scene",))
-    if not fields:
+    scene: Scene | None = stored_fields(idata, ("scene",)).get("scene")
+    if scene is None:
         raise PosteriorError("posterior: it holds no scene; make it with pbrl_ppl.fit")
-    scene: Scene = fields["scene"]
     return scene
 
 
@@ -433,12 +429,11 @@ def stored_fields(idata: Idata, names: Iterable[str] | None = None) -> dict[str,
 @cache
 def _kinds(record: type) -> dict[str, object]:
     """Return the types of a dataclass's fields, without the None of an optional one."""
-    hints = {field.name: get_type_hints(record)[field.name] for field in fields(record)}
-    optional = {name: set(get_args(kind)) - {type(None)} for name, kind in hints.items()}
-    return {
-        name: optional[name].pop() if type(None) in get_args(kind) else kind
-        for name, kind in hints.items()
-    }
+    kinds = get_type_hints(record)
+    for name, kind in kinds.items():
+        if type(None) in get_args(kind):
+            (kinds[name],) = set(get_args(kind)) - {type(None)}
+    return kinds
 
 
 #: How fields of these types are read from an attribute, and written to one.

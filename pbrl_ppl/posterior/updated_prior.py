@@ -7,14 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pandas as pd
-from scipy.optimize import brentq, least_squares
-from scipy.special import i0e, i1e
-from scipy.stats import truncnorm
+from scipy.optimize import least_squares
+from scipy.stats import truncnorm, vonmises
 
 from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.modes import NONE, index_law
-from pbrl_ppl.parameters import JOINT_INDICES, ParameterLibrary, Prior, nearest
+from pbrl_ppl.parameters import JOINT_INDICES, ParameterLibrary, Prior, folded
 from pbrl_ppl.physics import index_priors
 from pbrl_ppl.posterior.record import layout_of, scene_of, stored_fields
 from pbrl_ppl.posterior.store import Idata, group, labelled_draws, scalars
@@ -59,24 +58,20 @@ def updated_scene(idata: Idata, *, effects: Iterable[Effect] = catalogue) -> Sce
         model = pp.physics_model(scene, pp.History.load("tuesday.csv", scene))
     """
     scene, layout = scene_of(idata), layout_of(idata, effects)
-    draws = labelled_draws(idata)
-    folded = nearest(layout, layout.columns(draws))
-    draws |= {x: folded[:, i] for i, x in enumerate(layout.labels) if x in draws}
+    draws = folded(layout, labelled_draws(idata))
     priors: dict[str, dict[str, float]] = {}
-    for block in layout.blocks:
+    for label, (block, _, prior) in zip(layout.labels, layout.entries, strict=True):
         if block.of != "body":
             continue
-        for owner, prior in zip(block.owners, block.priors, strict=True):
-            label = f"{block.name}[{owner}]"
-            if label not in draws:
-                raise PosteriorError(f"posterior: it has no {label}, which its scene asks for")
-            if not np.ptp(draws[label]) > 0:
-                raise PosteriorError(
-                    f"posterior: the draws of {label} are all {draws[label][0]:g}, so that they"
-                    " give no width to a prior; fit again, with more draws"
-                )
-            matched = moment_matched(prior, draws[label])
-            priors[label] = {k: getattr(matched, k) for k in matched.hyper_names}
+        if label not in draws:
+            raise PosteriorError(f"posterior: it has no {label}, which its scene asks for")
+        if not np.ptp(draws[label]) > 0:
+            raise PosteriorError(
+                f"posterior: the draws of {label} are all {draws[label][0]:g}, so that they give no"
+                " width to a prior; fit again, with more draws"
+            )
+        matched = moment_matched(prior, draws[label])
+        priors[label] = {k: getattr(matched, k) for k in matched.hyper_names}
     bodies = tuple(with_priors(body, priors) for body in scene.bodies)
     return scene.replace(bodies=bodies, joints=_joints(idata, scene))
 
@@ -116,12 +111,9 @@ def _joints(idata: Idata, scene: Scene) -> tuple[Joint, ...]:
                     f"posterior: it does not say what {name} may join; make it with pbrl_ppl.fit"
                 )
             law = np.sum(laws, axis=0)
-            both = zip(JOINT_INDICES, (law.sum(axis=1), law.sum(axis=0)), strict=True)
-            named = [(index, zip(scene.joinable, p.tolist(), strict=True)) for index, p in both]
-            named_pairs = tuple(
-                (index, tuple((n, p) for n, p in table if p)) for index, table in named
-            )
-            joint = replace(joint, prior=named_pairs)
+            tables = (zip(scene.joinable, law.sum(axis=k).tolist(), strict=True) for k in (1, 0))
+            of_indices = (tuple((name, p) for name, p in table if p) for table in tables)
+            joint = replace(joint, prior=tuple(zip(JOINT_INDICES, of_indices, strict=True)))
         joints.append(joint)
     return tuple(joints)
 
@@ -194,30 +186,14 @@ def moment_matched(prior: Prior, draws: Floats) -> Prior:
     (2.0, 0.1)
     """
     if prior.family == "von_mises":
-        resultant = np.exp(1j * draws).mean()
-        kappa = _concentration(float(np.abs(resultant)))
-        return replace(prior, mu=float(np.angle(resultant)), kappa=kappa)
+        kappa, mu, _ = vonmises.fit(draws)
+        # below 0.001 nearly uniform; at most of 0.001 rad
+        return replace(prior, mu=float(mu), kappa=min(float(kappa), 1e6) if kappa > 1e-3 else 0.0)
     values = np.log(draws) if prior.family == "log_normal" else draws
     mean, sd = float(values.mean()), float(values.std())
     if prior.family in ("truncated_normal", "half_normal"):
         mean, sd = _parent(mean, sd, *prior.support)
     return replace(prior, mu=mean, sigma=sd)
-
-
-def _concentration(resultant: float, *, limits: tuple[float, ...] = (1e-3, 1e6)) -> float:
-    """Return kappa whose von Mises distribution has this mean resultant length, 0 to 1.
-
-    ``limits``: limits of a concentration: nearly uniform, and 0.001 rad.
-    """
-    low, high = np.log(limits)
-
-    def excess(log_kappa: float) -> float:
-        kappa = np.exp(log_kappa)
-        return float(i1e(kappa) / i0e(kappa)) - resultant
-
-    if excess(low) >= 0 or excess(high) <= 0:
-        return 0.0 if excess(low) >= 0 else limits[1]
-    return float(np.exp(brentq(excess, low, high)))
 
 
 def _parent(
@@ -303,11 +279,7 @@ def library_probabilities(idata: Idata) -> pd.DataFrame:
         raise PosteriorError(
             "posterior: its model has no library; pass its library to physics_model"
         )
-    names = library.names
     index = group(idata, "posterior")["library_index"].transpose("chain", "draw", ...)
     (dim,) = index.dims[2:]
-    share = {name: (index == i).mean(("chain", "draw")) for i, name in enumerate(names)}
-    return pd.DataFrame(
-        {name: probability.to_numpy() for name, probability in share.items()},
-        index=index[dim].to_numpy(),
-    )
+    shares = [(index == i).mean(("chain", "draw")).to_numpy() for i in range(len(library.names))]
+    return pd.DataFrame(dict(zip(library.names, shares, strict=True)), index[dim].to_numpy())
