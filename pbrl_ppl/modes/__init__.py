@@ -15,7 +15,6 @@ from .ladder import corrected as corrected
 from .ladder import fit_pieces as fit_pieces
 from .ladder import fit_pieces_closely as fit_pieces_closely
 from .ladder import growth as growth
-from .ladder import ladder as ladder
 from .ladder import piece_lengths as piece_lengths
 from .ladder import simulated_states as simulated_states
 from .ladder import with_robust_covariance as with_robust_covariance
@@ -41,7 +40,6 @@ from .trajectories import find_simulation_mode as find_simulation_mode
 from .trajectories import find_trajectory_mode as find_trajectory_mode
 from .trajectories import mode_of_more as mode_of_more
 from .trajectories import nearby_mode as nearby_mode
-from .trajectories import simulation_mode as simulation_mode
 from .trajectories import tempered_mode as tempered_mode
 from .trajectories import trajectory_mode as trajectory_mode
 from .trajectories import with_state_sensitivity as with_state_sensitivity

@@ -87,11 +87,6 @@ class Mode(Generic[LikelihoodT]):
     others: tuple[Mode[LikelihoodT], ...] = ()
 
     @property
-    def values(self) -> dict[str, Floats]:
-        """Parameters by name, shape (body,) each."""
-        return self.problem.layout.to_dict(self.phi)
-
-    @property
     def factor(self) -> Floats:
         """Cholesky factor of the covariance, shape (p, p)."""
         return covariance_factor(self.covariance)
@@ -177,23 +172,21 @@ def climb(
     ends = (lower - origin) / scale, (upper - origin) / scale
     steps = np.where(problem.layout.discrete, 0.0, 1e-3)
 
-    def whole(moved: Floats, sigma: Floats, engine: PartedSimulator | None = None) -> Floats:
+    def residual(
+        moved: Floats, sigma: Floats, steps: Floats, engine: PartedSimulator | None = None
+    ) -> Floats:
         points = np.clip(origin + scale * moved, lower, upper)  # rounding leaves no support
         z = _least_squares(problem, points, sigma, phi, engine)
         return np.nan_to_num(z, nan=FAR_OFF, posinf=FAR_OFF, neginf=-FAR_OFF)
 
+    def jacobian(moved: Floats, sigma: Floats, steps: Floats) -> Floats:
+        size = np.minimum(steps, 0.1 * np.maximum(np.abs(moved), steps))
+        return differentiate(lambda x: residual(x, sigma, steps, slope), moved, size, *ends)
+
     for _ in range(rounds):
-
-        def residual(moved: Floats, sigma: Floats = sigma) -> Floats:
-            return whole(moved, sigma)
-
-        def jacobian(moved: Floats, sigma: Floats = sigma, steps: Floats = steps) -> Floats:
-            size = np.minimum(steps, 0.1 * np.maximum(np.abs(moved), steps))
-            return differentiate(lambda points: whole(points, sigma, slope), moved, size, *ends)
-
         result = least_squares(
             residual, (phi - origin) / scale, jac=jacobian, bounds=ends, x_scale="jac",
-            max_nfev=tries, ftol=1e-6, xtol=1e-6, gtol=1e-6,
+            max_nfev=tries, ftol=1e-6, xtol=1e-6, gtol=1e-6, args=(sigma, steps),
         )  # fmt: skip
         reached = np.clip(origin + scale * result.x, lower, upper)
         reached = best_tails(problem, reached, sigma)
