@@ -14,7 +14,6 @@ from scipy.optimize import least_squares
 from scipy.special import logsumexp
 
 from pbrl_ppl.errors import FitError
-from pbrl_ppl.history import lever
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes.importance import Marginal, importance, laplace
 from pbrl_ppl.modes.search import Mode, find_mode, find_modes
@@ -27,7 +26,7 @@ from pbrl_ppl.threads import Say, counted, silent
 #: Two names in the order of ``scene.joinable``, or None where there is no joint.
 Pair = tuple[str, str] | None
 
-#: So many configurations are tried at most: each takes about a second.
+#: Most configurations that are tried; each takes about a second.
 MOST = 300
 #: A joint that joins nothing, in the tables that people read.
 NONE = "none"
@@ -205,15 +204,16 @@ def nothing(scene: Scene) -> Configuration:
 def one_more(scene: Scene, configuration: Configuration) -> tuple[Configuration, ...]:
     """Yield the configurations with one more joint."""
     groups, chosen, larger = alike(scene), dict(configuration.pairs), []
-    for i, alike_joints in enumerate(groups):
-        order = [pair for pair, _ in alike_joints.weights]
-        pairs_of = [[chosen[name] for name in group.names] for group in groups]
+    pairs_of = [[chosen[name] for name in group.names] for group in groups]
+    for i, group in enumerate(groups):
+        order = [pair for pair, _ in group.weights]
         if None not in pairs_of[i]:
             continue
         for pair in order[:-1]:
-            grown = sorted([*pairs_of[i][: pairs_of[i].index(None)], pair], key=order.index)
-            held_now = [*grown, *[None] * (len(alike_joints.names) - len(grown))]
-            larger.append(_configuration(groups, [*pairs_of[:i], held_now, *pairs_of[i + 1 :]]))
+            grown = pairs_of[i].copy()
+            grown[grown.index(None)] = pair
+            grown.sort(key=order.index)
+            larger.append(_configuration(groups, [*pairs_of[:i], grown, *pairs_of[i + 1 :]]))
     return tuple(larger)
 
 
@@ -275,7 +275,7 @@ def evidence_warning(
 # -- search --------------------------------------------------------------------------------------
 
 
-#: Configurations whose log-evidence is within this much of the best are sought from more starts.
+#: Log-evidence (nats) below the best up to which a configuration is sought from more starts.
 _CONTENDERS = 100.0
 
 
@@ -517,25 +517,29 @@ def _anchors(
     """
     priors = [problem.layout.priors[problem.layout.index(anchor, name)] for anchor in JOINT_ANCHORS]
     a, b = (_states(problem, body) for body in joint.bodies or ())
-    reference = [_reference(problem, body) for body in joint.bodies or ()]
+    by_anchors = np.concatenate([_turns(a), -_turns(b)], axis=2)
 
-    def miss(anchors: Floats) -> Floats:
-        apart = _at(a, anchors[:2]) - _at(b, anchors[2:])
+    def miss(anchors: Floats) -> tuple[Floats, Floats]:
+        """Return how far from their distance the anchors are, and the derivative of that."""
+        apart = (a - b)[:, :2] + by_anchors @ anchors
         if joint.kind == "hinge":
-            return np.asarray(apart.ravel())
-        length = _at(reference[0], anchors[:2]) - _at(reference[1], anchors[2:])
-        return np.asarray(np.linalg.norm(apart, axis=1) - np.linalg.norm(length, axis=1))
+            return apart[:-1].ravel(), by_anchors[:-1].reshape(-1, len(anchors))
+        length = np.maximum(np.linalg.norm(apart, axis=1), np.finfo(float).tiny)
+        slope = np.einsum("ri,ria->ra", apart / length[:, None], by_anchors)
+        return length[:-1] - length[-1], slope[:-1] - slope[-1]
 
-    rng = np.random.default_rng(0)
-    starts = prior_draws(priors, rng, n_starts)
+    starts = prior_draws(priors, np.random.default_rng(0), n_starts)
     starts[0] = [prior.centre for prior in priors]
-    if joint.kind == "hinge":
-        starts = starts[:1]
-    starts = inside(priors, starts)
+    starts = inside(priors, starts[:1] if joint.kind == "hinge" else starts)
     bounds = np.array([prior.support for prior in priors]).T
     size = float(np.ptp(bounds, axis=0).min())  # so that the optimiser's tolerances have no unit
     results = [
-        least_squares(lambda u: miss(size * u) / size, start / size, bounds=bounds / size)
+        least_squares(
+            lambda u: miss(size * u)[0] / size,
+            start / size,
+            lambda u: miss(size * u)[1],
+            bounds / size,
+        )
         for start in starts
     ]
     results.sort(key=lambda result: float(result.cost))
@@ -543,7 +547,9 @@ def _anchors(
 
 
 def _states(problem: Problem, body: str, *, most_rows: int = 500) -> Floats:
-    """Return a body's recorded initial states, shape (row, 6); zero for the world.
+    """Return a body's recorded initial states and its reference pose, shape (row + 1, 6).
+
+    They are zero for the world.
 
     ``most_rows``: rows of the recording that the geometry is taken from, at most.
     """
@@ -551,17 +557,13 @@ def _states(problem: Problem, body: str, *, most_rows: int = 500) -> Floats:
     rows = start[np.isfinite(start).all(axis=(-1, -2))]
     rows = rows[:: -(-len(rows) // most_rows)]
     if body == WORLD:
-        return np.zeros((len(rows), 6))
+        return np.zeros((len(rows) + 1, 6))
     names = [mover.name for mover in problem.scene.moving]
-    return np.asarray(rows[:, names.index(body)])
+    pose = problem.scene.body(body).pose or (0.0, 0.0, 0.0)
+    return np.vstack([rows[:, names.index(body)], [*pose, 0.0, 0.0, 0.0]])
 
 
-def _reference(problem: Problem, body: str) -> Floats:
-    """Return a body at rest in its reference pose, shape (1, 6)."""
-    pose = None if body == WORLD else problem.scene.body(body).pose
-    return np.array([[*(pose or (0.0, 0.0, 0.0)), 0.0, 0.0, 0.0]])
-
-
-def _at(states: Floats, anchor: Floats) -> Floats:
-    """Return an anchor's position in the world, shape (row, 2)."""
-    return np.asarray(states[:, :2] + lever(states, (anchor[0], anchor[1]))[0])
+def _turns(states: Floats) -> Floats:
+    """Return the rotations of states from a body's frame to the world, shape (row, 2, 2)."""
+    cos, sin = np.cos(states[:, 2]), np.sin(states[:, 2])
+    return np.moveaxis(np.array([[cos, -sin], [sin, cos]]), -1, 0)
