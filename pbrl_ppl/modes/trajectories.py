@@ -103,11 +103,11 @@ def trajectory_mode(
     else:
         whole = _smoothed_cheaply(problem, phi)
         mode = nearby_mode(whole, phi, whole.likelihood.noise.sigma)
-    small_noise = _with_small_process_noise(mode.problem, mode.sigma, share)
-    if not np.array_equal(small_noise, mode.sigma):
-        other = nearby_mode(smoothed(mode.problem, mode.phi, small_noise), mode.phi, small_noise)
-        mode = max(mode, other, key=lambda candidate: candidate.log_posterior)
-    return mode
+    small = _with_small_process_noise(mode.problem, mode.sigma, share)
+    if np.array_equal(small, mode.sigma):
+        return mode
+    other = nearby_mode(smoothed(mode.problem, mode.phi, small), mode.phi, small)
+    return max(mode, other, key=lambda candidate: candidate.log_posterior)
 
 
 def mode_of_more(problem: Problem, mode: FilteredMode) -> FilteredMode:
@@ -232,11 +232,11 @@ def with_state_sensitivity(mode: FilteredMode) -> FilteredMode:
         if i:
             problem = smoothed(problem, phi, sigma)
         problem = with_sensitivity(problem, phi, sigma)
+        mode = near_mode(problem, phi)
         # far from where it is linearised a climb may end anywhere: judged by where it began
-        value = float(log_posterior(problem, phi, sigma))
-        modes.append((value, near_mode(problem, phi)))
-        change = _change(modes[-1][1], phi)
-        phi, sigma = modes[-1][1].phi, modes[-1][1].sigma
+        modes.append((float(log_posterior(problem, phi, sigma)), mode))
+        change = _change(mode, phi)
+        phi, sigma = mode.phi, mode.sigma
         if change < _CONVERGED:
             break
     return max(modes, key=lambda pair: pair[0])[1]
@@ -294,10 +294,8 @@ def tempered_mode(mode: SimulatedMode, prior: NoisePrior | None = None) -> Simul
 
     The density of each dimension is divided by its autocorrelation time.
     """
-    if prior is None:
-        median, spread = mode.problem.noise_prior
-        prior = tuple(median.tolist()), spread
-    problem = mode.problem.with_likelihood(prior=prior)
+    median, spread = mode.problem.noise_prior
+    problem = mode.problem.with_likelihood(prior=prior or (tuple(median.tolist()), spread))
     return with_robust_covariance(near_mode(problem, mode.phi))
 
 
