@@ -14,7 +14,7 @@ from pbrl_ppl.criticism.refinement import declared_mode
 from pbrl_ppl.effects import attach, catalogue
 from pbrl_ppl.history import with_units
 from pbrl_ppl.likelihood import Problem
-from pbrl_ppl.modes.laplace import profiled
+from pbrl_ppl.modes.search import profiled
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Scene, state_sizes, units_of
 from tests.helpers.similar import (

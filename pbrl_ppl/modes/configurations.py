@@ -1,28 +1,32 @@
-"""Configurations of joints of unknown bodies, and the problem of each."""
+"""Configurations of joints of unknown bodies: a mode and the evidence of each."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, combinations_with_replacement, product
 from typing import Any
 
 import numpy as np
+from scipy.optimize import least_squares
+from scipy.special import logsumexp
 
+from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import Problem
-from pbrl_ppl.modes.importance import Marginal
-from pbrl_ppl.modes.laplace import Mode
-from pbrl_ppl.parameters import Prior
+from pbrl_ppl.modes.importance import Marginal, importance, laplace
+from pbrl_ppl.modes.search import Mode, find_mode, find_modes
+from pbrl_ppl.parameters import JOINT_ANCHORS, Prior, inside, prior_draws
 from pbrl_ppl.physics import index_priors
-from pbrl_ppl.scene import Scene
+from pbrl_ppl.scene import WORLD, Joint, Scene
 from pbrl_ppl.state import Floats
+from pbrl_ppl.threads import Say, counted, silent
 
 #: Two names in the order of ``scene.joinable``, or None where there is no joint.
 Pair = tuple[str, str] | None
 
-#: So many configurations are tried at most: each takes about a second.
+#: Most configurations that are tried; each takes about a second.
 MOST = 300
 #: A joint that joins nothing, in the tables that people read.
 NONE = "none"
@@ -117,13 +121,13 @@ def alike(scene: Scene) -> tuple[Alike, ...]:
     for (_, *priors), names in groups.items():
         p_a, p_b = (prior.probabilities for prior in priors)
         both = np.outer(p_a, p_b)
-        pairs = combinations(range(len(p_a)), 2)
+        either = both + both.T
         weighed: list[tuple[Pair, float]] = [
-            ((scene.joinable[i], scene.joinable[j]), float(both[i, j] + both[j, i]))
-            for i, j in pairs
+            ((scene.joinable[i], scene.joinable[j]), float(either[i, j]))
+            for i, j in combinations(range(len(p_a)), 2)
+            if either[i, j] > 0
         ]
-        possible = [option for option in weighed if option[1] > 0]
-        alikes.append(Alike(tuple(names), (*possible, (None, float(both.trace())))))
+        alikes.append(Alike(tuple(names), (*weighed, (None, float(both.trace())))))
     return tuple(alikes)
 
 
@@ -187,12 +191,8 @@ def configurations(scene: Scene) -> tuple[Configuration, ...]:
         for group in groups
     )
     listed = [_configuration(groups, pairs) for pairs in product(*ways)]
-    possible = [
-        configuration
-        for configuration in listed
-        if configuration.empty or np.isfinite(configuration.log_prior)
-    ]
-    return tuple(sorted(possible, key=lambda configuration: not configuration.empty))
+    possible = [each for each in listed if each.empty or np.isfinite(each.log_prior)]
+    return tuple(sorted(possible, key=lambda each: not each.empty))
 
 
 def nothing(scene: Scene) -> Configuration:
@@ -204,15 +204,16 @@ def nothing(scene: Scene) -> Configuration:
 def one_more(scene: Scene, configuration: Configuration) -> tuple[Configuration, ...]:
     """Yield the configurations with one more joint."""
     groups, chosen, larger = alike(scene), dict(configuration.pairs), []
-    for i, alike_joints in enumerate(groups):
-        order = [pair for pair, _ in alike_joints.weights]
-        pairs_of = [[chosen[name] for name in group.names] for group in groups]
+    pairs_of = [[chosen[name] for name in group.names] for group in groups]
+    for i, group in enumerate(groups):
+        order = [pair for pair, _ in group.weights]
         if None not in pairs_of[i]:
             continue
         for pair in order[:-1]:
-            grown = sorted([*pairs_of[i][: pairs_of[i].index(None)], pair], key=order.index)
-            held_now = [*grown, *[None] * (len(alike_joints.names) - len(grown))]
-            larger.append(_configuration(groups, [*pairs_of[:i], held_now, *pairs_of[i + 1 :]]))
+            grown = pairs_of[i].copy()
+            grown[grown.index(None)] = pair
+            grown.sort(key=order.index)
+            larger.append(_configuration(groups, [*pairs_of[:i], grown, *pairs_of[i + 1 :]]))
     return tuple(larger)
 
 
@@ -269,3 +270,300 @@ def evidence_warning(
                 " give parameters that the data say nothing of in the scene (known = ...)"
             )
     return None
+
+
+# -- search --------------------------------------------------------------------------------------
+
+
+#: Log-evidence (nats) below the best up to which a configuration is sought from more starts.
+_CONTENDERS = 100.0
+
+
+def weigh(
+    problem: Problem,
+    *,
+    seed: int = 0,
+    progress: Say = silent,
+    margin: float = 25.0,
+    at_least: int = 2,
+) -> tuple[Weighed, ...]:
+    """Return the probability of each configuration of the joints of unknown bodies.
+
+    Each gets the mode of the continuous parameters that it leaves; the search for it begins where
+    geometry puts the anchors. The evidence is Laplace's, and for those that it cannot rule out an
+    importance sampler's.
+
+    All configurations are tried where there are at most 300. Where there are more, each joint is
+    tried by itself first, and further ones are added to the best few (beam search), about 300 in
+    all. Then the probabilities are among what was tried, and joints that explain the recording only
+    together may be missed.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of a scene with such joints.
+    seed : int
+        The same seed gives the same answer.
+    progress : callable
+        Called with how many configurations are done.
+    margin : float
+        A log-evidence this far below the best by the Laplace method is not looked at more closely:
+        the approximation's error is a few units, and the same for all configurations in great part.
+    at_least : int
+        So many of the best are searched in any case.
+
+    Returns
+    -------
+    tuple of Weighed
+        No joint at all first; then as :func:`pbrl_ppl.modes.configurations.configurations` orders
+        them, or in the order in which they were tried.
+
+    Raises
+    ------
+    FitError
+        If a single joint may join more pairs than can be tried.
+    """
+    problem.segments  # noqa: B018  # checks the initial states, once for all
+    modes, evidence = _tried(problem, seed, progress)
+    tried, worth = tuple(modes), _worth(modes)
+    leading = _leading(evidence, _CONTENDERS, at_least=at_least)
+    for configuration in counted(leading, len(leading), "looking again", progress):
+        mode = modes[configuration]
+        if configuration.empty:
+            better = _apart(mode.problem, seed + 1)
+        else:
+            better = _searched_again(mode, configuration, worth, seed)
+        if better.log_posterior > mode.log_posterior:
+            modes[configuration], evidence[configuration] = better, laplace(better)
+    close = _leading(evidence, margin)
+    if len(close) > 1:
+        rng = np.random.default_rng(seed)
+        for configuration in counted(close, len(close), "weighing joints", progress):
+            evidence[configuration] = importance(modes[configuration], rng)
+    score = np.array([e.log_prior + evidence[e].log_z for e in tried])
+    probability = np.exp(score - logsumexp(score))
+    return tuple(
+        Weighed(configuration, modes[configuration], evidence[configuration], float(p))
+        for configuration, p in zip(tried, probability, strict=True)
+    )
+
+
+def _tried(
+    problem: Problem, seed: int, progress: Say, *, breadth: int = 4
+) -> tuple[dict[Configuration, Mode], dict[Configuration, Marginal]]:
+    """Return modes and Laplace evidence of the configurations that a search reaches.
+
+    ``breadth``: configurations to which further joints are added, at most.
+    """
+    scene = problem.scene
+    apart = nothing(scene)
+    modes = {apart: _apart(apart.problem(problem), seed)}
+    evidence = {apart: laplace(modes[apart])}
+
+    def extend(parents: Mapping[Configuration, Configuration], what: str) -> None:
+        for configuration, parent in counted(parents.items(), len(parents), what, progress):
+            tied = configuration.problem(problem)
+            modes[configuration] = _joint(tied, configuration, modes[parent], _worth(modes))
+            evidence[configuration] = laplace(modes[configuration])
+
+    if number(scene) <= MOST:
+        others = {other: apart for other in configurations(scene) if not other.empty}
+        extend(others, "trying joints")
+        return modes, evidence
+    best, levels = [apart], len(apart.pairs)
+    for level in range(levels):
+        grown = {
+            configuration: parent
+            for parent in best
+            for configuration in one_more(scene, parent)
+            if configuration not in modes
+        }
+        if not level and len(modes) + len(grown) > MOST:
+            raise FitError(
+                f"fit: the joints of unknown bodies have {len(grown)} configurations to be tried"
+                f" at once, of {len(scene.joinable)} that they may join"
+                f" ({', '.join(scene.joinable)}), expected at most {MOST}; name the bodies of some"
+                " joints in the scene, leave out bodies that cannot be joined, or give the joints a"
+                " prior that leaves them out (prior = { i_a = { ... } })"
+            )
+        extend(grown, f"trying joint {level + 1} of {levels}")
+        # one that is impossible by the prior may lead to what is not: if each joint joins something
+        score = {e: evidence[e].log_z + max(e.log_prior, -_CONTENDERS) for e in evidence}
+        least = max(score.values()) - 2 * _CONTENDERS
+        best = sorted((e for e in grown if score[e] > least), key=lambda e: -score[e])
+        room = (MOST - len(modes)) // max(levels - level - 1, 1)
+        most = max([1, *(len(one_more(scene, configuration)) for configuration in best[:1])])
+        best = best[: int(np.clip(room // most, 1, breadth))]
+    return modes, evidence
+
+
+def _worth(modes: Mapping[Configuration, Mode], *, hopeless: float = 300.0) -> float:
+    """Return the log-posterior below which a mode is given up.
+
+    ``hopeless``: a climb that ends this far below the best log-posterior so far goes no further:
+    wrong joints are explained by masses so unlike that the engine takes a hundred times as long.
+    """
+    return max(mode.log_posterior for mode in modes.values()) - hopeless
+
+
+def _leading(
+    evidence: dict[Configuration, Marginal], within: float, at_least: int = 1
+) -> list[Configuration]:
+    """Return configurations with a log-weight near the best, or among the first."""
+    score = {each: each.log_prior + marginal.log_z for each, marginal in evidence.items()}
+    order = sorted(score, key=lambda each: -score[each])
+    least = score[order[0]] - within
+    return [e for i, e in enumerate(order) if i < at_least or score[e] > least]
+
+
+def _apart(problem: Problem, seed: int) -> Mode:
+    """Return the mode of a problem without joints of unknown bodies."""
+    return _best(problem, find_modes(problem.coarse, seed=seed), -np.inf)
+
+
+def _joint(problem: Problem, configuration: Configuration, fewer: Mode, worth: float) -> Mode:
+    """Return the mode from anchors by geometry, and bodies of the prior or of fewer joints.
+
+    The modes are told apart with few engine steps; the best is climbed with the exact engine.
+    """
+    layout, starts = problem.layout, []
+    for anchors in _placed(problem, configuration):
+        centre = np.array([prior.centre for prior in layout.priors])
+        for start in (centre, layout.from_layout(fewer.problem.layout, fewer.phi)):
+            start[_anchor_places(problem, configuration)] = anchors
+            starts.append(start)
+    return _best(problem, _climbed(problem, starts), worth)
+
+
+def _climbed(problem: Problem, starts: Iterable[Floats], rounds: int = 8) -> list[Mode]:
+    """Return where a few rounds of climbs with few engine steps lead: they tell modes apart."""
+    return [find_mode(problem.coarse, initial=start, rounds=rounds) for start in starts]
+
+
+def _best(problem: Problem, found: list[Mode], worth: float, *, rounds: int = 2) -> Mode:
+    """The best of modes that were found with few engine steps, climbed with the exact engine.
+
+    One that has not come near the log-posterior ``worth`` by then is climbed no further.
+
+    ``rounds``: rounds of the first climb with the exact engine.
+    """
+    best = max(found, key=lambda mode: mode.log_posterior)
+    first = find_mode(problem, initial=best.phi, rounds=rounds)
+    return first if first.log_posterior < worth else find_mode(problem, initial=first.phi)
+
+
+def _searched_again(
+    mode: Mode,
+    configuration: Configuration,
+    worth: float,
+    seed: int,
+    *,
+    starts: int = 4,
+    screened: int = 200,
+) -> Mode:
+    """Return a better mode with the same anchors and any bodies' parameters.
+
+    ``starts``: starts of each of these configurations: a wheel's axes may have been caught in a
+    local optimum.
+
+    ``screened``: draws from the prior that they are chosen from.
+    """
+    problem, priors = mode.problem, mode.problem.layout.priors
+    draws = prior_draws(priors, np.random.default_rng(seed), screened)
+    places = _anchor_places(problem, configuration)
+    draws[:, places] = mode.phi[places]
+    draws = inside(priors, draws)
+    z = np.nan_to_num(problem.coarse.whitened(draws, mode.sigma), nan=1e6)
+    order = np.argsort(np.log1p(z**2).sum(axis=(1, 2)))[:starts]
+    return _best(problem, _climbed(problem, draws[order]), worth)
+
+
+def _joined(problem: Problem, configuration: Configuration) -> Iterator[tuple[str, Joint]]:
+    """Yield the names and joints of a configuration, as in its scene."""
+    chosen = {name for name, pair in configuration.pairs if pair is not None}
+    scene = problem.scene
+    for name, joint in zip(scene.joint_names, scene.joints, strict=True):
+        if name in chosen:
+            yield name, joint
+
+
+def _anchor_places(problem: Problem, configuration: Configuration) -> list[int]:
+    """Return the places in phi of the configuration's anchors, four a joint."""
+    return [
+        problem.layout.index(anchor, name)
+        for name, _ in _joined(problem, configuration)
+        for anchor in JOINT_ANCHORS
+    ]
+
+
+# -- where geometry puts the anchors ---------------------------------------------------------------
+
+
+def _placed(problem: Problem, configuration: Configuration) -> list[Floats]:
+    """Return likely anchors of a configuration's joints, four a joint, best first."""
+    alternatives = [_anchors(problem, *named) for named in _joined(problem, configuration)]
+    return [np.concatenate(anchors) for anchors in zip(*alternatives, strict=False)]
+
+
+def _anchors(
+    problem: Problem, name: str, joint: Joint, *, n_starts: int = 12, kept: int = 2
+) -> list[Floats]:
+    """Return anchors that keep their distance over the recording: zero for a hinge.
+
+    A hinge's are linear least squares; a rod's are not, and are sought from several starts.
+
+    ``n_starts``: starts of the search by geometry.
+    ``kept``: anchors that are kept.
+    """
+    priors = [problem.layout.priors[problem.layout.index(anchor, name)] for anchor in JOINT_ANCHORS]
+    a, b = (_states(problem, body) for body in joint.bodies or ())
+    by_anchors = np.concatenate([_turns(a), -_turns(b)], axis=2)
+
+    def miss(anchors: Floats) -> tuple[Floats, Floats]:
+        """Return how far from their distance the anchors are, and the derivative of that."""
+        apart = (a - b)[:, :2] + by_anchors @ anchors
+        if joint.kind == "hinge":
+            return apart[:-1].ravel(), by_anchors[:-1].reshape(-1, len(anchors))
+        length = np.maximum(np.linalg.norm(apart, axis=1), np.finfo(float).tiny)
+        slope = np.einsum("ri,ria->ra", apart / length[:, None], by_anchors)
+        return length[:-1] - length[-1], slope[:-1] - slope[-1]
+
+    starts = prior_draws(priors, np.random.default_rng(0), n_starts)
+    starts[0] = [prior.centre for prior in priors]
+    starts = inside(priors, starts[:1] if joint.kind == "hinge" else starts)
+    bounds = np.array([prior.support for prior in priors]).T
+    size = float(np.ptp(bounds, axis=0).min())  # so that the optimiser's tolerances have no unit
+    results = [
+        least_squares(
+            lambda u: miss(size * u)[0] / size,
+            start / size,
+            lambda u: miss(size * u)[1],
+            bounds / size,
+        )
+        for start in starts
+    ]
+    results.sort(key=lambda result: float(result.cost))
+    return [size * result.x for result in results[:kept]]
+
+
+def _states(problem: Problem, body: str, *, most_rows: int = 500) -> Floats:
+    """Return a body's recorded initial states and its reference pose, shape (row + 1, 6).
+
+    They are zero for the world.
+
+    ``most_rows``: rows of the recording that the geometry is taken from, at most.
+    """
+    start = problem.data.history.dataset["start"].to_numpy()
+    rows = start[np.isfinite(start).all(axis=(-1, -2))]
+    rows = rows[:: -(-len(rows) // most_rows)]
+    if body == WORLD:
+        return np.zeros((len(rows) + 1, 6))
+    names = [mover.name for mover in problem.scene.moving]
+    pose = problem.scene.body(body).pose or (0.0, 0.0, 0.0)
+    return np.vstack([rows[:, names.index(body)], [*pose, 0.0, 0.0, 0.0]])
+
+
+def _turns(states: Floats) -> Floats:
+    """Return the rotations of states from a body's frame to the world, shape (row, 2, 2)."""
+    cos, sin = np.cos(states[:, 2]), np.sin(states[:, 2])
+    return np.moveaxis(np.array([[cos, -sin], [sin, cos]]), -1, 0)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.special import gammaln, logsumexp
 
-from pbrl_ppl.modes.laplace import Mode
+from pbrl_ppl.modes.search import Mode
 from pbrl_ppl.modes.space import Space
 from pbrl_ppl.parameters import covariance_factor
 from pbrl_ppl.state import Floats

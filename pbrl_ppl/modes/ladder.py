@@ -8,7 +8,7 @@ were simulated there.
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -23,20 +23,15 @@ from pbrl_ppl.likelihood import (
     with_defect,
     without,
 )
-from pbrl_ppl.modes.laplace import Mode, SimulatedMode, covariance_of, sandwich
 from pbrl_ppl.modes.noise import finite
-from pbrl_ppl.modes.search import find_mode
+from pbrl_ppl.modes.search import Mode, SimulatedMode, covariance_of, near_mode, sandwich
 from pbrl_ppl.parameters import box, inside, prior_residual, prior_slopes, stepped
 from pbrl_ppl.state import Floats
 from pbrl_ppl.threads import one_blas_thread
 
-#: An initial state that is magnified by more than this, beyond growth in proportion to time, makes
-#: a piece too long to tell a law from.
+#: Largest magnification of initial states, beyond growth in proportion to time, of pieces that are
+#: not too long to tell a law from.
 MOST_GROWTH = 30.0
-#: Steps of derivatives, as a share of a posterior standard deviation of phi.
-_OF_PHI = 0.5
-#: The least and the largest of them, as shares of each scale.
-_LEAST, _MOST = 1e-6, 2e-2
 
 
 @one_blas_thread
@@ -160,24 +155,6 @@ def with_robust_covariance(mode: SimulatedMode, *, many: int = 8) -> SimulatedMo
     return replace(mode, covariance=robust)
 
 
-@dataclass(frozen=True, eq=False)
-class Linear:
-    """Residual and derivatives of simulated pieces at phi and initial states.
-
-    Parameters
-    ----------
-    residual : ndarray
-        Measured minus simulated, shape (piece, H, body, state), SI units.
-    by_phi, by_start : ndarray
-        Derivatives of the simulated states, shapes (piece, H, body, state, p) and (piece, H, body,
-        state, cell).
-    """
-
-    residual: Floats
-    by_phi: Floats
-    by_start: Floats
-
-
 @one_blas_thread
 def fit_pieces(
     problem: SimulatedProblem,
@@ -224,11 +201,11 @@ def fit_pieces(
     scale = layout.scale(phi)
     sizes = problem.likelihood.initial_states.coordinates.sizes(problem.scene)
     phi, start = inside(priors, phi), problem.segments.start
-    steps = first_width * np.where(layout.discrete, 0.0, scale), first_width * sizes
+    steps = first_width * scale, first_width * sizes
     damping, failed, one_sided = 1e-3, 0, True
     for _ in range(rounds):
-        linear = _linearise(problem, phi, start, steps, one_sided)
-        step = _Step(problem, linear, phi, start)
+        residual, *slopes = _linearised(problem, phi, start, steps, one_sided)
+        step = _Step(problem, phi, start, residual, *slopes)
         problem = step.problem
         if not failed:
             steps = step.differences(scale, sizes)
@@ -256,14 +233,14 @@ def fit_pieces(
             one_sided = False
             continue
         if failed == len(wider) or predicted_gain <= tolerance:
-            linear = replace(linear, residual=step.residual)
+            residual = step.residual
             break
         # friction makes kinks: over another width the derivative sees others
         steps = steps[0] * wider[failed], steps[1] * wider[failed]
         damping, failed = 1e-3, failed + 1
     else:
-        linear = _linearise(problem, phi, start, steps)
-    return _Step(problem, linear, phi, start).mode()
+        residual, *slopes = _linearised(problem, phi, start, steps)
+    return _Step(problem, phi, start, residual, *slopes).mode()
 
 
 @one_blas_thread
@@ -284,7 +261,7 @@ def fit_pieces_closely(
     """
     mode = fit_pieces(problem, phi, rounds, tolerance)
     for _ in range(repeats):
-        climbed = find_mode(mode.problem, initial=mode.phi, rounds=5)
+        climbed = near_mode(mode.problem, mode.phi)
         better = fit_pieces(mode.problem, climbed.phi, rounds, tolerance)
         if better.log_posterior < mode.log_posterior + worth:
             break
@@ -306,16 +283,17 @@ def _residual(problem: SimulatedProblem, points: Floats, initial_states: Floats)
     return finite(problem, problem.observations.residual(states))
 
 
-def _linearise(
+def _linearised(
     problem: SimulatedProblem,
     phi: Floats,
     start: Floats,
     steps: tuple[Floats, Floats],
     one_sided: bool = False,
-) -> Linear:
-    """Return residual and derivatives by differences, all in one call of the engine.
+) -> tuple[Floats, Floats, Floats]:
+    """Return residuals and the states' derivatives by phi and by initial states, in one simulation.
 
-    They are central but for those by phi where ``one_sided``.
+    Shapes (piece, H, body, state), (piece, H, body, state, p) and (piece, H, body, state, cell).
+    Differences are central but for those by phi where ``one_sided``.
     """
     coordinates = problem.likelihood.initial_states.coordinates
     lower, upper = box(problem.layout.priors)
@@ -336,7 +314,7 @@ def _linearise(
     by_phi = np.moveaxis(residual[1 : 1 + p] - before, 0, -1) / -width
     begun = residual[len(residual) - 2 * c :]
     by_start = np.moveaxis(begun[:c] - begun[c:], 0, -1) / (-2 * steps[1])
-    return Linear(residual[0], by_phi, by_start)
+    return residual[0], by_phi, by_start
 
 
 def _cost(problem: SimulatedProblem, sigma: Floats, phi: Floats) -> float:
@@ -350,17 +328,23 @@ class _Step:
     """Gauss-Newton steps from one linearisation, with fixed noise, weights and projection."""
 
     def __init__(
-        self, problem: SimulatedProblem, linear: Linear, phi: Floats, start: Floats
+        self,
+        problem: SimulatedProblem,
+        phi: Floats,
+        start: Floats,
+        residual: Floats,
+        by_phi: Floats,
+        by_start: Floats,
     ) -> None:
-        problem, residual = linearised_about(problem, start, linear.by_start), linear.residual
-        likelihood, self.by_start = problem.likelihood, linear.by_start
+        problem = linearised_about(problem, start, by_start)
+        likelihood, self.by_start = problem.likelihood, by_start
         self.sigma = likelihood.profile(residual, problem.least_noise)
         tau = likelihood.correlation_times(residual, self.sigma)
         self.problem = problem.with_likelihood(tau=tuple(tau.tolist()))
         likelihood = self.problem.likelihood
         self.initial_states, self.weight = likelihood.initial_states, likelihood.weight(self.sigma)
         self.u, self.back = self.initial_states.basis(self.weight)
-        by_phi = np.moveaxis(linear.by_phi, -1, 0) * self.weight
+        by_phi = np.moveaxis(by_phi, -1, 0) * self.weight
         pieces, rows = len(residual), residual[0].size
         by_phi = by_phi.reshape(len(phi), pieces, rows)
         n = self.u.shape[1] - rows
@@ -375,7 +359,7 @@ class _Step:
         self.rows = self._rows(start, residual)
         left = without(self.u, self.rows)
         priors = self.problem.layout.priors
-        slopes = prior_slopes(priors, phi) if priors else np.zeros(0)
+        slopes = prior_slopes(priors, phi)
         self.gradient = self.jacobian.T @ left.ravel() - slopes * prior_residual(priors, phi)
         self.precision = self.normal + np.diag(slopes**2)
         self.cost_before = self._profiled(left, residual, phi)
@@ -409,35 +393,37 @@ class _Step:
         tau = np.array(self.problem.likelihood.tau)
         problem = linearised_pieces(self.problem, self.start, self.by_start, tau)
         log_posterior = -_cost(problem, self.sigma, self.phi)
-        return Mode(problem, self.phi, self.sigma, self.jacobian, self.covariance, log_posterior)
-
-    @property
-    def covariance(self) -> Floats:
-        """Laplace covariance of phi, shape (p, p)."""
-        return covariance_of(self.precision)
+        covariance = covariance_of(self.precision)
+        return Mode(problem, self.phi, self.sigma, self.jacobian, covariance, log_posterior)
 
     @property
     def predicted_gain(self) -> float:
         """Gain that the derivatives predict (nats)."""
-        return 0.5 * float(self.gradient @ self.covariance @ self.gradient)
+        return 0.5 * float(self.gradient @ covariance_of(self.precision) @ self.gradient)
 
     def differences(
-        self, scale: Floats, sizes: Floats, *, of_start_sd: float = 0.3
+        self,
+        scale: Floats,
+        sizes: Floats,
+        *,
+        of_phi: float = 0.5,
+        of_start: float = 0.3,
+        least: float = 1e-6,
+        most: float = 2e-2,
     ) -> tuple[Floats, Floats]:
         """Return steps of the next derivatives, shapes (p,) and (cell,).
 
-        ``of_start_sd``: steps of derivatives as shares of a start's standard deviation.
+        ``of_phi``, ``of_start``: steps as shares of the standard deviations of phi and of a start.
+        ``least``, ``most``: the least and the largest steps, as shares of each scale.
         """
-        width = _OF_PHI / np.sqrt(np.maximum(np.diag(self.precision), 1e-300))
-        width = np.where(
-            self.problem.layout.discrete, 0.0, np.clip(width, _LEAST * scale, _MOST * scale)
-        )
+        width = of_phi / np.sqrt(np.maximum(np.diag(self.precision), 1e-300))
+        width = np.clip(width, least * scale, most * scale)
         by_start = np.where(self.initial_states.seen[..., None], self.by_start, 0.0)
-        of_start = ((by_start * self.weight[:, None]) ** 2).sum((1, 2, 3))
+        precision = ((by_start * self.weight[:, None]) ** 2).sum((1, 2, 3))
         of_weight = self.initial_states.of_coordinates(self.weight)
-        of_start += np.isfinite(self.initial_states.begin) * of_weight**2
-        begin = of_start_sd / np.sqrt(np.maximum(np.median(of_start, axis=0), 1e-300))
-        return width, np.clip(begin, _LEAST * sizes, _MOST * sizes)
+        precision += np.isfinite(self.initial_states.begin) * of_weight**2
+        begin = of_start / np.sqrt(np.maximum(np.median(precision, axis=0), 1e-300))
+        return width, np.clip(begin, least * sizes, most * sizes)
 
     def moved(self, damping: float, initial_states_alone: bool) -> tuple[Floats, Floats]:
         """Return phi and initial states a damped step on, shapes (p,) and (piece, body, 6)."""

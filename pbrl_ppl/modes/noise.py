@@ -23,9 +23,9 @@ from pbrl_ppl.parameters import box
 from pbrl_ppl.scene import state_sizes
 from pbrl_ppl.state import Floats
 
-#: Residuals are clipped at this many noise units.
+#: Largest residual, in noise units: larger ones are clipped.
 FAR_OFF = 1e3
-#: Bound of the change of a log noise parameter from the linearisation point.
+#: Largest change of a log noise parameter from where its optimisation begins.
 _FAR = 6.0
 #: Unexplained acceleration that counts as zero, as a share of its prior's median.
 NOTHING = 1e-3
@@ -66,20 +66,17 @@ def profile_sigma(
         begin = gaussian_log_sigma(problem, (residual**2).sum((0, 1, 2)))
         if gaussian:
             return np.asarray(np.exp(begin) * np.ones(len(medians)))
-    bounds = [(b - _FAR, b + _FAR) for b in begin]
+    lower, upper = begin - _FAR, begin + _FAR
     for place in np.flatnonzero(exponential(problem)).tolist():
-        least = np.log(NOTHING * medians[place])
-        begin[place] = max(begin[place], least)
-        bounds[place] = (least, max(bounds[place][1], least + _FAR))
+        lower[place] = np.log(NOTHING * medians[place])
+        begin[place] = max(begin[place], lower[place])
+        upper[place] = max(upper[place], lower[place] + _FAR)
     for place, value in (fixed or {}).items():
-        begin[place] = np.log(value)
-        bounds[place] = (begin[place], begin[place])
-    sloped = filtered and gaussian
+        begin[place] = lower[place] = upper[place] = np.log(value)
+    sloped, bounds = filtered and gaussian, np.transpose([lower, upper])
     cost = _cost_and_slope if sloped else partial(_cost, phi=phi)
-    result = minimize(
-        cost, begin, (problem, residual), jac=sloped, method="L-BFGS-B", bounds=bounds
-    )
-    return np.asarray(np.exp(result.x) * np.ones(len(medians)))
+    best = minimize(cost, begin, (problem, residual), jac=sloped, method="L-BFGS-B", bounds=bounds)
+    return np.asarray(np.exp(best.x) * np.ones(len(medians)))
 
 
 def _cost(log_sigma: Floats, problem: Problem, residual: Floats, phi: Floats | None) -> float:
@@ -171,19 +168,13 @@ def noise_gaussian(
 
     at = minimize(cost, begin, method="L-BFGS-B", bounds=[(b - _FAR, b + _FAR) for b in begin]).x
 
-    def moved(*places: tuple[int, float]) -> float:
-        point = at.copy()
-        for place, step in places:
-            point[place] += step
-        return cost(point)
-
-    middle, hessian, h = moved(), np.empty((n, n)), width
-    for i in range(n):
-        hessian[i, i] = (moved((i, h)) - 2 * middle + moved((i, -h))) / h**2
-        for j in range(i):
-            mixed = moved((i, h), (j, h)) - moved((i, h), (j, -h))
-            mixed += moved((i, -h), (j, -h)) - moved((i, -h), (j, h))
-            hessian[i, j] = hessian[j, i] = mixed / (4 * h**2)
+    middle, hessian, steps = cost(at), np.empty((n, n)), width * np.eye(n)
+    for i, one in enumerate(steps):
+        hessian[i, i] = (cost(at + one) - 2 * middle + cost(at - one)) / width**2
+        for j, other in enumerate(steps[:i]):
+            mixed = cost(at + one + other) - cost(at + one - other)
+            mixed += cost(at - one - other) - cost(at - one + other)
+            hessian[i, j] = hessian[j, i] = mixed / (4 * width**2)
     values, vectors = np.linalg.eigh(hessian)
     return at, np.asarray((vectors / np.maximum(values, spread**-2)) @ vectors.T)
 
@@ -205,14 +196,10 @@ def best_tails(problem: Problem, phi: Floats, sigma: Floats) -> Floats:
     """Return phi with the most probable tails, all else fixed."""
     if not problem.tails:
         return phi
-    tails = list(problem.tails)
-    lower, upper = (end[tails] for end in box(problem.layout.priors))
-    bounds = list(zip(lower, upper, strict=True))
-    optimum = minimize(
-        _tail_cost(problem, phi, sigma), phi[tails], method="L-BFGS-B", bounds=bounds
-    )
-    result = phi.copy()
-    result[tails] = optimum.x
+    result, tails = phi.copy(), list(problem.tails)
+    bounds = np.transpose([end[tails] for end in box(problem.layout.priors)])
+    cost = _tail_cost(problem, phi, sigma)
+    result[tails] = minimize(cost, phi[tails], method="L-BFGS-B", bounds=bounds).x
     return result
 
 
@@ -229,11 +216,8 @@ def tail_precision(
     cost = _tail_cost(problem, phi, sigma)
     curvature = np.empty(len(tails))
     for i, step in enumerate(np.minimum(width, 0.25 * (upper - lower))):
-        middle = phi[tails].copy()
+        middle, move = phi[tails], step * np.eye(len(tails))[i]
         middle[i] = np.clip(middle[i], lower[i] + step, upper[i] - step)
-        ends = [middle.copy(), middle, middle.copy()]
-        ends[0][i] -= step
-        ends[2][i] += step
-        below, at, above = (cost(end) for end in ends)
-        curvature[i] = max((below - 2 * at + above) / step**2, least)
+        fall = cost(middle - move) - 2 * cost(middle) + cost(middle + move)
+        curvature[i] = max(fall / step**2, least)
     return curvature

@@ -9,12 +9,12 @@ import numpy as np
 from scipy.special import expit
 
 from pbrl_ppl.likelihood import Problem, exponential, is_independent, log_noise_prior
-from pbrl_ppl.modes.laplace import Mode
+from pbrl_ppl.modes.search import Mode
 from pbrl_ppl.parameters import Prior, inside, nearest, symmetrised, wheels
 from pbrl_ppl.state import Bools, Floats, Ints, wrapped
 
-#: Noise that may vanish is a power of its coordinate.
-_ROOT = 3.0
+#: Power transform for noise near zero: such noise is this power of its coordinate.
+_POWER = 3.0
 
 
 def unconstrain(prior: Prior, x: Floats) -> tuple[Floats, Floats]:
@@ -151,7 +151,7 @@ class Space:
 
     def noise(self, log_sigma: Floats) -> Floats:
         """Return the coordinates of free noise parameters, given their logarithm, (..., free)."""
-        return np.where(self.roots, np.exp(log_sigma / _ROOT), log_sigma)
+        return np.where(self.roots, np.exp(log_sigma / _POWER), log_sigma)
 
     def split(self, q: Floats) -> tuple[Floats, Floats]:
         """Return phi, shape (..., p), and sigma, shape (..., parameter), at points (..., d)."""
@@ -159,7 +159,7 @@ class Space:
         with np.errstate(over="ignore"):
             columns = [constrain(prior, q[..., i]) for i, prior in enumerate(problem.layout.priors)]
             noise = q[..., p:]
-            sigma = np.where(self.roots, np.abs(noise) ** _ROOT, np.exp(noise))
+            sigma = np.where(self.roots, np.abs(noise) ** _POWER, np.exp(noise))
         phi = np.stack(columns, axis=-1) if columns else q[..., :0]
         return phi, np.broadcast_to(sigma, (*sigma.shape[:-1], len(problem.noise_prior[0])))
 
@@ -195,9 +195,9 @@ class Space:
         noise = q[..., self.phi_size :]
         with np.errstate(all="ignore"):
             size = np.abs(noise)  # a root of either sign is the same noise
-            log_sigma = np.where(self.roots, _ROOT * np.log(size), noise)
+            log_sigma = np.where(self.roots, _POWER * np.log(size), noise)
             # the density of a root, from that of the logarithm
-            slope = np.where(self.roots, np.log(0.5 * _ROOT / size), 0.0).sum(axis=-1)
+            slope = np.where(self.roots, np.log(0.5 * _POWER / size), 0.0).sum(axis=-1)
             return np.asarray(log_noise_prior(self.problem, log_sigma) + slope)
 
     def each(self, q: Floats, residual: Floats) -> Floats:
@@ -257,7 +257,7 @@ class Space:
         about = self._about(mean)
         centre, of_noise = _noise_gaussian(mode)
         mean[p:] = self.noise(centre)
-        stretch = np.where(self.roots, mean[p:] / _ROOT, 1.0)
+        stretch = np.where(self.roots, mean[p:] / _POWER, 1.0)
         covariance = np.zeros((len(mean), len(mean)))
         covariance[p:, p:] = stretch[:, None] * of_noise * stretch
         if p:

@@ -21,16 +21,22 @@ from pbrl_ppl.likelihood import (
     with_sensitivity,
 )
 from pbrl_ppl.modes.ladder import fit_pieces, ladder, with_robust_covariance
-from pbrl_ppl.modes.laplace import FilteredMode, LocalMode, Mode, SimulatedMode, finish, profiled
-from pbrl_ppl.modes.search import find_mode
+from pbrl_ppl.modes.search import (
+    FilteredMode,
+    LocalMode,
+    Mode,
+    SimulatedMode,
+    find_mode,
+    finish,
+    near_mode,
+    profiled,
+)
 from pbrl_ppl.parameters import change_from, inside
 from pbrl_ppl.state import Floats
 from pbrl_ppl.threads import one_blas_thread
 
-#: Rounds at most; one that moves phi by less than this, in standard deviations, is the last.
+#: Most linearisations, and change of phi (standard deviations) below which one is the last.
 _ROUNDS, _CONVERGED = 6, 0.2
-#: Rounds of a climb between two linearisations.
-_CLIMB = 5
 
 
 @one_blas_thread
@@ -97,11 +103,11 @@ def trajectory_mode(
     else:
         whole = _smoothed_cheaply(problem, phi)
         mode = nearby_mode(whole, phi, whole.likelihood.noise.sigma)
-    small_noise = _with_small_process_noise(mode.problem, mode.sigma, share)
-    if not np.array_equal(small_noise, mode.sigma):
-        other = nearby_mode(smoothed(mode.problem, mode.phi, small_noise), mode.phi, small_noise)
-        mode = max(mode, other, key=lambda candidate: candidate.log_posterior)
-    return mode
+    small = _with_small_process_noise(mode.problem, mode.sigma, share)
+    if np.array_equal(small, mode.sigma):
+        return mode
+    other = nearby_mode(smoothed(mode.problem, mode.phi, small), mode.phi, small)
+    return max(mode, other, key=lambda candidate: candidate.log_posterior)
 
 
 def mode_of_more(problem: Problem, mode: FilteredMode) -> FilteredMode:
@@ -199,7 +205,7 @@ def _alternate_smoothing(problem: FilteredProblem, phi: Floats, sigma: Floats) -
     for i in range(_ROUNDS):
         if i:
             problem = smoothed(problem, phi, sigma)
-        mode = find_mode(problem, initial=phi, rounds=_CLIMB)
+        mode = near_mode(problem, phi)
         change = _change(mode, phi)
         phi, sigma = mode.phi, mode.sigma
         if i and change < _CONVERGED:
@@ -226,11 +232,11 @@ def with_state_sensitivity(mode: FilteredMode) -> FilteredMode:
         if i:
             problem = smoothed(problem, phi, sigma)
         problem = with_sensitivity(problem, phi, sigma)
+        mode = near_mode(problem, phi)
         # far from where it is linearised a climb may end anywhere: judged by where it began
-        value = float(log_posterior(problem, phi, sigma))
-        modes.append((value, find_mode(problem, initial=phi, rounds=_CLIMB)))
-        change = _change(modes[-1][1], phi)
-        phi, sigma = modes[-1][1].phi, modes[-1][1].sigma
+        modes.append((float(log_posterior(problem, phi, sigma)), mode))
+        change = _change(mode, phi)
+        phi, sigma = mode.phi, mode.sigma
         if change < _CONVERGED:
             break
     return max(modes, key=lambda pair: pair[0])[1]
@@ -263,9 +269,7 @@ def find_simulation_mode(problem: Problem, seed: int) -> SimulatedMode:
 
 
 @one_blas_thread
-def simulation_mode(
-    mode: Mode, prior: NoisePrior | None = None, *, rounds: int = 5
-) -> SimulatedMode:
+def simulation_mode(mode: Mode, prior: NoisePrior | None = None) -> SimulatedMode:
     """Return the mode of simulated trajectories, from one of whole trajectories.
 
     Parameters
@@ -273,9 +277,8 @@ def simulation_mode(
     mode : Mode
         Of whole trajectories.
     prior : tuple, optional
-        Of sigma; by default it is taken from the pieces.
-    rounds : int
-        Of the last climb, which has all engine steps and the prior of sigma.
+        Of sigma; by default it is taken from the pieces. The last climb has it, and all engine
+        steps.
 
     Returns
     -------
@@ -283,21 +286,17 @@ def simulation_mode(
         Its problem has an :class:`pbrl_ppl.likelihood.OutputErrorLikelihood`, linearised at its
         initial states, and the prior of sigma fixed.
     """
-    return tempered_mode(ladder(mode)[-1], prior, rounds=rounds)
+    return tempered_mode(ladder(mode)[-1], prior)
 
 
-def tempered_mode(
-    mode: SimulatedMode, prior: NoisePrior | None = None, *, rounds: int = 5
-) -> SimulatedMode:
+def tempered_mode(mode: SimulatedMode, prior: NoisePrior | None = None) -> SimulatedMode:
     """Return a mode of simulated pieces as the mode of their posterior; arguments as above.
 
     The density of each dimension is divided by its autocorrelation time.
     """
-    if prior is None:
-        median, spread = mode.problem.noise_prior
-        prior = tuple(median.tolist()), spread
-    problem = mode.problem.with_likelihood(prior=prior)
-    return with_robust_covariance(find_mode(problem, initial=mode.phi, rounds=rounds))
+    median, spread = mode.problem.noise_prior
+    problem = mode.problem.with_likelihood(prior=prior or (tuple(median.tolist()), spread))
+    return with_robust_covariance(near_mode(problem, mode.phi))
 
 
 def carried_mode(mode: Mode, problem: Problem) -> Mode:

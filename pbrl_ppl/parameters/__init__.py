@@ -18,6 +18,7 @@ from .priors import prior_slopes as prior_slopes
 from .priors import stepped as stepped
 from .wheel_symmetry import by_prior as by_prior
 from .wheel_symmetry import change_from as change_from
+from .wheel_symmetry import folded as folded
 from .wheel_symmetry import nearest as nearest
 from .wheel_symmetry import symmetrised as symmetrised
 from .wheel_symmetry import wheels as wheels

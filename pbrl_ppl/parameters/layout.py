@@ -87,19 +87,28 @@ class Layout:
         return Layout(tuple(blocks))
 
     @cached_property
+    def entries(self) -> tuple[tuple[Block, str, Prior], ...]:
+        """Block, owner and prior of each entry."""
+        return tuple(
+            (block, owner, prior)
+            for block in self.blocks
+            for owner, prior in zip(block.owners, block.priors, strict=True)
+        )
+
+    @property
     def size(self) -> int:
         """Length of the vector."""
-        return sum(len(block.owners) for block in self.blocks)
+        return len(self.entries)
 
     @cached_property
     def labels(self) -> tuple[str, ...]:
         """One readable label an entry, such as ``mass[cart]``."""
-        return tuple(f"{block.name}[{owner}]" for block in self.blocks for owner in block.owners)
+        return tuple(f"{block.name}[{owner}]" for block, owner, _ in self.entries)
 
     @cached_property
     def priors(self) -> tuple[Prior, ...]:
         """One prior an entry."""
-        return tuple(prior for block in self.blocks for prior in block.priors)
+        return tuple(prior for *_, prior in self.entries)
 
     @property
     def bounds(self) -> tuple[Floats, Floats]:
@@ -167,7 +176,7 @@ class Layout:
     def scale(self, phi: Floats) -> Floats:
         """Return the scale of each entry of phi for step sizes, shape (p,); 0 if discrete."""
         least = np.array([prior.scale for prior in self.priors])
-        counts = [block.unit == "1" for block in self.blocks for _ in block.owners]
+        counts = [block.unit == "1" for block, *_ in self.entries]
         least[counts] = np.minimum(least[counts], 1.0)
         return np.where(self.discrete, 0.0, np.maximum(np.abs(phi - self.origin), 0.1 * least))
 
@@ -193,7 +202,7 @@ class Layout:
 
     def owner_kind(self, place: int) -> str:
         """Return whether an entry belongs to a ``body`` or a ``joint``."""
-        return [block.of for block in self.blocks for _ in block.owners][place]
+        return self.entries[place][0].of
 
     def index(self, name: str, owner: str) -> int:
         """Return the place of a parameter of a body, or joint, in the vector.
@@ -244,7 +253,7 @@ class Layout:
     def to_vectors(self, draws: Mapping[str, Floats], n: int) -> Floats:
         """Return vectors, shape (n, p), of ``n`` named draws, shape (n, owner) each."""
         columns = [draws[block.name].reshape(n, -1) for block in self.blocks]
-        return np.concatenate([np.zeros((n, 0)), *columns], axis=1)
+        return np.hstack([np.zeros((n, 0)), *columns])
 
     def columns(self, draws: Mapping[str, Floats]) -> Floats:
         """Return vectors, shape (n, p), of draws by label, shape (n,) each; NaN where one lacks."""
@@ -296,18 +305,18 @@ class ParameterLibrary:
 
     def __post_init__(self) -> None:
         """Freeze the mappings."""
-        sets = dict(self.sets)
+        sets = {name: dict(values) for name, values in dict(self.sets).items()}
         if not sets:
             raise ParameterError("library: it is empty; name at least one parameter set")
-        for name, values in sets.items():
-            for key, value in dict(values).items():
+        for name, parameters in sets.items():
+            for key, value in parameters.items():
                 if not np.isfinite(value):
                     raise ParameterError(
                         f"parameter set {name!r}: {key} is {value}, expected a finite number"
                     )
-        object.__setattr__(self, "sets", _frozen({k: dict(v) for k, v in sets.items()}))
+        object.__setattr__(self, "sets", tuple((k, tuple(v.items())) for k, v in sets.items()))
         probabilities = dict(self.probabilities or {})
-        nested = {k: dict(v) for k, v in probabilities.items() if isinstance(v, Mapping | tuple)}
+        nested = {k: dict(v) for k, v in probabilities.items() if _of_body(v)}
         by_set = {k: v for k, v in probabilities.items() if k not in nested}
         if by_set and nested:
             raise ParameterError(
@@ -326,7 +335,8 @@ class ParameterLibrary:
                     f"probabilities of {where} are {', '.join(f'{v:g}' for v in values)}; expected"
                     " none below 0, and some above"
                 )
-        object.__setattr__(self, "probabilities", _frozen(probabilities) if probabilities else None)
+        frozen = (*by_set.items(), *((k, tuple(v.items())) for k, v in nested.items()))
+        object.__setattr__(self, "probabilities", frozen or None)
 
     @classmethod
     def from_json(cls, text: str) -> ParameterLibrary:
@@ -335,12 +345,9 @@ class ParameterLibrary:
 
     def to_json(self) -> str:
         """Return the library as JSON, for a posterior file."""
-        probabilities = {
-            k: dict(v) if isinstance(v, tuple) else v for k, v in self.probabilities or ()
-        }
-        return json.dumps(
-            [{name: dict(values) for name, values in self.sets}, probabilities or None]
-        )
+        probabilities = {k: dict(v) if _of_body(v) else v for k, v in self.probabilities or ()}
+        sets = {name: dict(values) for name, values in self.sets}
+        return json.dumps([sets, probabilities or None])
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -350,7 +357,7 @@ class ParameterLibrary:
     def prior(self, body: str) -> Floats:
         """Return the probability of each set for a body or class, shape (set,)."""
         probabilities: dict[str, Any] = dict(self.probabilities or {})
-        if any(isinstance(value, tuple) for value in probabilities.values()):
+        if any(map(_of_body, probabilities.values())):
             probabilities = dict(probabilities.get(body, ()))
         p = np.array([float(probabilities.get(name, 0.0)) for name in self.names])
         return p / p.sum() if p.sum() else np.full(len(p), 1.0 / len(p))
@@ -381,28 +388,28 @@ class ParameterLibrary:
                         f" the scene{nearest(key, wanted)}"
                     )
         rows = []
-        for block in layout.blocks:
+        for block, owner, law in layout.entries:
             if block.of == "joint":
                 raise ParameterError(
-                    f"library: the joint {block.owners[0]} is to be inferred, and a library"
-                    " is of bodies; say in the scene what the joint is"
+                    f"library: the joint {owner} is to be inferred, and a library is of bodies; say"
+                    " in the scene what the joint is"
                 )
-            for owner, law in zip(block.owners, block.priors, strict=True):
-                row = [dict(values).get(block.name, np.nan) for _, values in self.sets]
-                rows.append(row)
-                lower, upper = law.support
-                for name, value, p in zip(self.names, row, self.prior(owner), strict=True):
-                    where = f"parameter set {name!r}: {block.name} of body {owner!r}"
-                    cure = f"give the set probability 0 for {owner!r}, or correct it"
-                    if p and np.isnan(value):
-                        raise ParameterError(f"{where} is missing; add it, or {cure}")
-                    if p and not (lower <= value <= upper and (value or block.name != "mass")):
-                        raise ParameterError(
-                            f"{where} is {value:g} {block.unit}, expected {lower:g} to {upper:g};"
-                            f" {cure}"
-                        )
+            row = [dict(values).get(block.name, np.nan) for _, values in self.sets]
+            rows.append(row)
+            lower, upper = law.support
+            for name, value, p in zip(self.names, row, self.prior(owner), strict=True):
+                where = f"parameter set {name!r}: {block.name} of body {owner!r}"
+                cure = f"give the set probability 0 for {owner!r}, or correct it"
+                if p and np.isnan(value):
+                    raise ParameterError(f"{where} is missing; add it, or {cure}")
+                if p and not (lower <= value <= upper and (value or block.name != "mass")):
+                    raise ParameterError(
+                        f"{where} is {value:g} {block.unit}, expected {lower:g} to {upper:g};"
+                        f" {cure}"
+                    )
         return np.array(rows).reshape(-1, len(self.names))
 
 
-def _frozen(mapping: Mapping[str, object]) -> tuple[tuple[str, object], ...]:
-    return tuple((k, _frozen(v) if isinstance(v, Mapping) else v) for k, v in mapping.items())
+def _of_body(probability: object) -> bool:
+    """Return whether an entry of a library's probabilities is of a body, with one for each set."""
+    return isinstance(probability, Mapping | tuple)

@@ -14,8 +14,6 @@ from scipy.stats import truncnorm
 from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.state import Floats
 
-#: How far (in sigmas) mu may lie outside the support: farther out, densities lose their digits.
-_FARTHEST = 30.0
 FAMILIES = (
     "log_normal", "truncated_normal", "normal", "half_normal", "von_mises", "categorical"
 )  # fmt: skip
@@ -85,12 +83,13 @@ class Prior:
             raise ParameterError(
                 f"{self.family}: lower is {lower} and upper {upper}, expected lower below upper"
             )
+        farthest = 30.0  # sigmas of mu outside the support: beyond, densities lose their digits
         away = max(lower - self.mu, self.mu - upper) / self.sigma
-        if away > _FARTHEST:
+        if away > farthest:
             raise ParameterError(
                 f"{self.family}: mu is {self.mu:g}, {away:.3g} sigma outside the support"
                 f" [{lower:g}, {upper:g}], where the density underflows; expected at most"
-                f" {_FARTHEST:g}; move mu towards the support or widen sigma"
+                f" {farthest:g}; move mu towards the support or widen sigma"
             )
 
     def scaled(self, factor: float, origin: float = 0.0) -> Prior:

@@ -7,6 +7,7 @@ draws to one. Elsewhere each description keeps the probability that the prior gi
 unless the prior is `symmetrised`.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product
 
@@ -61,15 +62,9 @@ class Wheel:
 
     def log_priors(self, phi: Floats, count: int = 4) -> Floats:
         """Return the wheel's log-prior 0, 1, ... quarter turns on, shape (count, ...)."""
-        return np.array(
-            [
-                sum(
-                    prior.log_density(turned[..., place])
-                    for place, prior in zip(self.places, self.priors, strict=True)
-                )
-                for turned in (self.turned(phi, turns) for turns in range(count))
-            ]
-        )
+        turned = np.array([self.turned(phi, turns) for turns in range(count)])
+        pairs = zip(self.places, self.priors, strict=True)
+        return np.asarray(sum(prior.log_density(turned[..., place]) for place, prior in pairs))
 
 
 def wheels(layout: Layout) -> tuple[Wheel, ...]:
@@ -134,6 +129,12 @@ def nearest(
             chosen = ((points - middle) ** 2).sum(axis=-1).argmin(axis=0)
         phi = equal[chosen, np.arange(len(phi))]
     return phi
+
+
+def folded(layout: Layout, draws: Mapping[str, Floats]) -> dict[str, Floats]:
+    """Return draws by label, shape (draw,) each, with wheels as :func:`nearest` describes them."""
+    phi = nearest(layout, layout.columns(draws))
+    return {label: phi[:, i] for i, label in enumerate(layout.labels) if label in draws}
 
 
 def _about_own_mean(points: Floats, rounds: int = 20) -> NDArray[np.intp]:

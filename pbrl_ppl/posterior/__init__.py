@@ -30,7 +30,7 @@ from .data import versions as versions
 from .identifiability import Identifiability as Identifiability
 from .identifiability import identify as identify
 from .identifiability import uninformed as uninformed
-from .record import Linearisation as Linearisation
+from .record import LinearisationCheck as LinearisationCheck
 from .record import ParameterPoint as ParameterPoint
 from .record import PosteriorRecord as PosteriorRecord
 from .record import StoredMode as StoredMode

@@ -32,7 +32,7 @@ from pbrl_ppl.parameters import Prior, by_prior, nearest, prior_draws
 from pbrl_ppl.posterior.data import parameter_draws, placed, places, record_of, recording
 from pbrl_ppl.posterior.identifiability import uninformed
 from pbrl_ppl.posterior.record import (
-    Linearisation,
+    LinearisationCheck,
     ParameterPoint,
     PosteriorRecord,
     packed_mode,
@@ -52,14 +52,6 @@ MAX_RHAT, MIN_ESS = 1.01, 400
 #: Standard deviation of the differences (nats) above which the linearisation does not hold:
 #: draws weighted by exp(difference) would be worth exp(-4), 2 %, of their number.
 MOST = 2.0
-#: Log-likelihood (nats) below which a draw is one at which the engine diverges.
-_DIVERGED = -1e100
-#: Draws are simulated in groups of this many, or of more with at most so many transitions.
-_GROUP, _GROUP_TRANSITIONS = 64, 20_000
-#: Predicted numbers that are stored, and least and most draws with predictions, which come first.
-_MOST_NUMBERS, _PREDICTED = 2_000_000, (50, 200)
-#: Fewest draws a chain for which R-hat is defined.
-_LEAST_DRAWS = 4
 #: Category and text of a warning.
 _Warned = tuple[type[Warning], str]
 
@@ -104,21 +96,17 @@ def complete(
     likelihood, predictive = evaluate(problem, phi, sigma, rows.ravel(), rng, known)
     data = groups(trace)
     posterior = _with_units(problem, posterior)
-    coords = {dim: data["observed_data"][dim].values for dim in NEXT_STATE_DIMS}
-    per_draw = {"chain": posterior["chain"], "draw": posterior["draw"]}
-    predicted = {"chain": posterior["chain"], "draw": posterior["draw"][rows[0]], **coords}
+    coords: dict[str, object] = {dim: posterior[dim] for dim in ("chain", "draw")}
+    coords |= {dim: data["observed_data"][dim].values for dim in NEXT_STATE_DIMS}
+    predicted = coords | {"draw": posterior["draw"][rows[0]]}
+    likelihoods = likelihood.reshape(chains, n, -1)
+    predictions = predictive.reshape(*rows.shape, *predictive.shape[1:])
     result = {
         "posterior": posterior,
         "sample_stats": data["sample_stats"],
-        "log_likelihood": _next_state(
-            ("chain", "draw", "transition"),
-            likelihood.reshape(chains, n, -1),
-            per_draw | {"transition": coords["transition"]},
-        ),
+        "log_likelihood": _next_state(("chain", "draw", "transition"), likelihoods, coords),
         "posterior_predictive": _next_state(
-            ("chain", "draw", *NEXT_STATE_DIMS),
-            predictive.reshape(*rows.shape, *predictive.shape[1:]),
-            predicted,
+            ("chain", "draw", *NEXT_STATE_DIMS), predictions, predicted
         ),
         **prior_groups(problem, posterior, phi, sigma, seed),
         "observed_data": _next_state(NEXT_STATE_DIMS, problem.measured, coords),
@@ -136,7 +124,7 @@ def complete(
 
 
 def _next_state(dims: tuple[str, ...], values: Floats, coords: Mapping[str, object]) -> xr.Dataset:
-    return xr.Dataset({"next_state": (dims, values)}, coords)
+    return xr.Dataset({"next_state": (dims, values)}, {dim: coords[dim] for dim in dims})
 
 
 def evaluate(
@@ -146,6 +134,9 @@ def evaluate(
     rows: Sequence[int] | Ints,
     rng: np.random.Generator,
     known: Floats | None = None,
+    *,
+    draws: int = 64,
+    transitions: int = 20_000,
 ) -> tuple[Floats, Floats]:
     """Return log-likelihoods of the transitions at draws, and next states drawn from some of them.
 
@@ -161,6 +152,8 @@ def evaluate(
         Of the predictions.
     known : ndarray, optional
         Log-likelihoods where the sampler has them already.
+    draws, transitions : int
+        Draws that are simulated at once: this many, or as many as have so many transitions.
 
     Returns
     -------
@@ -173,7 +166,7 @@ def evaluate(
     predictive = []
     parallel = problem.with_physics(threads=max(problem.physics.threads, 2))
     rows = np.asarray(rows, dtype=int)
-    size = max(_GROUP, _GROUP_TRANSITIONS // problem.segments.n)
+    size = max(draws, transitions // problem.segments.n)
     for begin in range(0, len(phi), size):
         part = slice(begin, begin + size)
         if known is None:
@@ -194,7 +187,15 @@ def evaluate(
     return likelihood, np.array(predictive)
 
 
-def predictive_rows(chains: int, draws: int, cells: int) -> Ints:
+def predictive_rows(
+    chains: int,
+    draws: int,
+    cells: int,
+    *,
+    least: int = 50,
+    most: int = 200,
+    cells_in_all: int = 2_000_000,
+) -> Ints:
     """Return draws to predict with: equally many of each chain, evenly spread, the last included.
 
     Parameters
@@ -203,13 +204,17 @@ def predictive_rows(chains: int, draws: int, cells: int) -> Ints:
         Of the posterior; draws of each chain.
     cells : int
         Numbers that one prediction has.
+    least, most : int
+        Draws with predictions, of all chains.
+    cells_in_all : int
+        Numbers that their predictions have, if that leaves the least.
 
     Returns
     -------
     ndarray
         Shape (chain, draw): indices of the draws, chains joined.
     """
-    wanted = int(np.clip(_MOST_NUMBERS // max(cells, 1), *_PREDICTED))
+    wanted = int(np.clip(cells_in_all // max(cells, 1), least, most))
     a_chain = min(draws, -(-wanted // chains))
     chosen = np.linspace(draws - 1, 0, a_chain).astype(int)[::-1]
     return np.asarray(draws * np.arange(chains)[:, None] + chosen)
@@ -256,11 +261,9 @@ def prior_groups(
     density = np.where(steps, -np.log(scale) - sigma[:, : len(scale)] / scale, density)
 
     def shaped(like: xr.Dataset, of_phi: Floats, of_noise: Floats) -> xr.Dataset:
+        named = problem.named(of_phi, of_noise)
         return xr.Dataset(
-            {
-                name: like[name].copy(data=values.reshape(like[name].shape))
-                for name, values in problem.named(of_phi, of_noise).items()
-            }
+            {x: like[x].copy(data=v.reshape(like[x].shape)) for x, v in named.items()}
         )
 
     return {
@@ -269,7 +272,9 @@ def prior_groups(
     }
 
 
-def linearisation_errors(problem: FilteredProblem, phi: Floats, sigma: Floats) -> Floats:
+def linearisation_errors(
+    problem: FilteredProblem, phi: Floats, sigma: Floats, *, diverged: float = -1e100
+) -> Floats:
     """Return log-likelihoods with the states smoothed at each draw, less the linearised ones.
 
     Parameters
@@ -278,6 +283,8 @@ def linearisation_errors(problem: FilteredProblem, phi: Floats, sigma: Floats) -
         Of whole trajectories.
     phi, sigma : ndarray
         Draws, shapes (draw, p) and (draw, parameter).
+    diverged : float
+        Log-likelihood (nats) of a draw at which the engine diverges.
 
     Returns
     -------
@@ -288,14 +295,14 @@ def linearisation_errors(problem: FilteredProblem, phi: Floats, sigma: Floats) -
     errors = np.zeros((len(phi), problem.data.history.n_trajectories))
     for row, point, noise in zip(errors, phi, sigma, strict=True):
         again, stored = (
-            np.maximum(other.log_density(other.residual(point), noise, point), _DIVERGED)
+            np.maximum(other.log_density(other.residual(point), noise, point), diverged)
             for other in (smoothed(problem, point, noise), problem)
         )
         np.add.at(row, problem.segments.trajectory, again - stored)
     return errors
 
 
-def linearisation(problem: FilteredProblem, phi: Floats, sigma: Floats) -> Linearisation:
+def linearisation(problem: FilteredProblem, phi: Floats, sigma: Floats) -> LinearisationCheck:
     """Return a summary of :func:`linearisation_errors` at up to 16 of a posterior's draws.
 
     Parameters
@@ -309,7 +316,7 @@ def linearisation(problem: FilteredProblem, phi: Floats, sigma: Floats) -> Linea
     errors = linearisation_errors(problem, phi[rows], sigma[rows])
     total = errors.sum(axis=1)
     sd, largest = float(total.std(ddof=1)), float(np.abs(total - total.mean()).max())
-    return Linearisation(len(rows), sd, largest, int(errors.std(axis=0).argmax()))
+    return LinearisationCheck(len(rows), sd, largest, int(errors.std(axis=0).argmax()))
 
 
 def checked(
@@ -345,7 +352,8 @@ def checked(
         )
         warnings.append((ConvergenceWarning, text))
     warnings += _of_approximations(record)
-    if sizes["draw"] >= _LEAST_DRAWS:
+    least_draws = 4  # a chain, for which R-hat is defined
+    if sizes["draw"] >= least_draws:
         r_hat, ess = convergence(idata)
         worst = max(r_hat, key=r_hat.__getitem__), min(ess, key=ess.__getitem__)
         record = replace(record, max_rhat=r_hat[worst[0]], min_ess=ess[worst[1]])
@@ -355,7 +363,7 @@ def checked(
     elif record.method != "map":  # a mode alone is one draw
         text = (
             f"with {sizes['draw']} draws a chain there is no R-hat (it takes at least"
-            f" {_LEAST_DRAWS}), so whether the chains have converged is not known; {more}"
+            f" {least_draws}), so whether the chains have converged is not known; {more}"
         )
         warnings.append((ConvergenceWarning, text))
     replace(record, warnings=tuple(text for _, text in warnings)).write(idata)
@@ -463,8 +471,8 @@ def _folded(problem: Problem, trace: Idata, seed: int | None) -> xr.Dataset:
 def _with_units(problem: Problem, posterior: xr.Dataset) -> xr.Dataset:
     units = {block.name: block.unit for block in problem.layout.blocks}
     units["sigma"] = "the unit of each state dimension"
-    if is_filtered(problem):
-        units |= dict.fromkeys((ACCELERATION, CONTACT), "m/s^2, of omega rad/s^2")
-    for name in units.keys() & set(posterior.data_vars):
-        posterior[str(name)].attrs["units"] = units[str(name)]
+    units |= dict.fromkeys((ACCELERATION, CONTACT), "m/s^2, of omega rad/s^2")
+    for name, variable in posterior.data_vars.items():
+        if name in units:
+            variable.attrs["units"] = units[str(name)]
     return posterior

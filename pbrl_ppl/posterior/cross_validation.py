@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -12,12 +11,19 @@ import xarray as xr
 
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.likelihood import NEXT_STATE_DIMS
-from pbrl_ppl.posterior.data import SMOOTHED
-from pbrl_ppl.posterior.store import DATATREE, Idata, arviz, from_groups, group, groups, smoothed
+from pbrl_ppl.posterior.data import PLACES, SMOOTHED
+from pbrl_ppl.posterior.store import (
+    Idata,
+    arviz,
+    elpd_of,
+    from_groups,
+    gain_of,
+    group,
+    groups,
+    smoothed,
+)
 from pbrl_ppl.state import STATE, THETA, Floats, Ints, wrapped
 
-#: Fewest draws: with fewer, the Pareto distribution is fitted to a tail of fewer than twenty.
-_LEAST_DRAWS = 100
 #: The dimension over which measured numbers are joined.
 _NUMBER = "number"
 
@@ -80,7 +86,7 @@ class Comparison:
         return vars(self) | {"before": vars(self.before), "after": vars(self.after)}
 
 
-def compare(before: Idata, after: Idata) -> Comparison | None:
+def compare(before: Idata, after: Idata, *, least_draws: int = 100) -> Comparison | None:
     """Compare two posteriors of the same data by leave-one-out cross-validation.
 
     For whole trajectories, one trajectory is left out at a time, see :func:`by_trajectory`.
@@ -89,11 +95,13 @@ def compare(before: Idata, after: Idata) -> Comparison | None:
     ----------
     before, after : InferenceData or DataTree
         With a group ``log_likelihood``; the same object twice is one model.
+    least_draws : int
+        With fewer, the Pareto distribution is fitted to a tail of fewer than twenty.
 
     Returns
     -------
     Comparison or None
-        None with fewer than 100 draws, or where a likelihood is not finite.
+        None with fewer draws, or where a likelihood is not finite.
 
     Raises
     ------
@@ -108,7 +116,7 @@ def compare(before: Idata, after: Idata) -> Comparison | None:
         )
     for posterior in (before, after):
         sizes = group(posterior, "posterior").sizes
-        if sizes["chain"] * sizes["draw"] < _LEAST_DRAWS:
+        if sizes["chain"] * sizes["draw"] < least_draws:
             return None
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         # warnings about Pareto k, which is in the result
@@ -117,7 +125,7 @@ def compare(before: Idata, after: Idata) -> Comparison | None:
         try:
             first = az.loo(separate(before), pointwise=True)
             second = first if after is before else az.loo(separate(after), pointwise=True)
-            difference, error = (0.0, 0.0) if after is before else _gain(az, first, second)
+            difference, error = (0.0, 0.0) if after is before else gain_of(first, second)
         except ValueError:  # of a tail of equal values, or of numbers that are not finite
             return None
     count = int(first.n_data_points)
@@ -126,22 +134,13 @@ def compare(before: Idata, after: Idata) -> Comparison | None:
     return comparison if np.isfinite(numbers).all() else None
 
 
-def _gain(az: ModuleType, first: object, second: object) -> tuple[float, float]:
-    """Return the difference of elpd, second less first model, and its standard error."""
-    exact = {"round_to": "none"} if DATATREE else {}
-    table = az.compare({"before": first, "after": second}, **exact)
-    worse = table.iloc[-1]
-    sign = 1.0 if worse.name == "before" else -1.0
-    return sign * abs(float(worse["elpd_diff"])), float(worse["dse"])
-
-
 def _summary(loo: Any) -> LeaveOneOut:
-    """Return the summary of an ArviZ result, whose names differ between 0.x and 1.x."""
-    elpd, p = (loo.elpd, loo.p) if DATATREE else (loo["elpd_loo"], loo["p_loo"])
+    """Return the summary of an ArviZ result."""
+    elpd, p = elpd_of(loo)
     good = float(loo.good_k)
     # NaN counts as high
     high = int((~(np.asarray(loo.pareto_k) <= good)).sum())
-    return LeaveOneOut(float(elpd), float(loo.se), float(p), high, good)
+    return LeaveOneOut(elpd, float(loo.se), p, high, good)
 
 
 def left_out(idata: Idata) -> str:
@@ -225,30 +224,26 @@ def by_number(idata: Idata) -> Idata:
     predictive = group(idata, "posterior_predictive")["next_state"]
     predictive = predictive.transpose("chain", "draw", *NEXT_STATE_DIMS)
     some = {"draw": predictive["draw"].to_numpy()}
-    posterior = group(idata, "posterior").sel(some).drop_vars(["chain", "draw"])
-    likelihood = group(idata, "log_likelihood")["next_state"].sel(some)
-    log_likelihood = likelihood.transpose("chain", "draw", "transition").to_numpy()
     measured = group(idata, "observed_data")["next_state"].transpose(*NEXT_STATE_DIMS)
-    values = measured.to_numpy()
-    seen = np.flatnonzero(np.isfinite(values))
-    places = np.unravel_index(seen, values.shape)
-    predicted = values + _deviations(predictive, measured)
-    predicted = predicted.reshape(*predicted.shape[:2], -1)[..., seen]
-    labels = {
-        dim: (_NUMBER, np.asarray(measured[dim])[place])
-        for dim, place in zip(NEXT_STATE_DIMS, places, strict=True)
+    likelihood = group(idata, "log_likelihood")["next_state"].sel(some)
+    data = {
+        "posterior_predictive": measured + predictive.copy(data=_deviations(predictive, measured)),
+        "log_likelihood": likelihood + xr.zeros_like(measured),
+        "observed_data": measured,
     }
-    sampled = ("chain", "draw", _NUMBER)
+    seen = np.isfinite(measured.to_numpy().ravel())
+    numbers = {
+        name: values.drop_vars(["chain", "draw", *PLACES], errors="ignore")
+        .stack({_NUMBER: NEXT_STATE_DIMS})
+        .transpose(..., _NUMBER)
+        .isel({_NUMBER: seen})
+        .reset_index(_NUMBER)
+        .to_dataset(name="next_state")
+        for name, values in data.items()
+    }
+    posterior = group(idata, "posterior").sel(some).drop_vars(["chain", "draw"])
     return from_groups(
-        {
-            "posterior": posterior.transpose("chain", "draw", ...),
-            "posterior_predictive": xr.Dataset({"next_state": (sampled, predicted)}, labels),
-            "log_likelihood": xr.Dataset(
-                {"next_state": (sampled, log_likelihood[..., places[0]])}, labels
-            ),
-            "observed_data": xr.Dataset({"next_state": (_NUMBER, values.ravel()[seen])}, labels),
-        },
-        idata.attrs,
+        {"posterior": posterior.transpose("chain", "draw", ...), **numbers}, idata.attrs
     )
 
 

@@ -45,7 +45,7 @@ _ORIGIN, _SENSITIVITY = "smoothed_at", "sensitivity"
 #: Prefix of the recording's variables and dimensions.
 _PREFIX = "recorded_"
 #: Coordinates of the dimension ``transition`` beside its index.
-_PLACES = ("trajectory", "time")
+PLACES = ("trajectory", "time")
 
 
 def record_of(problem: Problem, seed: int, method: str) -> PosteriorRecord:
@@ -63,14 +63,14 @@ def record_of(problem: Problem, seed: int, method: str) -> PosteriorRecord:
         tolerance=problem.physics.tolerance,
         together=tuple(problem.physics.together),
         measured=problem.observations.names,
-        scalar_sigma=problem.likelihood.scalar,
+        scalar_sigma=likelihood.scalar,
         sigma_prior=(tuple(float(value) for value in median), float(spread)),
         data_sha256=problem.data.history.data_sha256,
         seed=seed,
         versions=versions(),
         method=method,
         likelihood=likelihood.name,
-        nu=problem.likelihood.nu,
+        nu=likelihood.nu,
         library=problem.library,
         cells=problem.likelihood.noise.coordinates if is_filtered(problem) else None,
     )
@@ -134,8 +134,10 @@ def problem_of(
         library=record.library,
     )
     stored = with_recording(problem, constants, record.data_sha256)
-    if not other or not is_filtered(stored):
-        return stored if not other or SMOOTHED not in constants else problem
+    if not other:
+        return stored
+    if not is_filtered(stored):
+        return problem
     # linearised at the posterior's best draw
     phi, sigma = parameter_draws(stored, idata)
     best = best_draw(idata)
@@ -259,16 +261,15 @@ def recording(problem: Problem) -> xr.Dataset:
         slope, tau = problem.likelihood.initial_states.slope, np.array(problem.likelihood.tau)
         kept[_BY_START] = ((*NEXT_STATE_DIMS, "cell_before"), slope)
         kept[_TAU] = (("state",), tau, {"units": "rows"})
-    if not is_filtered(problem):
-        return kept.assign_attrs({})
-    noise = problem.likelihood.noise
-    kept["slope"] = (("transition", "cell_after", "cell_before"), noise.slope)
-    kept["linearised_at"] = (("noise_parameter",), noise.sigma)
-    if noise.sensitivity is not None:
-        kept[_ORIGIN] = (("transition", "parameter"), noise.sensitivity.phi)
-        dims = ("transition", "cell_before", "parameter")
-        kept[_SENSITIVITY] = (dims, noise.sensitivity.before)
-    return kept.assign_attrs({})
+    if is_filtered(problem):
+        noise = problem.likelihood.noise
+        kept["slope"] = (("transition", "cell_after", "cell_before"), noise.slope)
+        kept["linearised_at"] = (("noise_parameter",), noise.sigma)
+        if noise.sensitivity is not None:
+            kept[_ORIGIN] = (("transition", "parameter"), noise.sensitivity.phi)
+            dims = ("transition", "cell_before", "parameter")
+            kept[_SENSITIVITY] = (dims, noise.sensitivity.before)
+    return kept
 
 
 def with_recording(problem: Problem, constants: xr.Dataset, data_sha256: str) -> Problem:
@@ -276,24 +277,22 @@ def with_recording(problem: Problem, constants: xr.Dataset, data_sha256: str) ->
     if SMOOTHED not in constants:
         return problem
     history = recorded(problem.scene, constants, data_sha256)
-    states = constants[SMOOTHED].to_numpy()
-    if _BY_START in constants:
+    stored = {str(name): values.to_numpy() for name, values in constants.data_vars.items()}
+    states = stored[SMOOTHED]
+    if _BY_START in stored:
         length, prior = constants[_BY_START].sizes["step"], problem.likelihood.prior
         pieces = in_pieces(problem.with_data(history=history), length, states)
-        start = pieces.segments.start
-        slope, tau = constants[_BY_START].to_numpy(), constants[_TAU].to_numpy()
-        return linearised_pieces(pieces, start, slope, tau).with_likelihood(prior=prior)
-    coordinates = recorded_coordinates(problem.scene, constants)
+        start, slope = pieces.segments.start, stored[_BY_START]
+        return linearised_pieces(pieces, start, slope, stored[_TAU]).with_likelihood(prior=prior)
+    coordinates = observed_coordinates(problem.scene, history)
     data = replace(
         problem.data, history=history, horizon=1, states=states, columns=coordinates.columns
     )
-    problem, slope = problem.on(data), constants["slope"].to_numpy()
-    noise = linearised(problem, coordinates, slope, constants["linearised_at"].to_numpy())
-    if _SENSITIVITY in constants:
-        origin, before = constants[_ORIGIN].to_numpy(), constants[_SENSITIVITY].to_numpy()
-        follow = Sensitivity(
-            problem.scene, problem.layout, coordinates, noise.slope, origin, before
-        )
+    problem = problem.on(data)
+    noise = linearised(problem, coordinates, stored["slope"], stored["linearised_at"])
+    if _SENSITIVITY in stored:
+        slopes = noise.slope, stored[_ORIGIN], stored[_SENSITIVITY]
+        follow = Sensitivity(problem.scene, problem.layout, coordinates, *slopes)
         noise = replace(noise, sensitivity=follow)
     return problem.along(noise)
 
@@ -354,19 +353,15 @@ def both_places(earlier: xr.Dataset, segments: Segments) -> dict[str, xr.Variabl
     """
     new = {name: variable.to_numpy() for name, variable in places(segments).items()}
     new["trajectory"] += int(earlier["trajectory"].max()) + 1 - new["trajectory"].min()
-    return {
-        name: xr.Variable(
-            "transition", np.concatenate([earlier[name], values]), earlier[name].attrs
-        )
-        for name, values in new.items()
-    }
+    both = {name: np.concatenate([earlier[name], values]) for name, values in new.items()}
+    return {name: xr.Variable("transition", x, earlier[name].attrs) for name, x in both.items()}
 
 
 def placed(idata: Idata, coords: xr.Coordinates | Mapping[str, xr.Variable]) -> Idata:
     """Return the posterior with the trajectory and time of these coordinates, and no others."""
-    chosen = {name: coords[name] for name in _PLACES}
+    chosen = {name: coords[name] for name in PLACES}
     data = {
-        name: dataset.drop_vars(_PLACES, errors="ignore").assign_coords(chosen)
+        name: dataset.drop_vars(PLACES, errors="ignore").assign_coords(chosen)
         if "transition" in dataset.dims
         else dataset
         for name, dataset in groups(idata).items()

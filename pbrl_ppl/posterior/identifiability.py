@@ -12,7 +12,7 @@ import pandas as pd
 from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.likelihood import Observations, TransitionLikelihood
 from pbrl_ppl.modes import Mode, posterior_slopes
-from pbrl_ppl.parameters import JOINT_INDICES, Layout, Prior, box, inside, nearest, wheels
+from pbrl_ppl.parameters import JOINT_INDICES, Layout, Prior, box, folded, inside, wheels
 from pbrl_ppl.posterior.record import PosteriorRecord, layout_of
 from pbrl_ppl.posterior.store import Idata, best_draw, group, labelled_draws
 from pbrl_ppl.state import STATE, Floats
@@ -170,12 +170,12 @@ def identify(
         said.table()
         said.sentences  # ('The data say nothing about r[cart] and mu_c[cart]: record ...',)
     """
-    posterior = None if isinstance(fitted, Mode) else labelled_draws(fitted)
-    at = fitted if isinstance(fitted, Mode) or mode is None else mode
-    if isinstance(at, Mode):
-        layout, phi, jacobian = at.problem.layout, at.phi, at.jacobian
+    posterior: dict[str, Floats] | None = None
+    if isinstance(fitted, Mode):
+        layout, phi, jacobian = _of_mode(fitted)
     else:
-        layout, phi, jacobian = _linearised(at, tuple(effects))
+        posterior = labelled_draws(fitted)
+        layout, phi, jacobian = _of_mode(mode) if mode else _linearised(fitted, effects)
     prior = _prior_draws(layout)
     kept = [i for i, label in enumerate(layout.labels) if label in prior]
     labels, priors = [layout.labels[i] for i in kept], [layout.priors[i] for i in kept]
@@ -229,12 +229,10 @@ def _prior_draws(layout: Layout, *, n_draws: int = 20_000) -> dict[str, Floats]:
     free = {owner for b in layout.blocks if b.name in JOINT_INDICES for owner in b.owners}
     draws = {
         f"{block.name}[{owner}]": prior.sample(rng, n_draws)
-        for block in layout.blocks
-        for owner, prior in zip(block.owners, block.priors, strict=True)
+        for block, owner, prior in layout.entries
         if owner not in free or block.of != "joint"
     }
-    folded = dict(zip(layout.labels, nearest(layout, layout.columns(draws)).T, strict=True))
-    return {label: folded[label] for label in draws}
+    return folded(layout, draws)
 
 
 def _natural(prior: Prior, x: Floats) -> Floats:
@@ -268,15 +266,15 @@ def _widths(
     layout: Layout, prior: Mapping[str, Floats], posterior: Mapping[str, Floats]
 ) -> tuple[Width, ...]:
     """Return the widths of all parameters with prior draws."""
-    folded = dict(zip(layout.labels, nearest(layout, layout.columns(posterior)).T, strict=True))
+    posterior = folded(layout, posterior)
     turned = {x for wheel in wheels(layout) if wheel.period == 1 for x in wheel.labels}
     widths = []
     for label, law in zip(layout.labels, layout.priors, strict=True):
         if label not in prior:
             continue
-        before, after, moved = _spread(law, prior[label]), _spread(law, folded[label]), 0.0
+        before, after, moved = _spread(law, prior[label]), _spread(law, posterior[label]), 0.0
         if label not in turned and not law.uniform:  # where a fold put it says nothing
-            mean = _natural(law, folded[label]).mean() - _natural(law, prior[label]).mean()
+            mean = _natural(law, posterior[label]).mean() - _natural(law, prior[label]).mean()
             moved = float(abs(mean)) / before
         widths.append(_width(label, before, after, moved))
     return tuple(widths)
@@ -317,7 +315,12 @@ def _sparse(rows: Floats) -> Floats:
     return rows
 
 
-def _linearised(idata: Idata, effects: tuple[Effect, ...]) -> tuple[Layout, Floats, Floats]:
+def _of_mode(mode: Mode) -> tuple[Layout, Floats, Floats]:
+    """Return the layout, the mode, and the whitened residual's derivative there."""
+    return mode.problem.layout, mode.phi, mode.jacobian
+
+
+def _linearised(idata: Idata, effects: Iterable[Effect]) -> tuple[Layout, Floats, Floats]:
     """Return the layout, the best draw, and the whitened residual's derivative there."""
     record = PosteriorRecord.of(idata)
     physics = record.physics(effects, threads=2)

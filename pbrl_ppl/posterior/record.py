@@ -20,7 +20,7 @@ from pbrl_ppl.likelihood import (
     log_posterior,
     noise_labels,
 )
-from pbrl_ppl.modes import find_mode
+from pbrl_ppl.modes import near_mode
 from pbrl_ppl.parameters import Layout, ParameterLibrary, nearest
 from pbrl_ppl.physics import Physics, build_layout
 from pbrl_ppl.posterior.store import SCHEMA, Idata, check_schema, draws
@@ -29,8 +29,6 @@ from pbrl_ppl.state import Floats, Ints
 
 #: A JSON object.
 JsonObject = Mapping[str, Any]
-#: Rounds of a climb that starts near the mode.
-_CLIMB = 5
 
 
 @dataclass(frozen=True)
@@ -75,7 +73,7 @@ class ParameterPoint:
 
 
 @dataclass(frozen=True)
-class Linearisation:
+class LinearisationCheck:
     """Check of the smoothed states' linearisation, at some draws.
 
     Parameters
@@ -138,7 +136,7 @@ class PosteriorRecord:
         Which noise parameter each coordinate is subject to, where the fit is of whole trajectories.
     mode : StoredMode, optional
         The posterior's mode.
-    linearisation : Linearisation, optional
+    linearisation : LinearisationCheck, optional
         Check of the smoothed states' linearisation.
     configurations : tuple of mapping, optional
         Which bodies the joints may join, and the probability of each choice.
@@ -182,7 +180,7 @@ class PosteriorRecord:
     library: ParameterLibrary | None = None
     cells: Coordinates | None = None
     mode: StoredMode | None = None
-    linearisation: Linearisation | None = None
+    linearisation: LinearisationCheck | None = None
     configurations: tuple[JsonObject, ...] | None = None
     updates: tuple[JsonObject, ...] | None = None
     max_rhat: float | None = None
@@ -313,7 +311,7 @@ def packed_mode(
         draws = log_posterior(problem, phi, sigma, log_likelihood=likelihood)
         best = int(np.argmax(draws))
         if draws[best] > value + 0.1:
-            climbed = find_mode(problem, initial=phi[best], rounds=_CLIMB)
+            climbed = near_mode(problem, phi[best])
             if climbed.log_posterior > value:
                 mode, value = ParameterPoint(climbed.phi, climbed.sigma), climbed.log_posterior
     return _packed(problem, mode, value, phi)
@@ -344,25 +342,22 @@ def updated_mode(
     """
     phi, sigma, choice = draws
     if problem.library is None and not problem.layout.discrete.any():
-        mode = find_mode(problem, initial=earlier.phi, rounds=_CLIMB)
+        mode = near_mode(problem, earlier.phi)
         return _packed(problem, ParameterPoint(mode.phi, mode.sigma), mode.log_posterior, phi)
     value = log_posterior(problem, phi, sigma, choice, log_likelihood=likelihood)
     i = int(np.argmax(value))
     best = ParameterPoint(phi[i], sigma[i], None if choice is None else choice[i])
-    return _packed(problem, best, float(value[i]))
+    return _packed(problem, best, float(value[i]), phi)
 
 
-def _packed(
-    problem: Problem, mode: ParameterPoint, value: float, draws: Floats | None = None
-) -> StoredMode:
+def _packed(problem: Problem, mode: ParameterPoint, value: float, draws: Floats) -> StoredMode:
     """Return a point for a record, its wheels described as in draws (draw, p)."""
     layout, point, sets = problem.layout, mode.phi, None
-    if problem.library is None and draws is not None:
+    if problem.library is None:
         point = nearest(layout, point[None], draws)[0]
-    if problem.library is not None and mode.choice is not None:
-        names = problem.library.names
-        chosen = zip(problem.scene.owners, mode.choice.tolist(), strict=True)
-        sets = {owner: names[i] for owner, i in chosen}
+    elif mode.choice is not None:
+        chosen = (problem.library.names[i] for i in mode.choice)
+        sets = dict(zip(problem.scene.owners, chosen, strict=True))
     return StoredMode(
         dict(zip(layout.labels, point.tolist(), strict=True)),
         dict(zip(problem.noise_labels, mode.sigma.tolist(), strict=False)),  # a scalar is repeated
@@ -403,10 +398,9 @@ def scene_of(idata: Idata) -> Scene:
     PosteriorError
         If there is none.
     """
-    fields = stored_fields(idata, ("scene",))
-    if not fields:
+    scene: Scene | None = stored_fields(idata, ("scene",)).get("scene")
+    if scene is None:
         raise PosteriorError("posterior: it holds no scene; make it with pbrl_ppl.fit")
-    scene: Scene = fields["scene"]
     return scene
 
 
@@ -435,12 +429,11 @@ def stored_fields(idata: Idata, names: Iterable[str] | None = None) -> dict[str,
 @cache
 def _kinds(record: type) -> dict[str, object]:
     """Return the types of a dataclass's fields, without the None of an optional one."""
-    hints = {field.name: get_type_hints(record)[field.name] for field in fields(record)}
-    optional = {name: set(get_args(kind)) - {type(None)} for name, kind in hints.items()}
-    return {
-        name: optional[name].pop() if type(None) in get_args(kind) else kind
-        for name, kind in hints.items()
-    }
+    kinds = get_type_hints(record)
+    for name, kind in kinds.items():
+        if type(None) in get_args(kind):
+            (kinds[name],) = set(get_args(kind)) - {type(None)}
+    return kinds
 
 
 #: How fields of these types are read from an attribute, and written to one.

@@ -343,6 +343,21 @@ def smoothed(log_weights: Floats) -> tuple[Floats, float]:
     return weights / weights.sum(), np.inf if np.isnan(k) else float(k)
 
 
+def gain_of(first: Any, second: Any) -> tuple[float, float]:
+    """Return the difference of two ``az.loo``, second less first, and its standard error (nats)."""
+    exact = {"round_to": "none"} if DATATREE else {}
+    table = arviz().compare({"before": first, "after": second}, **exact)
+    worse = table.iloc[-1]
+    sign = 1.0 if worse.name == "before" else -1.0
+    return sign * abs(float(worse["elpd_diff"])), float(worse["dse"])
+
+
+def elpd_of(loo: Any) -> tuple[float, float]:
+    """Return the ``elpd`` and effective number of parameters of an ``az.loo``."""
+    elpd, p = (loo.elpd, loo.p) if DATATREE else (loo["elpd_loo"], loo["p_loo"])
+    return float(elpd), float(p)
+
+
 def _dataset(value: xr.Dataset | xr.DataTree) -> xr.Dataset:
     """Return the result of a diagnostic as a dataset, in both generations."""
     if isinstance(value, xr.Dataset):

@@ -7,23 +7,19 @@ from dataclasses import replace
 
 import numpy as np
 import pandas as pd
-from scipy.optimize import brentq, least_squares
-from scipy.special import i0e, i1e
-from scipy.stats import truncnorm
+from scipy.optimize import least_squares
+from scipy.stats import truncnorm, vonmises
 
 from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.modes import NONE, index_law
-from pbrl_ppl.parameters import JOINT_INDICES, ParameterLibrary, Prior, nearest
+from pbrl_ppl.parameters import JOINT_INDICES, ParameterLibrary, Prior, folded
 from pbrl_ppl.physics import index_priors
 from pbrl_ppl.posterior.record import layout_of, scene_of, stored_fields
 from pbrl_ppl.posterior.store import Idata, group, labelled_draws, scalars
 from pbrl_ppl.scene import Body, Joint, Scene
 from pbrl_ppl.state import Floats
 
-#: Limits of a truncated normal: it is exponential with mu this many sigmas outside its support, and
-#: uniform with sigma this many times the width of what it covers.
-_OUTSIDE, _LEVEL = 5.0, 5.0
 #: Variables of a posterior that are not parameters.
 _OTHERS = ("library_index", "sigma")
 
@@ -62,24 +58,20 @@ def updated_scene(idata: Idata, *, effects: Iterable[Effect] = catalogue) -> Sce
         model = pp.physics_model(scene, pp.History.load("tuesday.csv", scene))
     """
     scene, layout = scene_of(idata), layout_of(idata, effects)
-    draws = labelled_draws(idata)
-    folded = nearest(layout, layout.columns(draws))
-    draws |= {x: folded[:, i] for i, x in enumerate(layout.labels) if x in draws}
+    draws = folded(layout, labelled_draws(idata))
     priors: dict[str, dict[str, float]] = {}
-    for block in layout.blocks:
+    for label, (block, _, prior) in zip(layout.labels, layout.entries, strict=True):
         if block.of != "body":
             continue
-        for owner, prior in zip(block.owners, block.priors, strict=True):
-            label = f"{block.name}[{owner}]"
-            if label not in draws:
-                raise PosteriorError(f"posterior: it has no {label}, which its scene asks for")
-            if not np.ptp(draws[label]) > 0:
-                raise PosteriorError(
-                    f"posterior: the draws of {label} are all {draws[label][0]:g}, so that they"
-                    " give no width to a prior; fit again, with more draws"
-                )
-            matched = moment_matched(prior, draws[label])
-            priors[label] = {k: getattr(matched, k) for k in matched.hyper_names}
+        if label not in draws:
+            raise PosteriorError(f"posterior: it has no {label}, which its scene asks for")
+        if not np.ptp(draws[label]) > 0:
+            raise PosteriorError(
+                f"posterior: the draws of {label} are all {draws[label][0]:g}, so that they give no"
+                " width to a prior; fit again, with more draws"
+            )
+        matched = moment_matched(prior, draws[label])
+        priors[label] = {k: getattr(matched, k) for k in matched.hyper_names}
     bodies = tuple(with_priors(body, priors) for body in scene.bodies)
     return scene.replace(bodies=bodies, joints=_joints(idata, scene))
 
@@ -119,12 +111,9 @@ def _joints(idata: Idata, scene: Scene) -> tuple[Joint, ...]:
                     f"posterior: it does not say what {name} may join; make it with pbrl_ppl.fit"
                 )
             law = np.sum(laws, axis=0)
-            both = zip(JOINT_INDICES, (law.sum(axis=1), law.sum(axis=0)), strict=True)
-            named = [(index, zip(scene.joinable, p.tolist(), strict=True)) for index, p in both]
-            named_pairs = tuple(
-                (index, tuple((n, p) for n, p in table if p)) for index, table in named
-            )
-            joint = replace(joint, prior=named_pairs)
+            tables = (zip(scene.joinable, law.sum(axis=k).tolist(), strict=True) for k in (1, 0))
+            of_indices = (tuple((name, p) for name, p in table if p) for table in tables)
+            joint = replace(joint, prior=tuple(zip(JOINT_INDICES, of_indices, strict=True)))
         joints.append(joint)
     return tuple(joints)
 
@@ -197,9 +186,9 @@ def moment_matched(prior: Prior, draws: Floats) -> Prior:
     (2.0, 0.1)
     """
     if prior.family == "von_mises":
-        resultant = np.exp(1j * draws).mean()
-        kappa = _concentration(float(np.abs(resultant)))
-        return replace(prior, mu=float(np.angle(resultant)), kappa=kappa)
+        kappa, mu, _ = vonmises.fit(draws)
+        # below 0.001 nearly uniform; at most of 0.001 rad
+        return replace(prior, mu=float(mu), kappa=min(float(kappa), 1e6) if kappa > 1e-3 else 0.0)
     values = np.log(draws) if prior.family == "log_normal" else draws
     mean, sd = float(values.mean()), float(values.std())
     if prior.family in ("truncated_normal", "half_normal"):
@@ -207,30 +196,20 @@ def moment_matched(prior: Prior, draws: Floats) -> Prior:
     return replace(prior, mu=mean, sigma=sd)
 
 
-def _concentration(resultant: float, *, limits: tuple[float, ...] = (1e-3, 1e6)) -> float:
-    """Return kappa whose von Mises distribution has this mean resultant length, 0 to 1.
+def _parent(
+    mean: float, sd: float, lower: float, upper: float, *, outside: float = 5.0, level: float = 5.0
+) -> tuple[float, float]:
+    """Return mu and sigma of the normal that has this mean and sd once it is truncated.
 
-    ``limits``: limits of a concentration: nearly uniform, and 0.001 rad.
+    ``outside``: sigmas that mu is outside the support at most; there it is exponential.
+    ``level``: sigma at most, as a multiple of the width of what it covers; there it is uniform.
     """
-    low, high = np.log(limits)
-
-    def excess(log_kappa: float) -> float:
-        kappa = np.exp(log_kappa)
-        return float(i1e(kappa) / i0e(kappa)) - resultant
-
-    if excess(low) >= 0 or excess(high) <= 0:
-        return 0.0 if excess(low) >= 0 else limits[1]
-    return float(np.exp(brentq(excess, low, high)))
-
-
-def _parent(mean: float, sd: float, lower: float, upper: float) -> tuple[float, float]:
-    """Return mu and sigma of the normal that has this mean and sd once it is truncated."""
     reach = min(upper - lower, mean - lower + sd, upper - mean + sd)
     reach = reach if np.isfinite(upper - lower) else 10 * reach
 
     def hyper(point: Floats) -> tuple[float, float]:
         sigma = float(np.exp(point[1]))
-        mu = np.clip(mean + sd * point[0], lower - _OUTSIDE * sigma, upper + _OUTSIDE * sigma)
+        mu = np.clip(mean + sd * point[0], lower - outside * sigma, upper + outside * sigma)
         return float(mu), sigma
 
     def error(point: Floats) -> Floats:
@@ -239,9 +218,9 @@ def _parent(mean: float, sd: float, lower: float, upper: float) -> tuple[float, 
         return np.array([(law.mean() - mean) / sd, np.log(law.std() / sd)])
 
     # far from the bounds, the moments are those of the normal itself
-    begin = np.array([0.0, np.log(min(sd, 0.9 * _LEVEL * reach))])
-    far = _LEVEL * reach / sd * (_OUTSIDE + 1)
-    limits = ([-far, np.log(0.5 * sd)], [far, np.log(_LEVEL * reach)])
+    begin = np.array([0.0, np.log(min(sd, 0.9 * level * reach))])
+    far = level * reach / sd * (outside + 1)
+    limits = ([-far, np.log(0.5 * sd)], [far, np.log(level * reach)])
     return hyper(least_squares(error, begin, bounds=limits, x_scale="jac").x)
 
 
@@ -300,11 +279,7 @@ def library_probabilities(idata: Idata) -> pd.DataFrame:
         raise PosteriorError(
             "posterior: its model has no library; pass its library to physics_model"
         )
-    names = library.names
     index = group(idata, "posterior")["library_index"].transpose("chain", "draw", ...)
     (dim,) = index.dims[2:]
-    share = {name: (index == i).mean(("chain", "draw")) for i, name in enumerate(names)}
-    return pd.DataFrame(
-        {name: probability.to_numpy() for name, probability in share.items()},
-        index=index[dim].to_numpy(),
-    )
+    shares = [(index == i).mean(("chain", "draw")).to_numpy() for i in range(len(library.names))]
+    return pd.DataFrame(dict(zip(library.names, shares, strict=True)), index[dim].to_numpy())

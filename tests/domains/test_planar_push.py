@@ -63,7 +63,7 @@ def test_the_fitted_friction_predicts_held_out_pushes(recorded) -> None:
     problem = problem_in(physics_model(scene, train, horizon=68, threads=2))
     centres = np.array([prior.centre for prior in problem.layout.priors])
     mode: Mode = find_mode(problem, initial=centres)
-    far, turned = last_pose_error(scene, test, mode.values)
+    far, turned = last_pose_error(scene, test, mode.problem.layout.to_dict(mode.phi))
     assert far <= 2.0
     assert turned <= 1.7
 

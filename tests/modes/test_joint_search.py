@@ -5,7 +5,8 @@ import pytest
 
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import Problem
-from pbrl_ppl.modes import joint_search, weigh
+from pbrl_ppl.modes import configurations as module
+from pbrl_ppl.modes import weigh
 from pbrl_ppl.modes.configurations import MOST, configurations, number
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Joint, Scene, Shape
@@ -39,7 +40,7 @@ def test_two_hinges_are_found_among_more_than_can_be_tried(
     names, most, all_of_them, monkeypatch
 ) -> None:
     """Each hinge shows by itself."""
-    monkeypatch.setattr(joint_search, "MOST", most)
+    monkeypatch.setattr(module, "MOST", most)
     free = discs(*(Joint("hinge", known=False) for _ in range(2)), names=names)
     assert number(free) == all_of_them > most
     truth = discs(*(Joint("hinge", pair, *at) for pair, at in HINGES.items()), names=names)
@@ -65,7 +66,7 @@ def test_few_configurations_are_all_tried(monkeypatch) -> None:
     free = scene(Joint("hinge", known=False), Joint("distance", known=False))
     tried = tried_of(free, monkeypatch, lambda pairs: 0.0)
     assert tried == set(configurations(free))
-    monkeypatch.setattr(joint_search, "MOST", 60)
+    monkeypatch.setattr(module, "MOST", 60)
     good = {("joint1", ("a", "b")), ("joint2", ("c", "world"))}
     some = tried_of(free, monkeypatch, lambda pairs: 50.0 * len(good & set(pairs)))
     assert len(some) <= 60
@@ -77,13 +78,13 @@ def test_few_configurations_are_all_tried(monkeypatch) -> None:
 def test_hopeless_joints_are_not_added_to(monkeypatch) -> None:
     """Where every joint makes it far worse, two of them are not tried."""
     free = scene(Joint("hinge", known=False), Joint("distance", known=False))
-    monkeypatch.setattr(joint_search, "MOST", 60)
+    monkeypatch.setattr(module, "MOST", 60)
     joined = lambda pairs: len([p for _, p in pairs if p])  # noqa: E731
     assert len(tried_of(free, monkeypatch, lambda pairs: -1e4 * joined(pairs))) == 21
 
 
 def test_too_many_pairs_for_one_joint_are_refused(monkeypatch) -> None:
-    monkeypatch.setattr(joint_search, "MOST", 10)
+    monkeypatch.setattr(module, "MOST", 10)
     free = scene(Joint("hinge", known=False))
     with pytest.raises(
         FitError, match=r"10 configurations .* \(a, b, c, d, world\), .* at most 10"
@@ -104,13 +105,11 @@ def tried_of(free: Scene, monkeypatch, height):
         tried.add(configuration)
         return Found(height(configuration.pairs))
 
-    monkeypatch.setattr(joint_search, "_apart", lambda problem, seed: Found(0.0))
-    monkeypatch.setattr(joint_search, "_joint", joint)
-    monkeypatch.setattr(
-        joint_search, "laplace", lambda mode: joint_search.Marginal(mode.log_posterior)
-    )
+    monkeypatch.setattr(module, "_apart", lambda problem, seed: Found(0.0))
+    monkeypatch.setattr(module, "_joint", joint)
+    monkeypatch.setattr(module, "laplace", lambda mode: module.Marginal(mode.log_posterior))
     history = simulated_history(scene(), {}, seed=1, trajectories=1, intervals=2)
-    modes, _ = joint_search._tried(Problem.of(Physics(free), history), 1, joint_search.silent)
+    modes, _ = module._tried(Problem.of(Physics(free), history), 1, module.silent)
     first, *others = modes
     assert first.empty
     assert set(others) == tried

@@ -12,8 +12,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, TransitionLikelihood
 from pbrl_ppl.modes import mode_of_more, search, trajectory_mode
-from pbrl_ppl.modes.laplace import climb, covariance_of, sandwich
-from pbrl_ppl.modes.search import find_mode, find_modes
+from pbrl_ppl.modes.search import climb, covariance_of, find_mode, find_modes, sandwich
 from pbrl_ppl.parameters import by_prior, covariance_factor, differentiate
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Body, Scene, Shape
@@ -88,7 +87,7 @@ def test_modes_are_sorted_and_describe_themselves(problem, modes) -> None:
     assert mode.jacobian.shape == (n_cells, p)
     assert mode.covariance.shape == (p, p)
     assert np.linalg.eigvalsh(mode.covariance).min() > 0
-    assert mode.values["mass"] == pytest.approx(mode.phi[:1])
+    assert problem.layout.to_dict(mode.phi)["mass"] == pytest.approx(mode.phi[:1])
     # where sigma is the most probable, the slope of the log-posterior by its logarithm vanishes
     z = mode.whitened_residual.reshape(problem.observations.values.shape)
     n, (median, spread) = problem.segments.n, problem.noise_prior
@@ -242,7 +241,7 @@ def test_prior_alone_where_data_say_nothing() -> None:
     wheel = {name: CART[name] for name in ("mass", *WHEEL)}
     problem = Problem.of(Physics(cart_scene(known=wheel)), history)
     mode = find_mode(problem, seed=1)
-    found = mode.values
+    found = problem.layout.to_dict(mode.phi)
     assert found["mu_c"] == pytest.approx(0.5, abs=1e-3)
     # a log-normal's mode, exp(mu - sigma^2)
     assert found["r"] == pytest.approx(np.exp(-2.5), rel=1e-2)

@@ -15,7 +15,7 @@ from pbrl_ppl.errors import OutputError, PosteriorError
 from pbrl_ppl.likelihood import Coordinates
 from pbrl_ppl.parameters import ParameterLibrary
 from pbrl_ppl.physics import Physics
-from pbrl_ppl.posterior import Linearisation, PosteriorRecord, StoredMode, scene_of
+from pbrl_ppl.posterior import LinearisationCheck, PosteriorRecord, StoredMode, scene_of
 from pbrl_ppl.posterior import store as posterior
 from pbrl_ppl.posterior.store import (
     DATATREE,
@@ -296,7 +296,7 @@ OPTIONAL = {
     "library": ParameterLibrary({"light": {"mass": 1.0}, "heavy": {"mass": 2.0}}),
     "cells": CELLS,
     "mode": StoredMode({"mass[cart]": 0.1 + 0.2}, {"sigma[x]": 0.1}, -1.5, {"cart": "light"}),
-    "linearisation": Linearisation(16, 0.1, 0.2, 0),
+    "linearisation": LinearisationCheck(16, 0.1, 0.2, 0),
     "configurations": ({"joints": {"joint1": None}, "probability": 1.0},),
     "updates": ({"did": "reweighted", "share": 0.3},),
     "max_rhat": 1.002,
