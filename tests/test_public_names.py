@@ -53,7 +53,7 @@ def test_import_is_quick() -> None:
     assert not {"pymc", "arviz"} & with_scene
 
 
-@pytest.mark.parametrize("first", ["pbrl_ppl.close_loop", "import pbrl_ppl.planning"])
+@pytest.mark.parametrize("first", ["pbrl_ppl.close_loop", "from pbrl_ppl.planning import plan"])
 def test_the_core_loads_neither_pymc_nor_matplotlib(first) -> None:
     """The main call and planning load PyMC and matplotlib where they need them, not before."""
     code = f"import sys, pbrl_ppl; {first}; print(*sys.modules)"

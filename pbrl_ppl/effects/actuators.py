@@ -63,14 +63,12 @@ def _scale_torque(state: Floats, command: Floats, parameters: Floats, wrench: Fl
     wrench[2] *= parameters[0]
 
 
-torque_gain = Effect(
-    "torque_gain",
-    (EffectParameter("factor", "1", _GAIN, null=1.0),),
-    "every torque is stronger or weaker than commanded by the same factor: the motor's scale is"
-    " off",
-    "gain of an actuator",
-    Command(_scale_torque),
-    applies=sends_wrenches,
+torque_gain = replace(
+    force_gain,
+    name="torque_gain",
+    sentence="every torque is stronger or weaker than commanded by the same factor: the motor's"
+    " scale is off",
+    stage=Command(_scale_torque),
 )
 
 

@@ -1,6 +1,7 @@
 """Friction in joints, on the floor and of wheels; the engine solves it together with contacts."""
 
 import math
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -229,18 +230,15 @@ sliding_stribeck = Effect(
 )
 
 
-slider_stribeck = Effect(
-    "slider_stribeck",
-    (EffectParameter("force", "N", SIZE, scale="force"), _SPEED),
-    "dry friction in the slider that is stronger near standstill than in motion: it sticks, then"
-    " slips",
-    "Stribeck's curve, F = F_s exp(-(v/v_s)^2) beside Coulomb's",
-    Friction(_fall_with_speed),
+slider_stribeck = replace(
+    pivot_stribeck,
+    name="slider_stribeck",
+    parameters=(EffectParameter("force", "N", SIZE, scale="force"), _SPEED),
+    sentence="dry friction in the slider that is stronger near standstill than in motion: it"
+    " sticks, then slips",
+    reference="Stribeck's curve, F = F_s exp(-(v/v_s)^2) beside Coulomb's",
     applies=is_sliding,
     scan=_SCAN_SPEEDS,
-    log_odds=-2.0,
-    family="dry friction",
-    unusual="few recordings are slow and clean enough to show it beside dry friction",
 )
 
 

@@ -39,7 +39,7 @@ def _undone_by_opposites(measure: Callable[[Floats, Values], Floats]) -> Sensor:
 def _add_bias(state: Floats, parameters: Values) -> Floats:
     nothing = np.zeros(())  # of what the effect does not have on a hinged body
     given = (parameters.get(name, nothing) for name in STATE)
-    return state + np.stack(np.broadcast_arrays(*given), axis=-1)
+    return np.asarray(state + np.stack(np.broadcast_arrays(*given), axis=-1))
 
 
 sensor_bias = Effect(

@@ -1,5 +1,6 @@
 """What holds or stops a body and the scene does not show: springs, stops, rods and obstacles."""
 
+from dataclasses import replace
 from itertools import combinations, product
 from math import floor, pi
 
@@ -136,14 +137,12 @@ def _lower_stop(state: Floats, command: Floats, parameters: Floats, wrench: Floa
     wrench[2] += parameters[0] * max(0.0, parameters[1] - state[2])
 
 
-_STOP = (
-    EffectParameter("stiffness", "N m/rad", Prior("half_normal", sigma=10.0), scale="torque"),
-    EffectParameter("angle", "rad", ANY_ANGLE),
-)
-
 upper_stop = Effect(
     "upper_stop",
-    _STOP,
+    (
+        EffectParameter("stiffness", "N m/rad", Prior("half_normal", sigma=10.0), scale="torque"),
+        EffectParameter("angle", "rad", ANY_ANGLE),
+    ),
     "a springy stop above an angle: a bumper, a cable that gets tight",
     "one-sided spring, tau = -k max(0, theta - theta0)",
     Force(_upper_stop),
@@ -154,17 +153,13 @@ upper_stop = Effect(
     needs=("places",),
 )
 
-lower_stop = Effect(
-    "lower_stop",
-    _STOP,
-    "a springy stop below an angle: a bumper, a cable that gets tight",
-    "one-sided spring, tau = k max(0, theta0 - theta)",
-    Force(_lower_stop),
+lower_stop = replace(
+    upper_stop,
+    name="lower_stop",
+    sentence="a springy stop below an angle: a bumper, a cable that gets tight",
+    reference="one-sided spring, tau = k max(0, theta0 - theta)",
+    stage=Force(_lower_stop),
     scan=ScanWith(_scan_range, (0.3, 0.1)),
-    log_odds=-4.0,
-    family="place and angle",
-    unusual="stops are seen, and seldom reached",
-    needs=("places",),
 )
 
 

@@ -260,12 +260,10 @@ class Learner:
         share_classes: bool = False,
         relations: Sequence[Relation] = (),
     ) -> None:
-        if not checks.is_whole(neighbours):
-            raise FitError(f"LWR: neighbours is {neighbours!r}, expected a whole number from 1 up")
-        if not 0 < bandwidth < np.inf:
-            raise FitError(f"LWR: bandwidth is {bandwidth!r}, expected a number above 0")
-        if not 0 <= ridge < np.inf:
-            raise FitError(f"LWR: ridge is {ridge!r}, expected a number from 0 (Eq. 4) up")
+        with checks.located("LWR", FitError):
+            checks.whole(neighbours, "neighbours")
+            checks.positive(bandwidth, "bandwidth")
+            checks.not_negative(ridge, "ridge")
         self.scene, self.pose_invariant, self.relations = scene, pose_invariant, tuple(relations)
         options = {"neighbours": neighbours, "bandwidth": bandwidth, "ridge": ridge}
         self._experience: dict[int, Experience] = {}
@@ -491,7 +489,7 @@ class Learner:
         """
         names = [mover.name for mover in self.scene.dynamic]
         with checks.located(kind=FitError):
-            checks.known(body, names, "LWR: the scene has no body that can be pushed called")
+            checks.known(body, names, "LWR: the scene has no moving body")
         return dict(zip(names, self._experience.values(), strict=True))[body]
 
     def _inputs(self, states: Floats, wrenches: Floats) -> Floats:

@@ -165,12 +165,9 @@ class SectorContacts:
     by_object: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("sectors", "rays"):
-            value = getattr(self, name)
-            if not checks.is_whole(value):
-                raise FitError(f"contacts: {name} is {value!r}, expected a whole number from 1 up")
-        if self.radius is not None and not 0 <= self.radius < np.inf:
-            raise FitError(f"contacts: radius is {self.radius!r}, expected a length of 0 m or more")
+        with checks.located(kind=FitError):
+            checks.settle(self, "contacts", sectors=checks.whole, rays=checks.whole)
+            checks.settle(self, "contacts", radius=checks.not_negative)
 
     def objects(self, scene: Scene) -> tuple[str, ...]:
         """Return the names of the objects that a body may touch, in the order of the predicates."""

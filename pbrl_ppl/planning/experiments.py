@@ -500,7 +500,7 @@ def suggest_actions(
         said.to_csv("next.csv")  # play it, record, and close the loop on both recordings
     """
     if isinstance(known, Loop):
-        known, catalogue = known.posterior_after, known.catalogue
+        catalogue, known = known.catalogue, known.posterior_after
     posterior, catalogue, progress = known, tuple(catalogue), progress or silent
     scene = scene_of(posterior)
     if effects is None and not (groups := kept_groups(posterior)):

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,12 +18,7 @@ from pbrl_ppl.scene import Scene, checks, nearest
 from pbrl_ppl.state import POSE, THETA, WRENCH, Floats, turned
 
 if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
-
     from pbrl_ppl.posterior import Idata
-
-#: A class of what a table of a file declares.
-Table = TypeVar("Table", bound="DataclassInstance")
 
 
 @dataclass(frozen=True)
@@ -111,15 +106,22 @@ class Goal:
                 checks.settle(self, "goal", contact_penalty=checks.not_negative)
 
     @classmethod
-    def of(cls, targets: Goal | Mapping[str, Sequence[float | None]], **options: float) -> Goal:
+    def of(
+        cls,
+        targets: Goal | Mapping[str, Sequence[float | None]],
+        contact_penalty: float = 0.0,
+        **options: float,
+    ) -> Goal:
         """Return a goal from poses by body name: ``{"cart": (x, y, theta)}``, None where free.
 
         Parameters
         ----------
         targets : mapping or Goal
             Pose of each body, m and rad; a goal as it is.
+        contact_penalty : float
+            Of the goal.
         **options
-            ``contact_penalty`` of the goal, and options of every target.
+            Options of every target.
 
         Raises
         ------
@@ -128,17 +130,14 @@ class Goal:
         """
         if isinstance(targets, Goal):
             return targets
-        penalty = {k: options.pop(k) for k in ("contact_penalty",) if k in options}
         known = [field.name for field in fields(Target)][4:]
         with checks.located(kind=GoalError):
             checks.keyed(options, "goal", (), known)
         for name, pose in targets.items():
             if len(pose) != 3:
                 raise GoalError(f"goal of {name}: got {len(pose)} values, expected x, y, theta")
-        read = (
-            Target(name, pose[0], pose[1], pose[2], **options) for name, pose in targets.items()
-        )
-        return cls(tuple(read), **penalty)
+        read = (Target(name, x, y, turn, **options) for name, (x, y, turn) in targets.items())
+        return cls(tuple(read), contact_penalty)
 
     @classmethod
     def load(cls, path: str | Path) -> Goal:
@@ -235,8 +234,8 @@ def check_pushed(scene: Scene, names: Iterable[str], where: str, hint: str = "")
 
 
 def read_tables(
-    path: str | Path, what: str, kind: type[Table], options: Iterable[str]
-) -> tuple[list[Table], dict[str, Any]]:
+    path: str | Path, what: str, kind: type[Any], options: Iterable[str]
+) -> tuple[list[Any], dict[str, Any]]:
     """Read a TOML file: a Target or Action for each of its tables, and options.
 
     Raises

@@ -355,27 +355,22 @@ def check_classes(bodies: Sequence[Body]) -> None:
         if body.static:
             continue
         other = first.setdefault(body.owner, body)
-        for key, mine, its in _differing(body, other):
+        mine, its = _shaping(body), _shaping(other)
+        for key in (key for key in mine if mine[key] != its[key]):
             raise SceneError(
                 f'{where}: it shares the parameters of class "{body.owner}" with body'
-                f' "{other.name}", and they differ in {key}: {mine} and {its}; make them equal, or'
-                " give one of them another class or attributes"
+                f' "{other.name}", and they differ in {key}: {mine[key]} and {its[key]}; make them'
+                " equal, or give one of them another class or attributes"
             )
 
 
-def _differing(body: Body, other: Body) -> list[tuple[str, object, object]]:
-    """Return what shapes the parameters and differs between two bodies: its name, both values."""
-
-    def shaping(one: Body) -> dict[str, object]:
-        # an effect's parameters belong to each body alone
-        prior = {name: dict(hyper) for name, hyper in one.prior if name in checks.PARAMETERS}
-        return {
-            **{key: getattr(one, key) for key in ("object_class", "wheel", "kinematic")},
-            "known": dict(one.known),
-            "prior": prior,
-            "attributes": sorted(one.attributes),
-            "shape": one.shape if one.wheel else None,  # the wheel's place is bounded by it
-        }
-
-    pairs = zip(shaping(body).items(), shaping(other).values(), strict=True)
-    return [(key, mine, its) for (key, mine), its in pairs if mine != its]
+def _shaping(body: Body) -> dict[str, object]:
+    """Return what shapes a body's parameters, but for effects', which belong to it alone."""
+    prior = {name: dict(hyper) for name, hyper in body.prior if name in checks.PARAMETERS}
+    return {
+        **{key: getattr(body, key) for key in ("object_class", "wheel", "kinematic")},
+        "known": dict(body.known),
+        "prior": prior,
+        "attributes": sorted(body.attributes),
+        "shape": body.shape if body.wheel else None,  # the wheel's place is bounded by it
+    }

@@ -9,13 +9,10 @@ from contextlib import contextmanager
 from dataclasses import MISSING, fields
 from numbers import Integral, Real
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from pbrl_ppl.errors import PbrlError, SceneError
 from pbrl_ppl.files import parse_toml, read_text, reason
-
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
 
 Value = TypeVar("Value")
 Point = tuple[float, float]
@@ -56,9 +53,11 @@ def is_number(value: object) -> bool:
     return isinstance(value, Real) and not isinstance(value, bool)
 
 
-def is_whole(value: Any, *, least: int = 1) -> bool:
-    """Return whether a value is a whole number, from ``least`` up."""
-    return is_number(value) and isinstance(value, Integral) and int(value) >= least
+def whole(value: Any, where: str) -> int:
+    """Return a whole number from one up."""
+    if not is_number(value) or not isinstance(value, Integral) or int(value) < 1:
+        raise SceneError(f"{where} is {value!r}, expected a whole number from 1 up")
+    return int(value)
 
 
 def read_file(path: str | Path, what: str) -> str:
@@ -257,7 +256,7 @@ def entries(check: Check) -> Check:
     return checked
 
 
-def fields_of(kind: type[DataclassInstance], table: object, where: str) -> dict[str, Any]:
+def fields_of(kind: type[Any], table: object, where: str) -> dict[str, Any]:
     """Return values of a class's fields from a table whose keys are checked."""
     names = {RENAMED.get(field.name, field.name): field for field in fields(kind)}
     required = [key for key, field in names.items() if field.default is MISSING]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import Any
 
 from pbrl_ppl.errors import SceneError
@@ -161,11 +162,6 @@ def _separator(value: object, where: str) -> object:
     return value
 
 
-def _cuts(value: object, where: str) -> Pairs:
-    """Return where trajectories are cut."""
-    return table(value, where, dict.fromkeys(("every", "gaps", "rests", "jumps"), positive))
-
-
 def _clocks(value: object, where: str) -> object:
     """Return the clocks, of which a rate is positive."""
     if "rate" in (given := items(value, where)):
@@ -173,11 +169,12 @@ def _clocks(value: object, where: str) -> object:
     return entries(_name_or_number)(value, where)
 
 
+_CUTS = dict.fromkeys(("every", "gaps", "rests", "jumps"), positive)
 #: The check of each attribute.
 _CHECKS: Mapping[str, Check] = {
     **dict.fromkeys(("hold", "header", "resample", "trim", "camera"), flag),
     **{"columns": entries(_column), "units": entries(text), "not_seen": entries(finite)},
-    **{"time": _clocks, "cut": _cuts, "topics": entries(_topics)},
+    **{"time": _clocks, "cut": partial(table, checks=_CUTS), "topics": entries(_topics)},
     **{"commands": text, "separator": _separator, "forces": choice(("world", "body"))},
     "velocities": choice(("measured", "computed", "estimate")),
 }

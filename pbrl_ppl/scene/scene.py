@@ -13,7 +13,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -25,12 +25,6 @@ from pbrl_ppl.scene.joints import WORLD, Actuator, Joint, check_actuators
 from pbrl_ppl.scene.recording import Recording
 from pbrl_ppl.state import STATE
 
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
-
-Part = TypeVar("Part", bound="DataclassInstance")
-Table = dict[str, Any]
-
 #: Fields of a scene that are arrays of tables, with the key and the class of each.
 _PARTS: Mapping[str, tuple[str, type]] = {
     "bodies": ("body", Body),
@@ -39,7 +33,7 @@ _PARTS: Mapping[str, tuple[str, type]] = {
     "actuators": ("actuator", Actuator),
 }
 #: Values that are written of a body though they are empty.
-_EMPTY: Table = {"known": {}, "prior": {}, "effects": ()}
+_EMPTY: Mapping[str, object] = {"known": {}, "prior": {}, "effects": ()}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -359,14 +353,13 @@ def check_substeps(value: Any, where: str = "substeps", *, most: int = 1280) -> 
     SceneError
         If it is no whole number from 1 to the most that change a prediction.
     """
-    if not checks.is_whole(value):
-        raise SceneError(f"{where} is {value!r}, expected a whole number from 1 up")
-    if value > most:
+    number = checks.whole(value, where)
+    if number > most:
         raise SceneError(
             f"{where} is {value}, expected at most {most}: more change no"
             " prediction and take long; use fewer, or record with a shorter time_step"
         )
-    return int(value)
+    return number
 
 
 def toml_of(sections: Iterable[tuple[str, Mapping[str, object]]]) -> str:
@@ -378,7 +371,7 @@ def toml_of(sections: Iterable[tuple[str, Mapping[str, object]]]) -> str:
     return "\n".join(parts)
 
 
-def _part(kind: type[Part], where: str, table: object) -> Part:
+def _part(kind: type[Any], where: str, table: object) -> Any:
     """Return a body, wall, joint or actuator from its table."""
     entries = checks.fields_of(kind, table, where)
     shape = checks.fields_of(Shape, entries["shape"], f"shape of {where}") if kind is Body else None
