@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import shutil
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -112,8 +112,8 @@ class Recorded:
         Its name in messages.
     hinges : Hinges
         Those that it shows.
-    actuators : callable
-        Takes the outline of the one body; returns actuators that columns' names give away.
+    actuators : tuple of Actuator
+        Those of the one body that columns' names give away.
     """
 
     names: tuple[str, ...] = ()
@@ -122,15 +122,15 @@ class Recorded:
     said: Sequence[str] = ()
     source: str = ""
     hinges: Hinges = Hinges()
-    actuators: Callable[[Shape], tuple[Actuator, ...]] = lambda shape: ()
+    actuators: tuple[Actuator, ...] = ()
 
 
 def recorded(
     paths: Sequence[Path],
     layout: Recording,
-    given: Sequence[str],
+    outlined: Mapping[str, Shape],
     time_step: float | None,
-    side: bool = False,
+    side: bool,
 ) -> Recorded:
     """Read bodies, time step and layout from a recording.
 
@@ -140,8 +140,8 @@ def recorded(
         The recording's files, or folders of them.
     layout : Recording
         What is known of its layout.
-    given : sequence of str
-        Names of bodies from options, for a recording that names none.
+    outlined : mapping of str to Shape
+        Bodies from options, for a recording that names none.
     time_step : float, optional
         Time between rows (s), for a recording without times.
     side : bool
@@ -166,61 +166,81 @@ def recorded(
     if not plain:
         layout = histories.with_guesses(frame, commands[0], layout, said.append)
         histories.check_states(frame, layout, source)
-    columns = dict(layout.columns)
-    names = _names(frame, columns) or list(given)
-    if not names:
-        raise HistoryError(
-            f"{source}: no column has the bodies' names; give --body NAME=SHAPE for one body,"
-            " --columns body=COLUMN, or --columns NAME.x=COLUMN,... for bodies side by side"
-        )
+    names = _names(frame, dict(layout.columns), outlined, source)
     # later commands read it with the scene; any outline will do here
     bodies = tuple(Body(name, Shape.circle(1.0)) for name in names)
-    stand_in = Scene(time_step=time_step or 1.0, bodies=bodies)
-    timed = {"time", "duration"} & {*columns, *frame.columns} or layout.time
+    scene = Scene(time_step=time_step or 1.0, bodies=bodies)
+    timed = {"time", "duration"} & {*dict(layout.columns), *frame.columns} or layout.time
     if not plain and time_step is None and not timed:
         raise HistoryError(
             f"{source}: it has no column time; say which it is (--columns time=COLUMN, or"
             " duration=COLUMN for times since the row before), or give --time-step"
         )
-    read = partial(_as_history, [*zip(frames, logs, commands, strict=True)], stand_in)
-    table, layout = _read_with_cures(read, layout, logs, said, plain=plain)
+    parts = [*zip(frames, logs, commands, strict=True)]
+    table, layout = _read_with_cures(parts, scene, layout, said, plain=plain)
     table["time"] = pd.to_numeric(table["time"], errors="coerce")
-    # pandas 2 warns of a median of missing values alone
-    step = float(table.groupby(["trajectory", "body"])["time"].diff().dropna().median())
-    if not step > 0:
-        raise HistoryError(
-            f"{source}: its times do not rise from row to row of a body and trajectory;"
-            " correct them, or give --time-step; times since the row before are a column duration"
-        )
-    step = time_step or _longer_step(float(f"{step:.4g}"), commands[0], layout, said)
+    step = _time_step(table, commands[0], layout, said, source, time_step)
     hinges = Hinges.seen_in(table, names)
     proposed, shown = histories.propose(table, layout, step, jumps=not hinges.circles)
     shown += hinges.in_words()
-    acting: Callable[[Shape], tuple[Actuator, ...]] = Recorded.actuators
+    hung, acting = hinges != Hinges(), tuple[Actuator, ...]()
     if not plain and len(names) == 1:
-        hung = hinges != Hinges()
-        acting = partial(histories.guessed_actuators, frame, proposed, hung=hung)
-    sent = [one.column or one.name for one in acting(Shape.circle(1.0))]
-    if sent:
+        shape = outlined.get(names[0], bodies[0].shape)
+        acting = histories.guessed_actuators(frame, proposed, shape, hung)
+    if sent := [one.column or one.name for one in acting]:
         shown.append(f"commands by their names: {', '.join(sent)}; correct [[actuator]]")
-    falls = side and hinges == Hinges() and not sent
-    tried = stand_in.replace(time_step=step, gravity=(0.0, -9.81 * falls))
-    tried = tried.replace(recording=None if plain else proposed)
-    found, units, computed = _cures(paths, frame, tried)
+    falls = side and not (hung or sent)
+    scene = scene.replace(time_step=step, gravity=(0.0, -9.81 * falls))
+    found, units, computed = _cures(paths, frame, scene, None if plain else proposed)
     computed |= plain and any(name in STATE[VELOCITY:] for name in units)  # whose units are SI's
     cured = replace(asked, velocities="computed") if computed else asked
     if not plain and (time_step is None or "time" not in units):  # else the step is the user's
         cured = cured.with_entries(units=units)
     if cured != asked:
-        again = recorded(paths, cured, given, time_step, side)
+        again = recorded(paths, cured, outlined, time_step, side)
         return replace(again, said=[*found, *again.said])
     shown += found
     left = () if plain else histories.unused_columns(frame, proposed)
-    unused = [name for name in left if name not in sent]
-    if unused:
+    if unused := [name for name in left if name not in sent]:
         shown.append(f"columns that are not used: {', '.join(unused)}")
     layout_found = None if plain and not shown else proposed
     return Recorded(tuple(names), step, layout_found, [*said, *shown], name, hinges, acting)
+
+
+def _read_with_cures(
+    parts: Sequence[tuple[pd.DataFrame, Path, pd.DataFrame | None]],
+    scene: Scene,
+    layout: Recording,
+    said: list[str],
+    *,
+    plain: bool,
+) -> tuple[pd.DataFrame, Recording]:
+    """Return logs, each a table, path and commands, as a history's table, and the layout needed.
+
+    What was proposed and repaired is added to ``said``, each once, without the names of logs.
+    """
+
+    def say(message: object) -> None:
+        text = str(message)
+        for _, log, _ in parts:
+            text = text.removeprefix(f"history {log}: ")
+        if text not in said:
+            said.append(text)
+
+    while True:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", RecordingWarning)
+            try:
+                table = _as_history(parts, scene, None if plain else layout)
+            except LayoutError as proposal:
+                say(proposal)
+                before, layout = layout, layout.with_entries(**proposal.entries)
+                if layout == before:
+                    raise
+                continue
+        for warning in caught:
+            say(warning.message)
+        return table, layout
 
 
 def _as_history(
@@ -244,8 +264,40 @@ def _as_history(
     return histories.joined(tables)
 
 
+def _time_step(
+    table: pd.DataFrame,
+    commands: pd.DataFrame | None,
+    layout: Recording,
+    said: list[str],
+    source: str,
+    given: float | None,
+) -> float:
+    """Return the time step: as given, or the median one, or that of slower commands.
+
+    A command that is late by less than its own interval is late by a part of one time step.
+    """
+    from pbrl_ppl.history import command_step
+
+    # pandas 2 warns of a median of missing values alone
+    step = float(table.groupby(["trajectory", "body"])["time"].diff().dropna().median())
+    if not step > 0:
+        raise HistoryError(
+            f"{source}: its times do not rise from row to row of a body and trajectory;"
+            " correct them, or give --time-step; times since the row before are a column duration"
+        )
+    step = float(f"{step:.4g}")
+    slower = 0.0 if commands is None else command_step(commands, layout)
+    if given or slower < 2 * step:
+        return given or step
+    said.append(
+        f"rows are {step:g} s apart and commands {slower:g} s: time_step is the commands', so that"
+        " a delay of theirs is a part of it"
+    )
+    return slower
+
+
 def _cures(
-    paths: Sequence[Path], frame: pd.DataFrame, scene: Scene
+    paths: Sequence[Path], frame: pd.DataFrame, scene: Scene, layout: Recording | None
 ) -> tuple[list[str], dict[str, str], bool]:
     """Return what is wrong with units and velocities of a recording, and the entries that cure it.
 
@@ -256,66 +308,11 @@ def _cures(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            history = histories.History.load(paths, scene)
+            history = histories.History.load(paths, scene.replace(recording=layout))
         except HistoryError:  # later commands say it
             return [], {}, False
-    present = histories.present_units(frame, scene.recording or Recording())
+    present = histories.present_units(frame, layout or Recording())
     return histories.layout_cures(history, scene, present)
-
-
-def _read_with_cures(
-    read: Callable[..., pd.DataFrame],
-    layout: Recording,
-    logs: Sequence[Path],
-    said: list[str],
-    *,
-    plain: bool,
-) -> tuple[pd.DataFrame, Recording]:
-    """Return a table as ``read`` returns it, and the layout with the entries that it needed.
-
-    What was proposed and repaired is added to ``said``, each once, without the names of logs.
-    """
-
-    def say(message: object) -> None:
-        text = str(message)
-        for log in logs:
-            text = text.removeprefix(f"history {log}: ")
-        if text not in said:
-            said.append(text)
-
-    while True:
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", RecordingWarning)
-            try:
-                table = read(layout=None if plain else layout)
-            except LayoutError as proposal:
-                say(proposal)
-                before, layout = layout, layout.with_entries(**proposal.entries)
-                if layout == before:
-                    raise
-                continue
-        for warning in caught:
-            say(warning.message)
-        return table, layout
-
-
-def _longer_step(
-    step: float, commands: pd.DataFrame | None, layout: Recording, said: list[str]
-) -> float:
-    """Return the time step: that of commands in a file of their own, where they are slower.
-
-    A command that is late by less than its own interval is late by a part of one time step.
-    """
-    from pbrl_ppl.history import command_step
-
-    slower = 0.0 if commands is None else command_step(commands, layout)
-    if slower < 2 * step:
-        return step
-    said.append(
-        f"rows are {step:g} s apart and commands {slower:g} s: time_step is the commands', so that"
-        " a delay of theirs is a part of it"
-    )
-    return slower
 
 
 def _circle(track: Floats, round_: float = 0.02) -> tuple[float, float, float] | None:
@@ -343,16 +340,25 @@ def _circle(track: Floats, round_: float = 0.02) -> tuple[float, float, float] |
     return round(float(centre[0]), digits), round(float(centre[1]), digits), round(radius, digits)
 
 
-def _names(frame: pd.DataFrame, columns: Mapping[str, str | float]) -> list[str]:
-    """Return names of bodies: from columns side by side, a column of names, or one name."""
+def _names(
+    frame: pd.DataFrame, columns: Mapping[str, str | float], outlined: Iterable[str], source: str
+) -> list[str]:
+    """Return names of bodies: of columns side by side, of a column, one name, or as outlined."""
     beside = dict.fromkeys(key.rpartition(".")[0] for key in columns if "." in key)
     column = columns.get("body", "body")
-    if beside:
-        return list(beside)
-    if column in frame:
+    names = list(beside)
+    if not beside and column in frame:
         texts = (str(name).strip() for name in frame[column].dropna().unique())
-        return [text for text in texts if text]
-    return [column] if isinstance(column, str) and "body" in columns else []
+        names = [text for text in texts if text]
+    elif not beside and str(column) == columns.get("body"):
+        names = [str(column)]
+    names = names or list(outlined)
+    if not names:
+        raise HistoryError(
+            f"{source}: no column has the bodies' names; give --body NAME=SHAPE for one body,"
+            " --columns body=COLUMN, or --columns NAME.x=COLUMN,... for bodies side by side"
+        )
+    return names
 
 
 #: Where models/ is in an installed package, and in a clone.
@@ -416,7 +422,7 @@ def new(
     else:
         shapes = outlines(bodies or [])
         if history:
-            recording = recorded(history, layout, [*shapes], time_step, bool(side))
+            recording = recorded(history, layout, shapes, time_step, bool(side))
         shapes, time_step = _complete(shapes, time_step, recording)
         text = scene_text(shapes, bool(side), time_step, recording)
         Scene.from_toml(text)  # written whole and valid, or not at all
@@ -505,8 +511,7 @@ def scene_text(shapes: Mapping[str, Shape], side: bool, time_step: float, found:
     >>> Scene.from_toml(text).moving[0].shape
     Shape(kind='box', size=(0.9, 0.55), radius=None, vertices=None)
     """
-    name, shape = next(iter(shapes.items()))
-    actuators = [replace(one, body=name) for one in found.actuators(shape)]
+    actuators = [replace(one, body=next(iter(shapes))) for one in found.actuators]
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("pbrl_ppl", "cli"), undefined=jinja2.StrictUndefined,
         trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
