@@ -14,7 +14,7 @@ from pbrl_ppl.criticism import Loop, diverged_after
 from pbrl_ppl.posterior import HDI_PROB, scalars
 from pbrl_ppl.reporting import style
 from pbrl_ppl.reporting.residual_force import ForceLaw, bin_means
-from pbrl_ppl.reporting.words import error, plain
+from pbrl_ppl.reporting.words import error, plain, quantity
 from pbrl_ppl.scene import units_of
 from pbrl_ppl.state import Floats
 
@@ -47,10 +47,10 @@ def plot_candidates(loop: Loop, width: float = style.WIDE, level: float = 0.01) 
     )
     axes.plot(thresholds, range(len(shown)), "|", color=style.BEFORE, markersize=16, mew=2)
     if shown and max(candidate.statistic for candidate in shown) > 12 * max(thresholds):
-        axes.set_xscale("asinh", linear_width=5.0)
+        axes.set_xscale("symlog", linthresh=10.0)
+        axes.xaxis.set_major_formatter("{x:g}")
     axes.margins(x=0.1)
-    axes.set_xlim(left=0.0)
-    axes.set_xlabel("score statistic of the effect")
+    axes.set(xlim=(0.0, None), xlabel="score statistic of the effect")
     colours = {"added": style.AFTER, "not added": style.PLAIN}
     colours[f"{100 * level:g} % threshold"] = style.BEFORE
     style.legend(figure, style.patches(colours))
@@ -82,8 +82,8 @@ def plot_added(loop: Loop, width: float = style.WIDE, most: int = 12) -> Figure:
             x += f"; no effect at {null:g}"
             if abs(null - estimate.mean) < 25 * estimate.sd:
                 axes.axvline(null, color="black", linestyle="--", linewidth=1.2)
-        axes.set(ylim=(-0.14, 1.15), yticks=[])
-        style.name_axes(axes, f"{plain(added.effect)} on {added.body}", x)
+        title = f"{plain(added.effect)} on {added.body}"
+        axes.set(title=title, xlabel=x, ylim=(-0.14, 1.15), yticks=[])
     return figure
 
 
@@ -108,7 +108,7 @@ def plot_laws(laws: Sequence[ForceLaw], width: float = style.WIDE) -> Figure:
             axes.set_ylim(-reach, reach)
         x, force = f"{law.quantity} ({law.unit})".replace(" (1)", ""), law.residual
         y = f"{force.name}, {force.dimension} ({force.unit})" * (law is laws[0])
-        style.name_axes(axes, f"R² {max(law.curve.share, 0):.2f}", x, y)
+        axes.set(title=f"R² {max(law.curve.share, 0):.2f}", xlabel=x, ylabel=y)
     if laws:
         panels[0].legend(frameon=False, fontsize="small")
     return figure
@@ -142,9 +142,10 @@ def plot_residuals(loop: Loop, width: float = style.WIDE) -> Figure:
         for place, each, seen in zip(places, values, finite, strict=True):
             if seen.size < each.size:
                 axes.text(place, 0.0, "diverged", color=colour, fontsize=8, ha="center")
-    axes.set_yscale("symlog", linthresh=10.0)
-    axes.set_xticks(range(len(names)), names)
-    axes.set_ylabel("residual / noise")
+    if np.abs(axes.dataLim.intervaly).max() > 12:
+        axes.set_yscale("symlog", linthresh=10.0)
+        axes.yaxis.set_major_formatter("{x:g}")
+    axes.set(xticks=range(len(names)), xticklabels=names, ylabel="residual / noise")
     colours = {name: colour for name, _, colour in models}
     colours[f"noise alone, {100 * HDI_PROB:.0f} %"] = style.BAND
     style.legend(figure, style.patches(colours))
@@ -170,15 +171,18 @@ def plot_errors(loop: Loop, width: float = style.WIDE) -> Figure:
         for i, (_, values, colour) in enumerate(models):
             found = {d: values.get(d, np.nan) for d in before}
             shown = [np.nan_to_num(v / (scale[d] or np.nan), posinf=0.0) for d, v in found.items()]
-            texts = [error(v) + f" {style.UNITS[d]}" * np.isfinite(v) for d, v in found.items()]
+            texts = [
+                quantity(v, style.UNITS[d]) if np.isfinite(v) else error(v)
+                for d, v in found.items()
+            ]
             shift = 0.38 * (i - (len(models) - 1) / 2)
             style.bars(axes, list(before), shown, colour, texts, shift=shift, height=0.36)
         axes.axvline(1.0, color="black", linewidth=1.0, linestyle=":")
         axes.margins(x=0.3)
-        axes.set_xlim(left=0.0)
         scaled_by = "noise floor" if has_floor else "error before"
-        style.name_axes(axes, titles[kind], f"error / {scaled_by}")
-    style.legend(figure, style.patches({name: colour for name, _, colour in models}))
+        axes.set(title=titles[kind], xlabel=f"error / {scaled_by}", xlim=(0.0, None))
+    colours = {name: colour for name, _, colour in _models(loop, 0, 0)}
+    style.legend(figure, style.patches(colours))
     return figure
 
 
@@ -275,10 +279,8 @@ def plot_correlations(loop: Loop, width: float = style.WIDE, most: int = 4) -> F
         if shown:
             axes.legend(frameon=False, fontsize="small")
         top = max(1.3 * edge, 1.1 * largest.max())
-        axes.set(ylim=(-top, top), xticks=lags)
-        style.name_axes(
-            axes, title, "intervals before", "correlation of errors" * (axes is panels[0])
-        )
+        axes.set(title=title, xlabel="intervals before", ylim=(-top, top), xticks=lags)
+    panels[0].set_ylabel("correlation of errors")
     return figure
 
 

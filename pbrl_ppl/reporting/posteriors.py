@@ -318,9 +318,8 @@ def plot_rank(
             axes, {str(i): chain for i, chain in enumerate(ranks)}, size
         )
         top = max(1.4 * edge, 1.1 * largest)
-        axes.set_ylim(-top, top)
-        differ = ": chains differ" * (largest > edge)
-        style.name_axes(axes, f"{name}{differ}", "rank among all draws", small=True)
+        title = f"{name}{': chains differ' * (largest > edge)}"
+        axes.set(title=title, xlabel="rank among all draws", ylim=(-top, top))
     return figure
 
 
@@ -350,9 +349,7 @@ def plot_prior(posterior: Idata, parameters: Sequence[str], width: float = style
         ends = min(low, drawn[style.AFTER].min()), max(high, drawn[style.AFTER].max())
         for colour, values in drawn.items():
             style.density(axes, values, colour, ends, ends)
-        axes.set_yticks([])
-        style.name_axes(axes, name, small=True)
-        axes.set_ylim(bottom=0)
+        axes.set(title=name, yticks=[], ylim=(0.0, None))
     style.legend(figure, style.patches({"prior": style.PLAIN, "posterior": style.AFTER}))
     return figure
 
@@ -364,14 +361,15 @@ def plot_pairs(
     draws = scalars(posterior)
     correlation = rank_correlations(draws, parameters)
     pairs = list(combinations(range(len(parameters)), 2))
-    figure, panels = style.blank_figure(width, 2.2, len(pairs), min(3, len(pairs)), None)
+    columns = min(3, len(pairs)) if width > style.NARROW else 2
+    figure, panels = style.blank_figure(width, 2.0, len(pairs), columns, None, stack=False)
     for axes, (i, k) in zip(panels, pairs, strict=False):
         x, y = (draws[parameters[place]].to_numpy().ravel() for place in (i, k))
         some = slice(None, None, max(1, len(x) // points))
         axes.plot(x[some], y[some], ".", color=style.AFTER, markersize=2, alpha=0.4)
         axes.locator_params(nbins=3)
         title = f"{correlation[i, k]:+.2f}".replace("-", "−")
-        style.name_axes(axes, title, parameters[i], parameters[k], small=True)
+        axes.set(title=title, xlabel=parameters[i], ylabel=parameters[k])
     return figure
 
 
@@ -386,7 +384,7 @@ def plot_predictions(posterior: Idata, width: float = style.WIDE) -> Figure:
     axes.set_prop_cycle(style.LINES)
     style.shares_below(axes, seen, min((len(values) for values in seen.values()), default=1))
     x = "position in the prediction: 0 below all draws, 1 above"
-    style.name_axes(axes, x=x, y="share below, less expected")
+    axes.set(xlabel=x, ylabel="share below, less expected")
     if seen:
         style.legend(figure, axes.lines)
     return figure
@@ -399,7 +397,7 @@ def plot_pareto(k: Floats, good: float, unit: str, width: float = style.WIDE) ->
     axes.axhline(good, color=style.BEFORE, linewidth=1.2, linestyle="--")
     axes.plot(np.flatnonzero(~high), k[~high], ".", color=style.AFTER, markersize=4)
     axes.plot(np.flatnonzero(high), np.nan_to_num(k[high], posinf=2.0), "x", color=style.BEFORE)
-    style.name_axes(axes, x=unit, y="Pareto k")
+    axes.set(xlabel=unit, ylabel="Pareto k")
     return figure
 
 
@@ -419,5 +417,5 @@ def plot_prior_check(check: PriorCheck) -> Figure:
         axes.yaxis.set_inverted(True)
         share = float(changes["share_inside"])
         x = f"change in {check.seconds:g} s ({style.UNITS[str(state)]})"
-        style.name_axes(axes, f"{state} of {body}: {100 * share:.0f} % as expected", x, small=True)
+        axes.set(title=f"{state} of {body}: {100 * share:.0f} % as expected", xlabel=x)
     return figure

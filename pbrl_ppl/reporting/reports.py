@@ -150,7 +150,8 @@ def render_page(title: str, header: str, sections: Sequence[Section], **context:
 def picture(draw: Callable[..., Figure]) -> Mapping[str, str]:
     """Return a picture in both widths, ``wide`` and ``narrow``, as data URLs."""
     sizes = {"wide": WIDE, "narrow": NARROW}
-    with rc_context({"text.parse_math": False}):  # a $ is part of a name
+    # a $ is part of a name
+    with rc_context({"text.parse_math": False, "axes.titlesize": 9}):
         data = {name: base64.b64encode(png(draw(width=width))) for name, width in sizes.items()}
     return {name: f"data:image/png;base64,{code.decode('ascii')}" for name, code in data.items()}
 

@@ -107,7 +107,7 @@ def plot_recording(
         draw_scene(axes, scene, poses[trajectory, time], names=True)
     places = poses[..., :2].reshape(-1, 2)
     reach = max(body.shape.bounding_radius for body in scene.moving)
-    _show(axes, places, 1.5 * reach)
+    _show(axes, places, 1.5 * reach, figure.get_figheight() / figure.get_figwidth())
     handles = [Line2D([], [], color="black", label="fitted")]
     if held_out is not None:
         handles.append(Line2D([], [], color="black", linestyle=":", label="held out"))
@@ -115,11 +115,13 @@ def plot_recording(
     return figure
 
 
-def _show(axes: Axes, places: Floats, margin: float) -> None:
-    """Set the limits so that places are seen, with a margin (m), and fill the panel."""
-    (left, bottom), (right, top) = np.nanmin(places, axis=0), np.nanmax(places, axis=0)
-    axes.set(xlim=(left - margin, right + margin), ylim=(bottom - margin, top + margin))
-    axes.set_aspect("equal", adjustable="datalim")
+def _show(axes: Axes, places: Floats, margin: float, share: float = 1.0) -> None:
+    """Set the limits so that places are seen, with a margin (m); height over width is `share`."""
+    low, high = np.nanmin(places, axis=0) - margin, np.nanmax(places, axis=0) + margin
+    middle, half = (low + high) / 2, (high - low) / 2
+    half = np.maximum(half, [half[1] / share, half[0] * share])
+    (left, bottom), (right, top) = middle - half, middle + half
+    axes.set(xlim=(left, right), ylim=(bottom, top))
 
 
 def draw_goal(axes: Axes, scene: Scene, goal: Goal) -> None:

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 from cycler import cycler
+from matplotlib import rc_context
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -61,23 +62,16 @@ def blank_figure(
     if stack and width <= NARROW and columns > 1:
         height, rows, columns = height * columns * 0.95, rows * columns, 1
     figure = Figure(figsize=(width, height), layout="constrained")
-    panels = list(figure.subplots(rows, columns, squeeze=False).ravel())
-    for i, axes in enumerate(panels):
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.set_axisbelow(True)
-        axes.set_visible(i < count)
-        if grid:
-            axes.grid(axis=grid, color="#dddddd", linewidth=0.6)
+    look: Any = {
+        "axes.labelsize": 9, "axes.spines.top": False, "axes.spines.right": False,
+        "axes.axisbelow": True, "axes.grid": bool(grid), "axes.grid.axis": grid or "both",
+        "grid.color": "#dddddd", "grid.linewidth": 0.6,
+    }  # fmt: skip
+    with rc_context(look):
+        panels = list(figure.subplots(rows, columns, squeeze=False).ravel())
+    for axes in panels[count:]:
+        axes.set_visible(False)
     return figure, panels
-
-
-def name_axes(
-    axes: Axes, title: str = "", x: str = "", y: str = "", *, small: bool = False
-) -> None:
-    """Write the title and the labels of a panel, in small type if there are many."""
-    axes.set_title(title, fontsize=9 if small else 10)
-    axes.set_xlabel(x, fontsize=8 if small else 10)
-    axes.set_ylabel(y, fontsize=8 if small else 10)
 
 
 def legend(figure: Figure, handles: Sequence[Artist]) -> None:
