@@ -14,7 +14,7 @@ from contextlib import nullcontext
 from copy import copy
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Annotated, TypeVar, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, TypeVar, cast, get_args, get_origin, get_type_hints
 
 import typer
 
@@ -84,7 +84,7 @@ class Printing:
         """Run a command with what it takes, and print its result."""
         taken = inspect.signature(function).parameters
         staged = terminal.Progress(self.quiet) if "progress" in taken else nullcontext()
-        output = given.get("output", getattr(given.get("to"), "output", None))
+        output: Any = given.get("output", getattr(given.get("to"), "output", None))
         with (
             terminal.interruptible(kept.format(**given)) as interrupts,
             nullcontext() if output is None else only_writer(output),
@@ -105,11 +105,11 @@ def _bound(function: Callable[..., Result], kept: str) -> Callable[..., None]:
     kinds = {name: parameter.annotation for name, parameter in taken.items()}
     for name, kind in (kinds | {"printing": Printing}).items():
         if is_dataclass(kind):
-            groups[name] = kind
-            for base in kind.__mro__:
+            group = groups[name] = cast(type, kind)
+            for base in group.__mro__:
                 documented = _documented(base.__doc__)[1] | documented
-            hints = get_type_hints(kind, include_extras=True)  # each in the module of its class
-            declared = inspect.signature(kind).parameters.values()
+            hints = get_type_hints(group, include_extras=True)  # each in the module of its class
+            declared = inspect.signature(group).parameters.values()
             parameters += [each.replace(annotation=hints[each.name]) for each in declared]
         elif name not in ("as_json", "quiet", "progress", "interrupts"):
             parameters.append(taken[name])

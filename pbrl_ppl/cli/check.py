@@ -55,13 +55,13 @@ def check(
 
     check_history(declared, loaded, loaded.segments(1))
     missing, rows = _missing(loaded), int(loaded.dataset["n_rows"].sum())
-    used, said = histories.drawn_pieces(loaded, options.MOST_TRANSITIONS, seed)
+    used, drawn = histories.drawn_pieces(loaded, options.MOST_TRANSITIONS, seed)
     unused = histories.unused_velocities(used)
     masses = histories.mass_contradictions(declared, used)
     fall = histories.wrong_clock(used, declared)
     clock = [fall.sentence(declared)] if fall else []
     moved = histories.command_shifts(used, declared)
-    said = [*said, *(velocity.sentence for velocity in unused), *masses, *clock]
+    said = [*drawn, *(velocity.sentence for velocity in unused), *masses, *clock]
     said += [histories.shift_sentence(declared, body, late) for body, late in moved.items()]
     sized = histories.with_units(declared, used)
     priors = _default_priors(sized, catalogue)
@@ -71,7 +71,9 @@ def check(
     console.print(_missing_table(missing, rows))
     for sentence in (*said, *_lacking(declared, loaded)):
         console.print(sentence, soft_wrap=True)
-    console.print(_priors_table(priors, None if verbose else 3))
+    title, listed = _priors_table(priors, None if verbose else 3)
+    console.print(title, soft_wrap=True)
+    console.print(listed)
     checked = None
     if prior:
         progress("comparing with draws from the prior")
@@ -173,14 +175,14 @@ def _default_priors(scene: Scene, catalogue: Sequence[Effect]) -> dict[str, dict
     return priors
 
 
-def _priors_table(priors: dict[str, dict[str, str]], most: int | None) -> Table:
-    """Return a table of so many default priors, a column for each body; of all without a number."""
+def _priors_table(priors: dict[str, dict[str, str]], most: int | None) -> tuple[str, Table]:
+    """Return title and table of so many default priors, of all without a number, by body."""
     names = list(dict.fromkeys(chain(*priors.values())))
     shown = names[:most]
     title = "default priors of effects, from the recording"
     title += f" ({len(shown)} of {len(names)}: --verbose lists all)" * (len(shown) < len(names))
     cells = ([name, *(those.get(name, "") for those in priors.values())] for name in shown)
-    return table(title, dict.fromkeys(["parameter", *priors], "<"), cells)
+    return title, table(None, dict.fromkeys(["parameter", *priors], "<"), cells)
 
 
 @command("criticise", 4, "pbrl-ppl criticise scene.toml train.csv")

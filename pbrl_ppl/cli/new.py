@@ -6,7 +6,7 @@ import shlex
 import shutil
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -37,64 +37,6 @@ SHAPES = "box:0.9x0.55, circle:0.1 or polygon:0,2/-1,-1/1,-1, in m"
 
 
 @dataclass(frozen=True)
-class Hinges:
-    """Bodies of a recording that hang in hinges; by default none.
-
-    Parameters
-    ----------
-    angles : tuple of str
-        Bodies of which angles alone were measured: a chain, each hung by its upper end, circles by
-        their centre.
-    circles : dict of str to (float, float, float)
-        Centre and radius (m) of bodies that swing on a circle, and whose angle was not measured.
-    """
-
-    angles: tuple[str, ...] = ()
-    circles: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
-
-    @classmethod
-    def seen_in(cls, table: pd.DataFrame, names: Sequence[str]) -> Hinges:
-        """Return the hinges that the measurements of bodies show."""
-        measured = table.reindex(columns=[*STATE]).notna().groupby(table["body"]).any()
-        tracks = table.reindex(columns=["x", "y"]).groupby(table["body"])
-        turns = measured[["theta", "omega"]].any(axis=1)
-        angles = turns & ~measured[["x", "y", "vx", "vy"]].any(axis=1)
-        circles = {
-            name: circle
-            for name, track in tracks
-            if not measured["theta"][name] and (circle := _circle(track.to_numpy(float)))
-        }
-        return cls(tuple(name for name in names if angles.get(name, False)), circles)
-
-    def in_words(self) -> list[str]:
-        """Return sentences on what was seen, and what to correct."""
-        said = [
-            f"{name} swings on a circle of {radius:g} m about ({x:g}, {y:g}): hung on a hinge there"
-            for name, (x, y, radius) in self.circles.items()
-        ]
-        if not self.angles:
-            return said
-        return [
-            f"only the angle of {' and '.join(self.angles)} was measured: hung by the upper end"
-            " (a circle, as a wheel, by its centre); correct the places of [[joint]]",
-            *said,
-        ]
-
-    def joints(self, shapes: Mapping[str, Shape]) -> list[Joint]:
-        """Return the hinges of bodies with these outlines."""
-        joints: list[Joint] = []
-        above, end = WORLD, (0.0, 0.0)
-        for name in self.angles:
-            *_, low, high = shapes[name].bounds
-            top = 0.0 if shapes[name].kind == "circle" else high
-            joints.append(Joint("hinge", (name, above), (0.0, top), end))
-            above, end = name, (0.0, low)
-        for name, (x, y, radius) in self.circles.items():
-            joints.append(Joint("hinge", (name, WORLD), (0.0, radius), (x, y)))
-        return joints
-
-
-@dataclass(frozen=True)
 class Recorded:
     """Bodies and time steps of a recording; by default of none.
 
@@ -110,8 +52,8 @@ class Recorded:
         What was seen in it.
     source : str
         Its name in messages.
-    hinges : Hinges
-        Those that it shows.
+    joints : tuple of Joint
+        Hinges that it shows.
     actuators : tuple of Actuator
         Those of the one body that columns' names give away.
     """
@@ -121,7 +63,7 @@ class Recorded:
     layout: Recording | None = None
     said: Sequence[str] = ()
     source: str = ""
-    hinges: Hinges = Hinges()
+    joints: tuple[Joint, ...] = ()
     actuators: tuple[Actuator, ...] = ()
 
 
@@ -167,9 +109,9 @@ def recorded(
         layout = histories.with_guesses(frame, commands[0], layout, said.append)
         histories.check_states(frame, layout, source)
     names = _names(frame, dict(layout.columns), outlined, source)
-    # later commands read it with the scene; any outline will do here
-    bodies = tuple(Body(name, Shape.circle(1.0)) for name in names)
-    scene = Scene(time_step=time_step or 1.0, bodies=bodies)
+    disc = Shape.circle(1.0)  # later commands read it with the scene; any outline will do here
+    shapes = {name: outlined.get(name, disc) for name in names}
+    scene = Scene(time_step=time_step or 1.0, bodies=tuple(Body(name, disc) for name in names))
     timed = {"time", "duration"} & {*dict(layout.columns), *frame.columns} or layout.time
     if not plain and time_step is None and not timed:
         raise HistoryError(
@@ -180,16 +122,15 @@ def recorded(
     table, layout = _read_with_cures(parts, scene, layout, said, plain=plain)
     table["time"] = pd.to_numeric(table["time"], errors="coerce")
     step = _time_step(table, commands[0], layout, said, source, time_step)
-    hinges = Hinges.seen_in(table, names)
-    proposed, shown = histories.propose(table, layout, step, jumps=not hinges.circles)
-    shown += hinges.in_words()
-    hung, acting = hinges != Hinges(), tuple[Actuator, ...]()
+    hung, swinging, shown = _hinges(table, shapes)
+    joints, acting = (*hung, *swinging), tuple[Actuator, ...]()
+    proposed, seen = histories.propose(table, layout, step, jumps=not swinging)
+    shown = [*seen, *shown]
     if not plain and len(names) == 1:
-        shape = outlined.get(names[0], bodies[0].shape)
-        acting = histories.guessed_actuators(frame, proposed, shape, hung)
+        acting = histories.guessed_actuators(frame, proposed, shapes[names[0]], bool(joints))
     if sent := [one.column or one.name for one in acting]:
         shown.append(f"commands by their names: {', '.join(sent)}; correct [[actuator]]")
-    falls = side and not (hung or sent)
+    falls = side and not (joints or sent)
     scene = scene.replace(time_step=step, gravity=(0.0, -9.81 * falls))
     found, units, computed = _cures(paths, frame, scene, None if plain else proposed)
     computed |= plain and any(name in STATE[VELOCITY:] for name in units)  # whose units are SI's
@@ -204,7 +145,7 @@ def recorded(
     if unused := [name for name in left if name not in sent]:
         shown.append(f"columns that are not used: {', '.join(unused)}")
     layout_found = None if plain and not shown else proposed
-    return Recorded(tuple(names), step, layout_found, [*said, *shown], name, hinges, acting)
+    return Recorded(tuple(names), step, layout_found, [*said, *shown], name, joints, acting)
 
 
 def _read_with_cures(
@@ -313,6 +254,41 @@ def _cures(
             return [], {}, False
     present = histories.present_units(frame, layout or Recording())
     return histories.layout_cures(history, scene, present)
+
+
+def _hinges(
+    table: pd.DataFrame, shapes: Mapping[str, Shape]
+) -> tuple[list[Joint], list[Joint], list[str]]:
+    """Return the hinges that measurements of bodies show, and sentences on them.
+
+    Bodies of which angles alone were measured hang in a chain, each by its upper end, circles by
+    their centre. Others swing on a circle, and their angle was not measured.
+    """
+    measured = table.reindex(columns=[*STATE]).notna().groupby(table["body"]).any()
+    turns = measured[["theta", "omega"]].any(axis=1)
+    alone = turns & ~measured[["x", "y", "vx", "vy"]].any(axis=1)
+    names = [name for name in shapes if alone.get(name, False)]
+    hung, swinging, said = list[Joint](), list[Joint](), list[str]()
+    above, end = WORLD, (0.0, 0.0)
+    for name in names:
+        *_, low, high = shapes[name].bounds
+        top = 0.0 if shapes[name].kind == "circle" else high
+        hung.append(Joint("hinge", (name, above), (0.0, top), end))
+        above, end = name, (0.0, low)
+    if names:
+        said.append(
+            f"only the angle of {' and '.join(names)} was measured: hung by the upper end"
+            " (a circle, as a wheel, by its centre); correct the places of [[joint]]"
+        )
+    for name, track in table.reindex(columns=["x", "y"]).groupby(table["body"]):
+        if measured["theta"][name] or not (circle := _circle(track.to_numpy(float))):
+            continue
+        x, y, radius = circle
+        swinging.append(Joint("hinge", (str(name), WORLD), (0.0, radius), (x, y)))
+        said.append(
+            f"{name} swings on a circle of {radius:g} m about ({x:g}, {y:g}): hung on a hinge there"
+        )
+    return hung, swinging, said
 
 
 def _circle(track: Floats, round_: float = 0.02) -> tuple[float, float, float] | None:
@@ -518,7 +494,7 @@ def scene_text(shapes: Mapping[str, Shape], side: bool, time_step: float, found:
     )  # fmt: skip
     return environment.get_template("scene.toml.jinja").render(
         shapes={name: vars(shape) for name, shape in shapes.items()},
-        side=side, time_step=time_step, joints=found.hinges.joints(shapes),
+        side=side, time_step=time_step, joints=found.joints,
         actuators=actuators, recording=found.layout, said=map(in_a_line, found.said),
         entry=lambda key, value: toml_of([("", {key: value})]).strip(),
     )  # fmt: skip
@@ -546,11 +522,11 @@ def outlines(texts: Iterable[str]) -> dict[str, Shape]:
                 shapes[name] = Shape.box(width, height)
             elif kind == "circle":
                 shapes[name] = Shape.circle(float(rest))
+            elif kind == "polygon":
+                corners = [corner.split(",") for corner in rest.split("/")]
+                shapes[name] = Shape.polygon([(float(x), float(y)) for x, y in corners])
             else:
-                corners = [tuple(map(float, corner.split(","))) for corner in rest.split("/")]
-                if kind != "polygon" or {len(corner) for corner in corners} != {2}:
-                    raise ValueError
-                shapes[name] = Shape.polygon((corner[0], corner[1]) for corner in corners)
+                raise ValueError
         except SceneError:  # of a shape's numbers
             raise
         except ValueError:
