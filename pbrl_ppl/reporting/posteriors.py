@@ -368,6 +368,7 @@ def plot_pairs(
         some = slice(None, None, max(1, len(x) // points))
         axes.plot(x[some], y[some], ".", color=style.AFTER, markersize=2, alpha=0.4)
         axes.locator_params(nbins=3)
+        axes.tick_params(labelsize=7)
         title = f"{correlation[i, k]:+.2f}".replace("-", "−")
         axes.set(title=title, xlabel=parameters[i], ylabel=parameters[k])
     return figure
