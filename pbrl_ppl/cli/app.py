@@ -14,7 +14,7 @@ from contextlib import nullcontext
 from copy import copy
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Annotated, TypeVar, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, TypeVar, cast, get_args, get_origin, get_type_hints
 
 import typer
 
@@ -84,10 +84,10 @@ class Printing:
         """Run a command with what it takes, and print its result."""
         taken = inspect.signature(function).parameters
         staged = terminal.Progress(self.quiet) if "progress" in taken else nullcontext()
-        output = given.get("output", getattr(given.get("to"), "output", None))
+        output: Any = given.get("output", getattr(given.get("to"), "output", None))
         with (
             terminal.interruptible(kept.format(**given)) as interrupts,
-            only_writer(output) if isinstance(output, Path) else nullcontext(),
+            nullcontext() if output is None else only_writer(output),
             staged as progress,
         ):
             session = {"progress": progress, "interrupts": interrupts}
@@ -104,12 +104,12 @@ def _bound(function: Callable[..., Result], kept: str) -> Callable[..., None]:
     parameters: list[inspect.Parameter] = []
     kinds = {name: parameter.annotation for name, parameter in taken.items()}
     for name, kind in (kinds | {"printing": Printing}).items():
-        if isinstance(kind, type) and is_dataclass(kind):
-            groups[name] = kind
-            for base in kind.__mro__:
+        if is_dataclass(kind):
+            group = groups[name] = cast(type, kind)
+            for base in group.__mro__:
                 documented = _documented(base.__doc__)[1] | documented
-            hints = get_type_hints(kind, include_extras=True)  # each in the module of its class
-            declared = inspect.signature(kind).parameters.values()
+            hints = get_type_hints(group, include_extras=True)  # each in the module of its class
+            declared = inspect.signature(group).parameters.values()
             parameters += [each.replace(annotation=hints[each.name]) for each in declared]
         elif name not in ("as_json", "quiet", "progress", "interrupts"):
             parameters.append(taken[name])
@@ -181,7 +181,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         multiprocessing.set_forkserver_preload(["pymc"])
     argv = sys.argv[1:] if argv is None else list(argv)
     try:
-        _check_arguments(argv)
+        for argument in argv:  # a report shows them, names of files mostly
+            if printable(argument) != argument:
+                raise OutputError(
+                    f"argument '{argument}': it has control characters; rename the file, or leave"
+                    " them out"
+                )
         with terminal.warnings_in_a_line():
             app(args=argv, prog_name="pbrl-ppl")
     except SystemExit as stop:
@@ -192,16 +197,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"error: {in_a_line(error)}", file=sys.stderr)  # noqa: T201
         return terminal.BAD_INPUT
     return 0
-
-
-def _check_arguments(argv: Sequence[str]) -> None:
-    """Refuse arguments that cannot be shown, as in a report's command: names of files mostly."""
-    for argument in argv:
-        if printable(argument) != argument:
-            raise OutputError(
-                f"argument '{argument}': it has control characters; rename the file, or leave them"
-                " out"
-            )
 
 
 def _show_version(context: typer.Context, value: bool) -> None:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.table import Column, Table
 
 from pbrl_ppl.cli import options
 from pbrl_ppl.cli.app import command
@@ -16,7 +15,9 @@ from pbrl_ppl.cli.terminal import PlainConsole, Progress, Result, sizes, table
 from pbrl_ppl.state import STATE
 
 if TYPE_CHECKING:
-    from pbrl_ppl.criticism import Attribution, Candidate, Law
+    from rich.table import Table
+
+    from pbrl_ppl.criticism import Attribution, Candidate, Law, PriorCheck
     from pbrl_ppl.effects import Effect
     from pbrl_ppl.history import History
     from pbrl_ppl.scene import Scene
@@ -50,52 +51,33 @@ def check(
     declared, (loaded,) = reading.read(scene, [history])
     catalogue = reading.catalogue()
     from pbrl_ppl import history as histories
-    from pbrl_ppl.physics import Physics, check_history
+    from pbrl_ppl.physics import check_history
 
     check_history(declared, loaded, loaded.segments(1))
-    contents, missing = _contents(declared, loaded), _missing(loaded)
+    missing, rows = _missing(loaded), int(loaded.dataset["n_rows"].sum())
     used, drawn = histories.drawn_pieces(loaded, options.MOST_TRANSITIONS, seed)
     unused = histories.unused_velocities(used)
-    # shown at once: the prior's draws take long
-    console = PlainConsole(quiet=as_json)
-    listed = Table(show_header=False, box=None)
-    for row in contents.items():
-        listed.add_row(*row)
-    console.print(listed)
-    console.print(_missing_table(missing, int(loaded.dataset["n_rows"].sum())))
     masses = histories.mass_contradictions(declared, used)
     fall = histories.wrong_clock(used, declared)
     clock = [fall.sentence(declared)] if fall else []
     moved = histories.command_shifts(used, declared)
-    shifts = [histories.shift_sentence(declared, body, rows) for body, rows in moved.items()]
-    velocities = (velocity.sentence for velocity in unused)
-    for sentence in (*drawn, *velocities, *masses, *clock, *shifts):
-        console.print(sentence, soft_wrap=True)
-    if loaded.n_trajectories < 2:
-        console.print(
-            "one trajectory: close-loop holds out whole ones, and needs another, --test with a file"
-            " of its own, or cut = { every = ... } in [recording] (s)",
-            soft_wrap=True,
-        )
-    if any(joint.bodies is None for joint in declared.joints):
-        console.print(
-            "which bodies a joint joins is unknown: close-loop needs them in the scene, fit finds"
-            " them",
-            soft_wrap=True,
-        )
+    said = [*drawn, *(velocity.sentence for velocity in unused), *masses, *clock]
+    said += [histories.shift_sentence(declared, body, late) for body, late in moved.items()]
     sized = histories.with_units(declared, used)
     priors = _default_priors(sized, catalogue)
-    console.print(_priors_table(priors, None if verbose else 3))
+    # shown at once: the prior's draws take long
+    console, contents = PlainConsole(quiet=as_json), _contents(declared, loaded)
+    console.print(*(f"{name:15}{text}" for name, text in contents.items()), sep="\n")
+    console.print(_missing_table(missing, rows))
+    for sentence in (*said, *_lacking(declared, loaded)):
+        console.print(sentence, soft_wrap=True)
+    title, listed = _priors_table(priors, None if verbose else 3)
+    console.print(title, soft_wrap=True)
+    console.print(listed)
     checked = None
     if prior:
         progress("comparing with draws from the prior")
-        from pbrl_ppl.criticism import informative_horizon, prior_predictive_check
-        from pbrl_ppl.effects import attach
-        from pbrl_ppl.likelihood import Problem
-
-        physics = Physics(sized, attach(sized, (), catalogue))
-        problem = Problem.of(physics, used, horizon=informative_horizon(used))
-        checked = prior_predictive_check(problem, draws=draws, seed=seed)
+        checked = _compared(sized, used, catalogue, draws, seed)
         for sentence in (one for one in checked.summary if one not in clock):
             console.print(f"prior: {sentence}", soft_wrap=True)
     facts = {
@@ -112,6 +94,34 @@ def check(
         "prior": checked and {"passed": not checked.sentences, "sentences": checked.summary},
     }
     return Result(contents | facts, ())  # it is shown by now
+
+
+def _lacking(scene: Scene, history: History) -> Iterator[str]:
+    """Yield sentences on what close-loop will need."""
+    if history.n_trajectories < 2:
+        yield (
+            "one trajectory: close-loop holds out whole ones, and needs another, --test with a file"
+            " of its own, or cut = { every = ... } in [recording] (s)"
+        )
+    if any(joint.bodies is None for joint in scene.joints):
+        yield (
+            "which bodies a joint joins is unknown: close-loop needs them in the scene, fit finds"
+            " them"
+        )
+
+
+def _compared(
+    scene: Scene, history: History, catalogue: Sequence[Effect], draws: int, seed: int
+) -> PriorCheck:
+    """Return how the data compare with draws from the prior."""
+    from pbrl_ppl.criticism import informative_horizon, prior_predictive_check
+    from pbrl_ppl.effects import attach
+    from pbrl_ppl.likelihood import Problem
+    from pbrl_ppl.physics import Physics
+
+    physics = Physics(scene, attach(scene, (), catalogue))
+    problem = Problem.of(physics, history, horizon=informative_horizon(history))
+    return prior_predictive_check(problem, draws=draws, seed=seed)
 
 
 def _contents(scene: Scene, history: History) -> dict[str, str]:
@@ -141,12 +151,13 @@ def _missing(history: History) -> dict[str, dict[str, int]]:
 
 def _missing_table(missing: dict[str, dict[str, int]], rows: int) -> Table:
     """Return a table of missing measurements; a body has `rows` of each state dimension."""
-    numbers = [Column(name, justify="right") for name in STATE]
-    listed = Table("body", *numbers, title="missing measurements", title_justify="left")
     words = {0: "none", rows: "all"}
-    for body, counts in missing.items():
-        listed.add_row(body, *(words.get(n, f"{n} of {rows}") for n in counts.values()))
-    return listed
+    return table(
+        "missing measurements",
+        {"body": "<"} | dict.fromkeys(STATE, ""),
+        ([body, *(words.get(n, f"{n} of {rows}") for n in counts.values())]
+         for body, counts in missing.items()),
+    )  # fmt: skip
 
 
 def _default_priors(scene: Scene, catalogue: Sequence[Effect]) -> dict[str, dict[str, str]]:
@@ -164,16 +175,14 @@ def _default_priors(scene: Scene, catalogue: Sequence[Effect]) -> dict[str, dict
     return priors
 
 
-def _priors_table(priors: dict[str, dict[str, str]], most: int | None) -> Table:
-    """Return a table of so many default priors, a column for each body; of all without a number."""
+def _priors_table(priors: dict[str, dict[str, str]], most: int | None) -> tuple[str, Table]:
+    """Return title and table of so many default priors, of all without a number, by body."""
     names = list(dict.fromkeys(chain(*priors.values())))
     shown = names[:most]
     title = "default priors of effects, from the recording"
     title += f" ({len(shown)} of {len(names)}: --verbose lists all)" * (len(shown) < len(names))
-    listed = Table("parameter", *priors, title=title, title_justify="left")
-    for name in shown:
-        listed.add_row(name, *(those.get(name, "") for those in priors.values()))
-    return listed
+    cells = ([name, *(those.get(name, "") for those in priors.values())] for name in shown)
+    return title, table(None, dict.fromkeys(["parameter", *priors], "<"), cells)
 
 
 @command("criticise", 4, "pbrl-ppl criticise scene.toml train.csv")

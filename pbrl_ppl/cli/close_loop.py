@@ -7,11 +7,10 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -29,24 +28,13 @@ if TYPE_CHECKING:
     from pbrl_ppl.reporting import Source
 
 
-class Method(StrEnum):
-    """Samplers of the loop's posteriors."""
-
-    IMPORTANCE = "importance"
-    SMC = "smc"
-    LAPLACE = "laplace"
-
-
-class Catalogue(StrEnum):
-    """Laws that a loop tries."""
-
-    COMMON = "common"
-    ALL = "all"
+#: Samplers of the loop's posteriors.
+LoopMethod = Literal["importance", "smc", "laplace"]
 
 
 @dataclass(frozen=True)
-class Sampler:
-    """Options of a command that samples the posteriors of a loop.
+class LoopSettings:
+    """Options of a command that closes loops, arguments of `criticism.close_loop`.
 
     Parameters
     ----------
@@ -64,17 +52,17 @@ class Sampler:
 
     seed: options.Seed = 1
     draws: Annotated[int | None, typer.Option(min=100)] = None
-    method: Method = Method.IMPORTANCE
+    method: LoopMethod = "importance"
     most_transitions: options.Transitions = options.MOST_TRANSITIONS
-    catalogue: Catalogue | None = None
+    catalogue: Literal["common", "all"] | None = None
 
-    def settings(self, effects: Sequence[Effect]) -> dict[str, Any]:
-        """Return arguments of `criticism.close_loop`, given the catalogue."""
-        if self.catalogue is Catalogue.COMMON:
+    def with_laws(self, effects: Sequence[Effect]) -> dict[str, Any]:
+        """Return the arguments, with those of these effects that are tried."""
+        if self.catalogue == "common":
             effects = [effect for effect in effects if not effect.unusual]
-        if self.catalogue is Catalogue.ALL:
+        if self.catalogue == "all":
             effects = [replace(effect, unusual="") for effect in effects]
-        return vars(self) | {"method": self.method.value, "catalogue": tuple(effects)}
+        return vars(self) | {"catalogue": tuple(effects)}
 
 
 @command(
@@ -87,7 +75,7 @@ def close_loop(
     train: list[Path],
     to: options.FolderOutput,
     reading: options.SceneReading,
-    sampler: Sampler,
+    settings: LoopSettings,
     progress: Progress,
     interrupts: terminal.Interrupts,
     test: list[Path] | None = None,
@@ -120,8 +108,8 @@ def close_loop(
                 f"history {test[0]}: --test is given with --each; leave it out, and a quarter of"
                 " each log's trajectories is held out"
             )
-        settings = Each(scene, reading, sampler, to, options.command_line(context))
-        return _closed(settings, train, jobs, progress)
+        logs = Each(scene, reading, settings, to, options.command_line(context))
+        return _closed(logs, train, jobs, progress)
     if jobs > 1:
         raise typer.BadParameter(
             "several logs are one history; add --each to run each by itself", param_hint="--jobs"
@@ -133,11 +121,11 @@ def close_loop(
 
     output = to.output
     check_folder(output, True, criticism.FILES)
-    known, said = sampler.settings(reading.catalogue()), list[str]()
+    known, said = settings.with_laws(reading.catalogue()), list[str]()
     run = partial(criticism.close_loop, declared, *histories, **known)
     recorded, held_out = (", ".join(map(str, paths)) for paths in (train, test or ()))
     source = report.Source(str(scene), recorded, held_out, options.command_line(context))
-    interrupts.rescue = partial(_without_verdict, said, sampler, output, source)
+    interrupts.rescue = partial(_without_verdict, said, settings, output, source)
     progress.stages = (*criticism.Stage, "writing the report")
     loop, stopped = _finished(run, progress, interrupts, said)
     interrupts.rescue = None
@@ -155,7 +143,7 @@ class Each:
 
     scene: Path
     reading: options.SceneReading
-    sampler: Sampler
+    settings: LoopSettings
     to: options.FolderOutput
     command: str
 
@@ -167,13 +155,15 @@ class Each:
         with terminal.warnings_in_a_line(), terminal.noted_warnings("") as noted:
             try:
                 declared, histories = self.reading.read(self.scene, [[log]])
-                settings = self.sampler.settings(self.reading.catalogue())
-                loop = criticism.close_loop(declared, *histories, **settings)
+                known = self.settings.with_laws(self.reading.catalogue())
+                loop = criticism.close_loop(declared, *histories, **known)
                 source = report.Source(str(self.scene), str(log), "", self.command)
                 page = report.render(loop, source)
                 loop.save(self.to.output / name, self.to.overwrite, page=page)
+            except PbrlError as error:
+                return _failed(name, str(error))
             except Exception as error:
-                return _failed(name, error)
+                return _failed(name, f"{type(error).__name__}: {error}")
         return {
             "log": name,
             "verdict": loop.verdict,
@@ -190,13 +180,12 @@ class Each:
             with ProcessPoolExecutor(1, get_context("spawn"), obey_parent) as process:
                 return process.submit(self.close, name, log).result()
         except BrokenProcessPool as error:
-            return _failed(name, error)
+            return _failed(name, f"BrokenProcessPool: {error}")
 
 
-def _failed(name: str, error: Exception) -> dict[str, Any]:
+def _failed(name: str, why: str) -> dict[str, Any]:
     """Return the row of a log that failed."""
-    kind = "" if isinstance(error, PbrlError) else f"{type(error).__name__}: "
-    message = terminal.in_a_line(f"{kind}{error}")
+    message = terminal.in_a_line(why)
     return {"log": name, "verdict": "failed", "added": [], "warnings": [], "message": message}
 
 
@@ -267,14 +256,16 @@ def _finished(
         return interrupt.finish(), True
 
 
-def _without_verdict(said: Sequence[str], sampler: Sampler, output: Path, source: Source) -> str:
+def _without_verdict(
+    said: Sequence[str], settings: LoopSettings, output: Path, source: Source
+) -> str:
     """Write what was found before an interrupt, unless a report is there; return what is kept."""
     import pbrl_ppl.reporting as report
 
     faster = {
-        "--method laplace": sampler.method is not Method.LAPLACE,
-        "--catalogue common": sampler.catalogue is not Catalogue.COMMON,
-        f"--most-transitions {sampler.most_transitions // 4}": True,
+        "--method laplace": settings.method != "laplace",
+        "--catalogue common": settings.catalogue != "common",
+        f"--most-transitions {settings.most_transitions // 4}": True,
     }
     advice = f"{', '.join(one for one, new in faster.items() if new)} take less time"
     if not said or (output / "report.html").exists():
@@ -292,7 +283,7 @@ def demo(
     as_json: bool,
     quiet: bool,
     output: options.OutputFolder = Path("pbrl-ppl-demo"),
-    method: Method = Method.LAPLACE,
+    method: LoopMethod = "laplace",
     seed: options.Seed = 1,
     overwrite: bool = False,
 ) -> Result:
@@ -310,7 +301,7 @@ def demo(
         Write to a folder that is not empty.
     """
     cart = models_folder() / "shopping_cart"
-    to, sampler = options.FolderOutput(output, overwrite), Sampler(seed, method=method)
+    to, settings = options.FolderOutput(output, overwrite), LoopSettings(seed, method=method)
     if not (as_json or quiet):
         typer.echo(
             "A shopping cart is pushed; the scene does not declare that its castor resists turning."
@@ -318,7 +309,7 @@ def demo(
         )
     train, test = (cart / "recorded" / f"{name}.csv" for name in ("train", "test"))
     result = close_loop(
-        context, cart / "scene.toml", [train], to, options.SceneReading(), sampler, progress,
+        context, cart / "scene.toml", [train], to, options.SceneReading(), settings, progress,
         interrupts, [test],
     )  # fmt: skip
     if quiet or result.code:

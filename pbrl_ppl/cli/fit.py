@@ -20,9 +20,6 @@ if TYPE_CHECKING:
 
     from pbrl_ppl.posterior import Idata
 
-#: Formats of a summary's columns; of others, four digits.
-_DIGITS = {"ess": ".0f", "r_hat": ".3f"}
-
 
 @dataclass(frozen=True)
 class Model:
@@ -104,7 +101,7 @@ def fit(
     """
     progress("reading the scene and the history")
     declared, (loaded,) = reading.read(scene, [history])
-    declared, effects = reading.with_effects(declared)
+    declared, effects = options.added_effects(declared, options.own_effects(reading.effect_file))
     progress("loading the sampler")
     from pbrl_ppl import sampling
     from pbrl_ppl.physics import check_history
@@ -143,8 +140,9 @@ def _fitted(idata: Idata, output: Path, warned: set[type], interrupted: bool) ->
         "parameters": rows.to_dict("index"),
         "warnings": list(record.warnings or ()),
     }
-    formats = {str(name): _DIGITS.get(str(name), ".4g") for name in rows.columns}
-    listed = terminal.table(None, {"parameter": "<"} | formats, rows.itertuples(name=None))
+    formats = {"parameter": "<"} | dict.fromkeys(map(str, rows.columns), ".4g")
+    formats |= {"ess": ".0f", "r_hat": ".3f"} if "r_hat" in formats else {}
+    listed = terminal.table(None, formats, rows.itertuples(name=None))
     shown: list[str | Table] = [listed]
     if errors.LinearisationWarning in warned:
         shown += ["intervals: not to be trusted, the likelihood does not hold (warning above)"]
@@ -210,7 +208,7 @@ def update(
         raise KeyboardInterrupt
     posteriors.save_posterior(idata, to.output)
     (*_, last) = record.updates or ()
-    converged = not any(isinstance(warning, errors.ConvergenceWarning) for warning in caught)
+    converged = errors.ConvergenceWarning not in map(type, caught)
     share = last["share"]
     worth = f", the weights worth {share:.0%} of the draws" if share is not None else ""
     return Result(

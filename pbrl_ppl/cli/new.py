@@ -5,8 +5,8 @@ from __future__ import annotations
 import shlex
 import shutil
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -37,64 +37,6 @@ SHAPES = "box:0.9x0.55, circle:0.1 or polygon:0,2/-1,-1/1,-1, in m"
 
 
 @dataclass(frozen=True)
-class Hinges:
-    """Bodies of a recording that hang in hinges; by default none.
-
-    Parameters
-    ----------
-    angles : tuple of str
-        Bodies of which angles alone were measured: a chain, each hung by its upper end, circles by
-        their centre.
-    circles : dict of str to (float, float, float)
-        Centre and radius (m) of bodies that swing on a circle, and whose angle was not measured.
-    """
-
-    angles: tuple[str, ...] = ()
-    circles: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
-
-    @classmethod
-    def seen_in(cls, table: pd.DataFrame, names: Sequence[str]) -> Hinges:
-        """Return the hinges that the measurements of bodies show."""
-        measured = table.reindex(columns=[*STATE]).notna().groupby(table["body"]).any()
-        tracks = table.reindex(columns=["x", "y"]).groupby(table["body"])
-        turns = measured[["theta", "omega"]].any(axis=1)
-        angles = turns & ~measured[["x", "y", "vx", "vy"]].any(axis=1)
-        circles = {
-            name: circle
-            for name, track in tracks
-            if not measured["theta"][name] and (circle := _circle(track.to_numpy(float)))
-        }
-        return cls(tuple(name for name in names if angles.get(name, False)), circles)
-
-    def in_words(self) -> list[str]:
-        """Return sentences on what was seen, and what to correct."""
-        said = [
-            f"{name} swings on a circle of {radius:g} m about ({x:g}, {y:g}): hung on a hinge there"
-            for name, (x, y, radius) in self.circles.items()
-        ]
-        if not self.angles:
-            return said
-        return [
-            f"only the angle of {' and '.join(self.angles)} was measured: hung by the upper end"
-            " (a circle, as a wheel, by its centre); correct the places of [[joint]]",
-            *said,
-        ]
-
-    def joints(self, shapes: Mapping[str, Shape]) -> list[Joint]:
-        """Return the hinges of bodies with these outlines."""
-        joints: list[Joint] = []
-        above, end = WORLD, (0.0, 0.0)
-        for name in self.angles:
-            *_, low, high = shapes[name].bounds
-            top = 0.0 if shapes[name].kind == "circle" else high
-            joints.append(Joint("hinge", (name, above), (0.0, top), end))
-            above, end = name, (0.0, low)
-        for name, (x, y, radius) in self.circles.items():
-            joints.append(Joint("hinge", (name, WORLD), (0.0, radius), (x, y)))
-        return joints
-
-
-@dataclass(frozen=True)
 class Recorded:
     """Bodies and time steps of a recording; by default of none.
 
@@ -110,10 +52,10 @@ class Recorded:
         What was seen in it.
     source : str
         Its name in messages.
-    hinges : Hinges
-        Those that it shows.
-    actuators : callable
-        Takes the outline of the one body; returns actuators that columns' names give away.
+    joints : tuple of Joint
+        Hinges that it shows.
+    actuators : tuple of Actuator
+        Those of the one body that columns' names give away.
     """
 
     names: tuple[str, ...] = ()
@@ -121,16 +63,16 @@ class Recorded:
     layout: Recording | None = None
     said: Sequence[str] = ()
     source: str = ""
-    hinges: Hinges = Hinges()
-    actuators: Callable[[Shape], tuple[Actuator, ...]] = lambda shape: ()
+    joints: tuple[Joint, ...] = ()
+    actuators: tuple[Actuator, ...] = ()
 
 
 def recorded(
     paths: Sequence[Path],
     layout: Recording,
-    given: Sequence[str],
+    outlined: Mapping[str, Shape],
     time_step: float | None,
-    side: bool = False,
+    side: bool,
 ) -> Recorded:
     """Read bodies, time step and layout from a recording.
 
@@ -140,8 +82,8 @@ def recorded(
         The recording's files, or folders of them.
     layout : Recording
         What is known of its layout.
-    given : sequence of str
-        Names of bodies from options, for a recording that names none.
+    outlined : mapping of str to Shape
+        Bodies from options, for a recording that names none.
     time_step : float, optional
         Time between rows (s), for a recording without times.
     side : bool
@@ -166,61 +108,80 @@ def recorded(
     if not plain:
         layout = histories.with_guesses(frame, commands[0], layout, said.append)
         histories.check_states(frame, layout, source)
-    columns = dict(layout.columns)
-    names = _names(frame, columns) or list(given)
-    if not names:
-        raise HistoryError(
-            f"{source}: no column has the bodies' names; give --body NAME=SHAPE for one body,"
-            " --columns body=COLUMN, or --columns NAME.x=COLUMN,... for bodies side by side"
-        )
-    # later commands read it with the scene; any outline will do here
-    bodies = tuple(Body(name, Shape.circle(1.0)) for name in names)
-    stand_in = Scene(time_step=time_step or 1.0, bodies=bodies)
-    timed = {"time", "duration"} & {*columns, *frame.columns} or layout.time
+    names = _names(frame, dict(layout.columns), outlined, source)
+    disc = Shape.circle(1.0)  # later commands read it with the scene; any outline will do here
+    shapes = {name: outlined.get(name, disc) for name in names}
+    scene = Scene(time_step=time_step or 1.0, bodies=tuple(Body(name, disc) for name in names))
+    timed = {"time", "duration"} & {*dict(layout.columns), *frame.columns} or layout.time
     if not plain and time_step is None and not timed:
         raise HistoryError(
             f"{source}: it has no column time; say which it is (--columns time=COLUMN, or"
             " duration=COLUMN for times since the row before), or give --time-step"
         )
-    read = partial(_as_history, [*zip(frames, logs, commands, strict=True)], stand_in)
-    table, layout = _read_with_cures(read, layout, logs, said, plain=plain)
+    parts = [*zip(frames, logs, commands, strict=True)]
+    table, layout = _read_with_cures(parts, scene, layout, said, plain=plain)
     table["time"] = pd.to_numeric(table["time"], errors="coerce")
-    # pandas 2 warns of a median of missing values alone
-    step = float(table.groupby(["trajectory", "body"])["time"].diff().dropna().median())
-    if not step > 0:
-        raise HistoryError(
-            f"{source}: its times do not rise from row to row of a body and trajectory;"
-            " correct them, or give --time-step; times since the row before are a column duration"
-        )
-    step = time_step or _longer_step(float(f"{step:.4g}"), commands[0], layout, said)
-    hinges = Hinges.seen_in(table, names)
-    proposed, shown = histories.propose(table, layout, step, jumps=not hinges.circles)
-    shown += hinges.in_words()
-    acting: Callable[[Shape], tuple[Actuator, ...]] = Recorded.actuators
+    step = _time_step(table, commands[0], layout, said, source, time_step)
+    hung, swinging, shown = _hinges(table, shapes)
+    joints, acting = (*hung, *swinging), tuple[Actuator, ...]()
+    proposed, seen = histories.propose(table, layout, step, jumps=not swinging)
+    shown = [*seen, *shown]
     if not plain and len(names) == 1:
-        hung = hinges != Hinges()
-        acting = partial(histories.guessed_actuators, frame, proposed, hung=hung)
-    sent = [one.column or one.name for one in acting(Shape.circle(1.0))]
-    if sent:
+        acting = histories.guessed_actuators(frame, proposed, shapes[names[0]], bool(joints))
+    if sent := [one.column or one.name for one in acting]:
         shown.append(f"commands by their names: {', '.join(sent)}; correct [[actuator]]")
-    falls = side and hinges == Hinges() and not sent
-    tried = stand_in.replace(time_step=step, gravity=(0.0, -9.81 * falls))
-    tried = tried.replace(recording=None if plain else proposed)
-    found, units, computed = _cures(paths, frame, tried)
+    falls = side and not (joints or sent)
+    scene = scene.replace(time_step=step, gravity=(0.0, -9.81 * falls))
+    found, units, computed = _cures(paths, frame, scene, None if plain else proposed)
     computed |= plain and any(name in STATE[VELOCITY:] for name in units)  # whose units are SI's
     cured = replace(asked, velocities="computed") if computed else asked
     if not plain and (time_step is None or "time" not in units):  # else the step is the user's
         cured = cured.with_entries(units=units)
     if cured != asked:
-        again = recorded(paths, cured, given, time_step, side)
+        again = recorded(paths, cured, outlined, time_step, side)
         return replace(again, said=[*found, *again.said])
     shown += found
     left = () if plain else histories.unused_columns(frame, proposed)
-    unused = [name for name in left if name not in sent]
-    if unused:
+    if unused := [name for name in left if name not in sent]:
         shown.append(f"columns that are not used: {', '.join(unused)}")
     layout_found = None if plain and not shown else proposed
-    return Recorded(tuple(names), step, layout_found, [*said, *shown], name, hinges, acting)
+    return Recorded(tuple(names), step, layout_found, [*said, *shown], name, joints, acting)
+
+
+def _read_with_cures(
+    parts: Sequence[tuple[pd.DataFrame, Path, pd.DataFrame | None]],
+    scene: Scene,
+    layout: Recording,
+    said: list[str],
+    *,
+    plain: bool,
+) -> tuple[pd.DataFrame, Recording]:
+    """Return logs, each a table, path and commands, as a history's table, and the layout needed.
+
+    What was proposed and repaired is added to ``said``, each once, without the names of logs.
+    """
+
+    def say(message: object) -> None:
+        text = str(message)
+        for _, log, _ in parts:
+            text = text.removeprefix(f"history {log}: ")
+        if text not in said:
+            said.append(text)
+
+    while True:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", RecordingWarning)
+            try:
+                table = _as_history(parts, scene, None if plain else layout)
+            except LayoutError as proposal:
+                say(proposal)
+                before, layout = layout, layout.with_entries(**proposal.entries)
+                if layout == before:
+                    raise
+                continue
+        for warning in caught:
+            say(warning.message)
+        return table, layout
 
 
 def _as_history(
@@ -244,8 +205,40 @@ def _as_history(
     return histories.joined(tables)
 
 
+def _time_step(
+    table: pd.DataFrame,
+    commands: pd.DataFrame | None,
+    layout: Recording,
+    said: list[str],
+    source: str,
+    given: float | None,
+) -> float:
+    """Return the time step: as given, or the median one, or that of slower commands.
+
+    A command that is late by less than its own interval is late by a part of one time step.
+    """
+    from pbrl_ppl.history import command_step
+
+    # pandas 2 warns of a median of missing values alone
+    step = float(table.groupby(["trajectory", "body"])["time"].diff().dropna().median())
+    if not step > 0:
+        raise HistoryError(
+            f"{source}: its times do not rise from row to row of a body and trajectory;"
+            " correct them, or give --time-step; times since the row before are a column duration"
+        )
+    step = float(f"{step:.4g}")
+    slower = 0.0 if commands is None else command_step(commands, layout)
+    if given or slower < 2 * step:
+        return given or step
+    said.append(
+        f"rows are {step:g} s apart and commands {slower:g} s: time_step is the commands', so that"
+        " a delay of theirs is a part of it"
+    )
+    return slower
+
+
 def _cures(
-    paths: Sequence[Path], frame: pd.DataFrame, scene: Scene
+    paths: Sequence[Path], frame: pd.DataFrame, scene: Scene, layout: Recording | None
 ) -> tuple[list[str], dict[str, str], bool]:
     """Return what is wrong with units and velocities of a recording, and the entries that cure it.
 
@@ -256,66 +249,46 @@ def _cures(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            history = histories.History.load(paths, scene)
+            history = histories.History.load(paths, scene.replace(recording=layout))
         except HistoryError:  # later commands say it
             return [], {}, False
-    present = histories.present_units(frame, scene.recording or Recording())
+    present = histories.present_units(frame, layout or Recording())
     return histories.layout_cures(history, scene, present)
 
 
-def _read_with_cures(
-    read: Callable[..., pd.DataFrame],
-    layout: Recording,
-    logs: Sequence[Path],
-    said: list[str],
-    *,
-    plain: bool,
-) -> tuple[pd.DataFrame, Recording]:
-    """Return a table as ``read`` returns it, and the layout with the entries that it needed.
+def _hinges(
+    table: pd.DataFrame, shapes: Mapping[str, Shape]
+) -> tuple[list[Joint], list[Joint], list[str]]:
+    """Return the hinges that measurements of bodies show, and sentences on them.
 
-    What was proposed and repaired is added to ``said``, each once, without the names of logs.
+    Bodies of which angles alone were measured hang in a chain, each by its upper end, circles by
+    their centre. Others swing on a circle, and their angle was not measured.
     """
-
-    def say(message: object) -> None:
-        text = str(message)
-        for log in logs:
-            text = text.removeprefix(f"history {log}: ")
-        if text not in said:
-            said.append(text)
-
-    while True:
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", RecordingWarning)
-            try:
-                table = read(layout=None if plain else layout)
-            except LayoutError as proposal:
-                say(proposal)
-                before, layout = layout, layout.with_entries(**proposal.entries)
-                if layout == before:
-                    raise
-                continue
-        for warning in caught:
-            say(warning.message)
-        return table, layout
-
-
-def _longer_step(
-    step: float, commands: pd.DataFrame | None, layout: Recording, said: list[str]
-) -> float:
-    """Return the time step: that of commands in a file of their own, where they are slower.
-
-    A command that is late by less than its own interval is late by a part of one time step.
-    """
-    from pbrl_ppl.history import command_step
-
-    slower = 0.0 if commands is None else command_step(commands, layout)
-    if slower < 2 * step:
-        return step
-    said.append(
-        f"rows are {step:g} s apart and commands {slower:g} s: time_step is the commands', so that"
-        " a delay of theirs is a part of it"
-    )
-    return slower
+    measured = table.reindex(columns=[*STATE]).notna().groupby(table["body"]).any()
+    turns = measured[["theta", "omega"]].any(axis=1)
+    alone = turns & ~measured[["x", "y", "vx", "vy"]].any(axis=1)
+    names = [name for name in shapes if alone.get(name, False)]
+    hung, swinging, said = list[Joint](), list[Joint](), list[str]()
+    above, end = WORLD, (0.0, 0.0)
+    for name in names:
+        *_, low, high = shapes[name].bounds
+        top = 0.0 if shapes[name].kind == "circle" else high
+        hung.append(Joint("hinge", (name, above), (0.0, top), end))
+        above, end = name, (0.0, low)
+    if names:
+        said.append(
+            f"only the angle of {' and '.join(names)} was measured: hung by the upper end"
+            " (a circle, as a wheel, by its centre); correct the places of [[joint]]"
+        )
+    for name, track in table.reindex(columns=["x", "y"]).groupby(table["body"]):
+        if measured["theta"][name] or not (circle := _circle(track.to_numpy(float))):
+            continue
+        x, y, radius = circle
+        swinging.append(Joint("hinge", (str(name), WORLD), (0.0, radius), (x, y)))
+        said.append(
+            f"{name} swings on a circle of {radius:g} m about ({x:g}, {y:g}): hung on a hinge there"
+        )
+    return hung, swinging, said
 
 
 def _circle(track: Floats, round_: float = 0.02) -> tuple[float, float, float] | None:
@@ -343,16 +316,25 @@ def _circle(track: Floats, round_: float = 0.02) -> tuple[float, float, float] |
     return round(float(centre[0]), digits), round(float(centre[1]), digits), round(radius, digits)
 
 
-def _names(frame: pd.DataFrame, columns: Mapping[str, str | float]) -> list[str]:
-    """Return names of bodies: from columns side by side, a column of names, or one name."""
+def _names(
+    frame: pd.DataFrame, columns: Mapping[str, str | float], outlined: Iterable[str], source: str
+) -> list[str]:
+    """Return names of bodies: of columns side by side, of a column, one name, or as outlined."""
     beside = dict.fromkeys(key.rpartition(".")[0] for key in columns if "." in key)
     column = columns.get("body", "body")
-    if beside:
-        return list(beside)
-    if column in frame:
+    names = list(beside)
+    if not beside and column in frame:
         texts = (str(name).strip() for name in frame[column].dropna().unique())
-        return [text for text in texts if text]
-    return [column] if isinstance(column, str) and "body" in columns else []
+        names = [text for text in texts if text]
+    elif not beside and str(column) == columns.get("body"):
+        names = [str(column)]
+    names = names or list(outlined)
+    if not names:
+        raise HistoryError(
+            f"{source}: no column has the bodies' names; give --body NAME=SHAPE for one body,"
+            " --columns body=COLUMN, or --columns NAME.x=COLUMN,... for bodies side by side"
+        )
+    return names
 
 
 #: Where models/ is in an installed package, and in a clone.
@@ -416,7 +398,7 @@ def new(
     else:
         shapes = outlines(bodies or [])
         if history:
-            recording = recorded(history, layout, [*shapes], time_step, bool(side))
+            recording = recorded(history, layout, shapes, time_step, bool(side))
         shapes, time_step = _complete(shapes, time_step, recording)
         text = scene_text(shapes, bool(side), time_step, recording)
         Scene.from_toml(text)  # written whole and valid, or not at all
@@ -505,15 +487,14 @@ def scene_text(shapes: Mapping[str, Shape], side: bool, time_step: float, found:
     >>> Scene.from_toml(text).moving[0].shape
     Shape(kind='box', size=(0.9, 0.55), radius=None, vertices=None)
     """
-    name, shape = next(iter(shapes.items()))
-    actuators = [replace(one, body=name) for one in found.actuators(shape)]
+    actuators = [replace(one, body=next(iter(shapes))) for one in found.actuators]
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("pbrl_ppl", "cli"), undefined=jinja2.StrictUndefined,
         trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
     )  # fmt: skip
     return environment.get_template("scene.toml.jinja").render(
         shapes={name: vars(shape) for name, shape in shapes.items()},
-        side=side, time_step=time_step, joints=found.hinges.joints(shapes),
+        side=side, time_step=time_step, joints=found.joints,
         actuators=actuators, recording=found.layout, said=map(in_a_line, found.said),
         entry=lambda key, value: toml_of([("", {key: value})]).strip(),
     )  # fmt: skip
@@ -541,11 +522,11 @@ def outlines(texts: Iterable[str]) -> dict[str, Shape]:
                 shapes[name] = Shape.box(width, height)
             elif kind == "circle":
                 shapes[name] = Shape.circle(float(rest))
+            elif kind == "polygon":
+                corners = [corner.split(",") for corner in rest.split("/")]
+                shapes[name] = Shape.polygon([(float(x), float(y)) for x, y in corners])
             else:
-                corners = [tuple(map(float, corner.split(","))) for corner in rest.split("/")]
-                if kind != "polygon" or {len(corner) for corner in corners} != {2}:
-                    raise ValueError
-                shapes[name] = Shape.polygon((corner[0], corner[1]) for corner in corners)
+                raise ValueError
         except SceneError:  # of a shape's numbers
             raise
         except ValueError:

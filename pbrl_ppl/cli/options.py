@@ -94,8 +94,8 @@ class PosteriorOutput(RecordingOutput):
 
 
 @dataclass(frozen=True)
-class TableOutput(Output):
-    """Options of a command that can write a table."""
+class TableOutput(RecordingOutput):
+    """Options of a command that writes a table."""
 
     endings = (".csv",)
 
@@ -131,10 +131,6 @@ class EffectFiles:
 
         return (*catalogue, *own_effects(self.effect_file))
 
-    def with_effects(self, scene: Scene) -> tuple[Scene, tuple[Effect | Attached, ...]]:
-        """Return a scene and the effects of effect files on its bodies."""
-        return added_effects(scene, own_effects(self.effect_file))
-
 
 @dataclass(frozen=True)
 class Columns:
@@ -152,7 +148,7 @@ class Columns:
 
 
 @dataclass(frozen=True)
-class Reading(EffectFiles, Columns):
+class RecordingReading(EffectFiles, Columns):
     """Options of each command that reads a recording.
 
     Each is in place of what the scene file's ``[recording]`` says.
@@ -185,7 +181,7 @@ class Reading(EffectFiles, Columns):
 
 
 @dataclass(frozen=True)
-class PosteriorReading(Reading):
+class PosteriorReading(RecordingReading):
     """Options of a command that reads a recording with the scene of a posterior.
 
     Parameters
@@ -199,7 +195,7 @@ class PosteriorReading(Reading):
 
 
 @dataclass(frozen=True)
-class SceneReading(Reading):
+class SceneReading(RecordingReading):
     """Options of a command that reads a scene file and recordings.
 
     Parameters
@@ -235,7 +231,8 @@ def command_line(context: typer.Context) -> str:
         value = context.params.get(str(parameter.name))
         if value is None or value is False:
             continue
-        items = list(map(str, value if isinstance(value, (list, tuple)) else (value,)))
+        several = parameter.nargs != 1 or getattr(parameter, "multiple", False)
+        items = list(map(str, value if several else (value,)))
         if parameter.param_type_name == "argument":
             words += items
         elif value is True:
@@ -280,16 +277,20 @@ def pairs(
     return values
 
 
+def only_body(bodies: Sequence[str], option: str, rest: str) -> str:
+    """Return the body that an option leaves out; where there are several, it must have one."""
+    if len(bodies) > 1:
+        raise GoalError(f"{option}: say which body: {bodies[0]}{rest}")
+    return bodies[0]
+
+
 def pose(text: str, bodies: Sequence[str], option: str) -> tuple[str, list[float | None]]:
     """Return a body and its numbers from ``BODY=X,Y,THETA``.
 
     The body may be left out if there is one. A free coordinate, ``-``, is None.
     """
     name, separator, numbers = text.rpartition("=")
-    if not separator:
-        if len(bodies) > 1:
-            raise GoalError(f"{option} {text}: say which body: {bodies[0]}={text}")
-        name = bodies[0]
+    name = name if separator else only_body(bodies, f"{option} {text}", f"={text}")
     values: list[float | None] = []
     for number in map(str.strip, numbers.split(",")):
         try:

@@ -51,7 +51,7 @@ class Wanted:
 
 
 @dataclass(frozen=True)
-class Search:
+class PlanSearch:
     """Options of the search for a plan, arguments of `planning.plan`.
 
     Parameters
@@ -83,7 +83,7 @@ class Search:
 
 
 @dataclass(frozen=True)
-class PlanOutput(options.TableOutput):
+class PlanOutput(options.Output):
     """Options of a plan's files.
 
     Parameters
@@ -93,6 +93,8 @@ class PlanOutput(options.TableOutput):
     animate : FILE
         Show the plan as a picture that moves (.gif).
     """
+
+    endings = (".csv",)
 
     animate: Path | None = None
 
@@ -108,7 +110,7 @@ class PlanOutput(options.TableOutput):
 def plan(
     posterior: Path,
     wanted: Wanted,
-    search: Search,
+    search: PlanSearch,
     laws: options.EffectFiles,
     to: PlanOutput,
     progress: Progress,
@@ -191,9 +193,6 @@ def suggest(
     draws
         Posterior draws of each effect's model.
     """
-    output = to.output
-    if output is None:
-        raise GoalError("suggest: say where it should be written: -o next.csv")
     if bounds and actions is not None:
         raise GoalError("suggest: --bounds and --actions both say what is allowed; drop one")
     catalogue = laws.catalogue()
@@ -218,7 +217,7 @@ def suggest(
         effects=effect, steps=steps, hold=hold, draws=draws, seed=seed, catalogue=catalogue,
         progress=progress,
     )  # fmt: skip
-    result.to_csv(output)
+    result.to_csv(to.output)
     contents = {
         "effects": [str(name) for name in result.separation["true"].values],
         "expected_log_bayes_factor": result.expected,
@@ -227,9 +226,9 @@ def suggest(
         "decisive": result.decisive,
         "meeting": result.meeting,
         "sentences": result.sentences,
-        "written": [output],
+        "written": [to.output],
     }
-    shown = [*result.sentences, f"experiment: {output}"]
+    shown = [*result.sentences, f"experiment: {to.output}"]
     return Result(contents, shown, 0 if result.decisive else FAILED)
 
 
@@ -239,10 +238,7 @@ def _bounds(texts: Sequence[str], bodies: Sequence[str]) -> dict[str, dict[str, 
     for text in texts:
         place, _, numbers = text.partition("=")
         body, dot, name = place.strip().rpartition(".")
-        if not dot:
-            if len(bodies) != 1:
-                raise GoalError(f"--bounds {text}: say which body: {bodies[0]}.{text}")
-            body = bodies[0]
+        body = body if dot else options.only_body(bodies, f"--bounds {text}", f".{text}")
         try:
             bounds.setdefault(body, {})[name] = [float(number) for number in numbers.split(",")]
         except ValueError:

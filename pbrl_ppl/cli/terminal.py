@@ -14,7 +14,7 @@ from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Any, TextIO
+from typing import Any
 
 import typer
 from rich.console import Console
@@ -32,8 +32,6 @@ FAILED, BAD_INPUT, UNDECIDED, INTERRUPTED = 1, 2, 3, 130
 
 #: Signals that end a command: Ctrl-C, and that of `timeout` and of job schedulers.
 _ENDING = signal.SIGINT, signal.SIGTERM
-#: Seconds in which an interrupted command ends by itself.
-_PATIENCE = 1.5
 
 
 class PlainConsole(Console):
@@ -75,8 +73,8 @@ class Interrupts:
         return INTERRUPTED
 
     @contextmanager
-    def enforced(self, state: str) -> Iterator[None]:
-        """End the process if an interrupt has not ended the context after `_PATIENCE`.
+    def enforced(self, state: str, patience: float = 1.5) -> Iterator[None]:
+        """End the process if an interrupt has not ended the context after ``patience`` (s).
 
         Machine code and other threads run on until they are done: only the operating system's
         signal gets through to a thread that waits for it.
@@ -88,7 +86,7 @@ class Interrupts:
         def watch() -> None:
             while (number := os.read(reader, 1)) and number[0] not in _ENDING:
                 pass
-            if number and not self._going_on.wait(_PATIENCE):
+            if number and not self._going_on.wait(patience):
                 Console(stderr=True).show_cursor()
                 os._exit(self.ended(state))
 
@@ -154,13 +152,10 @@ def noted_warnings(hidden: str | None = None) -> Iterator[list[Warning | str]]:
     with warnings.catch_warnings():
         show = warnings.showwarning
 
-        def note(
-            message: Warning | str, category: type[Warning], filename: str, lineno: int,
-            file: TextIO | None = None, line: str | None = None,
-        ) -> None:  # fmt: skip
+        def note(message: Warning | str, *place: Any, **options: Any) -> None:
             noted.append(message)
             if hidden is None or hidden not in str(message):
-                show(message, category, filename, lineno, file, line)
+                show(message, *place, **options)
 
         warnings.showwarning = note
         yield noted

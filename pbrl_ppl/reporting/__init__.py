@@ -1,17 +1,17 @@
 """Plots and reports; the only place that imports matplotlib."""
 
-from pbrl_ppl.reporting.effect_plots import plot_candidates as plot_candidates
-from pbrl_ppl.reporting.error_plots import plot_errors as plot_errors
-from pbrl_ppl.reporting.error_plots import plot_rollout as plot_rollout
-from pbrl_ppl.reporting.logs_page import FAILED as FAILED
-from pbrl_ppl.reporting.logs_page import count_verdicts as count_verdicts
-from pbrl_ppl.reporting.logs_page import render_logs as render_logs
-from pbrl_ppl.reporting.page import Source as Source
-from pbrl_ppl.reporting.posterior_plots import plot_prior_check as plot_prior_check
-from pbrl_ppl.reporting.posterior_plots import plot_rank as plot_rank
-from pbrl_ppl.reporting.posterior_summary import summary as summary
+from pbrl_ppl.reporting.loop_plots import plot_candidates as plot_candidates
+from pbrl_ppl.reporting.loop_plots import plot_errors as plot_errors
+from pbrl_ppl.reporting.loop_plots import plot_rollout as plot_rollout
+from pbrl_ppl.reporting.posteriors import plot_prior_check as plot_prior_check
+from pbrl_ppl.reporting.posteriors import plot_rank as plot_rank
+from pbrl_ppl.reporting.posteriors import summary as summary
+from pbrl_ppl.reporting.reports import FAILED as FAILED
+from pbrl_ppl.reporting.reports import Source as Source
+from pbrl_ppl.reporting.reports import count_verdicts as count_verdicts
 from pbrl_ppl.reporting.reports import in_brief as in_brief
 from pbrl_ppl.reporting.reports import render as render
+from pbrl_ppl.reporting.reports import render_logs as render_logs
 from pbrl_ppl.reporting.reports import render_posterior as render_posterior
 from pbrl_ppl.reporting.reports import render_without_verdict as render_without_verdict
 from pbrl_ppl.reporting.reports import report as report

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pbrl_ppl.criticism import Loop, diverged_after, whole_rollouts
+from pbrl_ppl.files import json_values
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import along_trajectories
 from pbrl_ppl.modes import FilteredMode
@@ -119,75 +120,50 @@ def _predicted(mode: FilteredMode, history: History) -> dict[int, Floats]:
 def animation(loop: Loop, motions: Sequence[Motion]) -> dict[str, object] | None:
     """Return what the page's script draws, as JSON values; None where there is no motion.
 
-    Lengths are in m, to 1e-5 of the view, and angles in rad, to five decimals.
+    Lengths are in m, to 1e-5 of the view at least, and angles in rad.
     """
     if not motions:
         return None
     scene = loop.scene
     reach = max(body.shape.bounding_radius for body in scene.moving)
-    return {
+    static = (body for body in scene.bodies if body.static and body.pose is not None)
+    drawn: dict[str, object] = json_values({
         "models": ["before", "after"] if loop.added else ["before"],
-        "bodies": [
-            {"name": body.name, "outline": _outline(body.shape), "radius": body.shape.radius}
-            for body in scene.moving
-        ],
-        "static": [
-            {"outline": _outline(body.shape), "radius": body.shape.radius, "pose": list(body.pose)}
-            for body in scene.bodies
-            if body.static and body.pose is not None
-        ],
-        "walls": [[list(wall.start), list(wall.end)] for wall in scene.walls],
+        "bodies": [{"name": body.name} | _outline(body.shape) for body in scene.moving],
+        "static": [{"pose": body.pose} | _outline(body.shape) for body in static],
+        "walls": [(wall.start, wall.end) for wall in scene.walls],
         "motions": [_drawn(scene, motion, 1.2 * reach) for motion in motions],
-    }
+    })  # fmt: skip
+    return drawn
+
+
+def _outline(shape: Shape) -> dict[str, object]:
+    return {"outline": shape.outline, "radius": shape.radius}
 
 
 def _drawn(scene: Scene, motion: Motion, margin: float) -> dict[str, object]:
-    """Return a motion, and the corners of its view, as JSON values."""
+    """Return a motion, and the corners of its view."""
     box = _box(motion, margin)
-    places = _decimals(1e-5 * float((box[1] - box[0]).max()))
+    size = float((box[1] - box[0]).max())
+    places = max(5, 5 - int(np.floor(np.log10(size))))
     both = (motion.before, motion.after)
-
-    def poses(states: Floats) -> object:
-        return _listed(
-            np.concatenate([states[..., :2].round(places), states[..., 2:].round(5)], -1)
-        )
-
     return {
         "name": motion.name,
-        "box": box.round(places).tolist(),
-        "time": _listed(motion.time.round(_decimals(1e-4 * scene.time_step))),
-        "measured": poses(motion.measured),
-        "before": poses(motion.before),
-        "after": poses(motion.after),
-        "distance": [
-            round(far, places) if np.isfinite(far) else None
-            for far in (distance(scene, motion, predicted) for predicted in both)
-        ],
+        "box": box.round(places),
+        "time": motion.time.round(9),
+        "measured": motion.measured.round(places),
+        "before": motion.before.round(places),
+        "after": motion.after.round(places),
+        "distance": [distance(scene, motion, predicted) for predicted in both],
         "diverged": [diverged_after(motion.time, predicted) for predicted in both],
     }
 
 
 def _box(motion: Motion, margin: float) -> Floats:
     """Return the corners of the view, (2, 2): measured positions, and a margin for predictions."""
-    places = motion.measured[..., :2].reshape(-1, 2)
-    low, high = np.nanmin(places, axis=0), np.nanmax(places, axis=0)
+    measured = motion.measured[..., :2].reshape(-1, 2)
+    low, high = np.nanmin(measured, axis=0), np.nanmax(measured, axis=0)
     spare = 0.7 * float((high - low).max()) + margin
-    every = np.concatenate([motion.before, motion.after])[..., :2].reshape(-1, 2)
-    every = np.clip(every, low - spare, high + spare)
-    low = np.minimum(low, np.nanmin(every, axis=0, initial=np.inf)) - margin
-    high = np.maximum(high, np.nanmax(every, axis=0, initial=-np.inf)) + margin
-    return np.array([low, high])
-
-
-def _outline(shape: Shape) -> list[list[float]] | None:
-    return None if shape.outline is None else [list(map(float, point)) for point in shape.outline]
-
-
-def _decimals(size: float) -> int:
-    """Return the decimals that show a size."""
-    return int(np.ceil(-np.log10(size)))
-
-
-def _listed(values: Floats) -> object:
-    """Return nested lists, with None for NaN."""
-    return np.where(np.isfinite(values), values.astype(object), np.array(None)).tolist()
+    predicted = np.concatenate([motion.before, motion.after])[..., :2].reshape(-1, 2)
+    seen = np.concatenate([measured, np.clip(predicted, low - spare, high + spare)])
+    return np.array([np.nanmin(seen, axis=0) - margin, np.nanmax(seen, axis=0) + margin])

@@ -1,29 +1,160 @@
-"""Reports of a closed loop and of a posterior: their sections, and reports written to files."""
+"""Reports, self-contained pages of HTML: their sections, and how they are rendered."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import base64
+import re
+from collections import ChainMap, Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, NamedTuple, TypeVar
+from urllib.parse import quote
 
-from pbrl_ppl.criticism import Loop
+import jinja2
+from markupsafe import Markup
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+
+from pbrl_ppl.criticism import NOT_CONVERGED, Loop
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import PbrlError, PosteriorError
 from pbrl_ppl.files import write_text
 from pbrl_ppl.posterior import Idata, PosteriorRecord, compare, group, identify
+from pbrl_ppl.reporting import (
+    loop_plots,
+    motion,
+    posteriors,
+    residual_force,
+    scene_plots,
+    tables,
+    words,
+)
 from pbrl_ppl.reporting.motion import held_out_motions
-from pbrl_ppl.reporting.page import Section, Source, render_page, templates
-from pbrl_ppl.reporting.posterior_summary import (
+from pbrl_ppl.reporting.posteriors import (
     Parameters,
     coverage,
     most_dependent,
     pareto_k,
     recorded_poses,
 )
-from pbrl_ppl.reporting.words import plain
+from pbrl_ppl.reporting.style import NARROW, WIDE, png
+from pbrl_ppl.reporting.tables import tabulate
+from pbrl_ppl.reporting.words import added_labels, error, joined, plain
 
 T = TypeVar("T")
+
+#: Stands for the verdict of a log without a report.
+FAILED = "failed"
+
+#: Modules whose public names templates can use.
+_MODULES = (words, tables, residual_force, motion, posteriors, loop_plots, scene_plots)
+
+
+@dataclass(frozen=True)
+class Source:
+    """Files and command behind a page, for a reader who wants to reproduce it.
+
+    Parameters
+    ----------
+    scene, train, test : str
+        Names of the files, empty where there are none.
+    command : str
+        Command that makes the page again, at a shell or in Python.
+    """
+
+    scene: str = ""
+    train: str = ""
+    test: str = ""
+    command: str = ""
+
+
+class Section(NamedTuple):
+    """A section of a page; it is left out where its template gives nothing.
+
+    A new section is a template in ``templates/`` and an entry in a page's list of sections.
+    Templates can use the public names of this room's modules, functions also as filters, and draw
+    their pictures: ``draw(plot_errors, result)``.
+
+    Parameters
+    ----------
+    template : str
+        Name of the template, without ``.html.jinja``; also the anchor that others link to.
+    title : str
+        Heading, itself a template; none if empty.
+    link : str
+        Entry in the page's table of contents; none if empty.
+    """
+
+    template: str
+    title: str = ""
+    link: str = ""
+
+
+def templates() -> jinja2.Environment:
+    """Return the templates, with the public names of this room's modules."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("pbrl_ppl.reporting"),
+        autoescape=jinja2.select_autoescape(["html.jinja"]),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    names = ChainMap(*map(vars, _MODULES))
+    public = {name: value for name, value in names.items() if not name.startswith("_")}
+    environment.globals |= public
+    environment.filters = public | environment.filters
+    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
+    return environment
+
+
+def render_page(title: str, header: str, sections: Sequence[Section], **context: object) -> str:
+    """Return a page of HTML; pictures are drawn twice, for a page and for a telephone.
+
+    Parameters
+    ----------
+    title : str
+        Title of the window.
+    header : str
+        Template of what stands above the table of contents.
+    sections : sequence of Section
+        What stands below it, in this order.
+    **context
+        Values that the templates show, by name.
+    """
+    environment = templates()
+    draws: list[Callable[..., Figure]] = []
+
+    def draw(plot: Callable[..., Figure], *data: object) -> Mapping[str, str]:
+        """Return the places of a picture in both widths, which is drawn after all text."""
+        draws.append(partial(plot, *data))
+        return {width: f"\0{len(draws) - 1} {width}\0" for width in ("wide", "narrow")}
+
+    def rendered(name: str) -> Markup:
+        return Markup(environment.get_template(f"{name}.html.jinja").render(context, draw=draw))
+
+    shown = [
+        (section, environment.from_string(section.title).render(context), body)
+        for section in sections
+        if (body := rendered(section.template)).strip()
+    ]
+    page = environment.get_template("page.html.jinja").render(
+        title=title, header=rendered(header), sections=shown
+    )
+    pictures = [picture(draw) for draw in draws]
+    return re.sub(r"\0(\d+) (\w+)\0", lambda place: pictures[int(place[1])][place[2]], page)
+
+
+def picture(draw: Callable[..., Figure]) -> Mapping[str, str]:
+    """Return a picture in both widths, ``wide`` and ``narrow``, as data URLs."""
+    sizes = {"wide": WIDE, "narrow": NARROW}
+    # a $ is part of a name
+    with rc_context({"text.parse_math": False, "axes.titlesize": 9}):
+        data = {name: base64.b64encode(png(draw(width=width))) for name, width in sizes.items()}
+    return {name: f"data:image/png;base64,{code.decode('ascii')}" for name, code in data.items()}
+
 
 LOOP_SECTIONS = (
     Section("motions", "Measured and predicted motion", "Motion"),
@@ -119,7 +250,6 @@ def render(loop: Loop, source: Source | None = None) -> str:
     source : Source, optional
         Names of the files, and the command that makes the page again.
     """
-    added = [f"{e.effect}_{name}[{e.body}]" for e in loop.added for name in e.parameters]
     test = loop.held_out
     return render_page(
         plain(loop.verdict),
@@ -128,7 +258,7 @@ def render(loop: Loop, source: Source | None = None) -> str:
         result=loop,
         source=source or Source(),
         motions=held_out_motions(loop),
-        parameters=Parameters(loop.posterior_after, loop.catalogue, tuple(added)),
+        parameters=Parameters(loop.posterior_after, loop.catalogue, added_labels(loop)),
         scene=loop.scene,
         poses=recorded_poses(loop.posterior_before),
         held_out=None if test is None else test.dataset["start"].to_numpy()[..., :3],
@@ -232,3 +362,47 @@ def in_brief(loop: Loop, folder: str | Path) -> list[str]:
     brief = templates().get_template("brief.txt.jinja")
     text = brief.render(result=loop, folder=Path(folder))
     return [line.rstrip() for line in text.splitlines() if line.strip()]
+
+
+def render_logs(rows: Sequence[Mapping[str, Any]], command: str) -> str:
+    """Return one page of HTML with a row a log.
+
+    Parameters
+    ----------
+    rows : sequence of mapping
+        Of each log its name (``log``), which is its folder's beside the page, ``verdict``, laws
+        (``added``), ``error_before`` and ``error_after`` (in units of the noise) and ``warnings``;
+        of one that failed ``message``.
+    command : str
+        Command that makes the page again.
+    """
+
+    def named(row: Mapping[str, Any]) -> str:
+        link = Markup('<a href="{}/report.html">{}</a>').format(quote(row["log"]), row["log"])
+        return row["log"] if row["verdict"] == FAILED else link
+
+    table = tabulate(
+        "All logs",
+        rows,
+        {
+            "Log": named,
+            "Verdict": lambda row: row["verdict"].replace("-", " "),
+            "Added laws, or what went wrong": lambda row: (
+                row.get("message") or joined(map(plain, row["added"]))
+            ),
+            "Error before": lambda row: error(row.get("error_before")),
+            "Error after": lambda row: error(row.get("error_after")),
+            "Warnings": lambda row: "; ".join(row["warnings"]),
+        },
+        {"Verdict", "Added laws, or what went wrong", "Warnings"},
+        lambda row: "bad" * (row["verdict"] in (FAILED, NOT_CONVERGED)),
+    )
+    shown = {"count": len(rows), "verdicts": count_verdicts(rows), "logs": table}
+    sections = [Section("logs", "Logs")]
+    return render_page(f"{len(rows)} logs", "logs_header", sections, command=command, **shown)
+
+
+def count_verdicts(rows: Iterable[Mapping[str, Any]]) -> str:
+    """Return how many logs had which verdict, as ``1 adequate, 2 failed``."""
+    counts = Counter(row["verdict"] for row in rows)
+    return ", ".join(f"{count} {verdict}" for verdict, count in sorted(counts.items()))

@@ -12,35 +12,17 @@ from pbrl_ppl.likelihood import FilteredProblem
 from pbrl_ppl.state import STATE, Floats, acceleration_unit
 
 
-class Bins(NamedTuple):
-    """Means of y in bins of x that hold about as many values each.
+def bin_means(x: Floats, y: Floats, most: int = 10, least: int = 8) -> pd.DataFrame:
+    """Return the means of y in bins of x that hold about as many values each.
 
-    Parameters
-    ----------
-    centre, mean, error : ndarray
-        Median of x, mean of y, and its standard error (NaN for a single value), shape (bin,).
-    """
-
-    centre: Floats
-    mean: Floats
-    error: Floats
-
-
-def bin_means(x: Floats, y: Floats, most: int = 10, least: int = 8) -> Bins:
-    """Return the means of y in bins of x; equal values of x share a bin.
-
-    There are at most ``most`` bins, each with at least about ``least`` values.
+    There are at most ``most`` bins, each with at least about ``least`` values; equal values of x
+    share a bin. Columns are ``centre``, the median of x, ``mean`` of y and its standard ``error``
+    (NaN for a single value).
     """
     wanted = int(np.clip(len(x) // least, 1, most))
-    edges = np.unique(np.quantile(x, np.linspace(0, 1, wanted + 1)[1:-1]))
-    # equal values share a bin, so that some may be empty
-    _, which = np.unique(np.searchsorted(edges, x, side="left"), return_inverse=True)
-    means = pd.DataFrame({"x": x, "y": y}).groupby(which)
-    return Bins(
-        centre=means["x"].median().to_numpy(),
-        mean=means["y"].mean().to_numpy(),
-        error=np.asarray(means["y"].sem(), dtype=float),
-    )
+    edges = np.quantile(x, np.linspace(0, 1, wanted + 1)[1:-1])
+    binned = pd.DataFrame({"x": x, "y": y}).groupby(np.searchsorted(edges, x))
+    return binned.agg(centre=("x", "median"), mean=("y", "mean"), error=("y", "sem"))
 
 
 class ResidualForce(NamedTuple):
@@ -70,7 +52,7 @@ class Curve(NamedTuple):
     share: float
 
 
-class Law(NamedTuple):
+class ForceLaw(NamedTuple):
     """Residual force of a body against a quantity that it depends on.
 
     Parameters
@@ -92,7 +74,7 @@ class Law(NamedTuple):
     curve: Curve
 
 
-def find_laws(loop: Loop, most: int = 3, least: float = 0.02) -> list[Law]:
+def find_laws(loop: Loop, most: int = 3, least: float = 0.02) -> list[ForceLaw]:
     """Return the residual force against the quantity that it depends on, then against others.
 
     The residual force is the process noise that each step adds to the smoothed states, over the
@@ -111,7 +93,7 @@ def find_laws(loop: Loop, most: int = 3, least: float = 0.02) -> list[Law]:
     if residual is None:
         return []
     laws = [
-        Law(residual, quantity, unit, x, _simplest(x, residual.values))
+        ForceLaw(residual, quantity, unit, x, _simplest(x, residual.values))
         for (quantity, unit), x in zip(
             QUANTITIES.items(), recorded_quantities(problem, body).T, strict=True
         )

@@ -9,10 +9,12 @@ from typing import Any, Literal
 
 import numpy as np
 from cycler import cycler
+from matplotlib import rc_context
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 from PIL import Image
 from scipy.stats import gaussian_kde
 
@@ -60,23 +62,16 @@ def blank_figure(
     if stack and width <= NARROW and columns > 1:
         height, rows, columns = height * columns * 0.95, rows * columns, 1
     figure = Figure(figsize=(width, height), layout="constrained")
-    panels = list(figure.subplots(rows, columns, squeeze=False).ravel())
-    for i, axes in enumerate(panels):
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.set_axisbelow(True)
-        axes.set_visible(i < count)
-        if grid:
-            axes.grid(axis=grid, color="#dddddd", linewidth=0.6)
+    look: Any = {
+        "axes.labelsize": 9, "axes.spines.top": False, "axes.spines.right": False,
+        "axes.axisbelow": True, "axes.grid": bool(grid), "axes.grid.axis": grid or "both",
+        "grid.color": "#dddddd", "grid.linewidth": 0.6,
+    }  # fmt: skip
+    with rc_context(look):
+        panels = list(figure.subplots(rows, columns, squeeze=False).ravel())
+    for axes in panels[count:]:
+        axes.set_visible(False)
     return figure, panels
-
-
-def name_axes(
-    axes: Axes, title: str = "", x: str = "", y: str = "", *, small: bool = False
-) -> None:
-    """Write the title and the labels of a panel, in small type if there are many."""
-    axes.set_title(title, fontsize=9 if small else 10)
-    axes.set_xlabel(x, fontsize=8 if small else 10)
-    axes.set_ylabel(y, fontsize=8 if small else 10)
 
 
 def legend(figure: Figure, handles: Sequence[Artist]) -> None:
@@ -88,20 +83,9 @@ def legend(figure: Figure, handles: Sequence[Artist]) -> None:
     )  # fmt: skip
 
 
-def label(
-    axes: Axes,
-    text: str,
-    at: tuple[float, float],
-    shift: tuple[float, float] = (4, 0),
-    **options: object,
-) -> None:
-    """Write a label beside a point of the data, shifted by some typographic points."""
-    axes.annotate(text, at, shift, textcoords="offset points", fontsize=8).set(**options)
-
-
-def zero_line(axes: Axes) -> None:
-    """Draw a line at zero."""
-    axes.axhline(0.0, color="black", linewidth=0.8, zorder=1)
+def patches(colours: Mapping[str, str]) -> list[Patch]:
+    """Return a legend's entries from colours by name."""
+    return [Patch(color=colour, label=name) for name, colour in colours.items()]
 
 
 def bars(
@@ -109,11 +93,10 @@ def bars(
     names: Sequence[str],
     values: Sequence[float],
     colours: str | Sequence[str],
-    texts: Sequence[str] = (),
+    texts: Sequence[str],
     *,
     shift: float = 0.0,
     height: float = 0.8,
-    hatch: Sequence[str] | None = None,
 ) -> None:
     """Draw horizontal bars from the top down, with their names, and a text beside each.
 
@@ -127,15 +110,9 @@ def bars(
         Places by which the bars are lower than their names.
     height : float
         Of each bar, in places.
-    hatch : sequence of str, optional
-        Pattern of each bar; without one, bars have no edges either.
     """
-    places = np.arange(len(names)) + shift
-    edge = None if hatch is None else "white"
-    axes.barh(places, values, height, color=colours, edgecolor=edge, hatch=hatch)
-    for at in zip(values, places, strict=True):
-        text = texts[round(at[1] - shift)] if texts else ""
-        label(axes, text, at, (3, 0), va="center", bbox=BOX)
+    drawn = axes.barh(np.arange(len(names)) + shift, values, height, color=colours)
+    axes.bar_label(drawn, texts, padding=3, fontsize=8, bbox=BOX)
     axes.set_yticks(range(len(names)), names)
     axes.yaxis.set_inverted(True)
 

@@ -13,7 +13,7 @@ from pbrl_ppl.criticism import Candidate, Errors, Loop, SearchLength
 from pbrl_ppl.effects import Sensor
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.posterior import Comparison, Identifiability, interval, scalars
-from pbrl_ppl.reporting.posterior_summary import Parameters, prior_draws
+from pbrl_ppl.reporting.posteriors import Parameters, prior_draws
 from pbrl_ppl.reporting.style import UNITS
 from pbrl_ppl.reporting.words import (
     chance,
@@ -34,7 +34,7 @@ Cell = str | tuple[str, str]
 T = TypeVar("T")
 
 
-class Table(NamedTuple):
+class PageTable(NamedTuple):
     """A table as a page shows it; on a telephone each row becomes a card.
 
     Parameters
@@ -64,19 +64,19 @@ def tabulate(
     columns: Mapping[str, Callable[[T], Cell]],
     words: Collection[str] = (),
     mark: Callable[[T], str] = lambda item: "",
-) -> Table:
+) -> PageTable:
     """Tabulate items, one row each; a column is a head and what it shows of an item."""
     items = tuple(items)
     rows = [[cell(item) for cell in columns.values()] for item in items]
-    return Table(caption, tuple(columns), rows, words, [mark(item) for item in items])
+    return PageTable(caption, tuple(columns), rows, words, [mark(item) for item in items])
 
 
 def compare_models(
     caption: str, models: Mapping[str, T], measures: Mapping[str, Callable[[T], str]]
-) -> Table:
+) -> PageTable:
     """Tabulate measures of models, one row a measure, one column a model."""
     rows = [(name, *map(measure, models.values())) for name, measure in measures.items()]
-    return Table(caption, ("Measure", *models), rows)
+    return PageTable(caption, ("Measure", *models), rows)
 
 
 def measured_parameters(candidate: Candidate, loop: Loop) -> tuple[str, ...]:
@@ -129,7 +129,7 @@ def _draws(prior: Prior) -> Floats:
     return prior.sample(np.random.default_rng(0), 20_000)
 
 
-def error_tables(loop: Loop) -> list[Table]:
+def error_tables(loop: Loop) -> list[PageTable]:
     """Tabulate the held-out errors, one interval and a rollout ahead, and overall."""
     errors = dict(zip(models_of(loop), (loop.before, loop.after), strict=False))
     errors["Noise floor"] = loop.noise_floor
@@ -143,7 +143,7 @@ def error_tables(loop: Loop) -> list[Table]:
         sizes = [getattr(each, kind) for each in errors.values()]
         rows = [(d, *(error(size.get(d)) for size in sizes), UNITS[d]) for d in sizes[0]]
         caption, heads = f"{title} (root mean square error)", ("State dimension", *errors, "Unit")
-        tables += [Table(caption, heads, rows, {"Unit"})] * bool(rows)
+        tables += [PageTable(caption, heads, rows, {"Unit"})] * bool(rows)
     overall: dict[str, Callable[[Errors], str]] = {
         "Error in units of the noise": lambda each: error(each.normalised_rmse),
         "Log predictive density in nats (more is better)": lambda each: error(each.elpd, 4),
@@ -156,7 +156,7 @@ def models_of(loop: Loop) -> tuple[str, ...]:
     return ("Before", "After") if loop.added else ("Declared model",)
 
 
-def loo_table(loo: Comparison, columns: Sequence[str]) -> Table:
+def loo_table(loo: Comparison, columns: Sequence[str]) -> PageTable:
     """Tabulate the leave-one-out cross-validation of one model, or of two.
 
     Parameters
@@ -179,7 +179,7 @@ def loo_table(loo: Comparison, columns: Sequence[str]) -> Table:
     )
 
 
-def acceleration_table(loop: Loop) -> Table:
+def acceleration_table(loop: Loop) -> PageTable:
     """Tabulate the unexplained acceleration and its share of the bodies' acceleration."""
     left, models = loop.acceleration, models_of(loop)
     sizes = (left.before, left.after)[-len(models) :]
@@ -197,10 +197,10 @@ def acceleration_table(loop: Loop) -> Table:
     ]
     caption = "Unexplained acceleration (standard deviation in an interval)"
     words = ("Unit", "Significant")
-    return Table(caption, ("Velocity", *models, *heads, *words), rows, words)
+    return PageTable(caption, ("Velocity", *models, *heads, *words), rows, words)
 
 
-def residual_test_table(loop: Loop) -> Table:
+def residual_test_table(loop: Loop) -> PageTable:
     """Tabulate the tests of the model's residual."""
     return tabulate(
         f"Tests of the {model_of(loop)} model's residual, on the recordings that it was fitted to",
@@ -221,7 +221,7 @@ def yes_or_no(said: object) -> str:
     return "yes" if said else "no"
 
 
-def candidate_table(loop: Loop) -> Table:
+def candidate_table(loop: Loop) -> PageTable:
     """Tabulate the candidates: scores, the search's regression for each alone, the decision."""
     added = {(effect.effect, effect.body) for effect in loop.added}
 
@@ -252,7 +252,7 @@ def candidate_table(loop: Loop) -> Table:
     )
 
 
-def search_table(loop: Loop) -> Table:
+def search_table(loop: Loop) -> PageTable:
     """Tabulate what the search found on pieces of each length."""
     columns: dict[str, Callable[[SearchLength], str]] = {
         "Intervals": lambda one: str(one.rows),
@@ -267,7 +267,7 @@ def search_table(loop: Loop) -> Table:
     return tabulate("The search by length of pieces", loop.search, columns, words)
 
 
-def parameter_table(parameters: Parameters) -> Table:
+def parameter_table(parameters: Parameters) -> PageTable:
     """Tabulate the posterior of all parameters, in their units."""
     return tabulate(
         "Posterior of all parameters",
@@ -293,7 +293,7 @@ def _span(low: float, high: float) -> str:
     return f"{number(low, digits)} to {number(high, digits)}"
 
 
-def width_table(known: Identifiability, parameters: Parameters) -> Table:
+def width_table(known: Identifiability, parameters: Parameters) -> PageTable:
     """Tabulate the intervals of each parameter before and after the data."""
     before, after = (draws(parameters.posterior) for draws in (prior_draws, scalars))
     data = {"informed": "inform it", "weak": "inform it weakly"}
@@ -317,11 +317,11 @@ def width_table(known: Identifiability, parameters: Parameters) -> Table:
     )
 
 
-def coverage_table(covered: Mapping[str, tuple[float, float, int]]) -> Table:
+def coverage_table(covered: Mapping[str, tuple[float, float, int]]) -> PageTable:
     """Tabulate the shares of measurements inside leave-one-out predictions."""
     heads = ("State dimension", "In the central 50 %", "In the central 94 %", "Measurements")
     rows = [
         (name, f"{100 * half:.1f} %", f"{100 * wide:.1f} %", str(count))
         for name, (half, wide, count) in covered.items()
     ]
-    return Table("Measurements inside leave-one-out predictions", heads, rows)
+    return PageTable("Measurements inside leave-one-out predictions", heads, rows)

@@ -25,12 +25,6 @@ from pbrl_ppl.state import STATE
 
 #: Candidates and bad frames that are listed one by one.
 LISTED = 4
-#: A share of the bodies' acceleration below which a remainder that forecasts do not show is small.
-_SMALL = 0.05
-#: A held-out error above this many times the noise needs an explanation.
-_TOO_LARGE = 1.5
-#: A dimension that moves by less than this share of its natural size does not.
-_STILL = 1e-4
 
 
 def verdict_in_words(loop: Loop) -> str:
@@ -92,8 +86,12 @@ def _gained(loop: Loop) -> str:
     return f"held-out error {both} times the noise"
 
 
-def _remains(loop: Loop) -> str:
-    """Write what remains, and whether it matters."""
+def _remains(loop: Loop, small: float = 0.05) -> str:
+    """Write what remains, and whether it matters.
+
+    A remainder that forecasts do not show is negligible below the share ``small`` of the bodies'
+    acceleration.
+    """
     if loop.diverges:
         return f"forecasts of {number(loop.rollout_seconds)} s diverge"
     left, name = loop.unexplained, loop.acceleration.remaining
@@ -107,11 +105,16 @@ def _remains(loop: Loop) -> str:
     if where or left is not None:
         at = left.dimension if left is not None and left.dimension else name
         share = loop.acceleration.relative_after.get(at, 0.0)
-        small = "is negligible" if share < _SMALL else "does not show in forecasts"
-        return f"what remains{where and f', {where},'} {small}"
-    if loop.after.normalised_rmse > _TOO_LARGE:
+        said = "is negligible" if share < small else "does not show in forecasts"
+        return f"what remains{where and f', {where},'} {said}"
+    if _differ(loop):
         return "the recordings that were fitted leave only noise"
     return "only noise remains"
+
+
+def _differ(loop: Loop, largest: float = 1.5) -> bool:
+    """Return whether the held-out error is above ``largest`` times the noise: to be explained."""
+    return loop.after.normalised_rmse > largest
 
 
 def _where(loop: Loop, dimension: str, body: str = "") -> str:
@@ -183,13 +186,13 @@ def model_of(loop: Loop) -> str:
 
 def error_in_words(loop: Loop) -> str:
     """Explain a held-out error that seems to contradict the verdict; empty if none does."""
-    model, after = model_of(loop), loop.after.normalised_rmse
     if loop.unexplained is not None or loop.acceleration.remaining:
         return "The noise is that of the measurements alone, one interval ahead."
-    if after > _TOO_LARGE and loop.verdict != NOT_CONVERGED:
+    if _differ(loop) and loop.verdict != NOT_CONVERGED:
         return (
             "The verdict is of the fitted recordings alone: the held-out ones differ from the"
-            f" {model} model by {number(after)} times the noise (another load, wear, calibration?)."
+            f" {model_of(loop)} model by {number(loop.after.normalised_rmse)} times the noise"
+            " (another load, wear, calibration?)."
         )
     return ""
 
@@ -208,10 +211,11 @@ def left_out_in_words(loop: Loop) -> str:
     return f"{said}{rest}." if said else ""
 
 
-def moved_most(loop: Loop, kind: str) -> str:
+def moved_most(loop: Loop, kind: str, still: float = 1e-4) -> str:
     """Return the state dimension whose held-out error of a kind changed most; empty if none moves.
 
-    If none changed, that with the largest error over the noise floor.
+    If none changed, that with the largest error over the noise floor. A dimension that moves by
+    less than the share ``still`` of its natural size does not move.
     """
     before, after, floor = (getattr(e, kind) for e in (loop.before, loop.after, loop.noise_floor))
     moves = list(before)
@@ -220,7 +224,7 @@ def moved_most(loop: Loop, kind: str) -> str:
         spread = np.fmax.reduce(observed, axis=(0, 1)) - np.fmin.reduce(observed, axis=(0, 1))
         spread = np.nan_to_num(spread).max(axis=0)
         sizes = dict(zip(STATE, spread / state_sizes(loop.scene), strict=True))
-        moves = [name for name in before if sizes[name] > _STILL]
+        moves = [name for name in before if sizes[name] > still]
 
     def change(name: str) -> tuple[float, float]:
         first, last = before[name], after.get(name, before[name])
@@ -276,7 +280,7 @@ def gains_inferred(loop: Loop) -> list[str]:
     said = []
     for label, values in scalars(loop.posterior_after).items():
         name = str(label)
-        if "gain" in name.partition("[")[0].split("_") and name not in _added_labels(loop):
+        if "gain" in name.partition("[")[0].split("_") and name not in added_labels(loop):
             low, high = interval(values.to_numpy())
             digits = digits_of(low, high)
             ends = f"94 % {number(low, digits)} to {number(high, digits)}"
@@ -284,9 +288,9 @@ def gains_inferred(loop: Loop) -> list[str]:
     return said
 
 
-def _added_labels(loop: Loop) -> set[str]:
+def added_labels(loop: Loop) -> tuple[str, ...]:
     """Return the labels of the parameters of added effects."""
-    return {f"{e.effect}_{name}[{e.body}]" for e in loop.added for name in e.parameters}
+    return tuple(f"{e.effect}_{name}[{e.body}]" for e in loop.added for name in e.parameters)
 
 
 def _law(effect: str, body: str) -> str:

@@ -10,7 +10,7 @@ import pytest
 
 from pbrl_ppl import criticism
 from pbrl_ppl.cli import main
-from pbrl_ppl.cli.close_loop import Each, Sampler
+from pbrl_ppl.cli.close_loop import Each, LoopSettings
 from pbrl_ppl.cli.options import FolderOutput, SceneReading
 from pbrl_ppl.criticism import FILES, Loop
 from tests.helpers.made_up import made_up
@@ -151,7 +151,7 @@ def test_bad_usage(
 
 def test_a_process_that_dies_takes_no_other_with_it(tmp_path: Path) -> None:
     scene, to = tmp_path / "scene.toml", FolderOutput(tmp_path / "out")
-    each = Dies(scene, SceneReading(), Sampler(), to, "pbrl-ppl close-loop")
+    each = Dies(scene, SceneReading(), LoopSettings(), to, "pbrl-ppl close-loop")
     assert each.apart("lives", tmp_path)["verdict"] == "adequate"
     row = each.apart("dies", tmp_path)
     assert row["verdict"] == "failed" and "BrokenProcessPool" in row["message"]

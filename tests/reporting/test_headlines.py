@@ -8,7 +8,7 @@ import pytest
 from pbrl_ppl.criticism.loop import Loop
 from pbrl_ppl.criticism.results import Estimate
 from pbrl_ppl.reporting import in_brief, render
-from pbrl_ppl.reporting.error_plots import plot_errors, plot_growth, plot_rollout
+from pbrl_ppl.reporting.loop_plots import plot_errors, plot_growth, plot_rollout
 from pbrl_ppl.reporting.tables import acceleration_table, error_tables
 from pbrl_ppl.reporting.words import gains_in_words, number, remains_in_words, verdict_in_words
 from tests.helpers.html import Page

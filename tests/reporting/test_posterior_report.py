@@ -10,8 +10,7 @@ from pbrl_ppl.cli import main
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.posterior import DATATREE, from_groups, groups, load_posterior
 from pbrl_ppl.reporting import plot_rank, render_posterior
-from pbrl_ppl.reporting.posterior_plots import plot_pairs, plot_prior
-from pbrl_ppl.reporting.posterior_summary import coverage, most_dependent, summary
+from pbrl_ppl.reporting.posteriors import coverage, most_dependent, plot_pairs, plot_prior, summary
 from tests.helpers.html import Page, stands_alone
 from tests.helpers.made_up import made_up_posterior
 from tests.helpers.revised import revised

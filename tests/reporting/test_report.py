@@ -20,9 +20,9 @@ from pbrl_ppl.posterior import Fit
 from pbrl_ppl.posterior.cross_validation import Comparison, LeaveOneOut
 from pbrl_ppl.posterior.identifiability import Direction, Identifiability, Width
 from pbrl_ppl.reporting import in_brief, render
-from pbrl_ppl.reporting.error_plots import plot_rollout, unwrap
-from pbrl_ppl.reporting.page import Source
-from pbrl_ppl.reporting.posterior_summary import PARAMETERS, most_interesting, summary
+from pbrl_ppl.reporting.loop_plots import plot_rollout, unwrap
+from pbrl_ppl.reporting.posteriors import PARAMETERS, most_interesting, summary
+from pbrl_ppl.reporting.reports import Source
 from pbrl_ppl.reporting.words import number, remains_in_words, verdict_in_words
 from tests.helpers.html import Page, stands_alone
 from tests.helpers.made_up import DRAG, idata, made_up, made_up_posterior
@@ -323,7 +323,7 @@ def test_added_effects_with_a_rest() -> None:
 
 
 def test_odd_findings_still_make_a_page(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pbrl_ppl.reporting.page.png", lambda figure: b"")
+    monkeypatch.setattr("pbrl_ppl.reporting.reports.png", lambda figure: b"")
     findings = made_up()
     nothing = Errors({}, {}, float("nan"), float("nan"))
     many = 9 * findings.candidates

@@ -11,7 +11,7 @@ from pbrl_ppl.criticism.results import Unexplained, diverged_after
 from pbrl_ppl.history import History
 from pbrl_ppl.modes import trajectory_mode
 from pbrl_ppl.posterior import Fit
-from pbrl_ppl.reporting.effect_plots import plot_laws
+from pbrl_ppl.reporting.loop_plots import plot_laws
 from pbrl_ppl.reporting.motion import animation, distance, divergence_in_words, held_out_motions
 from pbrl_ppl.reporting.residual_force import bin_means, find_laws
 from pbrl_ppl.sampling import fit, physics_model
@@ -61,7 +61,7 @@ def test_a_law_may_follow_whatever_an_error_may_depend_on() -> None:
 
 def test_bins_hold_about_as_many_and_equal_values_share_one() -> None:
     even = bin_means(np.arange(100.0), np.arange(100.0))
-    assert even.centre.tolist() == even.mean.tolist() == [10 * i + 4.5 for i in range(10)]
+    assert even.centre.tolist() == even["mean"].tolist() == [10 * i + 4.5 for i in range(10)]
     two = bin_means(np.repeat([0.0, 1.0], 50), np.ones(100))
     assert two.centre.tolist() == [0.0, 1.0]
 

@@ -1,4 +1,4 @@
-"""What a posterior's report shows: parameters, their diagnostics, dependence and predictions."""
+"""What a posterior's report shows: parameters, their diagnostics, predictions, and their plots."""
 
 from __future__ import annotations
 
@@ -6,11 +6,15 @@ import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations
 
 import numpy as np
 import pandas as pd
 import xarray as xr
+from matplotlib.figure import Figure
+from scipy.stats import rankdata
 
+from pbrl_ppl.criticism import PriorCheck
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.parameters import BODY_PARAMETERS, JOINT_ANCHORS
@@ -20,6 +24,7 @@ from pbrl_ppl.posterior import (
     SIZE,
     Idata,
     arviz,
+    convergence,
     from_groups,
     group,
     groups,
@@ -29,14 +34,9 @@ from pbrl_ppl.posterior import (
     separate,
     stored_fields,
 )
-from pbrl_ppl.reporting.style import UNITS
+from pbrl_ppl.reporting import style
 from pbrl_ppl.reporting.words import number, plain
 from pbrl_ppl.state import Floats, acceleration_unit
-
-#: Chains are good up to this R-hat and from this effective sample size on.
-GOOD_R_HAT, GOOD_ESS = 1.01, 400.0
-#: Up to these they are good enough for a verdict, and for the first digits of an interval.
-USABLE_R_HAT, USABLE_ESS = 1.05, 100.0
 
 #: Of parameters, by the variable's name.
 PARAMETERS = {
@@ -72,11 +72,19 @@ class Parameters:
         Where the names of its effects are looked up.
     first : tuple of str
         Labels of parameters to show first.
+    good_r_hat, good_ess : float
+        R-hat up to which, and effective sample size from which on, chains are good.
+    usable_r_hat, usable_ess : float
+        Those that are enough for a verdict, and for the first digits of an interval.
     """
 
     posterior: Idata
     effects: tuple[Effect, ...]
     first: tuple[str, ...] = ()
+    good_r_hat: float = 1.01
+    good_ess: float = 400.0
+    usable_r_hat: float = 1.05
+    usable_ess: float = 100.0
 
     @cached_property
     def sampler(self) -> dict[str, object]:
@@ -99,7 +107,7 @@ class Parameters:
         names = [label.partition("[") for label in table.index]
         table["meaning"] = [meanings.get(name, "") for name, _, _ in names]
         table["unit"] = [
-            UNITS.get(place[:-1], "")
+            style.UNITS.get(place[:-1], "")
             if name == "sigma"
             else acceleration_unit(place[:-1])
             if name.endswith("_acceleration") and name in PARAMETERS
@@ -108,13 +116,16 @@ class Parameters:
         ]
         table["ess"] = ess = table[["ess_bulk", "ess_tail"]].min(axis=1)
         # written so that a value that is not a number counts as bad
-        agree = table["r_hat"] <= (USABLE_R_HAT if self.weighted else GOOD_R_HAT)
+        agree = table["r_hat"] <= (self.usable_r_hat if self.weighted else self.good_r_hat)
+        enough = ess >= self.good_ess
         table["wrong"] = [
-            [f"R-hat {number(r_hat, 4)}"] * (self.chains and not fine)
-            + [f"effective sample size {number(size)}"] * (self.chains and not size >= GOOD_ESS)
-            for r_hat, fine, size in zip(table["r_hat"], agree, ess, strict=True)
+            [f"R-hat {number(r_hat, 4)}"] * (self.chains and not agrees)
+            + [f"effective sample size {number(size)}"] * (self.chains and not suffices)
+            for r_hat, agrees, size, suffices in zip(
+                table["r_hat"], agree, ess, enough, strict=True
+            )
         ]
-        good = (table["r_hat"] <= USABLE_R_HAT) & (ess >= USABLE_ESS)
+        good = (table["r_hat"] <= self.usable_r_hat) & (ess >= self.usable_ess)
         table["failed"] = ~good & self.chains
         return table
 
@@ -268,3 +279,144 @@ def pareto_k(posterior: Idata) -> tuple[Floats, float, str]:
         except (TypeError, ValueError, KeyError, IndexError) as error:  # no finite likelihood
             raise PosteriorError(f"leave-one-out cross-validation: {error}") from error
     return np.asarray(loo.pareto_k, dtype=float).ravel(), float(loo.good_k), left_out(posterior)
+
+
+def plot_rank(
+    posterior: Idata, parameters: Sequence[str] | None = None, width: float = style.WIDE
+) -> Figure:
+    """Plot how evenly the ranks of each chain's draws are spread.
+
+    A curve is the share of a chain's draws below each rank, less what an even spread gives. The
+    band follows from the effective sample sizes of the chains: chains that agree stay inside it 99
+    times of 100.
+
+    Parameters
+    ----------
+    posterior : InferenceData or DataTree
+        With a group ``posterior``.
+    parameters : sequence of str, optional
+        Labels such as ``mass[cart]``; by default those with the worst R-hat.
+    width : float
+        Width of the figure (inches).
+    """
+    if parameters is None:
+        parameters = most_interesting(summary(posterior))
+    draws = scalars(posterior)[list(parameters)]
+    # by chain: chains that differ have few effective draws together
+    sizes = [
+        convergence(from_groups({"posterior": draws.isel(chain=[i])}, {}))[1]
+        for i in range(draws.sizes["chain"])
+    ]
+    count = len(draws.data_vars)
+    figure, panels = style.blank_figure(width, 1.7, count, min(count, 2), spare=0.6)
+    for axes, (name, values) in zip(panels, draws.items(), strict=False):
+        chains = values.to_numpy()
+        ranks = rankdata(chains).reshape(chains.shape) / chains.size
+        fewest = min(ess[str(name)] for ess in sizes)
+        size = fewest if np.isfinite(fewest) else 1.0
+        edge, largest = style.shares_below(
+            axes, {str(i): chain for i, chain in enumerate(ranks)}, size
+        )
+        top = max(1.4 * edge, 1.1 * largest)
+        title = f"{name}{': chains differ' * (largest > edge)}"
+        axes.set(title=title, xlabel="rank among all draws", ylim=(-top, top))
+    return figure
+
+
+def plot_prior(posterior: Idata, parameters: Sequence[str], width: float = style.WIDE) -> Figure:
+    """Plot posterior densities over those of the prior.
+
+    Parameters
+    ----------
+    posterior : InferenceData or DataTree
+        With a group ``prior``.
+    parameters : sequence of str
+        Labels such as ``mass[cart]``.
+    width : float
+        Width of the figure (inches).
+    """
+    after, before = scalars(posterior), prior_draws(posterior)
+    count = len(parameters)
+    columns = min(3, count) if width > style.NARROW else 2
+    figure, panels = style.blank_figure(width, 1.5, count, columns, None, spare=0.6, stack=False)
+    for axes, name in zip(panels, parameters, strict=False):
+        drawn = {
+            colour: draws[name].to_numpy().ravel()
+            for colour, draws in ((style.PLAIN, before), (style.AFTER, after))
+            if name in draws
+        }
+        low, high = np.quantile(next(iter(drawn.values())), [0.01, 0.99])
+        ends = min(low, drawn[style.AFTER].min()), max(high, drawn[style.AFTER].max())
+        for colour, values in drawn.items():
+            style.density(axes, values, colour, ends, ends)
+        axes.set(title=name, yticks=[], ylim=(0.0, None))
+    style.legend(figure, style.patches({"prior": style.PLAIN, "posterior": style.AFTER}))
+    return figure
+
+
+def plot_pairs(
+    posterior: Idata, parameters: Sequence[str], width: float = style.WIDE, points: int = 800
+) -> Figure:
+    """Plot some draws of each pair of parameters, with the rank correlation of all."""
+    draws = scalars(posterior)
+    correlation = rank_correlations(draws, parameters)
+    pairs = list(combinations(range(len(parameters)), 2))
+    columns = min(3, len(pairs)) if width > style.NARROW else 2
+    figure, panels = style.blank_figure(width, 2.0, len(pairs), columns, None, stack=False)
+    for axes, (i, k) in zip(panels, pairs, strict=False):
+        x, y = (draws[parameters[place]].to_numpy().ravel() for place in (i, k))
+        some = slice(None, None, max(1, len(x) // points))
+        axes.plot(x[some], y[some], ".", color=style.AFTER, markersize=2, alpha=0.4)
+        axes.locator_params(nbins=3)
+        axes.tick_params(labelsize=7)
+        title = f"{correlation[i, k]:+.2f}".replace("-", "−")
+        axes.set(title=title, xlabel=parameters[i], ylabel=parameters[k])
+    return figure
+
+
+def plot_predictions(posterior: Idata, width: float = style.WIDE) -> Figure:
+    """Plot the calibration of leave-one-out predictions, one curve a state dimension.
+
+    A curve is the share of measurements below each quantile, less what calibrated predictions give;
+    those of independent measurements stay in the band 99 times of 100.
+    """
+    seen = pit_values(posterior)
+    figure, (axes,) = style.blank_figure(width, 3.4)
+    axes.set_prop_cycle(style.LINES)
+    style.shares_below(axes, seen, min((len(values) for values in seen.values()), default=1))
+    x = "position in the prediction: 0 below all draws, 1 above"
+    axes.set(xlabel=x, ylabel="share below, less expected")
+    if seen:
+        style.legend(figure, axes.lines)
+    return figure
+
+
+def plot_pareto(k: Floats, good: float, unit: str, width: float = style.WIDE) -> Figure:
+    """Plot Pareto k of every unit left out, and the threshold above which LOO is unreliable."""
+    figure, (axes,) = style.blank_figure(width, 2.8)
+    high = ~(k <= good)
+    axes.axhline(good, color=style.BEFORE, linewidth=1.2, linestyle="--")
+    axes.plot(np.flatnonzero(~high), k[~high], ".", color=style.AFTER, markersize=4)
+    axes.plot(np.flatnonzero(high), np.nan_to_num(k[high], posinf=2.0), "x", color=style.BEFORE)
+    axes.set(xlabel=unit, ylabel="Pareto k")
+    return figure
+
+
+def plot_prior_check(check: PriorCheck) -> Figure:
+    """Plot the measured changes of state over a segment beside those that the prior predicts."""
+    bodies, states = check.dataset["body"].values, check.dataset["state"].values
+    pairs = [(body, state) for body in bodies for state in states]
+    figure, panels = style.blank_figure(8.0, 1.3, len(pairs), 2, "x", spare=0.8)
+    ends = ("whislo", "q1", "med", "q3", "whishi")
+    for axes, (body, state) in zip(panels, pairs, strict=False):
+        changes = check.dataset.sel(body=body, state=state)
+        boxes = [
+            {"label": label} | dict(zip(ends, changes[name].to_numpy(), strict=True))
+            for label, name in (("prior", "predicted"), ("measured", "measured"))
+        ]
+        axes.bxp(boxes, orientation="horizontal", showfliers=False, widths=0.5)
+        axes.yaxis.set_inverted(True)
+        share = float(changes["share_inside"])
+        x = f"change in {check.seconds:g} s ({style.UNITS[str(state)]})"
+        axes.set(title=f"{state} of {body}: {100 * share:.0f} % as expected", xlabel=x)
+    return figure

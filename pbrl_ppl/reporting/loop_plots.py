@@ -1,23 +1,117 @@
-"""Plots of errors: held-out residuals, errors, rollouts, correlations and growth."""
+"""Plots of a closed loop: candidates, added effects, held-out errors, residuals."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TypeVar
 
 import numpy as np
 from cycler import cycler
-from matplotlib.artist import Artist
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
-from scipy.stats import norm
+from scipy.stats import chi2, norm
 
 from pbrl_ppl.criticism import Loop, diverged_after
-from pbrl_ppl.posterior import HDI_PROB
+from pbrl_ppl.posterior import HDI_PROB, scalars
 from pbrl_ppl.reporting import style
+from pbrl_ppl.reporting.residual_force import ForceLaw, bin_means
+from pbrl_ppl.reporting.words import error, plain, quantity
+from pbrl_ppl.scene import units_of
 from pbrl_ppl.state import Floats
 
 T = TypeVar("T")
+
+#: Below this identifiable share a candidate is marked as hardly identifiable.
+HARDLY = 0.01
+#: Bars of candidates, at most; the report's table has all.
+MOST_CANDIDATES = 20
+
+
+def plot_candidates(loop: Loop, width: float = style.WIDE, level: float = 0.01) -> Figure:
+    """Plot the score of the candidates, best on top, with the threshold of each at a level."""
+    added = {(addition.effect, addition.body) for addition in loop.added}
+    rest = (c for c in loop.candidates[MOST_CANDIDATES:] if (c.effect, c.body) in added)
+    shown = [*loop.candidates[:MOST_CANDIDATES], *rest]
+    figure, (axes,) = style.blank_figure(width, 0.9 + 0.3 * max(len(shown), 3), grid="x")
+    several = len({candidate.body for candidate in shown}) > 1
+    thresholds = [
+        chi2.isf(level / (len(loop.candidates) * max(candidate.n_grid_points, 1)), candidate.dof)
+        for candidate in shown
+    ]
+    style.bars(
+        axes,
+        [f"{plain(c.effect)}{f' · {c.body}' * several}" for c in shown],
+        [c.statistic for c in shown],
+        [style.AFTER if (c.effect, c.body) in added else style.PLAIN for c in shown],
+        [f"{c.statistic:.3g}{', hardly identifiable' * (c.identifiable < HARDLY)}" for c in shown],
+        height=0.7,
+    )
+    axes.plot(thresholds, range(len(shown)), "|", color=style.BEFORE, markersize=16, mew=2)
+    if shown and max(candidate.statistic for candidate in shown) > 12 * max(thresholds):
+        axes.set_xscale("symlog", linthresh=10.0)
+        axes.xaxis.set_major_formatter("{x:g}")
+    axes.margins(x=0.1)
+    axes.set(xlim=(0.0, None), xlabel="score statistic of the effect")
+    colours = {"added": style.AFTER, "not added": style.PLAIN}
+    colours[f"{100 * level:g} % threshold"] = style.BEFORE
+    style.legend(figure, style.patches(colours))
+    return figure
+
+
+def plot_added(loop: Loop, width: float = style.WIDE, most: int = 12) -> Figure:
+    """Plot the posterior of the added effects' parameters, and the values that mean no effect."""
+    shown = [
+        (added, name, estimate)
+        for added in loop.accepted
+        for name, estimate in added.parameters.items()
+    ][:most]
+    columns = min(max(len(shown), 1), 2)
+    width = width if columns > 1 else min(width, 5.0)
+    figure, panels = style.blank_figure(width, 2.6, max(len(shown), 1), columns, "x")
+    draws = scalars(loop.posterior_after)
+    effects = {effect.name: effect for effect in loop.catalogue}
+    for axes, (added, name, estimate) in zip(panels, shown, strict=False):
+        variable, x = f"{added.effect}_{name}[{added.body}]", f"{plain(name)} ({estimate.unit})"
+        if variable in draws:
+            values = draws[variable].to_numpy().ravel()
+            style.density(axes, values, style.AFTER, (values.min(), values.max()), estimate.hdi)
+        axes.plot(estimate.hdi, [-0.06] * 2, color=style.AFTER, linewidth=4, solid_capstyle="butt")
+        axes.plot(estimate.mean, -0.06, "o", color="white", markeredgecolor=style.AFTER)
+        if added.effect in effects:
+            sized = effects[added.effect].in_si(units_of(loop.scene, added.body))
+            null = {parameter.name: parameter.null for parameter in sized.parameters}[name]
+            x += f"; no effect at {null:g}"
+            if abs(null - estimate.mean) < 25 * estimate.sd:
+                axes.axvline(null, color="black", linestyle="--", linewidth=1.2)
+        title = f"{plain(added.effect)} on {added.body}"
+        axes.set(title=title, xlabel=x, ylim=(-0.14, 1.15), yticks=[])
+    return figure
+
+
+def plot_laws(laws: Sequence[ForceLaw], width: float = style.WIDE) -> Figure:
+    """Plot residual forces against the quantities that they depend on, with means and a curve."""
+    count = max(len(laws), 1)
+    figure, panels = style.blank_figure(width, 3.6, count, count)
+    for axes, law in zip(panels, laws, strict=False):
+        axes.plot(law.x, law.residual.values, ".", color=style.PLAIN, markersize=3, alpha=0.6)
+        bins = bin_means(law.x, law.residual.values)
+        axes.errorbar(
+            bins["centre"], bins["mean"], 2 * bins["error"].fillna(0.0), fmt="o",
+            color=style.AFTER, markersize=4, linewidth=1.2, label="mean ± 2 se",
+        )  # fmt: skip
+        axes.axhline(0.0, color="black", linewidth=0.8, zorder=1)
+        order = np.argsort(law.x)
+        axes.plot(
+            law.x[order], law.curve.values, color=style.BEFORE, linewidth=1.8, label="simple curve"
+        )
+        reach = 1.25 * float(np.quantile(np.abs(law.residual.values), 0.98))
+        if reach > 0:  # a few far off would hide the rest
+            axes.set_ylim(-reach, reach)
+        x, force = f"{law.quantity} ({law.unit})".replace(" (1)", ""), law.residual
+        y = f"{force.name}, {force.dimension} ({force.unit})" * (law is laws[0])
+        axes.set(title=f"R² {max(law.curve.share, 0):.2f}", xlabel=x, ylabel=y)
+    if laws:
+        panels[0].legend(frameon=False, fontsize="small")
+    return figure
 
 
 def _models(loop: Loop, before: T, after: T) -> list[tuple[str, T, str]]:
@@ -33,36 +127,28 @@ def plot_residuals(loop: Loop, width: float = style.WIDE) -> Figure:
     figure, (axes,) = style.blank_figure(width, 3.6)
     edge = float(norm.ppf(0.5 + HDI_PROB / 2))
     axes.axhspan(-edge, edge, color=style.BAND, zorder=0)
-    style.zero_line(axes)
+    axes.axhline(0.0, color="black", linewidth=0.8, zorder=1)
     models = _models(loop, loop.residuals_before, loop.residuals_after)
-    largest = 0.0
     for i, (_, residuals, colour) in enumerate(models):
-        for where, name in enumerate(names):
-            place = where + 0.36 * (i - (len(models) - 1) / 2)
-            values = np.asarray(residuals[name], dtype=float)
-            values = values[np.isfinite(values)]
-            if values.size < len(residuals[name]):
-                style.label(axes, "diverged", (place, 0.0), color=colour)
-            if not values.size:
-                continue
-            largest = max(largest, float(np.abs(values).max()))
-            some = values[:: max(1, values.size // 300)]
-            # spread sideways by a sequence that is even and the same on every run
-            aside = (np.arange(some.size) * 0.618 % 1 - 0.5) * 0.24
-            axes.plot(place + aside, some, ".", color=colour, alpha=0.25, markersize=3)
-            ends = np.quantile(values, [0.5 - HDI_PROB / 2, 0.5 + HDI_PROB / 2])
-            axes.plot([place] * 2, ends, color=colour, linewidth=3)
-    if largest > 12:
-        axes.set_yscale("asinh", linear_width=4.0)
-        ticks = [tick for tick in (3, 10, 30, 100, 300, 1000) if tick <= largest]
-        ticks = [*(-tick for tick in reversed(ticks)), 0, *ticks]
-        axes.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
-        axes.set_yticks([], minor=True)
-    axes.set_xticks(range(len(names)), names)
-    axes.set_ylabel("residual / noise")
-    handles: list[Artist] = [Line2D([], [], color=c, linewidth=3, label=n) for n, _, c in models]
-    handles.append(Patch(color=style.BAND, label=f"noise alone, {100 * HDI_PROB:.0f} %"))
-    style.legend(figure, handles)
+        places = np.arange(len(names)) + 0.36 * (i - (len(models) - 1) / 2)
+        values = [np.asarray(residuals[name], dtype=float) for name in names]
+        finite = [each[np.isfinite(each)] for each in values]
+        drawn = axes.boxplot(
+            finite, positions=places, widths=0.3, whis=(50 - 50 * HDI_PROB, 50 + 50 * HDI_PROB),
+            manage_ticks=False, flierprops={"marker": ".", "markeredgecolor": colour, "alpha": 0.3},
+        )  # fmt: skip
+        for line in (*drawn["boxes"], *drawn["whiskers"], *drawn["caps"], *drawn["medians"]):
+            line.set_color(colour)
+        for place, each, seen in zip(places, values, finite, strict=True):
+            if seen.size < each.size:
+                axes.text(place, 0.0, "diverged", color=colour, fontsize=8, ha="center")
+    if np.abs(axes.dataLim.intervaly).max() > 12:
+        axes.set_yscale("symlog", linthresh=10.0)
+        axes.yaxis.set_major_formatter("{x:g}")
+    axes.set(xticks=range(len(names)), xticklabels=names, ylabel="residual / noise")
+    colours = {name: colour for name, _, colour in models}
+    colours[f"noise alone, {100 * HDI_PROB:.0f} %"] = style.BAND
+    style.legend(figure, style.patches(colours))
     return figure
 
 
@@ -86,20 +172,17 @@ def plot_errors(loop: Loop, width: float = style.WIDE) -> Figure:
             found = {d: values.get(d, np.nan) for d in before}
             shown = [np.nan_to_num(v / (scale[d] or np.nan), posinf=0.0) for d, v in found.items()]
             texts = [
-                "diverged"
-                if np.isinf(v)
-                else f"{v:.3g} {style.UNITS.get(d, '')}" * bool(np.isfinite(v))
+                quantity(v, style.UNITS[d]) if np.isfinite(v) else error(v)
                 for d, v in found.items()
             ]
             shift = 0.38 * (i - (len(models) - 1) / 2)
             style.bars(axes, list(before), shown, colour, texts, shift=shift, height=0.36)
         axes.axvline(1.0, color="black", linewidth=1.0, linestyle=":")
         axes.margins(x=0.3)
-        axes.set_xlim(left=0.0)
         scaled_by = "noise floor" if has_floor else "error before"
-        style.name_axes(axes, titles[kind], f"error / {scaled_by}")
-    handles = [Patch(color=colour, label=name) for name, _, colour in _models(loop, 0, 0)]
-    style.legend(figure, handles)
+        axes.set(title=titles[kind], xlabel=f"error / {scaled_by}", xlim=(0.0, None))
+    colours = {name: colour for name, _, colour in _models(loop, 0, 0)}
+    style.legend(figure, style.patches(colours))
     return figure
 
 
@@ -186,7 +269,7 @@ def plot_correlations(loop: Loop, width: float = style.WIDE, most: int = 4) -> F
     for axes, (title, (values, first, size, names)) in zip(panels, panels_of.items(), strict=True):
         edge = norm.isf(0.01 / 2 / max(values.size, 1)) / np.sqrt(max(size, 1))
         axes.axhspan(-edge, edge, color=style.BAND, zorder=0)
-        style.zero_line(axes)
+        axes.axhline(0.0, color="black", linewidth=0.8, zorder=1)
         largest, lags = np.abs(values).max(axis=0), np.arange(first, len(values) + first)
         shown = [i for i in np.argsort(-largest) if largest[i] > edge][:most]
         for i in (i for i in range(values.shape[1]) if i not in shown):
@@ -196,10 +279,8 @@ def plot_correlations(loop: Loop, width: float = style.WIDE, most: int = 4) -> F
         if shown:
             axes.legend(frameon=False, fontsize="small")
         top = max(1.3 * edge, 1.1 * largest.max())
-        axes.set(ylim=(-top, top), xticks=lags)
-        style.name_axes(
-            axes, title, "intervals before", "correlation of errors" * (axes is panels[0])
-        )
+        axes.set(title=title, xlabel="intervals before", ylim=(-top, top), xticks=lags)
+    panels[0].set_ylabel("correlation of errors")
     return figure
 
 
@@ -211,8 +292,8 @@ def plot_growth(loop: Loop, width: float = style.WIDE) -> Figure:
     axes.set_prop_cycle(style.LINES + cycler(marker=list("ooss^^")))
     for name in (name for name, size in growth.floor[-1].items() if size > 0):
         ratio = [
-            error.get(name, np.nan) / (floor.get(name) or np.nan)
-            for error, floor in zip(growth.error, growth.floor, strict=True)
+            errors.get(name, np.nan) / (floor.get(name) or np.nan)
+            for errors, floor in zip(growth.error, growth.floor, strict=True)
         ]
         ended, why = np.flatnonzero(~np.isfinite(ratio)), ""
         if ended.size:
