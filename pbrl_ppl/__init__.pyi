@@ -29,6 +29,7 @@ from .history.mujoco import from_mujoco as from_mujoco
 from .mjcf import mjcf_ranges as mjcf_ranges
 from .mjcf import scene_from_mjcf as scene_from_mjcf
 from .model import SimulatorOp as SimulatorOp
+from .model import physics_model as physics_model
 from .oomdp import LWR as LWR
 from .oomdp import OOLWR as OOLWR
 from .oomdp import Attributes as Attributes
@@ -64,7 +65,6 @@ from .posterior import uninformed as uninformed
 from .posterior import updated_scene as updated_scene
 from .reporting import report as report
 from .sampling import fit as fit
-from .sampling import physics_model as physics_model
 from .sampling import update as update
 from .scene import Actuator as Actuator
 from .scene import Body as Body

@@ -11,7 +11,10 @@ from .data import Observations as Observations
 from .data import estimate_sigma as estimate_sigma
 from .data import sigma_prior as sigma_prior
 from .declared import KINDS as KINDS
+from .declared import at_centre as at_centre
 from .declared import declared_problem as declared_problem
+from .declared import outlined_problem as outlined_problem
+from .declared import try_own_effects as try_own_effects
 from .likelihood import Likelihood as Likelihood
 from .likelihood import LikelihoodT as LikelihoodT
 from .likelihood import NoisePrior as NoisePrior

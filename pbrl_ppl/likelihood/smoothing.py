@@ -64,11 +64,7 @@ def along_trajectories(
     eq_11 = with_predicted_gaps(problem.on(data), phi)
     continued = coordinates is not None
     if coordinates is None:
-        coordinates = observed_coordinates(eq_11.scene, history)
-        check_moves(coordinates, eq_11.scene)
-        states = eq_11.data.smoothed_states
-        medians = tuple(noise_medians(coordinates, eq_11.scene, history, states).tolist())
-        eq_11 = eq_11.with_likelihood(scalar=False, prior=(medians, SPREAD))
+        eq_11, coordinates = _with_noise(eq_11)
     eq_11 = eq_11.with_data(columns=coordinates.columns)
     begin = _guess(eq_11, coordinates, phi)
     sigma = begin if sigma is None else sigma
@@ -86,6 +82,37 @@ def along_trajectories(
         least[steps] = np.minimum(least[steps], moved[steps])
         whole = whole.with_likelihood(prior=(tuple(least.tolist()), SPREAD))
     return whole
+
+
+def as_measured(problem: Problem) -> FilteredProblem:
+    """Return the problem with the likelihood of whole trajectories, not linearised yet.
+
+    States are as measured, gaps interpolated, and the medians of the noise's prior follow from
+    them.
+
+    Raises
+    ------
+    HistoryError
+        If nothing moves.
+    """
+    data = replace(problem.data, horizon=1, states=first_states(problem.data.history))
+    eq_11, coordinates = _with_noise(problem.on(data))
+    eq_11 = eq_11.with_data(columns=coordinates.columns)
+    d = len(coordinates.places)
+    nothing = np.zeros((eq_11.segments.n, d, d))
+    return eq_11.along(linearised(eq_11, coordinates, nothing, eq_11.noise_prior[0]))
+
+
+def _with_noise(
+    problem: Problem[TransitionLikelihood],
+) -> tuple[Problem[TransitionLikelihood], Coordinates]:
+    """Return the problem with the prior of trajectories' noise, and their coordinates."""
+    history, scene = problem.data.history, problem.scene
+    coordinates = observed_coordinates(scene, history)
+    check_moves(coordinates, scene)
+    medians = noise_medians(coordinates, scene, history, problem.data.smoothed_states)
+    prior = tuple(medians.tolist()), SPREAD
+    return problem.with_likelihood(scalar=False, prior=prior), coordinates
 
 
 def single_transitions(problem: Problem) -> Problem[TransitionLikelihood]:
