@@ -16,7 +16,7 @@ from pbrl_ppl.likelihood.coordinates import (
     first_states,
     observed_coordinates,
 )
-from pbrl_ppl.likelihood.data import least_noise
+from pbrl_ppl.likelihood.data import SPREAD, least_noise
 from pbrl_ppl.likelihood.likelihood import LikelihoodT, TransitionLikelihood
 from pbrl_ppl.likelihood.problem import FilteredProblem, Problem
 from pbrl_ppl.likelihood.trajectory_noise import Sensitivity, TrajectoryNoise
@@ -359,12 +359,6 @@ def _touching(problem: Problem, coordinates: Coordinates) -> Bools:
     return smooth | met
 
 
-#: Log-scale of the log-normal priors of errors of measuring and of contact accelerations.
-SPREAD = 2.0
-#: Median of an exponential law, as a share of what it exceeds with a probability of 1 %.
-_MEDIAN = np.log(2.0) / -np.log(0.01)
-
-
 def noise_medians(
     coordinates: Coordinates,
     scene: Scene,
@@ -396,7 +390,9 @@ def noise_medians(
     )
     dt = float(history.dataset.attrs["time_step"])
     sensors, contacts = list(coordinates.sensors), list(coordinates.contacts)
-    steps = acceleration_share * _MEDIAN * _vectors(typical, coordinates.rates) / dt
+    # of an exponential law, as a share of what it exceeds with a probability of 1 %
+    median = np.log(2.0) / -np.log(0.01)
+    steps = acceleration_share * median * _vectors(typical, coordinates.rates) / dt
     medians = sensor_share * seen[sensors], steps, contact_share * typical[contacts] / dt
     rates = least_noise(scene, (*coordinates.rates, *contacts)) / dt
     floors = least_noise(scene, sensors), rates

@@ -354,11 +354,6 @@ def _expected(op, variable, rng, size, predicted, *parameters):  # type: ignore[
     return predicted
 
 
-#: Above this concentration the von Mises density of PyMC 5 overflows; PyMC wants a concentration
-#: above 0, and at this one the density is uniform to the last digit.
-_SHARP, _LEVEL = 500.0, 1e-12
-
-
 def random_variable(
     name: str,
     priors: tuple[Prior, ...],
@@ -408,10 +403,15 @@ def random_variable(
     return pm.Categorical(name, p=p, dims=dims)
 
 
-def _von_mises(name: str, mu: Floats, kappa: Floats, dims: str | tuple[str, ...]) -> TensorVariable:
-    """Declare PyMC's von Mises, or an equal density that does not overflow if it is sharp."""
-    kappa = np.maximum(kappa, _LEVEL)
-    if kappa.max() <= _SHARP:
+def _von_mises(
+    name: str, mu: Floats, kappa: Floats, dims: str | tuple[str, ...], *, sharp: float = 500.0
+) -> TensorVariable:
+    """Declare PyMC's von Mises, or an equal density that does not overflow if it is sharp.
+
+    ``sharp``: concentration above which PyMC 5's density overflows.
+    """
+    kappa = np.maximum(kappa, 1e-12)  # has to be above 0: uniform to the last digit
+    if kappa.max() <= sharp:
         return pm.VonMises(name, mu=mu, kappa=kappa, dims=dims)
     log_norm = np.log(2 * np.pi * i0e(kappa))
     return pm.CustomDist(

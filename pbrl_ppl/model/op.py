@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from functools import cached_property
-from typing import Any, ClassVar, cast
+from functools import cached_property, partial
+from typing import Any, ClassVar
 
 import numpy as np
 import pytensor.tensor as pt
@@ -15,7 +15,7 @@ from pytensor.graph.op import Op
 from pytensor.link.numba.dispatch.basic import generate_fallback_impl, numba_funcify
 
 from pbrl_ppl.errors import FitError, ParameterError, SimulationError
-from pbrl_ppl.likelihood import Likelihood, Problem, Sensitivity, is_filtered, is_independent
+from pbrl_ppl.likelihood import Likelihood, Problem, is_filtered, is_independent
 from pbrl_ppl.physics import Memory, Physics
 from pbrl_ppl.state import INPUT, WRENCH, Bools, Floats
 
@@ -167,21 +167,14 @@ class SimulatorOp(_BlackBoxOp):
     ----------
     physics : Physics
         Scene, effects and the engine's settings.
-    engine : str, optional
-        ``chipmunk`` or ``contact-free`` to force one; see :class:`Physics`.
-    one_world : bool
-        Let bodies of independent parts meet, as draws of next states do.
     """
 
-    __props__: tuple[str, ...] = ("physics", "one_world")
+    __props__: tuple[str, ...] = ("physics",)
     differentiable = (0,)
     reason = "the engine is differentiated by phi alone"
 
-    def __init__(
-        self, physics: Physics, *, engine: str | None = None, one_world: bool = False
-    ) -> None:
-        self.physics = physics if engine is None else physics.changed(engine=engine)
-        self.one_world = one_world
+    def __init__(self, physics: Physics) -> None:
+        self.physics = physics
 
     def make_node(self, phi: Variable, start: Variable, actions: Variable) -> Apply:
         """Check the dimensions and static shapes of the inputs.
@@ -228,8 +221,7 @@ class SimulatorOp(_BlackBoxOp):
     predict = evaluate
 
     def _states(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
-        engine = self.physics.one_world if self.one_world else self.physics.simulator.recall
-        return engine(phi, start, actions)
+        return self.physics.simulator.recall(phi, start, actions)
 
     def _begun(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
         """Return initial states at phi."""
@@ -257,26 +249,24 @@ class PredictionOp(SimulatorOp):
     lazy : LazyProblem
         Linearised at the first evaluation.
     one_world : bool
-        As of :class:`SimulatorOp`.
+        Let bodies of independent parts meet, as draws of next states do.
     """
 
     __props__ = ("lazy", "one_world")
 
     def __init__(self, lazy: LazyProblem, *, one_world: bool = False) -> None:
-        super().__init__(lazy.outline.physics, one_world=one_world)
-        self.lazy, self._memory = lazy, Memory()
+        super().__init__(lazy.outline.physics)
+        self.lazy, self.one_world, self._memory = lazy, one_world, Memory()
 
     def _states(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
         start = self.lazy.start(start, actions)
-        if self.lazy.problem.likelihood.sensitivity is None:
-            return super()._states(phi, start, actions)
+        engine = self.physics.one_world if self.one_world else self.physics.simulator.recall
+        sensitivity = self.lazy.problem.likelihood.sensitivity
+        if sensitivity is None:
+            return engine(phi, start, actions)
+        follow = partial(sensitivity.predicted, engine)
         # a copy: a graph may write into its arrays
-        return self._memory.recall((phi, start, actions), self._following).copy()
-
-    def _following(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
-        """Return predictions from initial states that follow phi."""
-        sensitivity = cast(Sensitivity, self.lazy.problem.likelihood.sensitivity)
-        return sensitivity.predicted(super()._states, phi, start, actions)
+        return self._memory.recall((phi, start, actions), follow).copy()
 
     def _begun(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
         start = self.lazy.start(start, actions)
@@ -388,10 +378,6 @@ class NoiseMediansOp(Op):
         """Return a node without inputs."""
         size = len(self.lazy.outline.noise_prior[0])
         return Apply(self, [], [pt.tensor(dtype="float64", shape=(size,))])
-
-    def infer_shape(self, *arguments: object) -> list[tuple[int]]:
-        """Return (parameter,), known without the medians."""
-        return [(len(self.lazy.outline.noise_prior[0]),)]
 
     def do_constant_folding(self, *arguments: object) -> bool:
         """Return False: compiling a graph smooths nothing."""

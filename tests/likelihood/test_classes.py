@@ -5,8 +5,7 @@ import pytest
 
 import pbrl_ppl as pp
 from pbrl_ppl.history import History, with_units
-from pbrl_ppl.likelihood import Problem, along_trajectories
-from pbrl_ppl.likelihood.log_posterior import log_posterior, log_prior
+from pbrl_ppl.likelihood import Problem, along_trajectories, log_posterior, log_prior
 from pbrl_ppl.model import physics_model, problem_in
 from pbrl_ppl.parameters import ParameterLibrary
 from pbrl_ppl.physics import PartedSimulator, Physics, build_layout, independent_parts

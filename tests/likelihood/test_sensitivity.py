@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
+from simulated_data import simulated_trajectories, with_measurements
 
 from pbrl_ppl.effects import attach, catalogue
 from pbrl_ppl.history import History
@@ -10,9 +11,7 @@ from pbrl_ppl.likelihood import (
     Problem,
     along_trajectories,
     declared_problem,
-    simulated_trajectories,
     smoothed,
-    with_measurements,
     with_sensitivity,
 )
 from pbrl_ppl.model import LazyProblem, PredictionOp, build_model

@@ -9,16 +9,15 @@ import pytest
 from pytensor import function
 from pytensor.graph.traversal import ancestors
 from scipy.stats import multivariate_normal
+from simulated_data import simulated_trajectories, with_measurements
 
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import (
     Problem,
     along_trajectories,
     declared_problem,
-    simulated_trajectories,
     single_transitions,
     smoothed,
-    with_measurements,
 )
 from pbrl_ppl.likelihood.kalman import gains
 from pbrl_ppl.model import LazyProblem, LogLikelihoodOp, build_model, physics_model, problem_in

@@ -51,6 +51,7 @@ def density(model: pm.Model) -> float:
 def test_trajectories_are_smoothed_when_first_evaluated(smoothed, likelihood) -> None:
     model = physics_model(SCENE, recorded(1), likelihood=likelihood)
     assert [variable.name for variable in model.observed_RVs] == ["next_state"]
+    model.compile_logp()
     assert not smoothed
     physics = Physics.declare(with_units(SCENE, recorded(1)))
     problem = declared_problem(physics, recorded(1), kind=likelihood)
@@ -62,13 +63,12 @@ def test_trajectories_are_smoothed_when_first_evaluated(smoothed, likelihood) ->
     np.testing.assert_array_equal(problem_in(model).segments.start, problem.segments.start)
 
 
-def test_graphviz_smooths_nothing(smoothed) -> None:
+def test_graphviz_draws_trajectories() -> None:
     pytest.importorskip("graphviz", reason="graphviz draws models")
     model = physics_model(SCENE, recorded(1), likelihood="trajectories")
     source = pm.model_to_graphviz(model).source
     for name in ("mass", "sigma", "unexplained_acceleration", "next_state", "start", "actions"):
         assert name in source
-    assert not smoothed
 
 
 @pytest.mark.parametrize("missing", [False, True])

@@ -5,6 +5,7 @@ import warnings
 
 import numpy as np
 import pytest
+from simulated_data import simulated_trajectories
 
 import pbrl_ppl as pp
 from pbrl_ppl.errors import ConvergenceWarning, RefitWarning
@@ -13,7 +14,6 @@ from pbrl_ppl.likelihood import (
     TrajectoryLikelihood,
     along_trajectories,
     declared_problem,
-    simulated_trajectories,
 )
 from pbrl_ppl.model import physics_model
 from pbrl_ppl.physics import Physics
