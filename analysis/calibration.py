@@ -26,6 +26,7 @@ from rich.console import Console
 from rich.progress import track
 from scipy.signal import lfilter
 from scipy.stats import binom, chisquare
+from simulated_data import simulated_trajectories, with_measurements
 
 import pbrl_ppl as pp
 from pbrl_ppl import likelihood as likelihoods
@@ -145,7 +146,7 @@ def trajectories(design: Problem, phi: Floats, sigma: Floats, seed: int, colour:
     rngs = [np.random.default_rng([seed, i]) for i in range(len(phi))]
     if likelihoods.is_filtered(design):
         drawn = zip(phi, sigma, rngs, strict=True)
-        every = np.array([likelihoods.simulated_trajectories(design, *draw) for draw in drawn])
+        every = np.array([simulated_trajectories(design, *draw) for draw in drawn])
     else:
         every = np.repeat(design.data.smoothed_states[None], len(phi), axis=0)
         # without process noise; each piece of the design is a whole trajectory
@@ -168,7 +169,7 @@ def simulated(design: Problem, values: Floats) -> Problem:
     """
     if not likelihoods.is_independent(design):
         measured = np.isfinite(design.data.history.dataset["observed"].to_numpy())
-        return likelihoods.with_measurements(design, np.where(measured, values, np.nan))
+        return with_measurements(design, np.where(measured, values, np.nan))
     segments, observations = design.segments, design.observations
     observed = np.full((*segments.actions.shape[:3], len(STATE)), np.nan)
     observed[..., list(observations.columns)] = np.where(observations.measured, values, np.nan)

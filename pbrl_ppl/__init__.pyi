@@ -26,6 +26,7 @@ from .history import Segments as Segments
 from .history.bags import bag_topics as bag_topics
 from .history.bags import read_bag as read_bag
 from .model import SimulatorOp as SimulatorOp
+from .model import physics_model as physics_model
 from .oomdp import LWR as LWR
 from .oomdp import OOLWR as OOLWR
 from .oomdp import Attributes as Attributes
@@ -61,7 +62,6 @@ from .posterior import uninformed as uninformed
 from .posterior import updated_scene as updated_scene
 from .reporting import report as report
 from .sampling import fit as fit
-from .sampling import physics_model as physics_model
 from .sampling import update as update
 from .scene import Actuator as Actuator
 from .scene import Body as Body

@@ -13,8 +13,7 @@ from reliability.commands import run
 from reliability.valid import UNKNOWN, commands
 
 from pbrl_ppl.history import read_recording, read_scene
-from pbrl_ppl.model import problem_in
-from pbrl_ppl.sampling import physics_model
+from pbrl_ppl.model import physics_model, problem_in
 from tests.helpers.drawn import Case, cases, drawn_case
 
 pytestmark = [pytest.mark.one_stack, pytest.mark.slow]

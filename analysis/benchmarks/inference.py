@@ -32,7 +32,7 @@ import pbrl_ppl as pp
 from pbrl_ppl import Physics
 from pbrl_ppl.history import lever
 from pbrl_ppl.likelihood import Problem
-from pbrl_ppl.model import LogLikelihoodOp, problem_in
+from pbrl_ppl.model import LazyProblem, LogLikelihoodOp, problem_in
 from pbrl_ppl.model.declaration import random_variable
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.parameters import WHEEL_PARAMETERS
@@ -282,7 +282,9 @@ def plain_model(model: pm.Model) -> pm.Model:
         )
         median, spread = problem.noise_prior
         sigma = pm.LogNormal("sigma", mu=np.log(median), sigma=spread, dims="state")
-        logp = LogLikelihoodOp(problem)(problem.observations.values, loop(phi), sigma, phi)
+        logp = LogLikelihoodOp(LazyProblem(problem))(
+            problem.observations.values, loop(phi), sigma, phi
+        )
         pm.Potential("likelihood", logp.sum())
     return plain
 

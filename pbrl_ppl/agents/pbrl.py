@@ -18,13 +18,18 @@ from pbrl_ppl.effects import Attached, Effect, Structure, attach, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, FitError, UninformedWarning
 from pbrl_ppl.history import from_segments, with_units
-from pbrl_ppl.likelihood import Problem, TransitionLikelihood, declared_problem
+from pbrl_ppl.likelihood import (
+    Problem,
+    TransitionLikelihood,
+    declared_problem,
+    try_own_effects,
+)
 from pbrl_ppl.modes import Mode, choose_from_library, find_mode
 from pbrl_ppl.parameters import Layout, ParameterLibrary
 from pbrl_ppl.physics import Physics, build_layout, touching
 from pbrl_ppl.planning import Dynamics
 from pbrl_ppl.posterior import group
-from pbrl_ppl.sampling import sample, try_own_effects
+from pbrl_ppl.sampling import sample
 from pbrl_ppl.scene import Scene, body_sizes
 from pbrl_ppl.state import THETA, Bools, Floats, wrapped
 

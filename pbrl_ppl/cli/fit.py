@@ -104,13 +104,14 @@ def fit(
     declared, effects = options.added_effects(declared, options.own_effects(reading.effect_file))
     progress("loading the sampler")
     from pbrl_ppl import sampling
+    from pbrl_ppl.model import physics_model
     from pbrl_ppl.physics import check_history
     from pbrl_ppl.posterior import load_posterior, save_posterior
 
     check_history(declared, loaded, loaded.segments(1))
     earlier = None if resume is None else load_posterior(resume)
     try:
-        made = sampling.physics_model(
+        made = physics_model(
             declared, loaded, effects, likelihood=model.likelihood, horizon=model.horizon,
             nu=model.nu, sigma="scalar" if model.scalar else "per_dimension",
         )  # fmt: skip

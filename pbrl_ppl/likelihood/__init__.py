@@ -1,6 +1,5 @@
 """Likelihoods in numpy: data, noise, Eq. 11, whole trajectories and the log-posterior."""
 
-from .autocovariance import autocovariance as autocovariance
 from .coordinates import ACCELERATION as ACCELERATION
 from .coordinates import CONTACT as CONTACT
 from .coordinates import Coordinates as Coordinates
@@ -11,7 +10,17 @@ from .data import Observations as Observations
 from .data import estimate_sigma as estimate_sigma
 from .data import sigma_prior as sigma_prior
 from .declared import KINDS as KINDS
+from .declared import at_centre as at_centre
 from .declared import declared_problem as declared_problem
+from .declared import draw_prior as draw_prior
+from .declared import exponential as exponential
+from .declared import log_noise_prior as log_noise_prior
+from .declared import log_posterior as log_posterior
+from .declared import log_prior as log_prior
+from .declared import noise_law as noise_law
+from .declared import noise_prior_slope as noise_prior_slope
+from .declared import outlined_problem as outlined_problem
+from .declared import try_own_effects as try_own_effects
 from .likelihood import Likelihood as Likelihood
 from .likelihood import LikelihoodT as LikelihoodT
 from .likelihood import NoisePrior as NoisePrior
@@ -21,17 +30,9 @@ from .likelihood import log_norm as log_norm
 from .likelihood import next_state_random as next_state_random
 from .likelihood import noise_labels as noise_labels
 from .likelihood import robust as robust
-from .log_posterior import draw_prior as draw_prior
-from .log_posterior import exponential as exponential
-from .log_posterior import log_noise_prior as log_noise_prior
-from .log_posterior import log_posterior as log_posterior
-from .log_posterior import log_prior as log_prior
-from .log_posterior import noise_law as noise_law
-from .log_posterior import noise_prior_slope as noise_prior_slope
-from .log_posterior import simulated_trajectories as simulated_trajectories
-from .log_posterior import with_measurements as with_measurements
 from .output_error import OutputErrorLikelihood as OutputErrorLikelihood
 from .output_error import SimulatedProblem as SimulatedProblem
+from .output_error import autocovariance as autocovariance
 from .output_error import in_pieces as in_pieces
 from .output_error import is_simulated as is_simulated
 from .output_error import linearised_about as linearised_about
@@ -53,7 +54,6 @@ from .problem import with_defect as with_defect
 from .smoothing import along_trajectories as along_trajectories
 from .smoothing import bodies_acceleration as bodies_acceleration
 from .smoothing import linearised as linearised
-from .smoothing import noise_medians as noise_medians
 from .smoothing import single_transitions as single_transitions
 from .smoothing import smoothed as smoothed
 from .smoothing import with_sensitivity as with_sensitivity

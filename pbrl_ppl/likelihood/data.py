@@ -14,6 +14,9 @@ from pbrl_ppl.physics import check_history
 from pbrl_ppl.scene import Scene, state_sizes
 from pbrl_ppl.state import STATE, THETA, Bools, Floats, wrapped
 
+#: Standard deviation of the logarithm of noise under its log-normal priors.
+SPREAD = 2.0
+
 
 @dataclass(frozen=True)
 class Observations:
@@ -86,6 +89,11 @@ class Observations:
         difference[..., ~self.measured] = 0.0
         return np.asarray(difference)
 
+    def root_mean_square(self, residual: Floats) -> Floats:
+        """Return that of a residual (transition, H, body, state) by dimension, shape (state,)."""
+        count = np.maximum(self.measured.sum((0, 1, 2)), 1)
+        return np.asarray(np.sqrt((residual**2).sum((0, 1, 2)) / count))
+
 
 def least_noise(scene: Scene, columns: Sequence[int], *, share: float = 1e-9) -> Floats:
     """Return the least noise of state dimensions, shape (column,).
@@ -107,10 +115,8 @@ def sigma_prior(
     spread : float
         Standard deviation of the logarithm.
     """
-    change = observations.residual(segments.start[:, None])
-    seen = observations.measured
-    typical = np.sqrt((change**2).sum((0, 1, 2)) / np.maximum(seen.sum((0, 1, 2)), 1))
-    return np.maximum(0.1 * typical, least_noise(scene, observations.columns)), 2.0
+    typical = observations.root_mean_square(observations.residual(segments.start[:, None]))
+    return np.maximum(0.1 * typical, least_noise(scene, observations.columns)), SPREAD
 
 
 def estimate_sigma(residual: Floats, observations: Observations, scene: Scene) -> Floats:
@@ -125,9 +131,8 @@ def estimate_sigma(residual: Floats, observations: Observations, scene: Scene) -
     scene : Scene
         Its sizes give a scale to histories without noise.
     """
-    count = np.maximum(observations.measured.sum((0, 1, 2)), 1)
     least = least_noise(scene, observations.columns)
-    return np.asarray(np.maximum(np.sqrt((residual**2).sum((0, 1, 2)) / count), least))
+    return np.maximum(observations.root_mean_square(residual), least)
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any, Generic, Self, TypeGuard
+from typing import Any, Generic, Self, TypeGuard, cast
 
 import numpy as np
 
@@ -54,16 +54,16 @@ def degrees_of_freedom(physics: Physics, phi: Floats, nu: float | None) -> Float
         Shape (..., 1, 1, body, 1), to go with (..., transition, H, body, state); infinite for a
         Gaussian.
     """
-    labels = physics.layout.labels
-    tails = np.zeros((*phi.shape[:-1], 1, 1, len(physics.scene.moving), 1))
+    labels, bodies = physics.layout.labels, [body.name for body in physics.scene.moving]
+    tails = np.zeros((*phi.shape[:-1], 1, 1, len(bodies), 1))
     tails += 0.0 if nu is None else 1.0 / nu
-    for i, body in enumerate(physics.scene.moving):
-        for attached in at_stage(physics.effects, Noise):
-            if attached.body == body.name and isinstance(attached.effect.stage, Noise):
-                values = (phi[..., labels.index(label)] for label in attached.labels)
-                names = (parameter.name for parameter in attached.effect.parameters)
-                inverse = attached.effect.stage.tail(dict(zip(names, values, strict=True)))
-                tails[..., 0, 0, i, 0] += inverse
+    for attached in at_stage(physics.effects, Noise):
+        if attached.body in bodies:
+            values = (phi[..., labels.index(label)] for label in attached.labels)
+            names = (parameter.name for parameter in attached.effect.parameters)
+            stage = cast(Noise, attached.effect.stage)
+            inverse = stage.tail(dict(zip(names, values, strict=True)))
+            tails[..., 0, 0, bodies.index(attached.body), 0] += inverse
     with np.errstate(divide="ignore"):
         return np.asarray(1.0 / np.maximum(tails, 0.0))
 
@@ -157,13 +157,10 @@ class Problem(Generic[LikelihoodT]):
         """Return the same problem with other noise; arguments are fields of its likelihood."""
         return replace(self, likelihood=replace(self.likelihood, **changes))
 
-    def along(self, noise: TrajectoryNoise, **changes: Any) -> FilteredProblem:
-        """Return the same problem with the likelihood of whole trajectories.
-
-        ``changes`` are other fields of :class:`TrajectoryLikelihood`.
-        """
-        settings = {"nu": self.likelihood.nu, "prior": self.likelihood.prior, **changes}
-        likelihood = TrajectoryLikelihood(noise=noise, **settings)
+    def along(self, noise: TrajectoryNoise) -> FilteredProblem:
+        """Return the same problem with the likelihood of whole trajectories."""
+        nu, prior = self.likelihood.nu, self.likelihood.prior
+        likelihood = TrajectoryLikelihood(noise=noise, nu=nu, prior=prior)
         return Problem(self.data, self.physics, likelihood, self.library, self.defect)
 
     @property
@@ -239,7 +236,7 @@ class Problem(Generic[LikelihoodT]):
     @property
     def measured(self) -> Floats:
         """Measured next states, shape (transition, H, body, state), NaN where missing."""
-        if not isinstance(self.likelihood, TrajectoryLikelihood):
+        if not is_filtered(self):
             return self.observations.values
         segments = self.segments
         observed = self.data.history.dataset["observed"].to_numpy()
@@ -320,12 +317,12 @@ FilteredProblem = Problem[TrajectoryLikelihood]
 
 def is_independent(problem: Problem) -> TypeGuard[Problem[TransitionLikelihood]]:
     """Return whether transitions are independent given measured initial states (Eq. 11)."""
-    return isinstance(problem.likelihood, TransitionLikelihood)
+    return problem.likelihood.name == TransitionLikelihood.name
 
 
 def is_filtered(problem: Problem) -> TypeGuard[FilteredProblem]:
     """Return whether the problem's trajectories are filtered, with process noise."""
-    return isinstance(problem.likelihood, TrajectoryLikelihood)
+    return problem.likelihood.name == TrajectoryLikelihood.name
 
 
 def with_defect(problem: Problem[LikelihoodT], exact: Problem, phi: Floats) -> Problem[LikelihoodT]:

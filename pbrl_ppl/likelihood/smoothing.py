@@ -16,7 +16,7 @@ from pbrl_ppl.likelihood.coordinates import (
     first_states,
     observed_coordinates,
 )
-from pbrl_ppl.likelihood.data import least_noise
+from pbrl_ppl.likelihood.data import SPREAD, least_noise
 from pbrl_ppl.likelihood.likelihood import LikelihoodT, TransitionLikelihood
 from pbrl_ppl.likelihood.problem import FilteredProblem, Problem
 from pbrl_ppl.likelihood.trajectory_noise import Sensitivity, TrajectoryNoise
@@ -64,11 +64,7 @@ def along_trajectories(
     eq_11 = with_predicted_gaps(problem.on(data), phi)
     continued = coordinates is not None
     if coordinates is None:
-        coordinates = observed_coordinates(eq_11.scene, history)
-        check_moves(coordinates, eq_11.scene)
-        states = eq_11.data.smoothed_states
-        medians = tuple(noise_medians(coordinates, eq_11.scene, history, states).tolist())
-        eq_11 = eq_11.with_likelihood(scalar=False, prior=(medians, SPREAD))
+        eq_11, coordinates = _with_noise(eq_11)
     eq_11 = eq_11.with_data(columns=coordinates.columns)
     begin = _guess(eq_11, coordinates, phi)
     sigma = begin if sigma is None else sigma
@@ -86,6 +82,37 @@ def along_trajectories(
         least[steps] = np.minimum(least[steps], moved[steps])
         whole = whole.with_likelihood(prior=(tuple(least.tolist()), SPREAD))
     return whole
+
+
+def as_measured(problem: Problem) -> FilteredProblem:
+    """Return the problem with the likelihood of whole trajectories, not linearised yet.
+
+    States are as measured, gaps interpolated, and the medians of the noise's prior follow from
+    them.
+
+    Raises
+    ------
+    HistoryError
+        If nothing moves.
+    """
+    data = replace(problem.data, horizon=1, states=first_states(problem.data.history))
+    eq_11, coordinates = _with_noise(problem.on(data))
+    eq_11 = eq_11.with_data(columns=coordinates.columns)
+    d = len(coordinates.places)
+    nothing = np.zeros((eq_11.segments.n, d, d))
+    return eq_11.along(linearised(eq_11, coordinates, nothing, eq_11.noise_prior[0]))
+
+
+def _with_noise(
+    problem: Problem[TransitionLikelihood],
+) -> tuple[Problem[TransitionLikelihood], Coordinates]:
+    """Return the problem with the prior of trajectories' noise, and their coordinates."""
+    history, scene = problem.data.history, problem.scene
+    coordinates = observed_coordinates(scene, history)
+    check_moves(coordinates, scene)
+    medians = noise_medians(coordinates, scene, history, problem.data.smoothed_states)
+    prior = tuple(medians.tolist()), SPREAD
+    return problem.with_likelihood(scalar=False, prior=prior), coordinates
 
 
 def single_transitions(problem: Problem) -> Problem[TransitionLikelihood]:
@@ -332,12 +359,6 @@ def _touching(problem: Problem, coordinates: Coordinates) -> Bools:
     return smooth | met
 
 
-#: Log-scale of the log-normal priors of errors of measuring and of contact accelerations.
-SPREAD = 2.0
-#: Median of an exponential law, as a share of what it exceeds with a probability of 1 %.
-_MEDIAN = np.log(2.0) / -np.log(0.01)
-
-
 def noise_medians(
     coordinates: Coordinates,
     scene: Scene,
@@ -369,7 +390,9 @@ def noise_medians(
     )
     dt = float(history.dataset.attrs["time_step"])
     sensors, contacts = list(coordinates.sensors), list(coordinates.contacts)
-    steps = acceleration_share * _MEDIAN * _vectors(typical, coordinates.rates) / dt
+    # of an exponential law, as a share of what it exceeds with a probability of 1 %
+    median = np.log(2.0) / -np.log(0.01)
+    steps = acceleration_share * median * _vectors(typical, coordinates.rates) / dt
     medians = sensor_share * seen[sensors], steps, contact_share * typical[contacts] / dt
     rates = least_noise(scene, (*coordinates.rates, *contacts)) / dt
     floors = least_noise(scene, sensors), rates

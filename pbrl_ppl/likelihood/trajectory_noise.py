@@ -25,10 +25,6 @@ from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Bools, Floats, Ints
 from pbrl_ppl.threads import in_parallel, processors
 
-#: Larger changes of a state count as divergence, in typical sizes of its coordinates.
-_FAR = 1e6
-#: Innovations beyond this many standard deviations count as divergence: squares would overflow.
-_BEYOND = 1e100
 #: Predicts next states from phi, initial states and inputs, as a simulator does.
 Engine = Callable[[Floats, Floats, Floats], Floats]
 
@@ -71,11 +67,6 @@ class Sensitivity:
         parts = [self.before[row].reshape(-1, self.phi.shape[1]) for row in rows]
         return list(zip(sets, rows, parts, strict=True))
 
-    @cached_property
-    def _far(self) -> Floats:
-        """Changes of the coordinates that count as divergence, shape (coordinate,)."""
-        return _FAR * self.coordinates.sizes(self.scene)
-
     def at(self, rows: NDArray[np.intp]) -> Sensitivity:
         """Return the sensitivity of these transitions alone."""
         return replace(self, slope=self.slope[rows], phi=self.phi[rows], before=self.before[rows])
@@ -93,7 +84,9 @@ class Sensitivity:
         states = np.broadcast_to(start, (*moved.shape[:-2], *start.shape))
         return self.coordinates.completed(self.scene, self._added(states, moved))
 
-    def predicted(self, engine: Engine, phi: Floats, start: Floats, inputs: Floats) -> Floats:
+    def predicted(
+        self, engine: Engine, phi: Floats, start: Floats, inputs: Floats, *, far: float = 1e6
+    ) -> Floats:
         """Return next states from smoothed initial states, shape (..., transition, 1, body, 6).
 
         Parameters
@@ -106,11 +99,11 @@ class Sensitivity:
             Smoothed states before the transitions, shape (transition, body, 6), SI units.
         inputs : ndarray
             What acts, shape (transition, 1, body, 3 or 9).
+        far : float
+            Least change of a coordinate that counts as divergence, in its typical size.
         """
-        moved = self.moved(phi)
-        moved = np.where(
-            np.abs(moved) < self._far, moved, np.nan
-        )  # nothing is predicted from there
+        moved, limit = self.moved(phi), far * self.coordinates.sizes(self.scene)
+        moved = np.where(np.abs(moved) < limit, moved, np.nan)  # nothing is predicted from there
         states = engine(phi, self.begun(np.nan_to_num(moved), start), inputs)
         back = np.matmul(self.slope, moved[..., None])[..., 0]
         return self._added(states, -back[..., None, :])
@@ -206,7 +199,9 @@ class TrajectoryNoise:
         """1 where bodies touch in a transition and 0 elsewhere, shape (transition,)."""
         return self.touching.astype(np.int64)
 
-    def whitened(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
+    def whitened(
+        self, residual: Floats, sigma: Floats, *, beyond: float = 1e100
+    ) -> tuple[Floats, Floats]:
         """Return whitened innovations with the log of their standard deviations.
 
         Parameters
@@ -215,6 +210,9 @@ class TrajectoryNoise:
             Linearised minus predicted states, shape (..., transition, 1, body, state).
         sigma : ndarray
             Noise parameters, shape (parameter,) or (..., parameter) with the same leading axes.
+        beyond : float
+            Least innovation that counts as divergence (standard deviations): its square would
+            overflow.
 
         Returns
         -------
@@ -233,7 +231,7 @@ class TrajectoryNoise:
             sigmas = np.broadcast_to(sigma, (*lead, sigma.shape[-1])).reshape(-1, sigma.shape[-1])
             white, log_scale = self._whitened(rows, sigmas)
             log_scale = log_scale.reshape(coordinates.shape[:-1])
-        white = np.where(np.abs(white) < _BEYOND, white, np.nan)
+        white = np.where(np.abs(white) < beyond, white, np.nan)
         return white.reshape(coordinates.shape), log_scale
 
     def _whitened(

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from functools import cached_property
-from typing import Any, ClassVar, cast
+from functools import cached_property, partial
+from typing import Any, ClassVar
 
 import numpy as np
 import pytensor.tensor as pt
@@ -14,13 +14,85 @@ from pytensor.graph.basic import Apply, Variable
 from pytensor.graph.op import Op
 from pytensor.link.numba.dispatch.basic import generate_fallback_impl, numba_funcify
 
-from pbrl_ppl.errors import ParameterError, SimulationError
-from pbrl_ppl.likelihood import Problem, Sensitivity, is_filtered
+from pbrl_ppl.errors import FitError, ParameterError, SimulationError
+from pbrl_ppl.likelihood import Likelihood, Problem, is_filtered, is_independent
 from pbrl_ppl.physics import Memory, Physics
-from pbrl_ppl.state import INPUT, WRENCH, Floats
+from pbrl_ppl.state import INPUT, WRENCH, Bools, Floats
 
 #: Symbolic sizes of an array's axes.
 Shape = tuple[Variable, ...]
+
+
+class LazyProblem:
+    """A problem as declared, whose trajectories are linearised when it is first needed.
+
+    Parameters
+    ----------
+    outline : Problem
+        Has the final variables, dimensions and measurements.
+    linearise : callable, optional
+        Returns the problem of an outline; the outline is the problem without it.
+    """
+
+    def __init__(
+        self, outline: Problem, linearise: Callable[[Problem], Problem] | None = None
+    ) -> None:
+        self.outline, self._linearise = outline, linearise
+
+    @cached_property
+    def problem(self) -> Problem:
+        """The problem that is fitted."""
+        return self.outline if self._linearise is None else self._linearise(self.outline)
+
+    @cached_property
+    def _declared(self) -> tuple[Floats, Floats]:
+        """Initial states and inputs as declared."""
+        return self.outline.segments.start, self.outline.inputs
+
+    def start(self, start: Floats, actions: Floats) -> Floats:
+        """Return what to start from: smoothed states, or those of data that a user has set.
+
+        Raises
+        ------
+        FitError
+            If they were set and the likelihood holds for the declared ones alone.
+        """
+        given = zip((start, actions), self._declared, strict=True)
+        if all(np.array_equal(one, other, equal_nan=True) for one, other in given):
+            return self.problem.segments.start
+        self._refuse_other_data("start or actions", is_independent(self.outline))
+        parts = len(self.outline.physics.simulator.parts)
+        if parts > 1:
+            raise FitError(
+                f"pm.set_data: start or actions are set, and bodies are simulated in {parts} worlds"
+                " because they never meet in the declared recording; declare a physics_model of"
+                " the other recording"
+            )
+        return start
+
+    def measured(self, value: Floats) -> Floats:
+        """Return measured states, NaN where missing.
+
+        Raises
+        ------
+        FitError
+            If they are not the declared ones, and pieces begin at those.
+        """
+        value = np.ma.filled(value, np.nan)  # pm.set_data masks missing cells
+        outline = self.outline
+        if not (is_independent(outline) or is_filtered(outline)):
+            same = np.array_equal(value, outline.measured, equal_nan=True)
+            self._refuse_other_data("measured", same)
+        return value
+
+    def _refuse_other_data(self, names: str, fine: bool) -> None:
+        if not fine:
+            kind = self.outline.likelihood.name
+            raise FitError(
+                f"pm.set_data: {names} are set, and the likelihood {kind!r} is linearised along the"
+                " declared recording; declare a physics_model of the other recording, or use the"
+                " likelihood 'transitions'"
+            )
 
 
 class _BlackBoxOp(Op):
@@ -82,15 +154,6 @@ class _PullbackOp(Op):
             place[0] = value
 
 
-@numba_funcify.register(_BlackBoxOp)
-@numba_funcify.register(_PullbackOp)
-def _in_object_mode(op: Op, node: Apply | None = None, **kwargs: object) -> object:
-    """Dispatch the Op in numba as pytensor does by itself, without its warning."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        return generate_fallback_impl(op, node=node, **kwargs)
-
-
 class DensityOp(_BlackBoxOp):
     """Log-density of a point (d,), for samplers that need no derivative.
 
@@ -122,35 +185,20 @@ class SimulatorOp(_BlackBoxOp):
     or all of :data:`pbrl_ppl.state.INPUT` in place of the 3; the output has shape (transition, H,
     body, 6); all float64, in SI units. A transition in which the engine diverges is NaN, and so is
     everything where phi is impossible (a mass that is not positive, say): the likelihood of that is
-    zero. The derivative by phi is by finite differences, all columns in one call of the engine. It
-    leaves out that initial states follow phi: the correction to the smoothed states cancels that.
+    zero. The derivative by phi is by finite differences, all columns in one call of the engine.
 
     Parameters
     ----------
     physics : Physics
         Scene, effects and the engine's settings.
-    sensitivity : Sensitivity, optional
-        Derivative of smoothed initial states of whole trajectories by phi.
-    engine : str, optional
-        ``chipmunk`` or ``contact-free`` to force one; see :class:`Physics`.
-    one_world : bool
-        Let bodies of independent parts meet, as draws of next states do.
     """
 
-    __props__ = ("physics", "sensitivity", "one_world")
+    __props__: tuple[str, ...] = ("physics",)
     differentiable = (0,)
     reason = "the engine is differentiated by phi alone"
 
-    def __init__(
-        self,
-        physics: Physics,
-        sensitivity: Sensitivity | None = None,
-        *,
-        engine: str | None = None,
-        one_world: bool = False,
-    ) -> None:
-        self.physics = physics if engine is None else physics.changed(engine=engine)
-        self.sensitivity, self.one_world = sensitivity, one_world
+    def __init__(self, physics: Physics) -> None:
+        self.physics = physics
 
     def make_node(self, phi: Variable, start: Variable, actions: Variable) -> Apply:
         """Check the dimensions and static shapes of the inputs.
@@ -187,40 +235,67 @@ class SimulatorOp(_BlackBoxOp):
         actions = arguments[-1][2]  # older stacks pass (fgraph, node, shapes), newer (node, shapes)
         return [(*actions[:3], 6)]
 
-    @cached_property
-    def _memory(self) -> Memory:
-        return Memory()
-
     def evaluate(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
         """Run the engine; NaN where phi is impossible."""
         try:
-            if self.sensitivity is None:
-                return self._engine(phi, start, actions)
-            # a copy: a graph may write into its arrays
-            return self._memory.recall((phi, start, actions), self._with_state_sensitivity).copy()
+            return self._states(phi, start, actions)
         except ParameterError:  # samplers try such points: their likelihood is zero
             return np.full((*actions.shape[:3], 6), np.nan)
 
     predict = evaluate
 
-    @property
-    def _engine(self) -> Callable[[Floats, Floats, Floats], Floats]:
-        return self.physics.one_world if self.one_world else self.physics.simulator.recall
+    def _states(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
+        return self.physics.simulator.recall(phi, start, actions)
 
-    def _with_state_sensitivity(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
-        """Return predictions from initial states that follow phi."""
-        return cast(Sensitivity, self.sensitivity).predicted(self._engine, phi, start, actions)
+    def _begun(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
+        """Return initial states at phi."""
+        return start
 
     def pulled(
         self, phi: Floats, start: Floats, actions: Floats, cotangent: Floats
     ) -> list[Floats]:
         """Return the vector-Jacobian product by phi."""
         try:
-            if self.sensitivity is not None:
-                start = self.sensitivity.begun(self.sensitivity.moved(phi), start)
+            start = self._begun(phi, start, actions)
             return [np.tensordot(cotangent, self.physics.jacobian(phi, start, actions), 4)]
         except ParameterError:
             return [np.full(len(phi), np.nan)]
+
+
+class PredictionOp(SimulatorOp):
+    """Predictions of a problem, as :class:`SimulatorOp`, from smoothed states if it has such.
+
+    The derivative leaves out that smoothed initial states follow phi: the correction to them
+    cancels that.
+
+    Parameters
+    ----------
+    lazy : LazyProblem
+        Linearised at the first evaluation.
+    one_world : bool
+        Let bodies of independent parts meet, as draws of next states do.
+    """
+
+    __props__ = ("lazy", "one_world")
+
+    def __init__(self, lazy: LazyProblem, *, one_world: bool = False) -> None:
+        super().__init__(lazy.outline.physics)
+        self.lazy, self.one_world, self._memory = lazy, one_world, Memory()
+
+    def _states(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
+        start = self.lazy.start(start, actions)
+        engine = self.physics.one_world if self.one_world else self.physics.simulator.recall
+        sensitivity = self.lazy.problem.likelihood.sensitivity
+        if sensitivity is None:
+            return engine(phi, start, actions)
+        follow = partial(sensitivity.predicted, engine)
+        # a copy: a graph may write into its arrays
+        return self._memory.recall((phi, start, actions), follow).copy()
+
+    def _begun(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
+        start = self.lazy.start(start, actions)
+        sensitivity = self.lazy.problem.likelihood.sensitivity
+        return start if sensitivity is None else sensitivity.begun(sensitivity.moved(phi), start)
 
 
 class LogLikelihoodOp(_BlackBoxOp):
@@ -233,16 +308,16 @@ class LogLikelihoodOp(_BlackBoxOp):
 
     Parameters
     ----------
-    problem : Problem
+    lazy : LazyProblem
         Its likelihood, and what was measured.
     """
 
-    __props__ = ("problem",)
+    __props__ = ("lazy",)
     differentiable = (1, 2, 3)
     reason = "the log-likelihood is not differentiated by what was measured"
 
-    def __init__(self, problem: Problem) -> None:
-        self.problem, self._likelihood = problem, problem.likelihood
+    def __init__(self, lazy: LazyProblem) -> None:
+        self.lazy = lazy
 
     def make_node(self, *inputs: Variable) -> Apply:
         """Cast the inputs; shapes as in the class."""
@@ -253,48 +328,95 @@ class LogLikelihoodOp(_BlackBoxOp):
         """Return (transition,) from the shape of the measurements."""
         return [(arguments[-1][0][0],)]
 
-    def _residual(self, value: Floats, predicted: Floats) -> Floats:
-        """Return residuals about the linearisation, and set the likelihood to the measurements."""
-        observations = self.problem.observations
-        linearised = np.nan_to_num(observations.values) if is_filtered(self.problem) else value
-        deviation = observations.wrapped(value - linearised)
-        self._likelihood = self._likelihood.measuring(deviation)  # kept, with its gains
-        residual = observations.wrapped(linearised - predicted)
-        return np.where(observations.measured, residual, 0.0)
+    @cached_property
+    def _likelihood(self) -> Likelihood:
+        return self.lazy.problem.likelihood
 
-    def _density(self, residual: Floats, sigma: Floats, phi: Floats) -> Floats:
+    def _residual(self, value: Floats, predicted: Floats) -> tuple[Floats, Bools]:
+        """Return residuals about the linearisation, and a mask of what counts.
+
+        The likelihood is set to the measurements.
+        """
+        observations, value = self.lazy.problem.observations, self.lazy.measured(value)
+        measured = np.isfinite(value)
+        if is_filtered(self.lazy.problem):
+            linearised, measured = np.nan_to_num(observations.values), observations.measured
+            deviation = np.nan_to_num(observations.wrapped(value - linearised))
+            self._likelihood = self._likelihood.measuring(deviation)  # kept, with its gains
+            value = linearised
+        return np.where(measured, observations.wrapped(value - predicted), 0.0), measured
+
+    def _density(self, residual: Floats, measured: Bools, sigma: Floats, phi: Floats) -> Floats:
         if not (np.isfinite(sigma).all() and (sigma > 0).all()):
             return np.full(len(residual), -np.inf)
-        measured = self.problem.observations.measured
         with np.errstate(all="ignore"):  # samplers try points where it overflows
-            return self._likelihood.log_density(residual, sigma, measured, self.problem.nu(phi))
+            nu = self.lazy.problem.nu(phi)
+            return self._likelihood.log_density(residual, sigma, measured, nu)
 
     def evaluate(self, value: Floats, predicted: Floats, sigma: Floats, phi: Floats) -> Floats:
         """Return the log-likelihoods."""
-        return self._density(self._residual(value, predicted), sigma, phi)
+        return self._density(*self._residual(value, predicted), sigma, phi)
 
     def pulled(
         self, value: Floats, predicted: Floats, sigma: Floats, phi: Floats, cotangent: Floats,
         *, step: float = 1e-5,
     ) -> list[Floats]:  # fmt: skip
         """Return derivatives by predictions, noise and phi; ``step`` is relative in the noise."""
-        residual, nu = self._residual(value, predicted), self.problem.nu(phi)
-        slope = self._likelihood.slope(residual, sigma, nu, cotangent)
+        residual, measured = self._residual(value, predicted)
+        slope = self._likelihood.slope(residual, sigma, self.lazy.problem.nu(phi), cotangent)
 
-        def by_differences(point: Floats, i: int, step: float, **others: Floats) -> float:
+        def by_difference(i: int, point: Floats, step: float, *, of_noise: bool) -> float:
             ends = [point.copy(), point.copy()]
             ends[0][i] += step
             ends[1][i] = max(point[i] - step, 0.0)
-            name = "sigma" if "phi" in others else "phi"
-            high, low = (self._density(residual, **{name: end}, **others) for end in ends)
+            high, low = (
+                self._density(residual, measured, *((end, phi) if of_noise else (sigma, end)))
+                for end in ends
+            )
             return float((high - low) @ cotangent / (ends[0][i] - ends[1][i]))
 
-        by_sigma = [by_differences(sigma, i, step * x, phi=phi) for i, x in enumerate(sigma)]
+        by_sigma = [by_difference(i, sigma, step * x, of_noise=True) for i, x in enumerate(sigma)]
         by_phi = np.zeros_like(phi)
-        for i in self.problem.tails:
-            by_phi[i] = by_differences(phi, i, step, sigma=sigma)
-        return [
-            np.where(self.problem.observations.measured, -slope, 0.0),
-            np.array(by_sigma),
-            by_phi,
-        ]
+        for i in self.lazy.problem.tails:
+            by_phi[i] = by_difference(i, phi, step, of_noise=False)
+        return [np.where(measured, -slope, 0.0), np.array(by_sigma), by_phi]
+
+
+class NoiseMediansOp(Op):
+    """Medians of the prior of a problem's noise parameters, shape (parameter,).
+
+    They follow from smoothed states, and are computed with those.
+
+    Parameters
+    ----------
+    lazy : LazyProblem
+        Linearised at the first evaluation.
+    """
+
+    __props__ = ("lazy",)
+
+    def __init__(self, lazy: LazyProblem) -> None:
+        self.lazy = lazy
+
+    def make_node(self) -> Apply:
+        """Return a node without inputs."""
+        size = len(self.lazy.outline.noise_prior[0])
+        return Apply(self, [], [pt.tensor(dtype="float64", shape=(size,))])
+
+    def do_constant_folding(self, *arguments: object) -> bool:
+        """Return False: compiling a graph smooths nothing."""
+        return False
+
+    def perform(self, node: Apply, inputs: Sequence[Floats], outputs: list[list[Floats]]) -> None:
+        """Compute the medians."""
+        outputs[0][0] = self.lazy.problem.noise_prior[0].copy()  # a graph may write into it
+
+
+@numba_funcify.register(_BlackBoxOp)
+@numba_funcify.register(_PullbackOp)
+@numba_funcify.register(NoiseMediansOp)
+def _in_object_mode(op: Op, node: Apply | None = None, **kwargs: object) -> object:
+    """Dispatch the Op in numba as pytensor does by itself, without its warning."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        return generate_fallback_impl(op, node=node, **kwargs)

@@ -1,7 +1,5 @@
 """Draws from the posterior: `fit` and its samplers, and `update`."""
 
-from .declaration import physics_model as physics_model
-from .declaration import try_own_effects as try_own_effects
 from .fitting import DEFAULT as DEFAULT
 from .fitting import fit as fit
 from .fitting import sample as sample

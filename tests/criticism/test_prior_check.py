@@ -15,9 +15,8 @@ from pbrl_ppl.criticism.prior_check import (
 )
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.history import History
-from pbrl_ppl.model import problem_in
+from pbrl_ppl.model import physics_model, problem_in
 from pbrl_ppl.reporting import plot_prior_check, png
-from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.scene import Body, Scene, Shape
 from pbrl_ppl.state import STATE
 from tests.helpers.carts import CART, cart_scene

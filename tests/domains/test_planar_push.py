@@ -8,10 +8,9 @@ import pytest
 
 from pbrl_ppl.criticism import close_loop
 from pbrl_ppl.history import History
-from pbrl_ppl.model import problem_in
+from pbrl_ppl.model import physics_model, problem_in
 from pbrl_ppl.modes import Mode, find_mode
 from pbrl_ppl.physics import Transition
-from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.scene import Scene
 
 

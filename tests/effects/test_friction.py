@@ -6,10 +6,9 @@ import pytest
 from pbrl_ppl.effects import attach, catalogue
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.history import from_segments
-from pbrl_ppl.model import problem_in
+from pbrl_ppl.model import physics_model, problem_in
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.physics import Physics, Simulator
-from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.scene import Body, Scene, Shape, Wall
 from tests.helpers.plain import simulator_of
 from tests.helpers.worlds import BY_NAME, G, body, predict, simulator, state

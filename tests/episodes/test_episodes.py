@@ -26,8 +26,9 @@ from pbrl_ppl.agents import Agent, Revision, TrueModelAgent
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.errors import UninformedWarning
 from pbrl_ppl.history import from_segments
+from pbrl_ppl.model import physics_model
 from pbrl_ppl.posterior import group, load_posterior
-from pbrl_ppl.sampling import fit, physics_model
+from pbrl_ppl.sampling import fit
 from tests.helpers.tasks import CART, CART_TRUTH, PUCK, PUCK_TRUTH, puck_world
 
 

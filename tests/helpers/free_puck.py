@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from simulated_data import with_measurements
 
 from pbrl_ppl.criticism import DEFAULT, Criteria, Search
 from pbrl_ppl.criticism.search import SearchResult
 from pbrl_ppl.effects import candidates
 from pbrl_ppl.history import History
-from pbrl_ppl.likelihood import Problem, along_trajectories, with_measurements
+from pbrl_ppl.likelihood import Problem, along_trajectories
 from pbrl_ppl.modes import Mode, find_mode, trajectory_mode
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Body, Scene, Shape

@@ -10,10 +10,11 @@ from pbrl_ppl.criticism.loop import Loop
 from pbrl_ppl.criticism.results import Added, Estimate, Unexplained
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.history import History
+from pbrl_ppl.model import physics_model
 from pbrl_ppl.modes import trajectory_mode
 from pbrl_ppl.posterior import Fit
 from pbrl_ppl.posterior.store import from_groups, groups
-from pbrl_ppl.sampling import fit, physics_model
+from pbrl_ppl.sampling import fit
 from tests.helpers.free_puck import DISC, Disc
 from tests.helpers.made_up import made_up
 

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from pbrl_ppl.history import History
+from pbrl_ppl.model import physics_model
 from pbrl_ppl.posterior import save_posterior
-from pbrl_ppl.sampling import fit, physics_model
+from pbrl_ppl.sampling import fit
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.histories import simulated_history
 from tests.helpers.places import ROOT

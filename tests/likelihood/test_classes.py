@@ -5,15 +5,14 @@ import pytest
 
 import pbrl_ppl as pp
 from pbrl_ppl.history import History, with_units
-from pbrl_ppl.likelihood import Problem, along_trajectories
-from pbrl_ppl.likelihood.log_posterior import log_posterior, log_prior
-from pbrl_ppl.model import problem_in
+from pbrl_ppl.likelihood import Problem, along_trajectories, log_posterior, log_prior
+from pbrl_ppl.model import physics_model, problem_in
 from pbrl_ppl.parameters import ParameterLibrary
 from pbrl_ppl.physics import PartedSimulator, Physics, build_layout, independent_parts
 from pbrl_ppl.planning import ActionSet, Dynamics, Goal
 from pbrl_ppl.posterior import learned_library, library_probabilities, updated_scene
 from pbrl_ppl.posterior.store import scalars
-from pbrl_ppl.sampling import fit, physics_model
+from pbrl_ppl.sampling import fit
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.histories import simulated_history
 

@@ -4,13 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from simulated_data import simulated_trajectories, with_measurements
 
 from pbrl_ppl.likelihood import (
     Problem,
     along_trajectories,
-    simulated_trajectories,
     smoothed,
-    with_measurements,
 )
 from pbrl_ppl.likelihood.smoothing import linearised
 from pbrl_ppl.model import build_model

@@ -5,12 +5,12 @@ import pytest
 from pymc.model.transform.conditioning import remove_value_transforms
 
 from pbrl_ppl.likelihood import log_posterior, log_prior
-from pbrl_ppl.model import problem_in
+from pbrl_ppl.model import physics_model, problem_in
 from pbrl_ppl.modes import Space, find_mode
 from pbrl_ppl.modes.noise import profile_sigma
 from pbrl_ppl.parameters import ParameterLibrary
 from pbrl_ppl.posterior import draws, parameter_draws, stored_mode, updated_mode
-from pbrl_ppl.sampling import fit, physics_model
+from pbrl_ppl.sampling import fit
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, state_sizes
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history

@@ -13,12 +13,12 @@ from pbrl_ppl.criticism.held_out import HeldOut, example_rollout
 from pbrl_ppl.errors import MeetingWarning
 from pbrl_ppl.history import from_segments
 from pbrl_ppl.likelihood import ACCELERATION, Problem, TrajectoryLikelihood, along_trajectories
-from pbrl_ppl.model import build_model, problem_in
+from pbrl_ppl.model import build_model, physics_model, problem_in
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.modes.search import find_mode
 from pbrl_ppl.physics import Physics, Simulator
 from pbrl_ppl.posterior import Fit, evaluate, from_groups, group, problem_of
-from pbrl_ppl.sampling import fit, fitting, physics_model
+from pbrl_ppl.sampling import fit, fitting
 from pbrl_ppl.sampling.fitting import joined_at
 from pbrl_ppl.scene import Body, Scene, Shape
 from pbrl_ppl.state import STATE

@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
+from simulated_data import simulated_trajectories, with_measurements
 
 from pbrl_ppl.effects import attach, catalogue
 from pbrl_ppl.history import History
@@ -10,12 +11,10 @@ from pbrl_ppl.likelihood import (
     Problem,
     along_trajectories,
     declared_problem,
-    simulated_trajectories,
     smoothed,
-    with_measurements,
     with_sensitivity,
 )
-from pbrl_ppl.model import SimulatorOp, build_model
+from pbrl_ppl.model import LazyProblem, PredictionOp, build_model
 from pbrl_ppl.parameters import change_from
 from pbrl_ppl.physics import PartedSimulator, Physics, Simulator, build_layout
 from pbrl_ppl.posterior import parameter_draws, problem_of
@@ -104,8 +103,8 @@ def test_the_op_remembers_what_follows(cart) -> None:
     """In any order of parameters, and whatever a graph writes into what it was given."""
     still, phi = cart
     follows = with_sensitivity(still, phi, BLIND)
-    given = follows.segments.start, follows.segments.inputs
-    op = SimulatorOp(follows.physics, follows.likelihood.noise.sensitivity)
+    given = follows.segments.start, follows.inputs
+    op = PredictionOp(LazyProblem(follows))
     others = phi * (1.0 + 0.02 * np.random.default_rng(2).standard_normal((6, len(phi))))
     expected = [follows.predict(other) for other in others]
     for i in (0, 1, 0, 0, 5, 4, 3, 2, 1, 0):

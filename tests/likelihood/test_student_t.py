@@ -9,10 +9,10 @@ from scipy.stats import t as student
 
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import TransitionLikelihood, next_state_random, robust
-from pbrl_ppl.model import LogLikelihoodOp, problem_in
+from pbrl_ppl.model import LazyProblem, LogLikelihoodOp, physics_model, problem_in
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.posterior import draws
-from pbrl_ppl.sampling import fit, physics_model
+from pbrl_ppl.sampling import fit
 from pbrl_ppl.state import STATE
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import NOISE, simulated_history
@@ -60,7 +60,8 @@ def test_the_model_s_density_is_the_same(scene, clean) -> None:
     phi = problem.layout.to_vector(CART)
     mean = problem.predict(phi)[..., problem.observations.columns]
     value, sigma = problem.observations.values, np.array(NOISE)
-    found = LogLikelihoodOp(problem)(*map(pt.as_tensor, (value, mean, sigma, phi))).eval()
+    op = LogLikelihoodOp(LazyProblem(problem))
+    found = op(*map(pt.as_tensor, (value, mean, sigma, phi))).eval()
     residual = problem.residual(phi)
     np.testing.assert_allclose(found, problem.log_density(residual, np.array(NOISE)))
 

@@ -7,10 +7,9 @@ from scipy import stats
 from pbrl_ppl.effects import Effect, EffectParameter, Noise, catalogue
 from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.likelihood import log_norm, log_posterior, robust
-from pbrl_ppl.model import problem_in
+from pbrl_ppl.model import physics_model, problem_in
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.parameters import Prior
-from pbrl_ppl.sampling import physics_model
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import NOISE, simulated_history
 

@@ -9,10 +9,10 @@ import pytest
 from scipy.optimize import least_squares
 
 from pbrl_ppl.errors import ConvergenceWarning
-from pbrl_ppl.model import problem_in
+from pbrl_ppl.model import physics_model, problem_in
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.posterior.store import group
-from pbrl_ppl.sampling import fit, physics_model
+from pbrl_ppl.sampling import fit
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.histories import simulated_history
 

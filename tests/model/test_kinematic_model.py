@@ -6,12 +6,12 @@ import pytest
 from pbrl_ppl.errors import GoalError, HistoryError
 from pbrl_ppl.history import History, from_segments
 from pbrl_ppl.likelihood import along_trajectories
-from pbrl_ppl.model import problem_in
+from pbrl_ppl.model import physics_model, problem_in
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.physics import Transition
 from pbrl_ppl.planning import Action, ActionSet, Dynamics, Goal, plan
 from pbrl_ppl.posterior import load_posterior, problem_of, save_posterior
-from pbrl_ppl.sampling import fit, physics_model
+from pbrl_ppl.sampling import fit
 from pbrl_ppl.scene import Body, Scene, Shape
 
 NOISE = np.array([1e-3, 1e-3, 2e-3, 5e-3, 5e-3, 1e-2])

@@ -15,9 +15,8 @@ from pbrl_ppl.effects import catalogue
 from pbrl_ppl.errors import EffectError, HistoryError, SimulationError
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem, along_trajectories
-from pbrl_ppl.model import problem_in
+from pbrl_ppl.model import physics_model, problem_in
 from pbrl_ppl.physics import Physics
-from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, units_of
 from pbrl_ppl.state import STATE, WRENCH
 from tests.helpers.carts import CART, cart_scene

@@ -308,8 +308,9 @@ def test_an_engine_can_be_forced() -> None:
     op = make()
     values = inputs(op)
     values[1][..., 0] -= 20.0  # far from the wall
-    chipmunk, fast = (SimulatorOp(op.physics, engine=e) for e in ("chipmunk", "contact-free"))
-    assert chipmunk != op and chipmunk == SimulatorOp(op.physics, engine="chipmunk")
+    forced = [op.physics.changed(engine=engine) for engine in ("chipmunk", "contact-free")]
+    chipmunk, fast = map(SimulatorOp, forced)
+    assert chipmunk != op and chipmunk == SimulatorOp(forced[0])
     np.testing.assert_array_equal(fast.predict(*values), op.predict(*values))
     np.testing.assert_allclose(chipmunk.predict(*values), op.predict(*values), atol=1e-11)
 

@@ -3,8 +3,9 @@
 import pytest
 
 from pbrl_ppl.errors import SceneError
+from pbrl_ppl.model import physics_model
 from pbrl_ppl.posterior import joint_probabilities
-from pbrl_ppl.sampling import fit, physics_model
+from pbrl_ppl.sampling import fit
 from pbrl_ppl.scene import Body, Joint, Scene, Shape
 from tests.helpers.histories import simulated_history
 

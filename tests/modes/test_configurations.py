@@ -16,7 +16,7 @@ from scipy.special import logsumexp
 from pbrl_ppl.errors import FitError, PosteriorError, RefitWarning, UninformedWarning
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem
-from pbrl_ppl.model import problem_in
+from pbrl_ppl.model import physics_model, problem_in
 from pbrl_ppl.modes import Mode, find_mode, weigh
 from pbrl_ppl.modes.configurations import (
     Configuration,
@@ -40,7 +40,7 @@ from pbrl_ppl.posterior import (
     save_posterior,
     updated_scene,
 )
-from pbrl_ppl.sampling import fit, mixture, physics_model, updating
+from pbrl_ppl.sampling import fit, mixture, updating
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene, Shape
 from pbrl_ppl.state import STATE, WRENCH
 from tests.helpers.histories import simulated_history

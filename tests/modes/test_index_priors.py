@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pbrl_ppl.errors import PosteriorError, SceneError
-from pbrl_ppl.model import problem_in
+from pbrl_ppl.model import physics_model, problem_in
 from pbrl_ppl.modes import Mode, Weighed
 from pbrl_ppl.modes.configurations import (
     configurations,
@@ -20,7 +20,7 @@ from pbrl_ppl.modes.configurations import (
 from pbrl_ppl.modes.importance import Marginal
 from pbrl_ppl.physics import build_layout, index_priors
 from pbrl_ppl.posterior import draws, from_groups, group, updated_scene
-from pbrl_ppl.sampling import mixture, physics_model
+from pbrl_ppl.sampling import mixture
 from pbrl_ppl.scene import WORLD, Joint, Scene
 from tests.helpers.histories import simulated_history
 from tests.helpers.joints import scene

@@ -7,10 +7,9 @@ import pytest
 from pbrl_ppl.effects import attach, candidates
 from pbrl_ppl.errors import FitError, ParameterError
 from pbrl_ppl.history import History
-from pbrl_ppl.model import problem_in
+from pbrl_ppl.model import physics_model, problem_in
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.physics import Physics, Simulator, build_layout
-from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.scene import WORLD, Joint, Scene
 from tests.helpers.histories import simulated_history
 from tests.helpers.joints import HINGED, NAMES, POSES, reference_anchors, scene

@@ -15,12 +15,12 @@ from scipy.special import logsumexp
 
 import pbrl_ppl as pp
 from pbrl_ppl.errors import FitError, ParameterError, PosteriorError, RefitWarning
-from pbrl_ppl.model import build_model, problem_in
+from pbrl_ppl.model import build_model, physics_model, problem_in
 from pbrl_ppl.parameters import ParameterLibrary
 from pbrl_ppl.posterior import learned_library, library_probabilities, problem_of
 from pbrl_ppl.posterior import save_posterior as save
 from pbrl_ppl.posterior.store import convergence, draws, from_groups, group, load_posterior
-from pbrl_ppl.sampling import fit, physics_model, update
+from pbrl_ppl.sampling import fit, update
 from pbrl_ppl.scene import Body, Joint, Scene, Shape
 from tests.helpers.histories import simulated_history
 from tests.helpers.marks import OBJECT_MODE

@@ -7,6 +7,7 @@ from scipy import stats
 
 from pbrl_ppl.effects import attach
 from pbrl_ppl.effects.friction import wheel
+from pbrl_ppl.model import physics_model
 from pbrl_ppl.parameters import (
     Layout,
     by_prior,
@@ -16,7 +17,6 @@ from pbrl_ppl.parameters import (
     wheels,
 )
 from pbrl_ppl.physics import build_layout
-from pbrl_ppl.sampling import physics_model
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
 from tests.helpers.marks import OBJECT_MODE

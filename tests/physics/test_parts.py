@@ -10,12 +10,11 @@ import pytest
 
 from pbrl_ppl.errors import SceneError, SimulationError
 from pbrl_ppl.history import History
-from pbrl_ppl.model import problem_in
+from pbrl_ppl.model import physics_model, problem_in
 from pbrl_ppl.modes import Space
 from pbrl_ppl.parameters import inside
 from pbrl_ppl.physics import PartedSimulator, Physics, Simulator, build_layout, independent_parts
 from pbrl_ppl.physics.parts import Memory
-from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.histories import COLUMNS
 from tests.helpers.places import RECORDED

@@ -10,12 +10,12 @@ import pytest
 import xarray as xr
 from pymc.stats import compute_log_prior
 
-from pbrl_ppl.model import problem_in
+from pbrl_ppl.model import physics_model, problem_in
 from pbrl_ppl.parameters import wheels
 from pbrl_ppl.posterior import by_number, from_groups, group, groups, loo_pit, predicted_rows
 from pbrl_ppl.posterior.completion import predictive_rows, prior_groups
 from pbrl_ppl.posterior.store import DATATREE, load_posterior, save_posterior
-from pbrl_ppl.sampling import fit, physics_model, sample, update
+from pbrl_ppl.sampling import fit, sample, update
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
 from tests.helpers.stacks import SCENE, fitted, history

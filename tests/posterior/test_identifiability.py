@@ -9,12 +9,12 @@ import pytest
 import pbrl_ppl as pp
 from pbrl_ppl.effects import Effect, EffectParameter
 from pbrl_ppl.errors import ConvergenceWarning
-from pbrl_ppl.model import problem_in
+from pbrl_ppl.model import physics_model, problem_in
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.posterior import draws, identify, uninformed
 from pbrl_ppl.posterior.identifiability import _spread
-from pbrl_ppl.sampling import fit, physics_model
+from pbrl_ppl.sampling import fit
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
 

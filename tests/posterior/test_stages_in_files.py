@@ -8,11 +8,11 @@ import pytest
 
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.history import History
-from pbrl_ppl.model import problem_in
+from pbrl_ppl.model import physics_model, problem_in
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.planning import Dynamics, plan
 from pbrl_ppl.posterior import load_posterior, problem_of, save_posterior
-from pbrl_ppl.sampling import fit, fitting, physics_model, update
+from pbrl_ppl.sampling import fit, fitting, update
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.histories import simulated_history
 

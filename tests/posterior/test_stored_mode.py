@@ -10,6 +10,7 @@ import pytest
 
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.likelihood import log_posterior
+from pbrl_ppl.model import physics_model
 from pbrl_ppl.parameters import ParameterLibrary
 from pbrl_ppl.planning import Dynamics, plan
 from pbrl_ppl.posterior import (
@@ -22,7 +23,7 @@ from pbrl_ppl.posterior import (
     stored_mode,
 )
 from pbrl_ppl.posterior.record import ParameterPoint, packed_mode
-from pbrl_ppl.sampling import fit, physics_model, update
+from pbrl_ppl.sampling import fit, update
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
 

@@ -11,12 +11,13 @@ from scipy import stats
 import pbrl_ppl as pp
 from pbrl_ppl.effects import attach
 from pbrl_ppl.errors import ConvergenceWarning, ParameterError, PosteriorError, SceneError
+from pbrl_ppl.model import physics_model
 from pbrl_ppl.model.declaration import random_variable
 from pbrl_ppl.parameters import Prior, nearest
 from pbrl_ppl.physics import build_layout
 from pbrl_ppl.posterior import draws, from_groups, group, groups
 from pbrl_ppl.posterior.updated_prior import moment_matched, updated_scene
-from pbrl_ppl.sampling import fit, physics_model
+from pbrl_ppl.sampling import fit
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history

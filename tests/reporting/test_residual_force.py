@@ -9,12 +9,13 @@ import pytest
 from pbrl_ppl.criticism.dependence import FEATURES, PRODUCTS
 from pbrl_ppl.criticism.results import Unexplained, diverged_after
 from pbrl_ppl.history import History
+from pbrl_ppl.model import physics_model
 from pbrl_ppl.modes import trajectory_mode
 from pbrl_ppl.posterior import Fit
 from pbrl_ppl.reporting.loop_plots import plot_laws
 from pbrl_ppl.reporting.motion import animation, distance, divergence_in_words, held_out_motions
 from pbrl_ppl.reporting.residual_force import bin_means, find_laws
-from pbrl_ppl.sampling import fit, physics_model
+from pbrl_ppl.sampling import fit
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.free_puck import DISC, Disc
 from tests.helpers.made_up import made_up

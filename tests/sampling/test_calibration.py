@@ -18,11 +18,11 @@ from scipy import stats
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem, TransitionLikelihood, declared_problem
-from pbrl_ppl.model import build_model, problem_in
+from pbrl_ppl.model import build_model, physics_model, problem_in
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.posterior import Fit, from_groups
 from pbrl_ppl.posterior.store import groups
-from pbrl_ppl.sampling import physics_model, sample
+from pbrl_ppl.sampling import sample
 from pbrl_ppl.scene import Body, Joint, Scene, Shape
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history

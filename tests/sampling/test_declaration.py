@@ -7,12 +7,13 @@ import arviz as az
 import numpy as np
 import pymc as pm
 import pytest
+from simulated_data import simulated_trajectories
 
 import pbrl_ppl as pp
 from pbrl_ppl.cli import main
 from pbrl_ppl.errors import ConvergenceWarning, FitError, PosteriorError
 from pbrl_ppl.history import History
-from pbrl_ppl.likelihood import declared_problem, simulated_trajectories, smoothed
+from pbrl_ppl.likelihood import declared_problem, smoothed
 from pbrl_ppl.model import problem_in
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.posterior import (

@@ -8,9 +8,9 @@ from scipy.special import logsumexp
 
 from pbrl_ppl.errors import ConvergenceWarning
 from pbrl_ppl.likelihood import log_prior
-from pbrl_ppl.model import problem_in
+from pbrl_ppl.model import physics_model, problem_in
 from pbrl_ppl.posterior import convergence, draws
-from pbrl_ppl.sampling import fit, physics_model
+from pbrl_ppl.sampling import fit
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
 

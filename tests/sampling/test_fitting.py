@@ -18,7 +18,7 @@ from pbrl_ppl.errors import (
     PosteriorError,
     UninformedWarning,
 )
-from pbrl_ppl.model import problem_in
+from pbrl_ppl.model import physics_model, problem_in
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.posterior import (
     convergence,
@@ -32,7 +32,6 @@ from pbrl_ppl.posterior import (
 )
 from pbrl_ppl.posterior import save_posterior as save
 from pbrl_ppl.posterior.completion import MAX_RHAT, MIN_ESS, complete
-from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.sampling.fitting import METHODS, fit
 from pbrl_ppl.scene import Shape, Wall
 from tests.helpers.carts import CART, cart_scene

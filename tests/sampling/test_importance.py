@@ -11,7 +11,7 @@ from scipy.stats import ks_2samp, kstest, kstwobign, norm
 
 from pbrl_ppl.effects import Effect, EffectParameter
 from pbrl_ppl.errors import ConvergenceWarning, FitError, RefitWarning
-from pbrl_ppl.model import problem_in
+from pbrl_ppl.model import physics_model, problem_in
 from pbrl_ppl.modes import (
     Space,
     adaptive_importance,
@@ -36,7 +36,7 @@ from pbrl_ppl.posterior import (
     scalars,
     smoothed,
 )
-from pbrl_ppl.sampling import fit, physics_model, update
+from pbrl_ppl.sampling import fit, update
 from pbrl_ppl.sampling.importance import Reference, draw_proposals, resample
 from pbrl_ppl.scene import Body, Scene, Shape, Wall
 from tests.helpers.carts import CART, cart_scene

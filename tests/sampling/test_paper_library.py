@@ -6,10 +6,11 @@ import numpy as np
 import pymc as pm
 import pytest
 
+from pbrl_ppl.model import physics_model
 from pbrl_ppl.parameters import ParameterLibrary
 from pbrl_ppl.planning import Dynamics
 from pbrl_ppl.posterior import convergence, draws, group
-from pbrl_ppl.sampling import fit, physics_model
+from pbrl_ppl.sampling import fit
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.histories import simulated_history
 from tests.helpers.marks import OBJECT_MODE

@@ -5,10 +5,10 @@ import pymc as pm
 import pytest
 
 from pbrl_ppl.errors import ConvergenceWarning
-from pbrl_ppl.model import problem_in
+from pbrl_ppl.model import physics_model, problem_in
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.posterior import group
-from pbrl_ppl.sampling import fit, physics_model
+from pbrl_ppl.sampling import fit
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
 

@@ -11,10 +11,9 @@ import pbrl_ppl as pp
 from pbrl_ppl.cli import main
 from pbrl_ppl.errors import FitError, PosteriorError, RefitWarning
 from pbrl_ppl.likelihood import log_posterior
-from pbrl_ppl.model import problem_in
+from pbrl_ppl.model import physics_model, problem_in
 from pbrl_ppl.modes import find_simulation_mode
 from pbrl_ppl.posterior import PosteriorRecord, group, parameter_draws, problem_of, stored_mode
-from pbrl_ppl.sampling import physics_model
 from tests.helpers.falls import BALL, GRAVITY, MASS, fall
 from tests.helpers.marks import OBJECT_MODE
 

@@ -5,12 +5,12 @@ import pytest
 
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import Problem
-from pbrl_ppl.model import problem_in
+from pbrl_ppl.model import physics_model, problem_in
 from pbrl_ppl.modes import Space, find_mode
 from pbrl_ppl.parameters import ParameterLibrary
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.posterior import parameter_draws
-from pbrl_ppl.sampling import fit, physics_model
+from pbrl_ppl.sampling import fit
 from pbrl_ppl.sampling.methods import METHODS, SamplerRun, dispersed, prior_starts
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history

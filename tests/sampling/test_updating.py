@@ -19,7 +19,7 @@ from pbrl_ppl.errors import (
     RefitWarning,
 )
 from pbrl_ppl.history import History
-from pbrl_ppl.model import build_model
+from pbrl_ppl.model import build_model, physics_model
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.posterior import (
     convergence,
@@ -35,7 +35,7 @@ from pbrl_ppl.posterior import (
     scene_of,
     smoothed,
 )
-from pbrl_ppl.sampling import fit, physics_model, update
+from pbrl_ppl.sampling import fit, update
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history

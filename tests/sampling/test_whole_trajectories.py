@@ -5,6 +5,7 @@ import warnings
 
 import numpy as np
 import pytest
+from simulated_data import simulated_trajectories
 
 import pbrl_ppl as pp
 from pbrl_ppl.errors import ConvergenceWarning, RefitWarning
@@ -13,14 +14,13 @@ from pbrl_ppl.likelihood import (
     TrajectoryLikelihood,
     along_trajectories,
     declared_problem,
-    simulated_trajectories,
 )
+from pbrl_ppl.model import physics_model
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.planning import Dynamics
 from pbrl_ppl.posterior import convergence, group, parameter_draws, problem_of
 from pbrl_ppl.posterior.store import scalars
 from pbrl_ppl.reporting import render_posterior
-from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.scene import Body, Scene, Shape
 from pbrl_ppl.state import STATE
 from tests.helpers.histories import simulated_history
