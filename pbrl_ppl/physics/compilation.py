@@ -10,7 +10,11 @@ from pbrl_ppl.physics.physics import Transition
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 
 #: The loops by what moves in them: single bodies, joined ones or bodies on friction, and contacts.
-LOOPS = {"single": lockstep.rollout, "joined": flow.rollout, "touching": compiled.rollout}
+LOOPS = {
+    "single": lockstep.rollout_free,
+    "joined": flow.rollout_tree,
+    "touching": compiled.rollout_engine,
+}
 _PUCK = Body("puck", Shape.circle(0.1))
 _SCENES = {
     "single": Scene(time_step=0.1, bodies=(_PUCK,)),
@@ -32,4 +36,4 @@ def compile_for_search(scene: Scene) -> None:
     """Compile beside what follows the loop that a scene does not need, but friction on it does."""
     if not scene.joints:
         code = f"from {__name__} import compile_loops; compile_loops(('joined',))"
-        compile_beside(flow.rollout, code)
+        compile_beside(flow.rollout_tree, code)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
 from pbrl_ppl.physics.calls import (
@@ -14,9 +13,12 @@ from pbrl_ppl.physics.calls import (
     call_pointer,
     compiled,
     copy,
+    from_place,
     get1,
     get2,
+    inlined,
     inner,
+    start_of,
 )
 from pbrl_ppl.physics.laws import (
     ACTED,
@@ -267,7 +269,7 @@ def drive(fn, world, state, action):  # type: ignore[no-untyped-def]
             call1(fn.cpBodySetAngularVelocity, world.bodies[i], action[i, 2])
 
 
-@numba.njit(inline="always")
+@inlined
 def _forget(fn, world, bodies, batch, touched):  # type: ignore[no-untyped-def]
     """Clear the contacts and impulses that the engine keeps of the last transition.
 
@@ -306,7 +308,7 @@ def intervals(bodies, p, t, horizon):  # type: ignore[no-untyped-def]
     return bodies[p]
 
 
-@numba.njit(inline="always")
+@inlined
 def _push(fn, world, bodies, state, acted):  # type: ignore[no-untyped-def]
     """Set the forces and torques of a substep, which act at the bodies' origins."""
     for i in range(len(world.bodies)):
@@ -321,7 +323,7 @@ def _push(fn, world, bodies, state, acted):  # type: ignore[no-untyped-def]
         call1(fn.cpBodySetTorque, world.bodies[i], torque)
 
 
-@numba.njit(inline="always")
+@inlined
 def _read(fn, world, bodies, state):  # type: ignore[no-untyped-def]
     """Set the states of the bodies' origins from the engine; return whether one has diverged."""
     lost = False
@@ -339,7 +341,7 @@ def _read(fn, world, bodies, state):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _scratch_of(world, batch):  # type: ignore[no-untyped-def]
+def _scratch_of(world, laws):  # type: ignore[no-untyped-def]
     """Return the arrays of a transition.
 
     They are states (body, 6), cos and sin of the wheels' angles on the bodies (wheel, 2), what acts
@@ -349,11 +351,11 @@ def _scratch_of(world, batch):  # type: ignore[no-untyped-def]
     k = len(world.bodies)
     return (
         np.empty((k, 6)), np.empty((len(world.wheel_body), 2)), np.zeros((k + MORE, ACTED)),
-        np.zeros((2, batch.slots)), np.full(2, -1), np.zeros((2, batch.held)),
+        np.zeros((2, laws.n_slots)), np.full(2, -1), np.zeros((2, laws.n_held)),
     )  # fmt: skip
 
 
-@numba.njit(inline="always")  # a call costs as much as a substep: the world is many arrays
+@inlined
 def _transition(  # type: ignore[no-untyped-def]
     fn, world, batch, laws, p, t, substeps, scratch, first, begin, whole, out
 ):
@@ -377,12 +379,12 @@ def _transition(  # type: ignore[no-untyped-def]
     for follows in world.kinematic:
         driven |= follows
     acting = laws.n_commands + laws.n_forces > 0
-    remembered = memory.ctypes.data + 8 * memory.shape[1]
-    state_at, acted_at, held_at = state.ctypes.data, acted.ctypes.data, held.ctypes.data
+    remembered = from_place(start_of(memory), laws.n_slots)
+    state_at, acted_at, held_at = start_of(state), start_of(acted), start_of(held)
     still = world.still
     watch = len(still.obstacles) > 0 or k > 1
     place_bodies(fn, world, bodies, state)
-    set_memory(batch, laws, p, t, begin, state, acted, memory, held, at)
+    set_memory(batch, laws, p, t, begin, state, acted, memory, at)
     begin_held(state, laws, acted, held)
     while end < len(inputs) and (whole or near or end == begin):
         h = end
@@ -393,7 +395,7 @@ def _transition(  # type: ignore[no-untyped-def]
             set_strengths(fn, world, bodies, True)
             enough = iterations(world.iterations, world.chained, bodies)
             call_int(fn.cpSpaceSetIterations, world.space, enough)
-        inputs_at = inputs[h].ctypes.data
+        inputs_at = start_of(inputs[h])
         if driven:
             drive(fn, world, state, inputs[h])
         for i in range(k):
@@ -404,9 +406,9 @@ def _transition(  # type: ignore[no-untyped-def]
             if acting:
                 act(
                     state_at, inputs_at, laws, s / substeps, (s + 1) / substeps, acted_at,
-                    remembered, held_at, held.shape[1], False,
+                    remembered, held_at, from_place(held_at, laws.n_held),
                 )  # fmt: skip
-                for slot in range(held.shape[1]):
+                for slot in range(laws.n_held):
                     held[0, slot] += step * held[1, slot]
             if laws.n_frictions > 0:
                 set_brakes(world, laws, bodies, joints, state, acted)
@@ -421,14 +423,14 @@ def _transition(  # type: ignore[no-untyped-def]
                 near = near_contact(state, still.radii, still.obstacles, still.can_touch)
                 touched = _TOUCHED if near else touched
         copy(state, out[h])
-        if memory.shape[1] > 0:
-            remember(state, inputs_at, laws, acted, remembered, held)
+        if laws.n_slots > 0:
+            remember(state, inputs_at, laws, acted, remembered)
         end += 1
     return touched, end
 
 
 @compiled
-def rollout(fn, world, batch, items, begins, whole, out):  # type: ignore[no-untyped-def]
+def rollout_engine(fn, world, batch, items, begins, whole, out):  # type: ignore[no-untyped-def]
     """Predict ``items`` of ``out``, whose shape is (proposal * transition, H, body, 6).
 
     Those that are not ``whole`` are predicted from the interval in ``begins``, shape (item,), with
@@ -448,7 +450,7 @@ def rollout(fn, world, batch, items, begins, whole, out):  # type: ignore[no-unt
     states = np.empty((horizon, batch.inputs.shape[2], 6))
     total = np.empty_like(states)
     timed = bodies.shape[1] > 1
-    scratch = _scratch_of(world, batch)
+    scratch = _scratch_of(world, batch.laws[0])
     proposal, finer = -1, 1
     outcome = _TOUCHED  # an earlier call may have left contacts
     for place in range(len(items)):

@@ -13,15 +13,13 @@ import math
 
 import numpy as np
 
-from pbrl_ppl.physics.calls import compiled, copy, inner, real_at, whole_at
+from pbrl_ppl.physics.calls import compiled, copy, from_place, inner, numbers_at, start_of
 from pbrl_ppl.physics.laws import (
     COMMAND,
-    FIRST,
-    JUMPS,
-    ROW,
     WRENCHES,
     act,
     begin_held,
+    law_at,
     remember,
     set_memory,
     states_before,
@@ -58,7 +56,7 @@ from pbrl_ppl.physics.motion import (
     strain,
 )
 from pbrl_ppl.physics.solids import near_contact
-from pbrl_ppl.physics.tree import ALONG, LINK, TURNING
+from pbrl_ppl.physics.tree import ALONG, LINK, MOST, TURNING
 
 #: Times of the stages; weights of the slopes before each, and in the last row those of the error.
 _TIMES = np.array([0.0, 0.2, 0.3, 0.8, 8 / 9, 1.0, 1.0])
@@ -103,10 +101,11 @@ def _load(work, laws, u, share, low, high):  # type: ignore[no-untyped-def]
     for s in range(work.n_held):
         work.held[0, s] = motion[u - 1, held + s]
     if laws.n_commands + laws.n_forces > 0:
+        held_at = start_of(work.held)
         begin = min(max(low + _SHORTEST, share), high - _WINDOW)  # past a jump that is no switch
         act(
-            work.states.ctypes.data, work.inputs, laws, begin, begin + _WINDOW,
-            work.acted.ctypes.data, work.memory, work.held.ctypes.data, work.held.shape[1], False,
+            start_of(work.states), numbers_at(work.inputs), laws, begin, begin + _WINDOW,
+            start_of(work.acted), numbers_at(work.memory), held_at, from_place(held_at, MOST),
         )  # fmt: skip
     for s in range(work.n_held):
         motion[u, held + s] = work.held[1, s]
@@ -120,9 +119,9 @@ def _switch(laws, low):  # type: ignore[no-untyped-def]
     """Return the first time after ``low`` at which a command jumps, as a share of the interval."""
     high = 1.0
     for e in range(laws.n_commands):
-        law = laws.commands + ROW * e
-        if whole_at(law, JUMPS) > 0:
-            share = real_at(laws.commands_values, whole_at(law, FIRST))
+        law = law_at(laws.commands, e)
+        if law.jumps > 0:
+            share = numbers_at(laws.commands_values)[law.first]
             share -= math.floor(share)
             if low + _SHORTEST < share < high - _SHORTEST:
                 high = share
@@ -466,7 +465,7 @@ def _set_states(work, states):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def rollout(works, still, batch, items, begins, out):  # type: ignore[no-untyped-def]
+def rollout_tree(works, still, batch, items, begins, out):  # type: ignore[no-untyped-def]
     """Predict ``items`` of ``out``, whose shape is (proposal * transition, H, body, 6).
 
     ``begins``, shape (item,), are their first intervals; they become those in which a body comes
@@ -477,8 +476,9 @@ def rollout(works, still, batch, items, begins, out):  # type: ignore[no-untyped
     work = works[0]
     n, horizon, proposal, bodies = len(batch.inputs), batch.inputs.shape[1], -1, work.n_bodies
     timed = rows.shape[1] > 1
-    memory, at = np.zeros((2, batch.slots)), np.full(2, -1)
-    work.memory, work.n_held = memory.ctypes.data + 8 * batch.slots, batch.held
+    slots, work.n_held = batch.laws[0].n_slots, batch.laws[0].n_held
+    memory, at = np.zeros((2, slots)), np.full(2, -1)
+    work.memory = memory.ctypes.data + 8 * slots
     work.time_step, work.tolerance, work.length = batch.time_step, batch.tolerance, still.length
     for place in range(len(items)):
         item = items[place]
@@ -497,9 +497,9 @@ def rollout(works, still, batch, items, begins, out):  # type: ignore[no-untyped
                 )  # fmt: skip
             if h == first:
                 _set_states(work, states_before(batch, out, item, h))
-                set_memory(batch, laws, p, t, h, work.states, work.acted, memory, work.held, at)
+                set_memory(batch, laws, p, t, h, work.states, work.acted, memory, at)
                 begin_held(work.states, laws, work.acted, work.held)
-                for s in range(batch.held):
+                for s in range(work.n_held):
                     work.motion[Q, work.n + 1 + s] = work.held[0, s]
             inputs, budget, low, high = batch.inputs[t, h], MOST_STEPS, 0.0, 0.0
             work.inputs = inputs.ctypes.data
@@ -512,8 +512,9 @@ def rollout(works, still, batch, items, begins, out):  # type: ignore[no-untyped
                 low, high = high, 1.0
                 high = _switch(laws, low)
                 budget, wanted = _advance(work, laws, still, low, high, budget, wanted)
-            if batch.slots > 0:
-                remember(work.states, work.inputs, laws, work.acted, work.memory, work.held)
+            if slots > 0:
+                memory_at, inputs_at = numbers_at(work.memory), numbers_at(work.inputs)
+                remember(work.states, inputs_at, laws, work.acted, memory_at)
             if budget < 0:
                 begins[place] = h
                 break

@@ -43,12 +43,10 @@ _ONE_WORLD: Choice = ((), ())
 
 
 class Batch(NamedTuple):
-    """What the rollouts take: see `compiled.rollout`."""
+    """What the rollouts take: see `compiled.rollout_engine`."""
 
     given: tuple[Floats, ...]
     laws: NDArray[np.void]  # (proposal,), of dtype `laws.LAWS`
-    slots: int
-    held: int
     follows: Bools
     start: Floats
     inputs: Floats
@@ -101,14 +99,14 @@ class Engine:
         items, horizon = np.arange(first, last), batch.inputs.shape[1]
         begins = np.zeros(len(items), dtype=np.int64)
         tree = self._tree
-        if tree is not None and batch.held > max(0, MOST - 1 - tree.size):
+        if tree is not None and batch.laws[0]["n_held"] > max(0, MOST - 1 - tree.size):
             tree = None  # laws' own numbers have no place beside the coordinates
         whole = self._wheels is None and tree is None
         while len(items):
             if self._wheels is not None:
-                lockstep.rollout(self._wheels, self._still, batch, items, begins, out)
+                lockstep.rollout_free(self._wheels, self._still, batch, items, begins, out)
             elif tree is not None:
-                rollout = calls.compiled_beside(flow.rollout)
+                rollout = calls.compiled_beside(flow.rollout_tree)
                 rollout(self._work, self._still, batch, items, begins, out)
             left = begins < horizon
             items, begins = items[left], begins[left]
@@ -121,7 +119,7 @@ class Engine:
                 self.world.check_steps()
             done = 0
             while done < len(items):
-                done += compiled.rollout(
+                done += compiled.rollout_engine(
                     calls.FUNCTIONS, self.pointers, batch, items[done:], begins[done:], whole, out
                 )
                 if done < len(items):  # diverged: that world is spoilt, and the item is lost
@@ -324,7 +322,7 @@ class Simulator:
         return np.array(counts, dtype=np.int64), np.array(weights, dtype=float)
 
     @cached_property
-    def _laws(self) -> tuple[Ints, Ints, Ints, int, int]:
+    def _laws(self) -> list[NDArray[np.void]]:
         return law_tables(self.physics.scene, self.physics.effects)
 
     def _new_world(self, choice: Choice) -> World:
@@ -350,9 +348,9 @@ class Simulator:
 
         So many engine steps are worth a thread of their own.
         """
-        (*tables, slots, held), time_step = self._laws, self.physics.scene.time_step
+        time_step = self.physics.scene.time_step
         batch = Batch(
-            numbers[:3], laws_of(tables, numbers[3:6], inputs, time_step), slots, held,
+            numbers[:3], laws_of(self._laws, numbers[3:6], inputs, time_step),
             continues_previous(inputs), starts, inputs, time_step, *self.levels,
             self.physics.tolerance,
         )  # fmt: skip

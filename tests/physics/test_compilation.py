@@ -119,7 +119,7 @@ def test_an_older_cache_that_cannot_be_read_is_deleted(module) -> None:
     assert not index.exists()
 
 
-@pytest.mark.parametrize("rollout", [compiled.rollout, lockstep.rollout])
+@pytest.mark.parametrize("rollout", [compiled.rollout_engine, lockstep.rollout_free])
 def test_rollouts_are_cached_by_the_digest(rollout) -> None:
     assert rollout._cache._cache_file._source_stamp == SOURCES
 
@@ -172,4 +172,4 @@ def test_a_search_compiles_the_loop_of_joined_bodies_beside(monkeypatch) -> None
     compile_for_search(Scene(time_step=0.1, bodies=(body,), joints=(hinge,)))
     assert not asked
     compile_for_search(Scene(time_step=0.1, bodies=(body,)))
-    assert asked == [flow.rollout]
+    assert asked == [flow.rollout_tree]

@@ -90,15 +90,19 @@ def test_arrays_of_every_layout_use_the_same_machine_code() -> None:
     for name in ("wheel", "walls", "sensor"):
         simulator, phi, start, inputs = case(name)
         expected = simulator(phi, start, inputs)
-        compiled_once = [len(path.signatures) for path in (lockstep.rollout, compiled.rollout)]
+        compiled_once = [
+            len(path.signatures) for path in (lockstep.rollout_free, compiled.rollout_engine)
+        ]
         start.setflags(write=False)
         np.testing.assert_array_equal(simulator(phi, start, np.asfortranarray(inputs)), expected)
         coarse = Simulator(simulator.physics.changed(extrapolate=False))
         assert np.isfinite(coarse(phi, start, inputs)).all()
-        signatures = [len(path.signatures) for path in (lockstep.rollout, compiled.rollout)]
+        signatures = [
+            len(path.signatures) for path in (lockstep.rollout_free, compiled.rollout_engine)
+        ]
         assert signatures == compiled_once
-    assert len(compiled.rollout.signatures) == 1
-    assert len(lockstep.rollout.signatures) == 1
+    assert len(compiled.rollout_engine.signatures) == 1
+    assert len(lockstep.rollout_free.signatures) == 1
 
 
 def test_contacts_are_left_to_the_engine() -> None:
