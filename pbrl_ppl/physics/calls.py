@@ -155,6 +155,12 @@ def copy(source, target):  # type: ignore[no-untyped-def]
             target[i, j] = source[i, j]
 
 
+@inner
+def rotated(c, s, x, y):  # type: ignore[no-untyped-def]
+    """Return a vector turned by the angle with cosine ``c`` and sine ``s``."""
+    return c * x - s * y, s * x + c * y
+
+
 #: Addresses of the engine's C functions, by their names. Those that set properties of constraints
 #: are in the settings of `Pointers`.
 Functions = namedtuple(

@@ -18,6 +18,7 @@ from pbrl_ppl.physics.calls import (
     get2,
     inlined,
     inner,
+    rotated,
     start_of,
 )
 from pbrl_ppl.physics.laws import (
@@ -34,7 +35,7 @@ from pbrl_ppl.physics.laws import (
 )
 from pbrl_ppl.physics.properties import COLUMN
 from pbrl_ppl.physics.solids import near_contact
-from pbrl_ppl.physics.world import FINER, STICKING, TINY
+from pbrl_ppl.physics.world import FINER, TINY
 
 _FREE, _TOUCHED, _LOST = 0, 1, 2
 
@@ -103,8 +104,7 @@ def arm(row, theta):  # type: ignore[no-untyped-def]
     x, y = row[COLUMN.com_x], row[COLUMN.com_y]
     if x == 0.0 and y == 0.0:
         return 0.0, 0.0
-    c, s = math.cos(theta), math.sin(theta)
-    return c * x - s * y, s * x + c * y
+    return rotated(math.cos(theta), math.sin(theta), x, y)
 
 
 @compiled
@@ -122,8 +122,9 @@ def wheel_ends(row, after, axis_cos, axis_sin):  # type: ignore[no-untyped-def]
     """Return the far ends of a wheel's rods: x and y of the one along it, of the one across."""
     c, s, x, y, _, _ = after
     w_x, w_y = row[COLUMN.w_x] - row[COLUMN.com_x], row[COLUMN.w_y] - row[COLUMN.com_y]
-    x, y = x + c * w_x - s * w_y, y + s * w_x + c * w_y
-    c, s = c * axis_cos - s * axis_sin, s * axis_cos + c * axis_sin
+    w_x, w_y = rotated(c, s, w_x, w_y)
+    c, s = rotated(c, s, axis_cos, axis_sin)
+    x, y = x + w_x, y + w_y
     return x + c, y + s, x - s, y + c
 
 
@@ -131,15 +132,18 @@ def wheel_ends(row, after, axis_cos, axis_sin):  # type: ignore[no-untyped-def]
 def patch_point(row, after, omega, point, step, most):  # type: ignore[no-untyped-def]
     """Return the far end of a point's rod, along its velocity, and the rod's share of the friction.
 
-    ``point`` is in units of the ring's radius; ``most`` is the deceleration by friction (m/s^2).
+    ``point`` is in units of the ring's radius; ``most`` is the deceleration by friction (m/s^2). A
+    point may stick if its speed is below what friction takes away in a substep.
     """
     c, s, at_x, at_y, v_x, v_y = after
     x = point[0] * row[COLUMN.patch_radius] - row[COLUMN.com_x]
     y = point[1] * row[COLUMN.patch_radius] - row[COLUMN.com_y]
-    x, y = c * x - s * y, s * x + c * y
+    x, y = rotated(c, s, x, y)
     along_x, along_y = v_x - omega * y, v_y + omega * x
     speed = math.sqrt(along_x * along_x + along_y * along_y)
-    slow = STICKING * most * step
+    slow = (
+        most * step
+    )  # with a tenth of it, slow points would stick across their direction now and then
     share = 1.0 if speed >= slow else speed / slow
     if speed == 0.0:  # at rest any direction will do
         along_x, speed = 1.0, 1.0
@@ -159,8 +163,7 @@ def hinge_signal(pivots, gravity, row, joints, state, command, i):  # type: igno
         if hinge[0] == i:
             x = row[COLUMN.com_x] - joints[hinge[1], hinge[2]]
             y = row[COLUMN.com_y] - joints[hinge[1], hinge[2] + 1]
-            c, s = math.cos(state[2]), math.sin(state[2])
-            x, y = c * x - s * y, s * x + c * y
+            x, y = rotated(math.cos(state[2]), math.sin(state[2]), x, y)
             weight_x = gravity[0] + row[COLUMN.extra_gravity_x]
             weight_y = gravity[1] + row[COLUMN.extra_gravity_y]
             rest = row[COLUMN.mass] * (x * weight_y - y * weight_x)
@@ -301,11 +304,9 @@ def _forget(fn, world, bodies, batch, touched):  # type: ignore[no-untyped-def]
 
 
 @inner
-def intervals(bodies, p, t, horizon):  # type: ignore[no-untyped-def]
-    """Return the properties in a transition's intervals; one row if they do not change."""
-    if bodies.shape[1] > 1:
-        return bodies[p, t * horizon : (t + 1) * horizon]
-    return bodies[p]
+def properties_in(rows, p, t, h, horizon):  # type: ignore[no-untyped-def]
+    """Return the bodies' properties in an interval of a transition."""
+    return rows[p, t * horizon + h if rows.shape[1] > 1 else 0]
 
 
 @inlined
@@ -356,6 +357,29 @@ def _scratch_of(world, laws):  # type: ignore[no-untyped-def]
 
 
 @inlined
+def _renew(fn, world, bodies, joints, state):  # type: ignore[no-untyped-def]
+    """Set properties that change with time where an interval begins."""
+    set_properties(fn, world, bodies, joints)
+    place_bodies(fn, world, bodies, state)
+    set_strengths(fn, world, bodies, True)
+    enough = iterations(world.iterations, world.chained, bodies)
+    call_int(fn.cpSpaceSetIterations, world.space, enough)
+
+
+@inlined
+def _substep(fn, world, laws, bodies, joints, state, axes, step, acted):  # type: ignore[no-untyped-def]
+    """Do one step of the engine with what acts; return whether a body has diverged."""
+    if laws.n_frictions > 0:
+        set_brakes(world, laws, bodies, joints, state, acted)
+    _push(fn, world, bodies, state, acted)
+    place_wheels(fn, world, bodies, state, axes, step)
+    if len(world.patch_body) > 0:
+        place_patches(fn, world, laws, bodies, state, step, acted)
+    call1(fn.cpSpaceStep, world.space, step)
+    return _read(fn, world, bodies, state)
+
+
+@inlined
 def _transition(  # type: ignore[no-untyped-def]
     fn, world, batch, laws, p, t, substeps, scratch, first, begin, whole, out
 ):
@@ -368,16 +392,13 @@ def _transition(  # type: ignore[no-untyped-def]
     step = batch.time_step / substeps
     state, axes, acted, memory, at, held = scratch
     inputs, end = batch.inputs[t], begin
-    properties, joints = intervals(batch.given[0], p, t, len(inputs)), batch.given[1][p]
+    rows, joints = batch.given[0], batch.given[1][p]
+    bodies = properties_in(rows, p, t, begin, len(inputs))
     copy(first, state)
-    bodies = properties[begin if len(properties) > 1 else 0]
     for j in range(len(axes)):
         turn = bodies[world.wheel_body[j], COLUMN.w_theta]
         axes[j, 0], axes[j, 1] = math.cos(turn), math.sin(turn)
     touched, near = _FREE, False
-    driven = False
-    for follows in world.kinematic:
-        driven |= follows
     acting = laws.n_commands + laws.n_forces > 0
     remembered = from_place(start_of(memory), laws.n_slots)
     state_at, acted_at, held_at = start_of(state), start_of(acted), start_of(held)
@@ -388,16 +409,11 @@ def _transition(  # type: ignore[no-untyped-def]
     begin_held(state, laws, acted, held)
     while end < len(inputs) and (whole or near or end == begin):
         h = end
-        if h > begin and len(properties) > 1:
-            bodies = properties[h]
-            set_properties(fn, world, bodies, joints)
-            place_bodies(fn, world, bodies, state)
-            set_strengths(fn, world, bodies, True)
-            enough = iterations(world.iterations, world.chained, bodies)
-            call_int(fn.cpSpaceSetIterations, world.space, enough)
+        if h > begin and rows.shape[1] > 1:
+            bodies = properties_in(rows, p, t, h, len(inputs))
+            _renew(fn, world, bodies, joints, state)
         inputs_at = start_of(inputs[h])
-        if driven:
-            drive(fn, world, state, inputs[h])
+        drive(fn, world, state, inputs[h])
         for i in range(k):
             for w in range(3):
                 acted[i, COMMAND + w] = acted[i, WRENCHES + w] = inputs[h, i, w]
@@ -410,14 +426,7 @@ def _transition(  # type: ignore[no-untyped-def]
                 )  # fmt: skip
                 for slot in range(laws.n_held):
                     held[0, slot] += step * held[1, slot]
-            if laws.n_frictions > 0:
-                set_brakes(world, laws, bodies, joints, state, acted)
-            _push(fn, world, bodies, state, acted)
-            place_wheels(fn, world, bodies, state, axes, step)
-            if len(world.patch_body) > 0:
-                place_patches(fn, world, laws, bodies, state, step, acted)
-            call1(fn.cpSpaceStep, world.space, step)
-            if _read(fn, world, bodies, state):
+            if _substep(fn, world, laws, bodies, joints, state, axes, step, acted):
                 return _LOST, end
             if watch and (touched == _FREE or not whole):
                 near = near_contact(state, still.radii, still.obstacles, still.can_touch)
@@ -427,6 +436,16 @@ def _transition(  # type: ignore[no-untyped-def]
             remember(state, inputs_at, laws, acted, remembered)
         end += 1
     return touched, end
+
+
+@inner
+def _add(states, weight, first, total):  # type: ignore[no-untyped-def]
+    """Add weighted states (H, body, 6) to a total, which the first begin."""
+    for h in range(len(total)):
+        for i in range(total.shape[1]):
+            for d in range(6):
+                before = 0.0 if first else total[h, i, d]
+                total[h, i, d] = before + weight * states[h, i, d]
 
 
 @compiled
@@ -457,7 +476,7 @@ def rollout_engine(fn, world, batch, items, begins, whole, out):  # type: ignore
         item = items[place]
         p, t = item // n, item % n
         begin, laws = begins[place], batch.laws[p]
-        first = intervals(bodies, p, t, horizon)[begin if timed else 0]
+        first = properties_in(bodies, p, t, begin, horizon)
         before_begin = states_before(batch, out, item, begin)
         if p != proposal:
             proposal = p
@@ -493,11 +512,7 @@ def rollout_engine(fn, world, batch, items, begins, whole, out):  # type: ignore
                     copy(states[h], out[item, h])
             if outcome == _TOUCHED or not whole:
                 break
-            for h in range(horizon):
-                for i in range(states.shape[1]):
-                    for d in range(6):
-                        sum_before = total[h, i, d] if level else 0.0
-                        total[h, i, d] = sum_before + batch.weights[level] * states[h, i, d]
+            _add(states, batch.weights[level], level == 0, total)
         if whole and outcome == _FREE and len(batch.counts) > 1:
             for i in range(len(world.bodies)):
                 if world.kinematic[i]:  # the weights' sum is 1 but for rounding

@@ -18,8 +18,6 @@ from pbrl_ppl.state import Bools, Floats, Ints
 #: the first body's frame (m).
 JOINT_COLUMNS = (*JOINT_ANCHORS, "length", "low_x", "low_y", "high_x", "high_y")
 A_X, A_Y, B_X, B_Y, LENGTH, LOW_X, LOW_Y, HIGH_X, HIGH_Y = range(len(JOINT_COLUMNS))
-#: Half the length of a slider's line, in radii of the smallest body: no body reaches an end.
-_LINE = 1e6
 
 
 class Setting(NamedTuple):
@@ -36,11 +34,10 @@ class Setting(NamedTuple):
 
 
 @dataclass(frozen=True)
-class JointKind:
+class EngineJoint:
     """What a kind of joint is in the engine.
 
-    A new kind is one more entry of :data:`JOINT_KINDS`; without contact-free arithmetic, worlds
-    that have one are left to the engine.
+    A new kind is one more entry of :data:`JOINT_KINDS`, and a kind of link in `tree_of`.
 
     Attributes
     ----------
@@ -52,18 +49,15 @@ class JointKind:
         Distance of the anchors from that in the reference poses (m).
     friction : str
         The body's constraints by which friction and damping act in it: see `world`. None without.
-    contact_free : bool
-        Whether the contact-free fast path has its arithmetic.
     """
 
     constraint: Callable[[pymunk.Body, pymunk.Body], pymunk.Constraint]
     settings: tuple[Setting, ...]
     gap: Callable[[float], float]
     friction: str = ""
-    contact_free: bool = False
 
 
-HINGE = JointKind(
+HINGE = EngineJoint(
     constraint=lambda a, b: pymunk.PivotJoint(a, b, (0, 0), (0, 0)),
     settings=(
         Setting("anchor_a", "cpPivotJointSetAnchorA", (A_X, A_Y)),
@@ -71,9 +65,8 @@ HINGE = JointKind(
     ),
     gap=lambda distance: 0.0,
     friction="pivot",
-    contact_free=True,
 )
-ROD = JointKind(
+ROD = EngineJoint(
     constraint=lambda a, b: pymunk.PinJoint(a, b, (0, 0), (0, 0)),
     settings=(
         Setting("anchor_a", "cpPinJointSetAnchorA", (A_X, A_Y)),
@@ -81,10 +74,9 @@ ROD = JointKind(
         Setting("distance", "cpPinJointSetDist", (LENGTH,)),
     ),
     gap=lambda distance: distance,
-    contact_free=True,
 )
 #: Right for bodies that never turn alone: see `never_turning`.
-SLIDER = JointKind(
+SLIDER = EngineJoint(
     constraint=lambda a, b: pymunk.GrooveJoint(a, b, (-1, 0), (1, 0), (0, 0)),
     settings=(
         Setting("groove_a", "cpGrooveJointSetGrooveA", (LOW_X, LOW_Y)),
@@ -93,7 +85,6 @@ SLIDER = JointKind(
     ),
     gap=lambda distance: 0.0,
     friction="rail",
-    contact_free=True,
 )
 #: Every kind that a scene can declare.
 JOINT_KINDS = {"hinge": HINGE, "slider": SLIDER, "distance": ROD}
@@ -144,12 +135,14 @@ class SceneJoints:
                 free.append((j, *(places[f"{name}[{owner}]"] for name in JOINT_INDICES)))
         self._moved_anchors = np.array(moved, dtype=int).reshape(-1, 3).T
         self._free = np.array(free, dtype=int).reshape(-1, 3)
-        #: Ends of the sliders' lines from the first body's anchor, zero of other joints.
+        #: Ends of the sliders' lines from the first body's anchor, zero of other joints; no body
+        #: reaches one.
+        half = 1e6 * smallest_radius(scene)
         self._ends = np.zeros((len(scene.joints), 4))
         for j, joint in enumerate(scene.joints):
             if joint.traits.slides and joint.bodies:
                 turn = scene.direction(joint) - scene.reference_angle(joint.bodies[0])
-                along = _LINE * smallest_radius(scene) * np.array([np.cos(turn), np.sin(turn)])
+                along = half * np.array([np.cos(turn), np.sin(turn)])
                 self._ends[j] = *-along, *along
         lengths = self._lengths(self._anchors, self._held)
         #: Kind of each joint in the engine.

@@ -21,8 +21,8 @@ from pbrl_ppl.physics.calls import (
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import WRENCH, Floats
 
-#: When an interval is nearly over, as a share of it.
-LATE = 1.0 - 1e-7
+#: Width of the window in which a command is evaluated, as a share of the interval.
+WINDOW = 1e-7
 #: Columns of what acts on a body: its command, the one of the interval before, the wrench, and when
 #: it is; see :data:`pbrl_ppl.effects.effect.TIME`.
 COMMAND, PREVIOUS, WRENCHES, TIME, INTERVAL, ACTED = 0, 3, 6, 9, 10, 12
@@ -217,7 +217,7 @@ def _change(law, laws, state, begin, end, acted, memory, after):  # type: ignore
 @inner
 def remember(state, inputs, laws, acted, memory):  # type: ignore[no-untyped-def]
     """Bring what command laws remember up to date after an interval; see `act`."""
-    _command(start_of(state), inputs, laws, LATE, 1.0, start_of(acted), memory, True)
+    _command(start_of(state), inputs, laws, 1.0 - WINDOW, 1.0, start_of(acted), memory, True)
 
 
 @inner

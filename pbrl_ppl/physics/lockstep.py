@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pbrl_ppl.physics.calls import compiled, from_place, inlined, inner, start_of
+from pbrl_ppl.physics.calls import compiled, from_place, inlined, inner, rotated, start_of
 from pbrl_ppl.physics.laws import (
     ACTED,
     MORE,
@@ -34,7 +34,7 @@ from pbrl_ppl.physics.solids import reaches, segment
 from pbrl_ppl.physics.world import World
 from pbrl_ppl.state import Bools, Floats, Ints
 
-#: Number of transitions in a lanes, which are computed side by side.
+#: Number of transitions in a block, which are computed side by side.
 BLOCK = 32
 
 
@@ -47,14 +47,14 @@ def row_of(fields: str) -> Any:
     return namedtuple("Row", names)(*range(0, BLOCK * len(names), BLOCK))
 
 
-#: Fields of a body: the state of its centre of mass, which is at ``com`` in its frame; the place of
-#: its origin; the wrench on it and the weight beside the scene's gravity; the accelerations that
-#: they give. Then those of its wheel: place and axis in its frame, greatest and stored impulses of
-#: both rods; the axis in the world, levers and effective masses in a substep.
+#: Fields of a body: the state of its centre of mass, which is at ``com`` in its frame, and by how
+#: much it turned in a substep; the place of its origin; the wrench on it and the weight beside the
+#: scene's gravity. Then those of its wheel: place and axis in its frame, greatest and stored
+#: impulses of both rods; the axis in the world, levers and effective masses in a substep.
 BODY = row_of(
     """
-    x y angle vx vy omega cos sin com_x com_y inverse_mass inverse_moment
-    origin_x origin_y force_x force_y torque weight_x weight_y acceleration_x acceleration_y spin_up
+    x y angle turned vx vy omega cos sin com_x com_y inverse_mass inverse_moment
+    origin_x origin_y force_x force_y torque weight_x weight_y
     wheel_x wheel_y wheel_cos wheel_sin most_along most_across impulse_along impulse_across
     axis_x axis_y lever_along lever_across mass_along mass_across
     """
@@ -66,10 +66,7 @@ _S1, _S2, _S3, _S4, _S5, _S6, _S7 = ((-1) ** k / math.factorial(2 * k + 1) for k
 
 @inner
 def set_body(body, i, row, wheel, normal_gravity, step):  # type: ignore[no-untyped-def]
-    """Set a body's properties for an interval; keep stored impulses.
-
-    Returns whether the centre of mass is off the origin.
-    """
+    """Set a body's properties for an interval; keep stored impulses."""
     mass, com_x, com_y = row[COLUMN.mass], row[COLUMN.com_x], row[COLUMN.com_y]
     body[BODY.inverse_mass + i] = 1.0 / mass
     body[BODY.inverse_moment + i] = 1.0 / row[COLUMN.moment]
@@ -83,7 +80,6 @@ def set_body(body, i, row, wheel, normal_gravity, step):  # type: ignore[no-unty
         body[BODY.wheel_cos + i], body[BODY.wheel_sin + i] = math.cos(angle), math.sin(angle)
         body[BODY.most_along + i] = row[COLUMN.mu_x] * load * step
         body[BODY.most_across + i] = row[COLUMN.mu_y] * load * step
-    return com_x != 0.0 or com_y != 0.0
 
 
 @inner
@@ -96,11 +92,8 @@ def align(body, i):  # type: ignore[no-untyped-def]
 @inner
 def _arm(body, i):  # type: ignore[no-untyped-def]
     """Return the arm from the origin to the centre of mass, in the world's frame."""
-    x, y = body[BODY.com_x + i], body[BODY.com_y + i]
-    if x == 0.0 and y == 0.0:
-        return 0.0, 0.0
     c, s = body[BODY.cos + i], body[BODY.sin + i]
-    return c * x - s * y, s * x + c * y
+    return rotated(c, s, body[BODY.com_x + i], body[BODY.com_y + i])
 
 
 @inner
@@ -126,59 +119,40 @@ def get_state(body, i, states, k):  # type: ignore[no-untyped-def]
 
 @inner
 def set_wrench(body, i, force_x, force_y, torque):  # type: ignore[no-untyped-def]
-    """Set the accelerations by a wrench and the additional weight."""
+    """Set the wrench at the origin."""
     body[BODY.force_x + i], body[BODY.force_y + i], body[BODY.torque + i] = force_x, force_y, torque
-    inverse_mass = body[BODY.inverse_mass + i]
-    body[BODY.acceleration_x + i] = (force_x + body[BODY.weight_x + i]) * inverse_mass
-    body[BODY.acceleration_y + i] = (force_y + body[BODY.weight_y + i]) * inverse_mass
-    body[BODY.spin_up + i] = torque * body[BODY.inverse_moment + i]
 
 
 @inner
-def lever(body):  # type: ignore[no-untyped-def]
-    """Set the angular accelerations by forces on origins that are off the centres of mass."""
-    for i in range(BLOCK):
-        c, s = body[BODY.cos + i], body[BODY.sin + i]
-        x = c * body[BODY.com_x + i] - s * body[BODY.com_y + i]
-        y = s * body[BODY.com_x + i] + c * body[BODY.com_y + i]
-        moment = x * body[BODY.force_y + i] - y * body[BODY.force_x + i]
-        body[BODY.spin_up + i] = (body[BODY.torque + i] - moment) * body[BODY.inverse_moment + i]
-
-
-@inner
-def turn(body, step, small=0.5):  # type: ignore[no-untyped-def]
-    """Move a body and rotate its heading.
+def move(body, gravity, step, small=0.5):  # type: ignore[no-untyped-def]
+    """Move a body and rotate its heading; then add what gravity and the wrench change.
 
     Rotations by less than ``small`` (rad) are computed by a series, exact to rounding.
     """
-    fast = False
+    fast, (g_x, g_y) = False, gravity
     for i in range(BLOCK):
+        heading, slope = body[BODY.cos + i], body[BODY.sin + i]
+        f_x, f_y = body[BODY.force_x + i], body[BODY.force_y + i]
+        x, y = rotated(heading, slope, body[BODY.com_x + i], body[BODY.com_y + i])
+        torque = body[BODY.torque + i] - (x * f_y - y * f_x)
         body[BODY.x + i] += body[BODY.vx + i] * step
         body[BODY.y + i] += body[BODY.vy + i] * step
-        a = body[BODY.omega + i] * step
+        a = body[BODY.turned + i] = body[BODY.omega + i] * step
         body[BODY.angle + i] += a
         fast |= not abs(a) < small
         d = a * a
         c = 1.0 + d * (_C1 + d * (_C2 + d * (_C3 + d * (_C4 + d * (_C5 + d * (_C6 + d * _C7))))))
         s = _S1 + d * (_S2 + d * (_S3 + d * (_S4 + d * (_S5 + d * (_S6 + d * _S7)))))
         s = a * (1.0 + d * s)
-        before = body[BODY.cos + i]
-        body[BODY.cos + i] = before * c - body[BODY.sin + i] * s
-        body[BODY.sin + i] = body[BODY.sin + i] * c + before * s
+        body[BODY.cos + i], body[BODY.sin + i] = rotated(c, s, heading, slope)
+        mass = body[BODY.inverse_mass + i]
+        body[BODY.vx + i] += (g_x + (f_x + body[BODY.weight_x + i]) * mass) * step
+        body[BODY.vy + i] += (g_y + (f_y + body[BODY.weight_y + i]) * mass) * step
+        body[BODY.omega + i] += torque * body[BODY.inverse_moment + i] * step
     if fast:
         for i in range(BLOCK):
-            if not abs(body[BODY.omega + i] * step) < small:
+            if not abs(body[BODY.turned + i]) < small:
                 align(body, i)
-
-
-@inner
-def accelerate(body, gravity, step):  # type: ignore[no-untyped-def]
-    """Add the velocity changes by gravity and the wrench."""
-    g_x, g_y = gravity
-    for i in range(BLOCK):
-        body[BODY.vx + i] += (g_x + body[BODY.acceleration_x + i]) * step
-        body[BODY.vy + i] += (g_y + body[BODY.acceleration_y + i]) * step
-        body[BODY.omega + i] += body[BODY.spin_up + i] * step
 
 
 @inner
@@ -196,10 +170,11 @@ def watch(bodies, still, discs, touched):  # type: ignore[no-untyped-def]
     for k in range(len(still.radii)):
         body, radius = bodies[k], still.radii[k]
         for i in range(BLOCK):
-            c, s = body[BODY.cos + i], body[BODY.sin + i]
-            com_x, com_y = body[BODY.com_x + i], body[BODY.com_y + i]
-            body[BODY.origin_x + i] = body[BODY.x + i] - (c * com_x - s * com_y)
-            body[BODY.origin_y + i] = body[BODY.y + i] - (s * com_x + c * com_y)
+            x, y = _arm(body, i)
+            body[BODY.origin_x + i], body[BODY.origin_y + i] = (
+                body[BODY.x + i] - x,
+                body[BODY.y + i] - y,
+            )
         for j in range(len(still.obstacles) - discs.shape[1]):
             a_x, a_y, d_x, d_y, scale, size = segment(still.obstacles[j])
             for i in range(BLOCK):
@@ -232,10 +207,8 @@ def begin_wheel(body):  # type: ignore[no-untyped-def]
     """Place a wheel's two rods and apply their impulses of the substep before."""
     for i in range(BLOCK):
         c, s = body[BODY.cos + i], body[BODY.sin + i]
-        x, y = body[BODY.wheel_x + i], body[BODY.wheel_y + i]
-        r_x, r_y = c * x - s * y, s * x + c * y
-        x, y = body[BODY.wheel_cos + i], body[BODY.wheel_sin + i]
-        n_x, n_y = c * x - s * y, s * x + c * y
+        r_x, r_y = rotated(c, s, body[BODY.wheel_x + i], body[BODY.wheel_y + i])
+        n_x, n_y = rotated(c, s, body[BODY.wheel_cos + i], body[BODY.wheel_sin + i])
         along, across = r_x * n_y - r_y * n_x, r_x * n_x + r_y * n_y
         mass, moment = body[BODY.inverse_mass + i], body[BODY.inverse_moment + i]
         body[BODY.axis_x + i], body[BODY.axis_y + i] = n_x, n_y
@@ -352,11 +325,8 @@ def _get_states(lanes, i):  # type: ignore[no-untyped-def]
 
 @inlined
 def _begin_interval(lanes, batch, out, wheels, still, step, ahead):  # type: ignore[no-untyped-def]
-    """Set properties, states where transitions begin, and wrenches.
-
-    Returns whether a centre of mass is off an origin, as far as properties are set.
-    """
-    rows, states, shifted = batch.given[0], lanes.states, False
+    """Set properties, states where transitions begin, and wrenches."""
+    rows, states = batch.given[0], lanes.states
     timed, n, horizon = rows.shape[1] > 1, len(batch.inputs), batch.inputs.shape[1]
     for k in range(len(lanes.bodies)):
         body, wheel = lanes.bodies[k], wheels.under[k]
@@ -370,13 +340,12 @@ def _begin_interval(lanes, batch, out, wheels, still, step, ahead):  # type: ign
                     for d in range(6):
                         states[k, d] = before[k, d]
                 row = rows[p, t * horizon + h if timed else 0, k]
-                shifted |= set_body(body, i, row, wheel, still.normal_gravity, step)
+                set_body(body, i, row, wheel, still.normal_gravity, step)
                 set_state(body, i, states, k)
             else:
                 align(body, i)
             force = batch.inputs[t, h, k]
             set_wrench(body, i, force[0], force[1], force[2])
-    return shifted
 
 
 @inlined
@@ -438,13 +407,10 @@ def _add(lanes, out, items, ahead, weight, first_level):  # type: ignore[no-unty
 
 
 @inner
-def substep(bodies, touched, discs, wheels, still, step, shifted):  # type: ignore[no-untyped-def]
+def substep(bodies, touched, discs, wheels, still, step):  # type: ignore[no-untyped-def]
     """Do one step of the engine, and mark the transitions in which a body touches or diverges."""
     for k in range(len(wheels.under)):
-        if shifted:
-            lever(bodies[k])
-        turn(bodies[k], step)
-        accelerate(bodies[k], still.gravity, step)
+        move(bodies[k], still.gravity, step)
         if wheels.under[k]:
             begin_wheel(bodies[k])
             for _ in range(wheels.iterations):
@@ -467,17 +433,17 @@ def rollout_free(wheels, still, batch, items, begins, out):  # type: ignore[no-u
         width = min(BLOCK, len(items) - begin)
         longest = _choose(lanes, batch, items, begins, begin)
         for level in range(len(batch.counts)):
-            substeps, shifted = batch.counts[level], False
+            substeps = batch.counts[level]
             step = batch.time_step / substeps
             bodies[:], touched[:] = 0.0, False
             for ahead in range(longest):
-                shifted |= _begin_interval(lanes, batch, out, wheels, still, step, ahead)
+                _begin_interval(lanes, batch, out, wheels, still, step, ahead)
                 if ahead == 0 and laws.n_slots + laws.n_held > 0:
                     _begin_laws(lanes, batch, width)
                 for s in range(substeps):
                     if laws.n_commands + laws.n_forces > 0:
                         _act(lanes, batch, width, ahead, s, substeps)
-                    substep(bodies, touched, discs, wheels, still, step, shifted)
+                    substep(bodies, touched, discs, wheels, still, step)
                 if laws.n_slots > 0:
                     _remember(lanes, batch, width, ahead)
                 chosen = items[begin : begin + width]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import namedtuple
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -32,16 +32,8 @@ from pbrl_ppl.state import Floats, Ints
 #: it, ``extra_gravity_x`` and ``extra_gravity_y`` (m/s^2) are added to the scene's gravity.
 COLUMNS = (
     *BODY_PARAMETERS,
-    "moment",
-    "pivot_torque",
-    "pivot_damping",
-    "turn_torque",
-    "patch_mu",
-    "patch_radius",
-    "extra_gravity_x",
-    "extra_gravity_y",
-    "com_x",
-    "com_y",
+    *("moment", "pivot_torque", "pivot_damping", "turn_torque", "patch_mu", "patch_radius"),
+    *("extra_gravity_x", "extra_gravity_y", "com_x", "com_y"),
 )
 #: Index of each column, by name.
 COLUMN: Any = namedtuple("COLUMN", COLUMNS)(*range(len(COLUMNS)))
@@ -55,11 +47,9 @@ SEEN = {
     "gravity_x": "extra_gravity_x",
     "gravity_y": "extra_gravity_y",
 }
-#: Least value of each column.
-_LEAST = np.zeros(len(COLUMNS))
-_LEAST[[COLUMNS.index(name) for name in _POSITIVE]] = np.nextafter(0, 1)
-_LEAST[[COLUMNS.index(name) for name in _ANY_SIGN]] = -np.finfo(float).max
-_NEVER = np.full((1, 1), np.inf)
+#: The time of what acts after the recording.
+_AFTER = Clock(*np.full((3, 1, 1), np.inf))
+S = TypeVar("S")
 
 
 class EngineInput(NamedTuple):
@@ -90,14 +80,17 @@ class EngineInput(NamedTuple):
     indices: Ints
 
 
-def _changed_columns(attached: Attached) -> frozenset[str]:
+def staged(effects: tuple[Attached, ...], kind: type[S]) -> list[tuple[Attached, S]]:
+    """Return the effects that act at a stage, each with it."""
+    stages = ((attached, attached.effect.stage) for attached in at_stage(effects, kind))
+    return [(attached, stage) for attached, stage in stages if isinstance(stage, kind)]
+
+
+def _changed_columns(attached: Attached, stage: Properties) -> frozenset[str]:
     """Return the names of the body's numbers that an effect changes, by a trial evaluation."""
-    stage = attached.effect.stage
-    if not isinstance(stage, Properties):
-        return frozenset()
     row = {name: np.zeros((1, 1)) for name in (*COLUMNS, *SEEN)}
     centre = {p.name: np.full((1, 1), p.prior.centre) for p in attached.effect.parameters}
-    stage.modify(row, centre, Clock(_NEVER, _NEVER, _NEVER))
+    stage.modify(row, centre, _AFTER)
     return frozenset(name for name, value in row.items() if value.any())
 
 
@@ -131,26 +124,19 @@ class EngineProperties:
         self._moved = np.array(moved, dtype=int).reshape(-1, 3).T
         self._unit_moment = np.array([body.shape.unit_moment for body in scene.moving])
         self._places = places
-        stages = (Structure, Properties, Command, Force, Friction, Sensor)
-        self._acting: dict[type, list[Attached]] = {s: at_stage(effects, s) for s in stages}
+        self._modifying, self._sensors = staged(effects, Properties), staged(effects, Sensor)
+        self._structures = staged(effects, Structure)
         self._bodies = bodies
         #: Which bodies never turn, and all reference angles.
         self.upright = never_turning(scene)
         self.angles = np.array([scene.reference_angle(name) for name in bodies])
         #: Whether a body's numbers depend on time.
-        self.timed = any(
-            isinstance(attached.effect.stage, Properties) and attached.effect.stage.timed
-            for attached in effects
-        )
-        self._tying = [
-            (attached, attached.effect.stage.rod)
-            for attached in self._acting[Structure]
-            if isinstance(attached.effect.stage, Structure) and attached.effect.stage.rod
-        ]
+        self.timed = any(stage.timed for _, stage in self._modifying)
+        self._tying = [(one, stage.rod) for one, stage in self._structures if stage.rod]
         #: Number of discs that the structure stage adds.
         self.n_discs = self._discs(np.zeros((1, layout.size))).shape[1]
         #: Bodies under which effects put a ring of friction, a wheel, and friction against turning.
-        self.under = tuple(self._changed(effects, names) for names in (_PATCH, _WHEEL, _TURN))
+        self.under = tuple(map(self._changed, (_PATCH, _WHEEL, _TURN)))
         #: Body and row among all joints of each rod that an effect adds.
         self.tied = tuple(
             (bodies.index(attached.body), len(scene.joints) + j)
@@ -158,9 +144,13 @@ class EngineProperties:
         )
         self.joints = SceneJoints(scene, places)
 
-    def _changed(self, effects: tuple[Attached, ...], names: tuple[str, ...]) -> tuple[int, ...]:
+    def _changed(self, names: tuple[str, ...]) -> tuple[int, ...]:
         """Return the bodies for which effects change one of these columns."""
-        changed = {e.body for e in effects if _changed_columns(e).intersection(names)}
+        changed = {
+            one.body
+            for one, stage in self._modifying
+            if _changed_columns(one, stage).intersection(names)
+        }
         return tuple(i for i, name in enumerate(self._bodies) if name in changed)
 
     def values(self, attached: Attached, phi: Floats, axes: int = 0) -> dict[str, Floats]:
@@ -180,8 +170,7 @@ class EngineProperties:
         """Return body, sensor and its parameters, shape (proposal, 1, 1), in the sensors' order."""
         return [
             (self._bodies.index(attached.body), stage, self.values(attached, phi, 2))
-            for attached in self._acting[Sensor]
-            if isinstance(stage := attached.effect.stage, Sensor)
+            for attached, stage in self._sensors
         ]
 
     def __call__(self, phi: Floats, clock: Clock | None = None) -> EngineInput:
@@ -224,14 +213,13 @@ class EngineProperties:
 
     def _modified(self, bodies: Floats, phi: Floats, clock: Clock | None) -> Floats:
         """Return properties after the properties stage, with the moments of inertia."""
-        modifying = self._acting[Properties]
         bodies[..., COLUMN.moment] = bodies[..., COLUMN.mass] * self._unit_moment
-        if not modifying:
+        if not self._modifying:
             return bodies[:, None]
-        clock = clock if self.timed and clock is not None else Clock(_NEVER, _NEVER, _NEVER)
+        clock = clock if self.timed and clock is not None else _AFTER
         m, gravity = clock.begin.shape[1], self._scene.gravity
         result = np.repeat(bodies[:, None], m, axis=1)
-        for name in dict.fromkeys(attached.body for attached in modifying):
+        for name in dict.fromkeys(attached.body for attached, _ in self._modifying):
             i = self._bodies.index(name)
             row = {
                 key: result[:, :, i, column].copy()
@@ -241,9 +229,9 @@ class EngineProperties:
             row["moment_per_mass"] = np.full((len(phi), m), self._unit_moment[i])
             for key, value in zip(("gravity_x", "gravity_y"), gravity, strict=True):
                 row[key] = np.full((len(phi), m), value)
-            for attached in modifying:
-                if attached.body == name and isinstance(attached.effect.stage, Properties):
-                    attached.effect.stage.modify(row, self.values(attached, phi, 1), clock)
+            for attached, stage in self._modifying:
+                if attached.body == name:
+                    stage.modify(row, self.values(attached, phi, 1), clock)
             row["moment"] = row["mass"] * row["moment_per_mass"]
             row["extra_gravity_x"] = row["gravity_x"] - gravity[0]
             row["extra_gravity_y"] = row["gravity_y"] - gravity[1]
@@ -255,7 +243,7 @@ class EngineProperties:
         """Return parameters and constants of a stage's laws, one after another, (proposal, q)."""
         columns = [
             column
-            for law in self._acting[stage]
+            for law in at_stage(self._effects, stage)
             for column in (
                 *self.values(law, phi).values(),
                 *(np.full(len(phi), constant) for constant in law.effect.constants),
@@ -267,9 +255,8 @@ class EngineProperties:
         """Return the structure stage's discs, shape (proposal, disc, 3)."""
         rows = [
             np.stack(np.broadcast_arrays(disc.x, disc.y, disc.radius), axis=-1)
-            for attached in self._acting[Structure]
-            if isinstance(attached.effect.stage, Structure)
-            for disc in attached.effect.stage.discs(self.values(attached, phi))
+            for attached, stage in self._structures
+            for disc in stage.discs(self.values(attached, phi))
         ]
         if not rows:
             return np.empty((len(phi), 0, 3))
@@ -296,7 +283,10 @@ class EngineProperties:
 
     def _check(self, bodies: Floats) -> None:
         """Refuse impossible numbers of bodies."""
-        possible = (bodies >= _LEAST) & (bodies < np.inf)
+        least = np.zeros(len(COLUMNS))
+        least[[COLUMNS.index(name) for name in _POSITIVE]] = np.nextafter(0, 1)
+        least[[COLUMNS.index(name) for name in _ANY_SIGN]] = -np.finfo(float).max
+        possible = (bodies >= least) & (bodies < np.inf)
         if possible.all():
             return
         first = tuple(np.argwhere(~possible)[0])

@@ -31,9 +31,6 @@ from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import INPUT, STATE, THETA, VELOCITY, WRENCH, Bools, Floats, Ints
 from pbrl_ppl.threads import in_worker
 
-#: Bodies are near each other within this multiple of their radii: a step of half a radius that
-#: passes through the edge of a bounding circle ends in it.
-_NEAR = 1.04
 #: For each joint of unknown bodies, which of ``scene.joinable`` it holds.
 Joined = tuple[tuple[int, int], ...]
 #: And which rods there are: what worlds differ in.
@@ -78,7 +75,8 @@ class Engine:
         if self._name == "chipmunk":
             return
         self._wheels = lockstep.free_wheels(self.world)
-        self._still = still(self.world, _NEAR if self._wheels is None else 1.0)
+        # a tree's step of half a radius that passes through the edge of a circle is to end in it
+        self._still = still(self.world, 1.04 if self._wheels is None else 1.0)
         if self._wheels is None:
             self._tree = tree_of(self.world)
         if self._tree is not None:
@@ -326,13 +324,10 @@ class Simulator:
         return law_tables(self.physics.scene, self.physics.effects)
 
     def _new_world(self, choice: Choice) -> World:
-        joined, there = choice
-        properties = self._properties
+        (joined, there), properties = choice, self._properties
         rods = tuple(compress(properties.tied, there))
-        scene, kinds = self.physics.scene, properties.joints.kinds
-        patches, wheels, turners = properties.under
-        discs = properties.n_discs
-        return World(scene, kinds, joined, discs, patches, wheels, turners, rods)
+        kinds, discs = properties.joints.kinds, properties.n_discs
+        return World(self.physics.scene, kinds, joined, discs, *properties.under, rods)
 
     def _run(
         self,

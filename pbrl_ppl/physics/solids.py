@@ -27,7 +27,6 @@ _OUTLINE, _SHARE = 0.05, 0.5 / (_POSES - 1)
 
 #: Violation that noise and resting contact may explain, as a share of the smaller body's size.
 ALLOWED = 0.25
-_ORIGIN = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -340,7 +339,8 @@ def overlap(scene: Scene, poses: Floats) -> Floats:
 def _apart(scene: Scene, poses: Floats) -> Iterator[tuple[int, str]]:
     """Yield the first transition and a message for each known joint with wrong anchors."""
     moving = {body.name: i for i, body in enumerate(scene.moving)}
-    reference = {body.name: body.pose or _ORIGIN for body in scene.bodies} | {WORLD: _ORIGIN}
+    origin = (0.0, 0.0, 0.0)
+    reference = {body.name: body.pose or origin for body in scene.bodies} | {WORLD: origin}
     for joint in scene.joints:
         if not joint.known or joint.bodies is None:
             continue

@@ -192,12 +192,9 @@ def _applied(effect: Effect, state: Floats, parameters: Floats, body: Body, unit
         stage.law(state.copy(), command, numbers, wrench)
         slots = 3 * stage.memory if isinstance(stage, Command) else getattr(stage, "memory", 0)
         remembered = np.zeros(slots)
-        if isinstance(stage, Command) and stage.remember is not None:
-            stage.remember(state.copy(), command, numbers, remembered)
-        if isinstance(stage, Force) and stage.rate is not None:
-            stage.rate(state.copy(), command, numbers, remembered)
-            if stage.begin is not None:
-                stage.begin(state.copy(), command, numbers, remembered)
+        for name in ("remember", "rate", "begin"):
+            if (law := getattr(stage, name, None)) is not None:
+                law(state.copy(), command, numbers, remembered)
         return np.concatenate([wrench, remembered])
     if isinstance(stage, Properties):
         values = {name: np.ones((1, 1)) for name in (*COLUMNS, *SEEN)}

@@ -22,18 +22,16 @@ from pbrl_ppl.physics.joints import (
     HINGE,
     JOINT_KINDS,
     ROD,
-    JointKind,
+    EngineJoint,
     Setting,
     never_turning,
 )
 from pbrl_ppl.physics.properties import COLUMN
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene, smallest_radius
+from pbrl_ppl.state import Floats
 
 #: Points of a ring that carry a body's weight, in units of the ring's radius.
 RING = tuple((math.cos(0.25 * i * math.pi), math.sin(0.25 * i * math.pi)) for i in range(8))
-#: A point may stick if its speed is below this multiple of what friction takes away in a substep.
-#: (With 0.1, slow points stick across their direction of motion now and then: predictions jump.)
-STICKING = 1.0
 #: Bounding radius (m) and engine time (s) of the shopping cart, for which the engine's treatment of
 #: overlaps was chosen.
 _CART = math.hypot(0.45, 0.275)
@@ -157,7 +155,7 @@ class Link(NamedTuple):
     """
 
     joint: int
-    kind: JointKind
+    kind: EngineJoint
     constraint: pymunk.Constraint
     pivot: int
     axis: float = 0.0
@@ -170,7 +168,7 @@ class World:
     ----------
     scene : Scene
         Geometry, joints and gravity.
-    kinds : tuple of JointKind
+    kinds : tuple of EngineJoint
         Kind of each of the scene's joints in the engine.
     joined : tuple of (int, int)
         Indices into ``scene.joinable`` of the bodies of each joint of unknown bodies, in the
@@ -188,7 +186,7 @@ class World:
     def __init__(
         self,
         scene: Scene,
-        kinds: tuple[JointKind, ...] = (),
+        kinds: tuple[EngineJoint, ...] = (),
         joined: tuple[tuple[int, int], ...] = (),
         discs: int = 0,
         patches: tuple[int, ...] = (),
@@ -221,10 +219,7 @@ class World:
         self.discs: list[pymunk.Circle] = []
         self._by_name: dict[str, pymunk.Body] = {WORLD: self.space.static_body}
         self._add_fixed()
-        for j in range(discs):
-            away = -self.far, -self.far * (j + 1)
-            self.discs.append(pymunk.Circle(self.space.static_body, 0.0, away))
-            self._add_static(self.discs[j])
+        self._add_discs(discs)
         #: Which bodies follow a path, at the velocities in their actions.
         self.kinematic = np.array([body.kinematic for body in scene.moving])
         self._add_moving(wheels)
@@ -246,14 +241,7 @@ class World:
         self.iterations = 30 if self.chained.any() else 5 if alone else 10
         #: For the near-contact test: radii of bounding circles, and segments with a radius.
         self.radii = np.array([body.shape.bounding_radius for body in scene.moving])
-        fixed = [(*wall.start, *wall.end, 0.0) for wall in scene.walls]
-        fixed += [
-            (*body.pose[:2], *body.pose[:2], body.shape.bounding_radius)
-            for body in scene.bodies
-            if body.static and body.pose is not None
-        ]
-        fixed += [(-self.far, -self.far, -self.far, -self.far, 0.0)] * discs  # the last ones
-        self.obstacles = np.array(fixed, dtype=float).reshape(-1, 5)
+        self.obstacles = self._obstacles(discs)
 
     def check_steps(self) -> None:
         """Refuse sliders on what turns, for which the engine has no right joint.
@@ -328,6 +316,24 @@ class World:
                 for shape in engine_shapes(body, rigid):
                     self._add_static(shape)
 
+    def _add_discs(self, discs: int) -> None:
+        """Add hidden discs, far from everything."""
+        for j in range(discs):
+            away = -self.far, -self.far * (j + 1)
+            self.discs.append(pymunk.Circle(self.space.static_body, 0.0, away))
+            self._add_static(self.discs[j])
+
+    def _obstacles(self, discs: int) -> Floats:
+        """Return what does not move as segments with a radius, shape (obstacle, 5), discs last."""
+        fixed = [(*wall.start, *wall.end, 0.0) for wall in self.scene.walls]
+        fixed += [
+            (*body.pose[:2], *body.pose[:2], body.shape.bounding_radius)
+            for body in self.scene.bodies
+            if body.static and body.pose is not None
+        ]
+        fixed += [(-self.far, -self.far, -self.far, -self.far, 0.0)] * discs
+        return np.array(fixed, dtype=float).reshape(-1, 5)
+
     def _add_static(self, shape: pymunk.Shape) -> None:
         shape.elasticity = shape.friction = 1.0  # the engine multiplies both shapes' values
         self.space.add(shape)
@@ -358,7 +364,7 @@ class World:
         self.space.add(constraint)
 
     def _add_joints(
-        self, kinds: tuple[JointKind, ...], joined: tuple[tuple[int, int], ...]
+        self, kinds: tuple[EngineJoint, ...], joined: tuple[tuple[int, int], ...]
     ) -> None:
         """Add the scene's joints; their anchors and lengths are properties."""
         pairs, names = iter(joined), self.scene.joinable
@@ -380,7 +386,7 @@ class World:
         position: int,
         a: pymunk.Body,
         b: pymunk.Body,
-        kind: JointKind,
+        kind: EngineJoint,
         joint: Joint | None = None,
     ) -> None:
         link = kind.constraint(a, b)

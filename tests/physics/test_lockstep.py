@@ -1,7 +1,5 @@
 """The contact-free fast path of single bodies agrees with the engine."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -153,7 +151,5 @@ def test_worlds_of_the_fast_path() -> None:
     assert tree_of(pushed).bodies.tolist() == [0, -1]
     held = pushed.scene.replace(joints=(Joint("hinge", ("a", "finger"), (0.5, 0.0), (-0.5, 0.0)),))
     assert tree_of(World(held, (HINGE,))) is None
-    unknown = dataclasses.replace(HINGE, contact_free=False)
-    assert tree_of(World(two.replace(joints=(joint,)), (unknown,))) is None
     closed = (joint, Joint("distance", ("a", "b"), (0.0, 0.3), (0.0, -0.3)))
     assert tree_of(World(two.replace(joints=closed), (HINGE, ROD))) is None
