@@ -33,8 +33,7 @@ from pymunk import _chipmunk_cffi
 from pbrl_ppl.effects import Law
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.parameters import BODY_PARAMETERS, JOINT_ANCHORS
-from pbrl_ppl.physics.joints import JOINT_KINDS
-from pbrl_ppl.physics.world import BODY_CONSTRAINTS, RING, Placed, World
+from pbrl_ppl.physics.world import BODY_CONSTRAINTS, JOINT_KINDS, RING, Placed, World
 
 
 def sources_digest(folder: Path) -> str:

@@ -33,9 +33,8 @@ from pbrl_ppl.physics.laws import (
     set_memory,
     states_before,
 )
-from pbrl_ppl.physics.properties import COLUMN
 from pbrl_ppl.physics.solids import near_contact
-from pbrl_ppl.physics.world import FINER, TINY
+from pbrl_ppl.physics.world import COLUMN, FINER, TINY
 
 _FREE, _TOUCHED, _LOST = 0, 1, 2
 
@@ -356,7 +355,7 @@ def _scratch_of(world, laws):  # type: ignore[no-untyped-def]
     )  # fmt: skip
 
 
-@inlined
+@inner
 def _renew(fn, world, bodies, joints, state):  # type: ignore[no-untyped-def]
     """Set properties that change with time where an interval begins."""
     set_properties(fn, world, bodies, joints)
@@ -364,19 +363,6 @@ def _renew(fn, world, bodies, joints, state):  # type: ignore[no-untyped-def]
     set_strengths(fn, world, bodies, True)
     enough = iterations(world.iterations, world.chained, bodies)
     call_int(fn.cpSpaceSetIterations, world.space, enough)
-
-
-@inlined
-def _substep(fn, world, laws, bodies, joints, state, axes, step, acted):  # type: ignore[no-untyped-def]
-    """Do one step of the engine with what acts; return whether a body has diverged."""
-    if laws.n_frictions > 0:
-        set_brakes(world, laws, bodies, joints, state, acted)
-    _push(fn, world, bodies, state, acted)
-    place_wheels(fn, world, bodies, state, axes, step)
-    if len(world.patch_body) > 0:
-        place_patches(fn, world, laws, bodies, state, step, acted)
-    call1(fn.cpSpaceStep, world.space, step)
-    return _read(fn, world, bodies, state)
 
 
 @inlined
@@ -398,7 +384,7 @@ def _transition(  # type: ignore[no-untyped-def]
     for j in range(len(axes)):
         turn = bodies[world.wheel_body[j], COLUMN.w_theta]
         axes[j, 0], axes[j, 1] = math.cos(turn), math.sin(turn)
-    touched, near = _FREE, False
+    touched, near, driven = _FREE, False, world.kinematic.any()
     acting = laws.n_commands + laws.n_forces > 0
     remembered = from_place(start_of(memory), laws.n_slots)
     state_at, acted_at, held_at = start_of(state), start_of(acted), start_of(held)
@@ -413,7 +399,8 @@ def _transition(  # type: ignore[no-untyped-def]
             bodies = properties_in(rows, p, t, h, len(inputs))
             _renew(fn, world, bodies, joints, state)
         inputs_at = start_of(inputs[h])
-        drive(fn, world, state, inputs[h])
+        if driven:
+            drive(fn, world, state, inputs[h])
         for i in range(k):
             for w in range(3):
                 acted[i, COMMAND + w] = acted[i, WRENCHES + w] = inputs[h, i, w]
@@ -426,7 +413,14 @@ def _transition(  # type: ignore[no-untyped-def]
                 )  # fmt: skip
                 for slot in range(laws.n_held):
                     held[0, slot] += step * held[1, slot]
-            if _substep(fn, world, laws, bodies, joints, state, axes, step, acted):
+            if laws.n_frictions > 0:
+                set_brakes(world, laws, bodies, joints, state, acted)
+            _push(fn, world, bodies, state, acted)
+            place_wheels(fn, world, bodies, state, axes, step)
+            if len(world.patch_body) > 0:
+                place_patches(fn, world, laws, bodies, state, step, acted)
+            call1(fn.cpSpaceStep, world.space, step)
+            if _read(fn, world, bodies, state):
                 return _LOST, end
             if watch and (touched == _FREE or not whole):
                 near = near_contact(state, still.radii, still.obstacles, still.can_touch)

@@ -304,25 +304,19 @@ def _advance(work, laws, still, budget, wanted):  # type: ignore[no-untyped-def]
             fresh, left = False, _first_margin(work)
         width = min(wanted, _way(work, still)) if still.watched else wanted
         last, width = width >= work.high - share, min(width, work.high - share)
-        budget -= 1
-        if budget <= 0:
-            return 0, wanted
-        error, end, way = _step(work, laws, share, width)
+        error, end, way, width, budget, located = _attempt(work, laws, share, width, left, budget)
         short, switches = width <= SHORTEST, end < -_LOCATED
-        if short and not error < np.inf:
+        if budget <= 0 or (short and not located and not error < np.inf):
             return 0, wanted
-        if not short and not error <= 1.0:
+        if located:
+            fresh, last = True, False
+        elif not short and not error <= 1.0:
             wanted = width * (max(0.1, 0.9 * error**-0.2) if error < np.inf else 0.25)
             continue
         # it has just switched, or switches on the way alone
-        if not short and (left <= _LOCATED if switches else way < -_LOCATED):
+        elif not short and (left <= _LOCATED if switches else way < -_LOCATED):
             wanted = 0.5 * width
             continue
-        if switches and not short:
-            width, budget = _locate(work, laws, share, width, left, end, budget)
-            if budget <= 0:
-                return 0, wanted
-            fresh, last = True, False
         else:
             fresh, left = switches, end
             wider = width * min(5.0, 0.9 * max(error, 1e-9) ** -0.2)
@@ -338,22 +332,27 @@ def _advance(work, laws, still, budget, wanted):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _locate(work, laws, share, until, before, after, budget):  # type: ignore[no-untyped-def]
-    """Repeat a step of the width ``until`` in which something switches, up to the switch.
+def _attempt(work, laws, share, width, left, budget):  # type: ignore[no-untyped-def]
+    """Try a step; one in which something switches is narrowed to the switch.
 
-    ``before`` and ``after`` are by how much nothing switches at its begin and end (regula falsi,
-    Illinois). Returns the width, and the steps left.
+    By regula falsi (Illinois) from its begin, where nothing switches by ``left``. Returns what
+    `_step` does, the width, the steps left, and whether it ends at a switch.
     """
-    begin, kept = 0.0, 0
+    begin, before, until, after, kept = 0.0, left, width, 0.0, 0
+    located = False
     while True:
-        width = begin + (until - begin) * before / (before - after)
         budget -= 1
         if budget <= 0:
-            return width, budget
-        _, end, _ = _step(work, laws, share, width)
-        if not (abs(end) > _LOCATED and until - begin > 1e-12):
-            return width, budget
-        if end > 0.0:
+            return np.inf, 0.0, 0.0, width, budget, located
+        error, end, way = _step(work, laws, share, width)
+        if not located:
+            wide = width > SHORTEST and error <= 1.0 and left > _LOCATED
+            if not wide or not end < -_LOCATED:
+                return error, end, way, width, budget, located
+            located, after = True, end
+        elif not (abs(end) > _LOCATED and until - begin > 1e-12):
+            return error, end, way, width, budget, located
+        elif end > 0.0:
             begin, before = width, end
             after *= 0.5 if kept == 1 else 1.0
             kept = 1
@@ -361,6 +360,7 @@ def _locate(work, laws, share, until, before, after, budget):  # type: ignore[no
             until, after = width, end
             before *= 0.5 if kept == -1 else 1.0
             kept = -1
+        width = begin + (until - begin) * before / (before - after)
 
 
 @inner
@@ -433,6 +433,15 @@ def _write(work, still, out):  # type: ignore[no-untyped-def]
     return lost
 
 
+@inner
+def _lose(states, first):  # type: ignore[no-untyped-def]
+    """Set the states (H, body, 6) from an interval on to NaN."""
+    for h in range(first, len(states)):
+        for k in range(states.shape[1]):
+            for d in range(6):
+                states[h, k, d] = np.nan
+
+
 @compiled
 def rollout_tree(  # type: ignore[no-untyped-def]
     works, still, batch, items, begins, out, most_steps=4000
@@ -481,5 +490,5 @@ def rollout_tree(  # type: ignore[no-untyped-def]
                 begins[place] = h
                 break
             if _write(work, still, out[item, h]) or budget == 0:
-                out[item, h:] = np.nan
+                _lose(out[item], h)
                 break

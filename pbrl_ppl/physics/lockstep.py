@@ -29,9 +29,8 @@ from pbrl_ppl.physics.laws import (
     set_memory,
     states_before,
 )
-from pbrl_ppl.physics.properties import COLUMN
 from pbrl_ppl.physics.solids import reaches, segment
-from pbrl_ppl.physics.world import World
+from pbrl_ppl.physics.world import COLUMN, World
 from pbrl_ppl.state import Bools, Floats, Ints
 
 #: Number of transitions in a block, which are computed side by side.
@@ -170,11 +169,10 @@ def watch(bodies, still, discs, touched):  # type: ignore[no-untyped-def]
     for k in range(len(still.radii)):
         body, radius = bodies[k], still.radii[k]
         for i in range(BLOCK):
-            x, y = _arm(body, i)
-            body[BODY.origin_x + i], body[BODY.origin_y + i] = (
-                body[BODY.x + i] - x,
-                body[BODY.y + i] - y,
-            )
+            c, s = body[BODY.cos + i], body[BODY.sin + i]
+            x, y = rotated(c, s, body[BODY.com_x + i], body[BODY.com_y + i])
+            body[BODY.origin_x + i] = body[BODY.x + i] - x
+            body[BODY.origin_y + i] = body[BODY.y + i] - y
         for j in range(len(still.obstacles) - discs.shape[1]):
             a_x, a_y, d_x, d_y, scale, size = segment(still.obstacles[j])
             for i in range(BLOCK):

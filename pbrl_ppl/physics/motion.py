@@ -14,11 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.physics.calls import from_place, inner, numbers_at, rotated, start_of
-from pbrl_ppl.physics.joints import LENGTH
 from pbrl_ppl.physics.laws import ACTED, COMMAND, MORE, WINDOW, WRENCHES, act, bound
-from pbrl_ppl.physics.properties import COLUMN
-from pbrl_ppl.physics.tree import FRICTION, KIND, LINK, MOST, POSE, Tree, columns
-from pbrl_ppl.physics.world import RING
+from pbrl_ppl.physics.tree import FRICTION, KIND, LINK, MOST, POSE, Tree
+from pbrl_ppl.physics.world import COLUMN, JOINT, RING, columns
 
 #: Columns of a link's numbers. Mass, moment, centre of mass from the place of its joint (in its
 #: frame), that place in the parent's frame or the world and in the body's own frame, gravity,
@@ -111,7 +109,7 @@ def set_numbers(work, gravity, normal_gravity, ring, bodies, joints):  # type: i
             at_x, at_y, c, s, _, _ = work.poses[i]
             x, y = at_x + c * x - s * y, at_y + s * x + c * y
         elif work.tree[parent, LINK.kind] == KIND.bar:
-            x = joints[joint, LENGTH]
+            x = joints[joint, JOINT.length]
         else:
             x, y = x - work.links[parent, HAS.own_x], y - work.links[parent, HAS.own_y]
         link[HAS.at_x], link[HAS.at_y] = x, y
@@ -344,32 +342,33 @@ def set_bounds(work, laws, u):  # type: ignore[no-untyped-def]
     """Set the greatest forces of dry friction that laws change, where forces and rows are set."""
     if laws.n_frictions == 0:
         return
-    tree, motion, acted, states = work.tree, work.motion, work.acted, work.states
+    tree, rows, rings, acted = work.tree, work.rows, work.rings, work.acted
+    points = rings.shape[1] - RIM.points
     for r in range(work.n_kinds):
-        kind, i = work.kinds[r, 0], work.kinds[r, 1]
-        turn, body = tree[i, LINK.turn], tree[i, LINK.body]
-        if kind == FRICTION.pivot:
-            owner, torque = tree[i, LINK.owner], acted[body, COMMAND + 2]
-            first, speed = tree[i, LINK.first], row_speed(work, r, u)
+        kind, i, ring = work.kinds[r, 0], work.kinds[r, 1], r - work.n_rows
+        body, under, torque, rest = tree[i, LINK.body], 1, 0.0, 0.0
+        if kind < 0:
+            base = points * rings[ring, RIM.twist, 3]
+            speed = math.sqrt(set_twist(work, ring, i, u, RIM.twist_now))
+        elif kind == FRICTION.pivot:
+            base, torque, speed = rows[r, ROW.base], acted[body, COMMAND + 2], row_speed(work, r, u)
+            first = tree[i, LINK.first]
             if tree[i, LINK.kind] == KIND.rail:
                 torque = work.slope[i, first, 0] * acted[body, COMMAND]
                 torque += work.slope[i, first, 1] * acted[body, COMMAND + 1]
-            rest = motion[LOAD, first] + work.links[i, HAS.damping] * speed - torque
-            work.rows[r, ROW.bound] = bound(
-                work.rows[r, ROW.base], laws, owner, 0, states, torque, rest, abs(speed), acted
-            )
+            rest = work.motion[LOAD, first] + work.links[i, HAS.damping] * speed - torque
+            body, under, speed = tree[i, LINK.owner], 0, abs(speed)
         elif kind == FRICTION.under:
             x, y = work.links[i, HAS.own_x], work.links[i, HAS.own_y]
-            speed = abs(motion[u, turn]) * math.sqrt(x * x + y * y)
-            work.rows[r, ROW.bound] = bound(
-                work.rows[r, ROW.base], laws, body, 1, states, 0.0, 0.0, speed, acted
-            )
-        elif kind < 0:
-            ring = r - work.n_rows
-            points, base = work.rings.shape[1] - RIM.points, work.rings[ring, RIM.twist, 3]
-            speed = math.sqrt(set_twist(work, ring, i, u, RIM.twist_now))
-            most = bound(points * base, laws, body, 1, states, 0.0, 0.0, speed, acted)
-            work.rings[ring, RIM.grip, 0] = most / points
+            base = rows[r, ROW.base]
+            speed = abs(work.motion[u, tree[i, LINK.turn]]) * math.sqrt(x * x + y * y)
+        else:
+            continue
+        most = bound(base, laws, body, under, work.states, torque, rest, speed, acted)
+        if kind < 0:
+            rings[ring, RIM.grip, 0] = most / points
+        else:
+            rows[r, ROW.bound] = most
 
 
 @inner

@@ -20,13 +20,12 @@ from pbrl_ppl.history import fill_joints, joint_coordinates
 from pbrl_ppl.parameters import Layout, differentiate
 from pbrl_ppl.physics import calls, compiled, flow, lockstep
 from pbrl_ppl.physics.calls import pointers, still
-from pbrl_ppl.physics.joints import LENGTH, on_rod
 from pbrl_ppl.physics.laws import law_tables, laws_of
 from pbrl_ppl.physics.motion import work_of
-from pbrl_ppl.physics.properties import EngineInput, EngineProperties
+from pbrl_ppl.physics.properties import EngineInput, EngineProperties, on_rod
 from pbrl_ppl.physics.settings import PhysicsSettings
 from pbrl_ppl.physics.tree import MOST, tree_of
-from pbrl_ppl.physics.world import World
+from pbrl_ppl.physics.world import JOINT, World
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import INPUT, STATE, THETA, VELOCITY, WRENCH, Bools, Floats, Ints
 from pbrl_ppl.threads import in_worker
@@ -97,7 +96,7 @@ class Engine:
         items, horizon = np.arange(first, last), batch.inputs.shape[1]
         begins = np.zeros(len(items), dtype=np.int64)
         tree = self._tree
-        if tree is not None and batch.laws[0]["n_held"] > max(0, MOST - 1 - tree.size):
+        if tree is not None and batch.laws["n_held"].max(initial=0) > max(0, MOST - 1 - tree.size):
             tree = None  # laws' own numbers have no place beside the coordinates
         whole = self._wheels is None and tree is None
         while len(items):
@@ -147,13 +146,9 @@ class Simulator:
         self._worlds: OrderedDict[Choice, list[Engine]] = OrderedDict()
         self._lock = threading.Lock()  # the worlds serve one call at a time
 
-    def __getstate__(self) -> PhysicsSettings:
-        """Return the state to pickle, without C objects: another process builds its own."""
-        return self.physics
-
-    def __setstate__(self, physics: PhysicsSettings) -> None:
-        """Restore a pickled simulator."""
-        Simulator.__init__(self, physics)
+    def __reduce__(self) -> tuple[type[Simulator], tuple[PhysicsSettings]]:
+        """Return what to pickle, without C objects: another process builds its own."""
+        return type(self), (self.physics,)
 
     def __call__(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
         """Predict the states after each interval of each transition.
@@ -222,7 +217,7 @@ class Simulator:
         Friction under bodies does not, where its coefficient is zero: a derivative there is not to
         see the difference of two solvers.
         """
-        tied = numbers.joints[:, len(self.physics.scene.joints) :, LENGTH] > 0
+        tied = numbers.joints[:, len(self.physics.scene.joints) :, JOINT.length] > 0
         proposals, joints, _ = numbers.indices.shape
         indices = numbers.indices.reshape(proposals, 2 * joints)
         keys = np.column_stack([tied, indices])
@@ -272,7 +267,8 @@ class Simulator:
             states = _each(states, len(joints))
         for i, position in self._properties.tied:
             moment = self.physics.scene.moving[i].shape.unit_moment
-            states[:, :, i] = on_rod(states[:, :, i], joints[:, position, : LENGTH + 1], moment)
+            rod = joints[:, position, : JOINT.length + 1]
+            states[:, :, i] = on_rod(states[:, :, i], rod, moment)
         return states
 
     def jacobian(self, phi: Floats, start: Floats, actions: Floats, step: float = 1e-5) -> Floats:
@@ -327,7 +323,8 @@ class Simulator:
         (joined, there), properties = choice, self._properties
         rods = tuple(compress(properties.tied, there))
         kinds, discs = properties.joints.kinds, properties.n_discs
-        return World(self.physics.scene, kinds, joined, discs, *properties.under, rods)
+        patches, wheels, turners = properties.under
+        return World(self.physics.scene, kinds, joined, discs, patches, wheels, turners, rods)
 
     def _run(
         self,

@@ -9,22 +9,12 @@ ends; a free body has three. Nothing has to hold the joints together, and nothin
 from __future__ import annotations
 
 import math
-from collections import namedtuple
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from pbrl_ppl.physics.joints import A_X, B_X, HINGE, ROD, SLIDER
-from pbrl_ppl.physics.world import Link, World
+from pbrl_ppl.physics.world import HINGE, JOINT, ROD, SLIDER, Link, World, columns
 from pbrl_ppl.state import Floats, Ints
-
-
-def columns(names: str) -> Any:
-    """Return the numbers of columns by their names."""
-    fields = names.split()
-    return namedtuple("Columns", fields)(*range(len(fields)))
-
 
 #: Kinds of links.
 KIND = columns("free hinge bar rail")
@@ -136,7 +126,7 @@ class _Links:
         if holder < 0:
             fixed = link.constraint.b if turned else link.constraint.a
             pose = (*fixed.position, math.cos(fixed.angle), math.sin(fixed.angle), 0.0, 0.0)
-        near, far = (B_X, A_X) if turned else (A_X, B_X)
+        near, far = (JOINT.b_x, JOINT.a_x) if turned else (JOINT.a_x, JOINT.b_x)
         if link.kind is ROD:
             parent = self.add(KIND.bar, parent, -1, link.joint, near, -1, -1, pose=pose)
             pose, near = _NOWHERE, -1

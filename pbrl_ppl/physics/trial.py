@@ -24,7 +24,8 @@ from pbrl_ppl.effects.effect import INTERVAL, MEMORY, MOST_MEMORY, TIME
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.history import History
 from pbrl_ppl.physics.physics import Physics
-from pbrl_ppl.physics.properties import COLUMNS, SEEN
+from pbrl_ppl.physics.properties import SEEN
+from pbrl_ppl.physics.world import COLUMNS
 from pbrl_ppl.scene import Body, Scene, Units, body_sizes, units_of
 from pbrl_ppl.state import STATE, STATE_UNITS, Floats
 

@@ -25,11 +25,11 @@ from pbrl_ppl.physics.compiled import (
     wheel_ends,
 )
 from pbrl_ppl.physics.laws import WINDOW
-from pbrl_ppl.physics.properties import COLUMN, EngineInput
+from pbrl_ppl.physics.properties import EngineInput
 from pbrl_ppl.physics.settings import PhysicsSettings
 from pbrl_ppl.physics.simulator import Choice, continues_previous
 from pbrl_ppl.physics.solids import near_contact
-from pbrl_ppl.physics.world import FINER, RING, World
+from pbrl_ppl.physics.world import COLUMN, FINER, RING, World
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import WRENCH, Floats
 

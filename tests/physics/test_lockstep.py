@@ -5,9 +5,8 @@ import pytest
 
 from pbrl_ppl.effects import attach
 from pbrl_ppl.physics import Physics, Simulator, build_layout, compiled, lockstep
-from pbrl_ppl.physics.joints import HINGE, ROD
 from pbrl_ppl.physics.tree import tree_of
-from pbrl_ppl.physics.world import World
+from pbrl_ppl.physics.world import HINGE, ROD, World
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.engines import BOX, proposals
 from tests.helpers.plain import PlainSimulator, simulator_of
