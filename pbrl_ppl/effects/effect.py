@@ -124,7 +124,7 @@ class Properties:
     ----------
     modify : callable
         ``modify(properties, parameters, clock)`` changes a dict of arrays in place. Its keys are
-        :data:`pbrl_ppl.physics.properties.COLUMNS`, with two exceptions: ``moment_per_mass``, from
+        :data:`pbrl_ppl.physics.world.COLUMNS`, with two exceptions: ``moment_per_mass``, from
         which the moment of inertia is computed afterwards, and ``gravity_x`` and ``gravity_y``
         (m/s^2), the total gravity.
     timed : bool

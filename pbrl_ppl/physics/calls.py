@@ -33,8 +33,7 @@ from pymunk import _chipmunk_cffi
 from pbrl_ppl.effects import Law
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.parameters import BODY_PARAMETERS, JOINT_ANCHORS
-from pbrl_ppl.physics.joints import JOINT_KINDS
-from pbrl_ppl.physics.world import BODY_CONSTRAINTS, RING, Placed, World
+from pbrl_ppl.physics.world import BODY_CONSTRAINTS, JOINT_KINDS, RING, Placed, World
 
 
 def sources_digest(folder: Path) -> str:
@@ -136,6 +135,14 @@ def inner(function: Callable[..., object]) -> Any:
     return dispatcher
 
 
+def inlined(function: Callable[..., object]) -> Any:
+    """Return a function that compiled ones take in as if its lines were theirs.
+
+    It is for what takes many arrays, where a call would cost as much as what it does.
+    """
+    return numba.njit(inline="always")(function)
+
+
 @inner
 def copy(source, target):  # type: ignore[no-untyped-def]
     """Copy an array with two axes to another.
@@ -145,6 +152,12 @@ def copy(source, target):  # type: ignore[no-untyped-def]
     for i in range(source.shape[0]):
         for j in range(source.shape[1]):
             target[i, j] = source[i, j]
+
+
+@inner
+def rotated(c, s, x, y):  # type: ignore[no-untyped-def]
+    """Return a vector turned by the angle with cosine ``c`` and sine ``s``."""
+    return c * x - s * y, s * x + c * y
 
 
 #: Addresses of the engine's C functions, by their names. Those that set properties of constraints
@@ -171,6 +184,7 @@ SETTERS = sorted(
     }
 )
 _PLACE, _DOUBLE = ir.IntType(64), ir.DoubleType()
+_DOUBLES = types.CPointer(types.float64)
 
 
 def _addresses(names: Sequence[str]) -> dict[str, int]:
@@ -255,47 +269,64 @@ def get2(typing, function, pointer):  # type: ignore[no-untyped-def]
     return types.UniTuple(types.float64, 2)(types.int64, types.int64), codegen
 
 
-def _loading(kind: ir.Type) -> Callable[..., object]:
-    """Return numba's code generator for an element of an array by the array's address."""
+@intrinsic
+def numbers_at(typing, address):  # type: ignore[no-untyped-def]
+    """Return a pointer to the real numbers at an address, whose elements are read and set by index.
+
+    To pass an array costs more than most laws: each call counts references to it.
+    """
 
     def codegen(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
-        address, place = arguments
-        return builder.load(builder.gep(builder.inttoptr(address, kind.as_pointer()), [place]))
+        return builder.inttoptr(arguments[0], _DOUBLE.as_pointer())
 
-    return codegen
-
-
-@intrinsic
-def whole_at(typing, address, place):  # type: ignore[no-untyped-def]
-    """Return a whole number of an array by the array's address."""
-    return types.int64(types.int64, types.int64), _loading(_PLACE)
+    return _DOUBLES(types.int64), codegen
 
 
 @intrinsic
-def real_at(typing, address, place):  # type: ignore[no-untyped-def]
-    """Return a real number of an array by the array's address."""
-    return types.float64(types.int64, types.int64), _loading(_DOUBLE)
-
-
-@intrinsic
-def put_at(typing, address, place, value):  # type: ignore[no-untyped-def]
-    """Set a real number of an array by the array's address."""
+def from_place(typing, pointer, place):  # type: ignore[no-untyped-def]
+    """Return a pointer to the numbers from a place on."""
 
     def codegen(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
-        start, at, number = arguments
-        builder.store(number, builder.gep(builder.inttoptr(start, _DOUBLE.as_pointer()), [at]))
-        return context.get_dummy_value()
+        start, at = arguments
+        return builder.gep(start, [at])
 
-    return types.void(types.int64, types.int64, types.float64), codegen
+    return _DOUBLES(_DOUBLES, types.int64), codegen
+
+
+@inner
+def start_of(array):  # type: ignore[no-untyped-def]
+    """Return a pointer to the first number of an array, which must be kept."""
+    return numbers_at(array.ctypes.data)
+
+
+def record_reader(kind: np.dtype[np.void]) -> Any:
+    """Return a compiled function of an array's address and a place that returns the record there.
+
+    A record is its address: the function that it is passed to gets no array.
+    """
+
+    @intrinsic
+    def record_at(typing, address, place):  # type: ignore[no-untyped-def]
+        record = numba.from_dtype(kind)
+
+        def codegen(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+            start, at = arguments
+            size = ir.Constant(_PLACE, kind.itemsize)
+            place = builder.add(start, builder.mul(at, size))
+            return builder.inttoptr(place, context.get_value_type(record))
+
+        return record(types.int64, types.int64), codegen
+
+    return record_at
 
 
 @intrinsic
 def call_law(typing, function, a, b, c, d):  # type: ignore[no-untyped-def]
     """Call an effect's law: four pointers to doubles."""
-    return types.void(*[types.int64] * 5), _calling(ir.VoidType(), *[_PLACE] * 4)
+    signature = types.void(types.int64, *[_DOUBLES] * 4)
+    return signature, _calling(ir.VoidType(), *[_DOUBLE.as_pointer()] * 4)
 
 
-_DOUBLES = types.CPointer(types.float64)
 #: Address of each compiled law, and the C function itself, which must be kept.
 _LAWS: dict[Law, tuple[int, object]] = {}
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
 from pbrl_ppl.physics.calls import (
@@ -14,9 +13,13 @@ from pbrl_ppl.physics.calls import (
     call_pointer,
     compiled,
     copy,
+    from_place,
     get1,
     get2,
+    inlined,
     inner,
+    rotated,
+    start_of,
 )
 from pbrl_ppl.physics.laws import (
     ACTED,
@@ -30,9 +33,8 @@ from pbrl_ppl.physics.laws import (
     set_memory,
     states_before,
 )
-from pbrl_ppl.physics.properties import COLUMN
 from pbrl_ppl.physics.solids import near_contact
-from pbrl_ppl.physics.world import FINER, STICKING, TINY
+from pbrl_ppl.physics.world import COLUMN, FINER, TINY
 
 _FREE, _TOUCHED, _LOST = 0, 1, 2
 
@@ -101,8 +103,7 @@ def arm(row, theta):  # type: ignore[no-untyped-def]
     x, y = row[COLUMN.com_x], row[COLUMN.com_y]
     if x == 0.0 and y == 0.0:
         return 0.0, 0.0
-    c, s = math.cos(theta), math.sin(theta)
-    return c * x - s * y, s * x + c * y
+    return rotated(math.cos(theta), math.sin(theta), x, y)
 
 
 @compiled
@@ -120,8 +121,9 @@ def wheel_ends(row, after, axis_cos, axis_sin):  # type: ignore[no-untyped-def]
     """Return the far ends of a wheel's rods: x and y of the one along it, of the one across."""
     c, s, x, y, _, _ = after
     w_x, w_y = row[COLUMN.w_x] - row[COLUMN.com_x], row[COLUMN.w_y] - row[COLUMN.com_y]
-    x, y = x + c * w_x - s * w_y, y + s * w_x + c * w_y
-    c, s = c * axis_cos - s * axis_sin, s * axis_cos + c * axis_sin
+    w_x, w_y = rotated(c, s, w_x, w_y)
+    c, s = rotated(c, s, axis_cos, axis_sin)
+    x, y = x + w_x, y + w_y
     return x + c, y + s, x - s, y + c
 
 
@@ -129,15 +131,18 @@ def wheel_ends(row, after, axis_cos, axis_sin):  # type: ignore[no-untyped-def]
 def patch_point(row, after, omega, point, step, most):  # type: ignore[no-untyped-def]
     """Return the far end of a point's rod, along its velocity, and the rod's share of the friction.
 
-    ``point`` is in units of the ring's radius; ``most`` is the deceleration by friction (m/s^2).
+    ``point`` is in units of the ring's radius; ``most`` is the deceleration by friction (m/s^2). A
+    point may stick if its speed is below what friction takes away in a substep.
     """
     c, s, at_x, at_y, v_x, v_y = after
     x = point[0] * row[COLUMN.patch_radius] - row[COLUMN.com_x]
     y = point[1] * row[COLUMN.patch_radius] - row[COLUMN.com_y]
-    x, y = c * x - s * y, s * x + c * y
+    x, y = rotated(c, s, x, y)
     along_x, along_y = v_x - omega * y, v_y + omega * x
     speed = math.sqrt(along_x * along_x + along_y * along_y)
-    slow = STICKING * most * step
+    slow = (
+        most * step
+    )  # with a tenth of it, slow points would stick across their direction now and then
     share = 1.0 if speed >= slow else speed / slow
     if speed == 0.0:  # at rest any direction will do
         along_x, speed = 1.0, 1.0
@@ -157,8 +162,7 @@ def hinge_signal(pivots, gravity, row, joints, state, command, i):  # type: igno
         if hinge[0] == i:
             x = row[COLUMN.com_x] - joints[hinge[1], hinge[2]]
             y = row[COLUMN.com_y] - joints[hinge[1], hinge[2] + 1]
-            c, s = math.cos(state[2]), math.sin(state[2])
-            x, y = c * x - s * y, s * x + c * y
+            x, y = rotated(math.cos(state[2]), math.sin(state[2]), x, y)
             weight_x = gravity[0] + row[COLUMN.extra_gravity_x]
             weight_y = gravity[1] + row[COLUMN.extra_gravity_y]
             rest = row[COLUMN.mass] * (x * weight_y - y * weight_x)
@@ -267,7 +271,7 @@ def drive(fn, world, state, action):  # type: ignore[no-untyped-def]
             call1(fn.cpBodySetAngularVelocity, world.bodies[i], action[i, 2])
 
 
-@numba.njit(inline="always")
+@inlined
 def _forget(fn, world, bodies, batch, touched):  # type: ignore[no-untyped-def]
     """Clear the contacts and impulses that the engine keeps of the last transition.
 
@@ -299,14 +303,12 @@ def _forget(fn, world, bodies, batch, touched):  # type: ignore[no-untyped-def]
 
 
 @inner
-def intervals(bodies, p, t, horizon):  # type: ignore[no-untyped-def]
-    """Return the properties in a transition's intervals; one row if they do not change."""
-    if bodies.shape[1] > 1:
-        return bodies[p, t * horizon : (t + 1) * horizon]
-    return bodies[p]
+def properties_in(rows, p, t, h, horizon):  # type: ignore[no-untyped-def]
+    """Return the bodies' properties in an interval of a transition."""
+    return rows[p, t * horizon + h if rows.shape[1] > 1 else 0]
 
 
-@numba.njit(inline="always")
+@inlined
 def _push(fn, world, bodies, state, acted):  # type: ignore[no-untyped-def]
     """Set the forces and torques of a substep, which act at the bodies' origins."""
     for i in range(len(world.bodies)):
@@ -321,7 +323,7 @@ def _push(fn, world, bodies, state, acted):  # type: ignore[no-untyped-def]
         call1(fn.cpBodySetTorque, world.bodies[i], torque)
 
 
-@numba.njit(inline="always")
+@inlined
 def _read(fn, world, bodies, state):  # type: ignore[no-untyped-def]
     """Set the states of the bodies' origins from the engine; return whether one has diverged."""
     lost = False
@@ -339,7 +341,7 @@ def _read(fn, world, bodies, state):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _scratch_of(world, batch):  # type: ignore[no-untyped-def]
+def _scratch_of(world, laws):  # type: ignore[no-untyped-def]
     """Return the arrays of a transition.
 
     They are states (body, 6), cos and sin of the wheels' angles on the bodies (wheel, 2), what acts
@@ -349,11 +351,21 @@ def _scratch_of(world, batch):  # type: ignore[no-untyped-def]
     k = len(world.bodies)
     return (
         np.empty((k, 6)), np.empty((len(world.wheel_body), 2)), np.zeros((k + MORE, ACTED)),
-        np.zeros((2, batch.slots)), np.full(2, -1), np.zeros((2, batch.held)),
+        np.zeros((2, laws.n_slots)), np.full(2, -1), np.zeros((2, laws.n_held)),
     )  # fmt: skip
 
 
-@numba.njit(inline="always")  # a call costs as much as a substep: the world is many arrays
+@inner
+def _renew(fn, world, bodies, joints, state):  # type: ignore[no-untyped-def]
+    """Set properties that change with time where an interval begins."""
+    set_properties(fn, world, bodies, joints)
+    place_bodies(fn, world, bodies, state)
+    set_strengths(fn, world, bodies, True)
+    enough = iterations(world.iterations, world.chained, bodies)
+    call_int(fn.cpSpaceSetIterations, world.space, enough)
+
+
+@inlined
 def _transition(  # type: ignore[no-untyped-def]
     fn, world, batch, laws, p, t, substeps, scratch, first, begin, whole, out
 ):
@@ -366,34 +378,27 @@ def _transition(  # type: ignore[no-untyped-def]
     step = batch.time_step / substeps
     state, axes, acted, memory, at, held = scratch
     inputs, end = batch.inputs[t], begin
-    properties, joints = intervals(batch.given[0], p, t, len(inputs)), batch.given[1][p]
+    rows, joints = batch.given[0], batch.given[1][p]
+    bodies = properties_in(rows, p, t, begin, len(inputs))
     copy(first, state)
-    bodies = properties[begin if len(properties) > 1 else 0]
     for j in range(len(axes)):
         turn = bodies[world.wheel_body[j], COLUMN.w_theta]
         axes[j, 0], axes[j, 1] = math.cos(turn), math.sin(turn)
-    touched, near = _FREE, False
-    driven = False
-    for follows in world.kinematic:
-        driven |= follows
+    touched, near, driven = _FREE, False, world.kinematic.any()
     acting = laws.n_commands + laws.n_forces > 0
-    remembered = memory.ctypes.data + 8 * memory.shape[1]
-    state_at, acted_at, held_at = state.ctypes.data, acted.ctypes.data, held.ctypes.data
+    remembered = from_place(start_of(memory), laws.n_slots)
+    state_at, acted_at, held_at = start_of(state), start_of(acted), start_of(held)
     still = world.still
     watch = len(still.obstacles) > 0 or k > 1
     place_bodies(fn, world, bodies, state)
-    set_memory(batch, laws, p, t, begin, state, acted, memory, held, at)
+    set_memory(batch, laws, p, t, begin, state, acted, memory, at)
     begin_held(state, laws, acted, held)
     while end < len(inputs) and (whole or near or end == begin):
         h = end
-        if h > begin and len(properties) > 1:
-            bodies = properties[h]
-            set_properties(fn, world, bodies, joints)
-            place_bodies(fn, world, bodies, state)
-            set_strengths(fn, world, bodies, True)
-            enough = iterations(world.iterations, world.chained, bodies)
-            call_int(fn.cpSpaceSetIterations, world.space, enough)
-        inputs_at = inputs[h].ctypes.data
+        if h > begin and rows.shape[1] > 1:
+            bodies = properties_in(rows, p, t, h, len(inputs))
+            _renew(fn, world, bodies, joints, state)
+        inputs_at = start_of(inputs[h])
         if driven:
             drive(fn, world, state, inputs[h])
         for i in range(k):
@@ -404,9 +409,9 @@ def _transition(  # type: ignore[no-untyped-def]
             if acting:
                 act(
                     state_at, inputs_at, laws, s / substeps, (s + 1) / substeps, acted_at,
-                    remembered, held_at, held.shape[1], False,
+                    remembered, held_at, from_place(held_at, laws.n_held),
                 )  # fmt: skip
-                for slot in range(held.shape[1]):
+                for slot in range(laws.n_held):
                     held[0, slot] += step * held[1, slot]
             if laws.n_frictions > 0:
                 set_brakes(world, laws, bodies, joints, state, acted)
@@ -421,14 +426,24 @@ def _transition(  # type: ignore[no-untyped-def]
                 near = near_contact(state, still.radii, still.obstacles, still.can_touch)
                 touched = _TOUCHED if near else touched
         copy(state, out[h])
-        if memory.shape[1] > 0:
-            remember(state, inputs_at, laws, acted, remembered, held)
+        if laws.n_slots > 0:
+            remember(state, inputs_at, laws, acted, remembered)
         end += 1
     return touched, end
 
 
+@inner
+def _add(states, weight, first, total):  # type: ignore[no-untyped-def]
+    """Add weighted states (H, body, 6) to a total, which the first begin."""
+    for h in range(len(total)):
+        for i in range(total.shape[1]):
+            for d in range(6):
+                before = 0.0 if first else total[h, i, d]
+                total[h, i, d] = before + weight * states[h, i, d]
+
+
 @compiled
-def rollout(fn, world, batch, items, begins, whole, out):  # type: ignore[no-untyped-def]
+def rollout_engine(fn, world, batch, items, begins, whole, out):  # type: ignore[no-untyped-def]
     """Predict ``items`` of ``out``, whose shape is (proposal * transition, H, body, 6).
 
     Those that are not ``whole`` are predicted from the interval in ``begins``, shape (item,), with
@@ -448,14 +463,14 @@ def rollout(fn, world, batch, items, begins, whole, out):  # type: ignore[no-unt
     states = np.empty((horizon, batch.inputs.shape[2], 6))
     total = np.empty_like(states)
     timed = bodies.shape[1] > 1
-    scratch = _scratch_of(world, batch)
+    scratch = _scratch_of(world, batch.laws[0])
     proposal, finer = -1, 1
     outcome = _TOUCHED  # an earlier call may have left contacts
     for place in range(len(items)):
         item = items[place]
         p, t = item // n, item % n
         begin, laws = begins[place], batch.laws[p]
-        first = intervals(bodies, p, t, horizon)[begin if timed else 0]
+        first = properties_in(bodies, p, t, begin, horizon)
         before_begin = states_before(batch, out, item, begin)
         if p != proposal:
             proposal = p
@@ -491,11 +506,7 @@ def rollout(fn, world, batch, items, begins, whole, out):  # type: ignore[no-unt
                     copy(states[h], out[item, h])
             if outcome == _TOUCHED or not whole:
                 break
-            for h in range(horizon):
-                for i in range(states.shape[1]):
-                    for d in range(6):
-                        sum_before = total[h, i, d] if level else 0.0
-                        total[h, i, d] = sum_before + batch.weights[level] * states[h, i, d]
+            _add(states, batch.weights[level], level == 0, total)
         if whole and outcome == _FREE and len(batch.counts) > 1:
             for i in range(len(world.bodies)):
                 if world.kinematic[i]:  # the weights' sum is 1 but for rounding

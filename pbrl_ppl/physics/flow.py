@@ -3,7 +3,7 @@
 Between switches of dry friction the equations are smooth: steps of order five whose error is
 estimated (J. R. Dormand and P. J. Prince, Journal of Computational and Applied Mathematics 6,
 1980), and halved where it is too large. A switch, where a row stops or what sticks gives way, is
-located within its step (E. Hairer, S. P. Norsett and G. Wanner, Solving Ordinary Differential
+located within its step (E. Hairer, S. P. Norsett and ROW.g. Wanner, Solving Ordinary Differential
 Equations I, section II.6): the motion is a continuous function of parameters and start.
 """
 
@@ -12,107 +12,51 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from scipy.integrate import RK45
 
-from pbrl_ppl.physics.calls import compiled, copy, inner, real_at, whole_at
-from pbrl_ppl.physics.laws import (
-    COMMAND,
-    FIRST,
-    JUMPS,
-    ROW,
-    WRENCHES,
-    act,
-    begin_held,
-    remember,
-    set_memory,
-    states_before,
-)
+from pbrl_ppl.physics.calls import compiled, copy, inner, numbers_at
+from pbrl_ppl.physics.laws import begin_held, law_at, remember, set_memory, states_before
 from pbrl_ppl.physics.motion import (
-    BIAS,
-    BOUND,
     END_Q,
     END_U,
-    FORCE,
-    GRIP,
-    MASS,
-    POINTS,
+    HAS,
+    MODE,
+    RIM,
+    ROW,
+    SHORTEST,
     SIZE,
-    SLIDE,
     SLOPES,
-    SMOOTH,
-    STICK,
-    TWIST,
-    TWIST_END,
-    G,
     Q,
     U,
+    load,
     row_speed,
-    set_bounds,
     set_coordinates,
     set_first_slide,
-    set_forces,
+    set_inputs,
     set_numbers,
     set_places,
-    set_rows,
     set_twist,
     solve,
     strain,
 )
 from pbrl_ppl.physics.solids import near_contact
-from pbrl_ppl.physics.tree import ALONG, LINK, TURNING
+from pbrl_ppl.physics.tree import FRICTION, LINK
+from pbrl_ppl.state import Floats
 
-#: Times of the stages; weights of the slopes before each, and in the last row those of the error.
-_TIMES = np.array([0.0, 0.2, 0.3, 0.8, 8 / 9, 1.0, 1.0])
-_WEIGHTS = np.array(
-    [
-        [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
-        [1 / 5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
-        [3 / 40, 9 / 40, 0.0, 0.0, 0.0, 0.0, 0.0],
-        [44 / 45, -56 / 15, 32 / 9, 0.0, 0.0, 0.0, 0.0],
-        [19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0.0, 0.0, 0.0],
-        [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0.0, 0.0],
-        [35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84, 0.0],
-        [71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40],
-    ]
-)
-#: Steps of an interval, at most: laws that are stiffer, or jump more often, have no prediction.
-MOST_STEPS = 4000
-#: Steps of less than this share of an interval are taken as they are.
-_SHORTEST = 1e-6
+
+def _tableau() -> tuple[Floats, Floats]:
+    """Return the times of the stages, and the weights of the slopes before each, shape (8, 7).
+
+    The last row is those of the error.
+    """
+    weights = np.zeros((8, 7))
+    weights[:6, :5], weights[6, :6], weights[7] = RK45.A, RK45.B, RK45.E
+    return np.append(RK45.C, 1.0), weights
+
+
+_TIMES, _WEIGHTS = _tableau()
 #: Speeds of rows that are none, and accuracy of a switch, as shares of the natural speed.
 _STILL, _LOCATED = 1e-9, 1e-10
-#: Width of the window in which a command is evaluated, as a share of the interval.
-_WINDOW = 1e-7
-#: A ring that would slide on less far than this many tolerances stops.
-_COAST = 0.1
-
-
-@inner
-def _slope(work, laws, u, a, share, low, high):  # type: ignore[no-untyped-def]
-    """Compute accelerations (row a) at places that are set and a time in a piece of the interval.
-
-    ``low`` and ``high`` are the ends of the piece, as shares of the interval.
-    """
-    _load(work, laws, u, share, low, high)
-    solve(work, u, a, False)
-
-
-@inner
-def _load(work, laws, u, share, low, high):  # type: ignore[no-untyped-def]
-    """Set what acts there: wrenches, forces, and rows of friction."""
-    motion, held = work.motion, work.n + 1
-    for s in range(work.n_held):
-        work.held[0, s] = motion[u - 1, held + s]
-    if laws.n_commands + laws.n_forces > 0:
-        begin = min(max(low + _SHORTEST, share), high - _WINDOW)  # past a jump that is no switch
-        act(
-            work.states.ctypes.data, work.inputs, laws, begin, begin + _WINDOW,
-            work.acted.ctypes.data, work.memory, work.held.ctypes.data, work.held.shape[1], False,
-        )  # fmt: skip
-    for s in range(work.n_held):
-        motion[u, held + s] = work.held[1, s]
-    set_forces(work, u)
-    set_rows(work, u)
-    set_bounds(work, laws, u)
 
 
 @inner
@@ -120,27 +64,30 @@ def _switch(laws, low):  # type: ignore[no-untyped-def]
     """Return the first time after ``low`` at which a command jumps, as a share of the interval."""
     high = 1.0
     for e in range(laws.n_commands):
-        law = laws.commands + ROW * e
-        if whole_at(law, JUMPS) > 0:
-            share = real_at(laws.commands_values, whole_at(law, FIRST))
+        law = law_at(laws.commands, e)
+        if law.jumps > 0:
+            share = numbers_at(laws.commands_values)[law.first]
             share -= math.floor(share)
-            if low + _SHORTEST < share < high - _SHORTEST:
+            if low + SHORTEST < share < high - SHORTEST:
                 high = share
     return high
 
 
 @inner
-def _slowest(work, r):  # type: ignore[no-untyped-def]
-    """Return the square of a ring's speed from which friction lets it slide by next to nothing."""
-    ring, points = r - work.n_rows, work.rings.shape[1] - POINTS
-    slowing = work.rings[ring, GRIP, 0] * points / work.links[work.kinds[r, 1], MASS]
-    return 2.0 * slowing * _COAST * work.tolerance * work.length
+def _slowest(work, r, coast=0.1):  # type: ignore[no-untyped-def]
+    """Return the square of a ring's speed from which friction lets it slide by next to nothing.
+
+    A ring that would slide on less far than ``coast`` tolerances stops.
+    """
+    ring, points = r - work.n_rows, work.rings.shape[1] - RIM.points
+    slowing = work.rings[ring, RIM.grip, 0] * points / work.links[work.kinds[r, 1], HAS.mass]
+    return 2.0 * slowing * coast * work.tolerance * work.length
 
 
 @inner
 def _size(work, r):  # type: ignore[no-untyped-def]
     """Return the natural size of a row's way: of a wheel's in m, or of its joint's coordinate."""
-    if work.kinds[r, 0] >= ALONG:
+    if work.kinds[r, 0] >= FRICTION.along:
         return work.length
     return work.motion[SIZE, work.tree[work.kinds[r, 1], LINK.first]]
 
@@ -149,13 +96,13 @@ def _size(work, r):  # type: ignore[no-untyped-def]
 def _set_wheel(work, r, mode):  # type: ignore[no-untyped-def]
     """Set the mode of rows of a wheel, or against turning, under the body of a ring at place r."""
     for row in range(work.n_rows):
-        under = work.kinds[row, 1] == work.kinds[r, 1] and work.kinds[row, 0] >= TURNING
-        if under and work.rows[row, BOUND] > 0.0:
+        under = work.kinds[row, 1] == work.kinds[r, 1] and work.kinds[row, 0] >= FRICTION.turning
+        if under and work.rows[row, ROW.bound] > 0.0:
             work.kinds[row, 2], work.kinds[row, 3] = mode, 2
 
 
 @inner
-def _decide(work, laws, share, low, high):  # type: ignore[no-untyped-def]
+def _decide(work, laws, share):  # type: ignore[no-untyped-def]
     """Set which rows and rings stick and which way the others slip; and the step's first slopes.
 
     Rows with a speed slip. Of the others all stick first; that which is pulled hardest gives way,
@@ -164,24 +111,25 @@ def _decide(work, laws, share, low, high):  # type: ignore[no-untyped-def]
     motion, kinds, rows = work.motion, work.kinds, work.rows
     count = work.n_rows
     set_places(work, Q, U)
-    _load(work, laws, U, share, low, high)  # for the rows
+    load(work, laws, U, share)  # for the rows
     stop = _begin_modes(work)
     for _ in range(5 * work.n_kinds + 2):
-        _slope(work, laws, U, SLOPES + 1, share, low, high)
+        load(work, laws, U, share)
+        solve(work, U, SLOPES + 1, False)
         worst, back, most = -1, -1, 1.0 - _STILL
         for r in range(count):
-            if kinds[r, 3] == 0 and kinds[r, 2] == STICK:
-                pull = abs(rows[r, FORCE]) / max(rows[r, BOUND], 1e-300)
+            if kinds[r, 3] == 0 and kinds[r, 2] == MODE.stick:
+                pull = abs(rows[r, ROW.force]) / max(rows[r, ROW.bound], 1e-300)
                 if pull > most:
                     worst, most = r, pull
             elif kinds[r, 3] == 0:
-                rate = row_speed(work, r, SLOPES + 1) + rows[r, BIAS]
+                rate = row_speed(work, r, SLOPES + 1) + rows[r, ROW.bias]
                 back = r if kinds[r, 2] * rate < 0.0 else back
         if worst >= 0:
-            kinds[worst, 2] = -1 if rows[worst, FORCE] > 0.0 else 1
+            kinds[worst, 2] = -1 if rows[worst, ROW.force] > 0.0 else 1
             continue
         if back >= 0:  # it holds, since another slips
-            kinds[back, 2], kinds[back, 3] = STICK, 1
+            kinds[back, 2], kinds[back, 3] = MODE.stick, 1
             continue
         if _slide(work):
             continue
@@ -193,7 +141,7 @@ def _decide(work, laws, share, low, high):  # type: ignore[no-untyped-def]
         set_places(work, Q, U)
         stop = False
     for r in range(count, work.n_kinds):
-        set_twist(work, r - count, kinds[r, 1], U, TWIST)
+        set_twist(work, r - count, kinds[r, 1], U, RIM.twist)
 
 
 @inner
@@ -205,9 +153,9 @@ def _begin_modes(work):  # type: ignore[no-untyped-def]
     kinds, rows, count, moves = work.kinds, work.rows, work.n_rows, False
     for r in range(work.n_kinds):
         # what stuck before moves by the error of steps alone
-        still = 100.0 * work.tolerance if kinds[r, 2] == STICK else _STILL
-        greatest = rows[r, BOUND] if r < count else work.rings[r - count, GRIP, 0]
-        kinds[r, 2], kinds[r, 3] = STICK if greatest > 0.0 else SMOOTH, 1
+        still = 100.0 * work.tolerance if kinds[r, 2] == MODE.stick else _STILL
+        greatest = rows[r, ROW.bound] if r < count else work.rings[r - count, RIM.grip, 0]
+        kinds[r, 2], kinds[r, 3] = MODE.stick if greatest > 0.0 else MODE.smooth, 1
         if greatest == 0.0:
             continue
         if r < count:
@@ -217,16 +165,16 @@ def _begin_modes(work):  # type: ignore[no-untyped-def]
                 kinds[r, 2] = 1 if speed > 0.0 else -1
             moved = speed != 0.0
         else:
-            square = set_twist(work, r - count, kinds[r, 1], U, TWIST)
+            square = set_twist(work, r - count, kinds[r, 1], U, RIM.twist)
             if square > _slowest(work, r):
-                kinds[r, 2] = SLIDE
+                kinds[r, 2] = MODE.slide
             moved = square > 0.0
-        if kinds[r, 2] == STICK:
+        if kinds[r, 2] == MODE.stick:
             kinds[r, 3] = 0  # not settled
             moves |= moved
     for r in range(count, work.n_kinds):
-        if kinds[r, 2] == STICK:
-            _set_wheel(work, r, SMOOTH)  # the ring holds for it
+        if kinds[r, 2] == MODE.stick:
+            _set_wheel(work, r, MODE.smooth)  # the ring holds for it
     return moves
 
 
@@ -239,22 +187,22 @@ def _slide(work):  # type: ignore[no-untyped-def]
     motion, kinds, rows, count = work.motion, work.kinds, work.rows, work.n_rows
     slid = False
     for r in range(count, work.n_kinds):
-        if kinds[r, 2] == STICK and strain(work, r - count, kinds[r, 1]) > 0.0:
-            kinds[r, 2], slid = SLIDE, True
-            _set_wheel(work, r, STICK)
+        if kinds[r, 2] == MODE.stick and strain(work, r - count, kinds[r, 1]) > 0.0:
+            kinds[r, 2], slid = MODE.slide, True
+            _set_wheel(work, r, MODE.stick)
     if not slid:
         return False
     set_first_slide(work, U, END_U)
     for r in range(count):
-        if kinds[r, 2] == STICK and kinds[r, 3] == 2:
+        if kinds[r, 2] == MODE.stick and kinds[r, 3] == 2:
             rate, most = row_speed(work, r, END_U), 0.0
             for j in range(work.n):
-                most += abs(rows[r, G + j] * motion[END_U, j])
+                most += abs(rows[r, ROW.g + j] * motion[END_U, j])
             kinds[r, 3] = 0
             if abs(rate) > 0.05 * most:
                 kinds[r, 2], kinds[r, 3] = 1 if rate > 0.0 else -1, 1
     for r in range(count, work.n_kinds):
-        kinds[r, 3] = 1 if kinds[r, 2] == SLIDE else 0
+        kinds[r, 3] = 1 if kinds[r, 2] == MODE.slide else 0
     for j in range(work.n):
         motion[U, j] += 1e-6 * work.time_step * motion[END_U, j]
     set_places(work, Q, U)
@@ -267,10 +215,10 @@ def _margin(work, u):  # type: ignore[no-untyped-def]
     least = 1.0
     for r in range(work.n_rows):
         mode = work.kinds[r, 2]
-        if mode == STICK:
-            bound = max(work.rows[r, BOUND], 1e-300)
-            least = min(least, 1.0 - abs(work.rows[r, FORCE]) / bound)
-        elif mode != SMOOTH:
+        if mode == MODE.stick:
+            bound = max(work.rows[r, ROW.bound], 1e-300)
+            least = min(least, 1.0 - abs(work.rows[r, ROW.force]) / bound)
+        elif mode != MODE.smooth:
             size = _size(work, r)
             least = min(least, mode * row_speed(work, r, u) * work.time_step / size)
     return least
@@ -281,7 +229,7 @@ def _first_margin(work):  # type: ignore[no-untyped-def]
     """Return by how much nothing switches where a step begins."""
     least = _margin(work, U)
     for r in range(work.n_rows, work.n_kinds):
-        if work.kinds[r, 2] == STICK:
+        if work.kinds[r, 2] == MODE.stick:
             least = min(least, -strain(work, r - work.n_rows, work.kinds[r, 1]))
     return least
 
@@ -296,7 +244,7 @@ def _weighted(motion, stage, first, j):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _step(work, laws, share, low, high, width):  # type: ignore[no-untyped-def]
+def _step(work, laws, share, width):  # type: ignore[no-untyped-def]
     """Try a step of a width (share of the interval) from its first slopes.
 
     Returns its error over the tolerance, and by how much nothing switches: at its end, and on the
@@ -306,103 +254,75 @@ def _step(work, laws, share, low, high, width):  # type: ignore[no-untyped-def]
     n, count, seconds, end, way = work.n, work.n_rows, width * work.time_step, 1.0, 1.0
     ends = n + 1 + work.n_held  # after the numbers of laws, which have speeds alone
     for j in range(ends):
-        if j != n:
-            motion[SLOPES, j] = motion[U, j]
+        motion[SLOPES, j] = motion[U, j]
     for stage in range(1, 7):
         for j in range(ends):
-            if j != n:
-                motion[END_Q, j] = motion[Q, j] + seconds * _weighted(motion, stage, SLOPES, j)
+            motion[END_Q, j] = motion[Q, j] + seconds * _weighted(motion, stage, SLOPES, j)
             if j < n:
                 u = motion[U, j] + seconds * _weighted(motion, stage, SLOPES + 1, j)
                 motion[END_U, j] = motion[SLOPES + 2 * stage, j] = u
         set_places(work, END_Q, END_U)
-        at = share + _TIMES[stage] * width
-        _slope(work, laws, END_U, SLOPES + 2 * stage + 1, at, low, high)
+        load(work, laws, END_U, share + _TIMES[stage] * width)
+        solve(work, END_U, SLOPES + 2 * stage + 1, False)
         for j in range(n + 1, ends):
             motion[SLOPES + 2 * stage, j] = motion[END_U, j]
         end = _margin(work, END_U)
         way = min(way, end)
     for r in range(count, work.n_kinds):
-        if kinds[r, 2] == STICK:
+        if kinds[r, 2] == MODE.stick:
             end = min(end, -strain(work, r - count, kinds[r, 1]))
-        elif kinds[r, 2] == SLIDE:
-            set_twist(work, r - count, kinds[r, 1], END_U, TWIST_END)
+        elif kinds[r, 2] == MODE.slide:
+            set_twist(work, r - count, kinds[r, 1], END_U, RIM.twist_end)
             square, along = 0.0, 0.0
             for d in range(3):
-                before = rings[r - count, TWIST, d]
+                before = rings[r - count, RIM.twist, d]
                 square += before * before
-                along += before * rings[r - count, TWIST_END, d]
+                along += before * rings[r - count, RIM.twist_end, d]
             end = min(end, along / square if square > 0.0 else 1.0)
     error = 0.0
     for j in range(ends):
-        if j != n:
-            q = _weighted(motion, 7, SLOPES, j)
-            u = _weighted(motion, 7, SLOPES + 1, j) if j < n else 0.0
-            error = max(error, seconds * (abs(q) + work.time_step * abs(u)) / motion[SIZE, j])
-            if not math.isfinite(q + u):
-                return np.inf, end, way
+        q = _weighted(motion, 7, SLOPES, j)
+        u = _weighted(motion, 7, SLOPES + 1, j) if j < n else 0.0
+        error = max(error, seconds * (abs(q) + work.time_step * abs(u)) / motion[SIZE, j])
+        if not math.isfinite(q + u):
+            return np.inf, end, way
     return error / work.tolerance, end, way
 
 
 @inner
-def _advance(work, laws, still, low, high, budget, wanted):  # type: ignore[no-untyped-def]
+def _advance(work, laws, still, budget, wanted):  # type: ignore[no-untyped-def]
     """Move through a piece of an interval in which no command jumps.
 
     Begins with steps of a ``wanted`` width. Returns the steps left, and the width wanted next. Left
     is 0 where the motion has no prediction, and -1 where a body comes near an obstacle.
     """
-    share, width, last = low, wanted, False
-    fresh, locating = True, False  # whether modes are to be decided; whether a switch is located
+    share, fresh = work.low, True  # whether modes are to be decided
     left = 0.0  # by how much nothing switches where the step begins
-    begin, before, until, after, kept = 0.0, 0.0, 0.0, 0.0, 0
-    while share < high:
+    while share < work.high:
         if fresh:
-            _decide(work, laws, share, low, high)
+            _decide(work, laws, share)
             fresh, left = False, _first_margin(work)
-        if locating:
-            width = begin + (until - begin) * before / (before - after)
-        else:
-            width = min(wanted, _way(work, still)) if still.watched else wanted
-            last = width >= high - share
-            width = min(width, high - share)
-        budget -= 1
-        if budget <= 0:
+        width = min(wanted, _way(work, still)) if still.watched else wanted
+        last, width = width >= work.high - share, min(width, work.high - share)
+        error, end, way, width, budget, located = _attempt(work, laws, share, width, left, budget)
+        short, switches = width <= SHORTEST, end < -_LOCATED
+        if budget <= 0 or (short and not located and not error < np.inf):
             return 0, wanted
-        error, end, way = _step(work, laws, share, low, high, width)
-        if locating:  # regula falsi (Illinois)
-            if abs(end) > _LOCATED and until - begin > 1e-12:
-                if end > 0.0:
-                    begin, before = width, end
-                    after *= 0.5 if kept == 1 else 1.0
-                    kept = 1
-                else:
-                    until, after = width, end
-                    before *= 0.5 if kept == -1 else 1.0
-                    kept = -1
-                continue
-            fresh, locating, last = True, False, False
+        if located:
+            fresh, last = True, False
+        elif not short and not error <= 1.0:
+            wanted = width * (max(0.1, 0.9 * error**-0.2) if error < np.inf else 0.25)
+            continue
+        # it has just switched, or switches on the way alone
+        elif not short and (left <= _LOCATED if switches else way < -_LOCATED):
+            wanted = 0.5 * width
+            continue
         else:
-            short = width <= _SHORTEST
-            if short and not error < np.inf:
-                return 0, wanted
-            if not short and not error <= 1.0:
-                wanted = width * (max(0.1, 0.9 * error**-0.2) if error < np.inf else 0.25)
-                continue
-            if not short and way < -_LOCATED and end >= -_LOCATED:
-                wanted = 0.5 * width
-                continue
-            if end < -_LOCATED and not short:
-                if left > _LOCATED:
-                    locating = True
-                    begin, before, until, after, kept = 0.0, left, width, end, 0
-                else:  # it has just switched
-                    wanted = 0.5 * width
-                continue
-            fresh, left = end < -_LOCATED, end
+            fresh, left = switches, end
             wider = width * min(5.0, 0.9 * max(error, 1e-9) ** -0.2)
             wanted = min(1.0, max(wanted, wider) if last or wanted > width else wider)
         fresh |= _accept(work)
-        share = high if last else share + width
+        share = work.high if last else share + width
         _follow_paths(work, work.time_step * width)
         if still.watched and near_contact(
             work.states, still.radii, still.obstacles, still.can_touch
@@ -412,20 +332,50 @@ def _advance(work, laws, still, low, high, budget, wanted):  # type: ignore[no-u
 
 
 @inner
+def _attempt(work, laws, share, width, left, budget):  # type: ignore[no-untyped-def]
+    """Try a step; one in which something switches is narrowed to the switch.
+
+    By regula falsi (Illinois) from its begin, where nothing switches by ``left``. Returns what
+    `_step` does, the width, the steps left, and whether it ends at a switch.
+    """
+    begin, before, until, after, kept = 0.0, left, width, 0.0, 0
+    located = False
+    while True:
+        budget -= 1
+        if budget <= 0:
+            return np.inf, 0.0, 0.0, width, budget, located
+        error, end, way = _step(work, laws, share, width)
+        if not located:
+            wide = width > SHORTEST and error <= 1.0 and left > _LOCATED
+            if not wide or not end < -_LOCATED:
+                return error, end, way, width, budget, located
+            located, after = True, end
+        elif not (abs(end) > _LOCATED and until - begin > 1e-12):
+            return error, end, way, width, budget, located
+        elif end > 0.0:
+            begin, before = width, end
+            after *= 0.5 if kept == 1 else 1.0
+            kept = 1
+        else:
+            until, after = width, end
+            before *= 0.5 if kept == -1 else 1.0
+            kept = -1
+        width = begin + (until - begin) * before / (before - after)
+
+
+@inner
 def _accept(work):  # type: ignore[no-untyped-def]
     """Begin the next step where one ends; return whether a ring that slides is to stop."""
     motion, n, stops = work.motion, work.n, False
-    for j in range(n + 1, n + 1 + work.n_held):
-        motion[Q, j], motion[U, j] = motion[END_Q, j], motion[END_U, j]
-    for j in range(n):
+    for j in range(n + 1 + work.n_held):
         motion[Q, j], motion[U, j] = motion[END_Q, j], motion[END_U, j]
         motion[SLOPES + 1, j] = motion[SLOPES + 13, j]
     for r in range(work.n_rows, work.n_kinds):
         ring, square = r - work.n_rows, 0.0
         for d in range(3):
-            work.rings[ring, TWIST, d] = work.rings[ring, TWIST_END, d]
-            square += work.rings[ring, TWIST, d] ** 2
-        stops |= work.kinds[r, 2] == SLIDE and square <= _slowest(work, r)
+            work.rings[ring, RIM.twist, d] = work.rings[ring, RIM.twist_end, d]
+            square += work.rings[ring, RIM.twist, d] ** 2
+        stops |= work.kinds[r, 2] == MODE.slide and square <= _slowest(work, r)
     return stops
 
 
@@ -444,7 +394,7 @@ def _way(work, still):  # type: ignore[no-untyped-def]
     for k in range(work.n_bodies):
         square = work.states[k, 3] ** 2 + work.states[k, 4] ** 2
         fastest = max(fastest, math.sqrt(square))
-    return max(_SHORTEST, 0.5 * still.length / (fastest * work.time_step))
+    return max(SHORTEST, 0.5 * still.length / (fastest * work.time_step))
 
 
 @inner
@@ -457,28 +407,58 @@ def _place_discs(still, discs):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _set_states(work, states):  # type: ignore[no-untyped-def]
-    """Begin at states (body, 6); nothing is known of the friction."""
+def _begin(work, laws, batch, out, item, h, memory, at):  # type: ignore[no-untyped-def]
+    """Begin an item before an interval; nothing is known of the friction."""
+    n, states = len(batch.inputs), states_before(batch, out, item, h)
     for r in range(work.n_kinds):
-        work.kinds[r, 2] = SMOOTH
+        work.kinds[r, 2] = MODE.smooth
     set_coordinates(work, states)
     copy(states, work.states)
+    set_memory(batch, laws, item // n, item % n, h, work.states, work.acted, memory, at)
+    begin_held(work.states, laws, work.acted, work.held)
+    for s in range(work.n_held):
+        work.motion[Q, work.n + 1 + s] = work.held[0, s]
+
+
+@inner
+def _write(work, still, out):  # type: ignore[no-untyped-def]
+    """Write the states (body, 6); return whether one has diverged."""
+    lost = False
+    for k in range(work.n_bodies):
+        speed = abs(work.states[k, 3]) + abs(work.states[k, 4])
+        speed += still.length * abs(work.states[k, 5])
+        lost |= not speed < still.fastest  # also true of NaN
+        for d in range(6):
+            out[k, d] = work.states[k, d]
+    return lost
+
+
+@inner
+def _lose(states, first):  # type: ignore[no-untyped-def]
+    """Set the states (H, body, 6) from an interval on to NaN."""
+    for h in range(first, len(states)):
+        for k in range(states.shape[1]):
+            for d in range(6):
+                states[h, k, d] = np.nan
 
 
 @compiled
-def rollout(works, still, batch, items, begins, out):  # type: ignore[no-untyped-def]
+def rollout_tree(  # type: ignore[no-untyped-def]
+    works, still, batch, items, begins, out, most_steps=4000
+):
     """Predict ``items`` of ``out``, whose shape is (proposal * transition, H, body, 6).
 
     ``begins``, shape (item,), are their first intervals; they become those in which a body comes
-    near an obstacle, H where none does. Those that diverge, or take more than ``MOST_STEPS`` steps
-    of an interval, are NaN from there on.
+    near an obstacle, H where none does. Those that diverge, or take more than ``most_steps`` steps
+    of an interval (laws that are stiffer, or jump more often), are NaN from there on.
     """
     rows, joints, discs = batch.given[:3]
     work = works[0]
-    n, horizon, proposal, bodies = len(batch.inputs), batch.inputs.shape[1], -1, work.n_bodies
+    n, horizon, proposal = len(batch.inputs), batch.inputs.shape[1], -1
     timed = rows.shape[1] > 1
-    memory, at = np.zeros((2, batch.slots)), np.full(2, -1)
-    work.memory, work.n_held = memory.ctypes.data + 8 * batch.slots, batch.held
+    slots, work.n_held = batch.laws[0].n_slots, batch.laws[0].n_held
+    memory, at = np.zeros((2, slots)), np.full(2, -1)
+    work.memory = memory.ctypes.data + 8 * slots
     work.time_step, work.tolerance, work.length = batch.time_step, batch.tolerance, still.length
     for place in range(len(items)):
         item = items[place]
@@ -496,37 +476,19 @@ def rollout(works, still, batch, items, begins, out):  # type: ignore[no-untyped
                     rows[p, t * horizon + h if timed else 0], joints[p],
                 )  # fmt: skip
             if h == first:
-                _set_states(work, states_before(batch, out, item, h))
-                set_memory(batch, laws, p, t, h, work.states, work.acted, memory, work.held, at)
-                begin_held(work.states, laws, work.acted, work.held)
-                for s in range(batch.held):
-                    work.motion[Q, work.n + 1 + s] = work.held[0, s]
-            inputs, budget, low, high = batch.inputs[t, h], MOST_STEPS, 0.0, 0.0
-            work.inputs = inputs.ctypes.data
-            for k in range(bodies):
-                for w in range(3):
-                    work.acted[k, COMMAND + w] = work.acted[k, WRENCHES + w] = inputs[k, w]
-                    if work.bodies[k] < 0:
-                        work.states[k, 3 + w] = inputs[k, w]
-            while high < 1.0 and budget > 0:
-                low, high = high, 1.0
-                high = _switch(laws, low)
-                budget, wanted = _advance(work, laws, still, low, high, budget, wanted)
-            if batch.slots > 0:
-                remember(work.states, work.inputs, laws, work.acted, work.memory, work.held)
+                _begin(work, laws, batch, out, item, h, memory, at)
+            set_inputs(work, batch.inputs[t, h])
+            work.high, budget = 0.0, most_steps
+            while work.high < 1.0 and budget > 0:
+                work.low = work.high
+                work.high = _switch(laws, work.low)
+                budget, wanted = _advance(work, laws, still, budget, wanted)
+            if slots > 0:
+                memory_at, inputs_at = numbers_at(work.memory), numbers_at(work.inputs)
+                remember(work.states, inputs_at, laws, work.acted, memory_at)
             if budget < 0:
                 begins[place] = h
                 break
-            lost = budget == 0
-            for k in range(bodies):
-                speed = abs(work.states[k, 3]) + abs(work.states[k, 4])
-                speed += still.length * abs(work.states[k, 5])
-                lost |= not speed < still.fastest  # also true of NaN
-                for d in range(6):
-                    out[item, h, k, d] = work.states[k, d]
-            if lost:
-                for later in range(h, horizon):
-                    for k in range(bodies):
-                        for d in range(6):
-                            out[item, later, k, d] = np.nan
+            if _write(work, still, out[item, h]) or budget == 0:
+                _lose(out[item], h)
                 break

@@ -18,12 +18,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pbrl_ppl.physics.calls import compiled, inner
-from pbrl_ppl.physics.laws import ACTED, MORE, act, begin_held, remember, set_memory
-from pbrl_ppl.physics.properties import COLUMN
+from pbrl_ppl.physics.calls import compiled, from_place, inlined, inner, rotated, start_of
+from pbrl_ppl.physics.laws import (
+    ACTED,
+    MORE,
+    WRENCHES,
+    act,
+    begin_held,
+    remember,
+    set_memory,
+    states_before,
+)
 from pbrl_ppl.physics.solids import reaches, segment
-from pbrl_ppl.physics.world import World
-from pbrl_ppl.state import Bools
+from pbrl_ppl.physics.world import COLUMN, World
+from pbrl_ppl.state import Bools, Floats, Ints
 
 #: Number of transitions in a block, which are computed side by side.
 BLOCK = 32
@@ -38,30 +46,26 @@ def row_of(fields: str) -> Any:
     return namedtuple("Row", names)(*range(0, BLOCK * len(names), BLOCK))
 
 
-#: Fields of a body: the state of its centre of mass, which is at ``com`` in its frame; the place of
-#: its origin; the wrench on it and the weight beside the scene's gravity; the accelerations that
-#: they give. Then those of its wheel: place and axis in its frame, greatest and stored impulses of
-#: both rods; the axis in the world, levers and effective masses in a substep.
+#: Fields of a body: the state of its centre of mass, which is at ``com`` in its frame, and by how
+#: much it turned in a substep; the place of its origin; the wrench on it and the weight beside the
+#: scene's gravity. Then those of its wheel: place and axis in its frame, greatest and stored
+#: impulses of both rods; the axis in the world, levers and effective masses in a substep.
 BODY = row_of(
     """
-    x y angle vx vy omega cos sin com_x com_y inverse_mass inverse_moment
-    origin_x origin_y force_x force_y torque weight_x weight_y acceleration_x acceleration_y spin_up
+    x y angle turned vx vy omega cos sin com_x com_y inverse_mass inverse_moment
+    origin_x origin_y force_x force_y torque weight_x weight_y
     wheel_x wheel_y wheel_cos wheel_sin most_along most_across impulse_along impulse_across
     axis_x axis_y lever_along lever_across mass_along mass_across
     """
 )
-#: Smaller rotations in a substep (rad) are computed by a series, exact to rounding.
-_SMALL_TURN = 0.5
+#: Coefficients of the series of cosine and sine.
 _C1, _C2, _C3, _C4, _C5, _C6, _C7 = ((-1) ** k / math.factorial(2 * k) for k in range(1, 8))
 _S1, _S2, _S3, _S4, _S5, _S6, _S7 = ((-1) ** k / math.factorial(2 * k + 1) for k in range(1, 8))
 
 
 @inner
 def set_body(body, i, row, wheel, normal_gravity, step):  # type: ignore[no-untyped-def]
-    """Set a body's properties for an interval; keep stored impulses.
-
-    Returns whether the centre of mass is off the origin.
-    """
+    """Set a body's properties for an interval; keep stored impulses."""
     mass, com_x, com_y = row[COLUMN.mass], row[COLUMN.com_x], row[COLUMN.com_y]
     body[BODY.inverse_mass + i] = 1.0 / mass
     body[BODY.inverse_moment + i] = 1.0 / row[COLUMN.moment]
@@ -75,7 +79,6 @@ def set_body(body, i, row, wheel, normal_gravity, step):  # type: ignore[no-unty
         body[BODY.wheel_cos + i], body[BODY.wheel_sin + i] = math.cos(angle), math.sin(angle)
         body[BODY.most_along + i] = row[COLUMN.mu_x] * load * step
         body[BODY.most_across + i] = row[COLUMN.mu_y] * load * step
-    return com_x != 0.0 or com_y != 0.0
 
 
 @inner
@@ -88,11 +91,8 @@ def align(body, i):  # type: ignore[no-untyped-def]
 @inner
 def _arm(body, i):  # type: ignore[no-untyped-def]
     """Return the arm from the origin to the centre of mass, in the world's frame."""
-    x, y = body[BODY.com_x + i], body[BODY.com_y + i]
-    if x == 0.0 and y == 0.0:
-        return 0.0, 0.0
     c, s = body[BODY.cos + i], body[BODY.sin + i]
-    return c * x - s * y, s * x + c * y
+    return rotated(c, s, body[BODY.com_x + i], body[BODY.com_y + i])
 
 
 @inner
@@ -118,56 +118,40 @@ def get_state(body, i, states, k):  # type: ignore[no-untyped-def]
 
 @inner
 def set_wrench(body, i, force_x, force_y, torque):  # type: ignore[no-untyped-def]
-    """Set the accelerations by a wrench and the additional weight."""
+    """Set the wrench at the origin."""
     body[BODY.force_x + i], body[BODY.force_y + i], body[BODY.torque + i] = force_x, force_y, torque
-    inverse_mass = body[BODY.inverse_mass + i]
-    body[BODY.acceleration_x + i] = (force_x + body[BODY.weight_x + i]) * inverse_mass
-    body[BODY.acceleration_y + i] = (force_y + body[BODY.weight_y + i]) * inverse_mass
-    body[BODY.spin_up + i] = torque * body[BODY.inverse_moment + i]
 
 
 @inner
-def lever(body):  # type: ignore[no-untyped-def]
-    """Set the angular accelerations by forces on origins that are off the centres of mass."""
-    for i in range(BLOCK):
-        c, s = body[BODY.cos + i], body[BODY.sin + i]
-        x = c * body[BODY.com_x + i] - s * body[BODY.com_y + i]
-        y = s * body[BODY.com_x + i] + c * body[BODY.com_y + i]
-        moment = x * body[BODY.force_y + i] - y * body[BODY.force_x + i]
-        body[BODY.spin_up + i] = (body[BODY.torque + i] - moment) * body[BODY.inverse_moment + i]
+def move(body, gravity, step, small=0.5):  # type: ignore[no-untyped-def]
+    """Move a body and rotate its heading; then add what gravity and the wrench change.
 
-
-@inner
-def turn(body, step):  # type: ignore[no-untyped-def]
-    """Move a body and rotate its heading."""
-    fast = False
+    Rotations by less than ``small`` (rad) are computed by a series, exact to rounding.
+    """
+    fast, (g_x, g_y) = False, gravity
     for i in range(BLOCK):
+        heading, slope = body[BODY.cos + i], body[BODY.sin + i]
+        f_x, f_y = body[BODY.force_x + i], body[BODY.force_y + i]
+        x, y = rotated(heading, slope, body[BODY.com_x + i], body[BODY.com_y + i])
+        torque = body[BODY.torque + i] - (x * f_y - y * f_x)
         body[BODY.x + i] += body[BODY.vx + i] * step
         body[BODY.y + i] += body[BODY.vy + i] * step
-        a = body[BODY.omega + i] * step
+        a = body[BODY.turned + i] = body[BODY.omega + i] * step
         body[BODY.angle + i] += a
-        fast |= not abs(a) < _SMALL_TURN
+        fast |= not abs(a) < small
         d = a * a
         c = 1.0 + d * (_C1 + d * (_C2 + d * (_C3 + d * (_C4 + d * (_C5 + d * (_C6 + d * _C7))))))
         s = _S1 + d * (_S2 + d * (_S3 + d * (_S4 + d * (_S5 + d * (_S6 + d * _S7)))))
         s = a * (1.0 + d * s)
-        before = body[BODY.cos + i]
-        body[BODY.cos + i] = before * c - body[BODY.sin + i] * s
-        body[BODY.sin + i] = body[BODY.sin + i] * c + before * s
+        body[BODY.cos + i], body[BODY.sin + i] = rotated(c, s, heading, slope)
+        mass = body[BODY.inverse_mass + i]
+        body[BODY.vx + i] += (g_x + (f_x + body[BODY.weight_x + i]) * mass) * step
+        body[BODY.vy + i] += (g_y + (f_y + body[BODY.weight_y + i]) * mass) * step
+        body[BODY.omega + i] += torque * body[BODY.inverse_moment + i] * step
     if fast:
         for i in range(BLOCK):
-            if not abs(body[BODY.omega + i] * step) < _SMALL_TURN:
+            if not abs(body[BODY.turned + i]) < small:
                 align(body, i)
-
-
-@inner
-def accelerate(body, gravity, step):  # type: ignore[no-untyped-def]
-    """Add the velocity changes by gravity and the wrench."""
-    g_x, g_y = gravity
-    for i in range(BLOCK):
-        body[BODY.vx + i] += (g_x + body[BODY.acceleration_x + i]) * step
-        body[BODY.vy + i] += (g_y + body[BODY.acceleration_y + i]) * step
-        body[BODY.omega + i] += body[BODY.spin_up + i] * step
 
 
 @inner
@@ -186,9 +170,9 @@ def watch(bodies, still, discs, touched):  # type: ignore[no-untyped-def]
         body, radius = bodies[k], still.radii[k]
         for i in range(BLOCK):
             c, s = body[BODY.cos + i], body[BODY.sin + i]
-            com_x, com_y = body[BODY.com_x + i], body[BODY.com_y + i]
-            body[BODY.origin_x + i] = body[BODY.x + i] - (c * com_x - s * com_y)
-            body[BODY.origin_y + i] = body[BODY.y + i] - (s * com_x + c * com_y)
+            x, y = rotated(c, s, body[BODY.com_x + i], body[BODY.com_y + i])
+            body[BODY.origin_x + i] = body[BODY.x + i] - x
+            body[BODY.origin_y + i] = body[BODY.y + i] - y
         for j in range(len(still.obstacles) - discs.shape[1]):
             a_x, a_y, d_x, d_y, scale, size = segment(still.obstacles[j])
             for i in range(BLOCK):
@@ -221,10 +205,8 @@ def begin_wheel(body):  # type: ignore[no-untyped-def]
     """Place a wheel's two rods and apply their impulses of the substep before."""
     for i in range(BLOCK):
         c, s = body[BODY.cos + i], body[BODY.sin + i]
-        x, y = body[BODY.wheel_x + i], body[BODY.wheel_y + i]
-        r_x, r_y = c * x - s * y, s * x + c * y
-        x, y = body[BODY.wheel_cos + i], body[BODY.wheel_sin + i]
-        n_x, n_y = c * x - s * y, s * x + c * y
+        r_x, r_y = rotated(c, s, body[BODY.wheel_x + i], body[BODY.wheel_y + i])
+        n_x, n_y = rotated(c, s, body[BODY.wheel_cos + i], body[BODY.wheel_sin + i])
         along, across = r_x * n_y - r_y * n_x, r_x * n_x + r_y * n_y
         mass, moment = body[BODY.inverse_mass + i], body[BODY.inverse_moment + i]
         body[BODY.axis_x + i], body[BODY.axis_y + i] = n_x, n_y
@@ -278,123 +260,191 @@ def free_wheels(world: World) -> Wheels | None:
     return Wheels(np.isin(np.arange(len(world.bodies)), wheels), world.iterations)
 
 
+class Lanes(NamedTuple):
+    """Transitions side by side: which they are, where they are, and what acts in them."""
+
+    proposal: Ints  # (BLOCK,)
+    transition: Ints
+    first: Ints  # intervals with which they begin
+    until: Ints  # intervals in which a body comes near an obstacle
+    touched: Bools
+    discs: Floats  # (BLOCK, disc, 3)
+    bodies: Floats  # (body, BLOCK * field)
+    states: Floats  # (body, 6) of one transition
+    acted: Floats  # (body + MORE, ACTED), see `laws.act`
+    memory: Floats  # (2, slot), see `laws.set_memory`
+    at: Ints  # (2,)
+    remembered: Floats  # (BLOCK, slot)
+    held: Floats  # (BLOCK, 2, number)
+
+
 @inner
-def substep(bodies, wheels, gravity, step):  # type: ignore[no-untyped-def]
-    """Do one step of the engine."""
+def _lanes_of(batch, moving):  # type: ignore[no-untyped-def]
+    """Return the arrays of a block of so many moving bodies."""
+    slots, held = batch.laws[0].n_slots, batch.laws[0].n_held
+    return Lanes(
+        np.zeros(BLOCK, np.int64), np.zeros(BLOCK, np.int64), np.zeros(BLOCK, np.int64),
+        np.zeros(BLOCK, np.int64), np.zeros(BLOCK, np.bool_),
+        np.zeros((BLOCK, batch.given[2].shape[1], 3)), np.zeros((moving, BLOCK * len(BODY))),
+        np.empty((moving, 6)), np.zeros((moving + MORE, ACTED)),
+        np.zeros((2, slots)), np.full(2, -1),
+        np.zeros((BLOCK, slots)), np.zeros((BLOCK, 2, held)),
+    )  # fmt: skip
+
+
+@inlined
+def _choose(lanes, batch, items, begins, begin):  # type: ignore[no-untyped-def]
+    """Choose the transitions of the items from ``begin`` on; return the most intervals of one."""
+    n, horizon, longest = len(batch.inputs), batch.inputs.shape[1], 0
+    for i in range(BLOCK):
+        place = min(begin + i, len(items) - 1)  # the rest of a block repeats the last
+        lanes.proposal[i], lanes.transition[i] = items[place] // n, items[place] % n
+        lanes.first[i], lanes.until[i] = begins[place], horizon
+        longest = max(longest, horizon - lanes.first[i])
+        for j in range(lanes.discs.shape[1]):
+            for d in range(3):
+                lanes.discs[i, j, d] = batch.given[2][lanes.proposal[i], j, d]
+    return longest
+
+
+@inlined
+def _interval(lanes, batch, i, ahead):  # type: ignore[no-untyped-def]
+    """Return proposal, transition and interval of one that is so many intervals ahead."""
+    h = min(lanes.first[i] + ahead, batch.inputs.shape[1] - 1)
+    return lanes.proposal[i], lanes.transition[i], h
+
+
+@inlined
+def _get_states(lanes, i):  # type: ignore[no-untyped-def]
+    """Write the states of all bodies of a transition."""
+    for k in range(len(lanes.bodies)):
+        get_state(lanes.bodies[k], i, lanes.states, k)
+
+
+@inlined
+def _begin_interval(lanes, batch, out, wheels, still, step, ahead):  # type: ignore[no-untyped-def]
+    """Set properties, states where transitions begin, and wrenches."""
+    rows, states = batch.given[0], lanes.states
+    timed, n, horizon = rows.shape[1] > 1, len(batch.inputs), batch.inputs.shape[1]
+    for k in range(len(lanes.bodies)):
+        body, wheel = lanes.bodies[k], wheels.under[k]
+        for i in range(BLOCK):
+            p, t, h = _interval(lanes, batch, i, ahead)
+            if timed or ahead == 0:
+                if ahead > 0:
+                    get_state(body, i, states, k)
+                else:
+                    before = states_before(batch, out, p * n + t, h)
+                    for d in range(6):
+                        states[k, d] = before[k, d]
+                row = rows[p, t * horizon + h if timed else 0, k]
+                set_body(body, i, row, wheel, still.normal_gravity, step)
+                set_state(body, i, states, k)
+            else:
+                align(body, i)
+            force = batch.inputs[t, h, k]
+            set_wrench(body, i, force[0], force[1], force[2])
+
+
+@inlined
+def _begin_laws(lanes, batch, width):  # type: ignore[no-untyped-def]
+    """Set what laws remember where transitions begin."""
+    for i in range(width):
+        p, t, h = _interval(lanes, batch, i, 0)
+        laws = batch.laws[p]
+        _get_states(lanes, i)
+        set_memory(batch, laws, p, t, h, lanes.states, lanes.acted, lanes.memory, lanes.at)
+        begin_held(lanes.states, laws, lanes.acted, lanes.held[i])
+        for slot in range(laws.n_slots):
+            lanes.remembered[i, slot] = lanes.memory[1, slot]
+
+
+@inlined
+def _act(lanes, batch, width, ahead, s, substeps):  # type: ignore[no-untyped-def]
+    """Set the wrenches of laws in a substep."""
+    states, acted = start_of(lanes.states), start_of(lanes.acted)
+    for i in range(width):
+        p, t, h = _interval(lanes, batch, i, ahead)
+        laws = batch.laws[p]
+        _get_states(lanes, i)
+        memory = from_place(start_of(lanes.remembered), laws.n_slots * i)
+        held = from_place(start_of(lanes.held), 2 * laws.n_held * i)
+        rates = from_place(held, laws.n_held)
+        share, end = s / substeps, (s + 1) / substeps
+        act(states, start_of(batch.inputs[t, h]), laws, share, end, acted, memory, held, rates)
+        for slot in range(laws.n_held):
+            held[slot] += batch.time_step / substeps * rates[slot]
+        for k in range(len(lanes.bodies)):
+            on = lanes.acted[k]
+            set_wrench(lanes.bodies[k], i, on[WRENCHES], on[WRENCHES + 1], on[WRENCHES + 2])
+
+
+@inlined
+def _remember(lanes, batch, width, ahead):  # type: ignore[no-untyped-def]
+    """Bring what laws remember up to date after an interval."""
+    for i in range(width):
+        p, t, h = _interval(lanes, batch, i, ahead)
+        _get_states(lanes, i)
+        inputs, memory = start_of(batch.inputs[t, h]), start_of(lanes.remembered[i])
+        remember(lanes.states, inputs, batch.laws[p], lanes.acted, memory)
+
+
+@inlined
+def _add(lanes, out, items, ahead, weight, first_level):  # type: ignore[no-untyped-def]
+    """Add weighted states to ``out``, up to the interval in which a transition touches."""
+    for i in range(len(items)):
+        h = lanes.first[i] + ahead
+        if lanes.touched[i]:
+            lanes.until[i] = min(lanes.until[i], h)
+        if h < lanes.until[i]:
+            _get_states(lanes, i)
+            for k in range(len(lanes.bodies)):
+                for d in range(6):
+                    total = 0.0 if first_level else out[items[i], h, k, d]
+                    out[items[i], h, k, d] = total + weight * lanes.states[k, d]
+
+
+@inner
+def substep(bodies, touched, discs, wheels, still, step):  # type: ignore[no-untyped-def]
+    """Do one step of the engine, and mark the transitions in which a body touches or diverges."""
     for k in range(len(wheels.under)):
-        turn(bodies[k], step)
-        accelerate(bodies[k], gravity, step)
+        move(bodies[k], still.gravity, step)
         if wheels.under[k]:
             begin_wheel(bodies[k])
             for _ in range(wheels.iterations):
                 solve_wheel(bodies[k])
+        lose(bodies[k], still, touched)
+    if still.watched:
+        watch(bodies, still, discs, touched)
 
 
 @compiled
-def rollout(wheels, still, batch, items, begins, out):  # type: ignore[no-untyped-def]
-    """Predict ``items`` as `compiled.rollout` does, but for intervals that the engine must predict.
+def rollout_free(wheels, still, batch, items, begins, out):  # type: ignore[no-untyped-def]
+    """Predict ``items`` as the engine's rollout does, but for intervals that it must predict.
 
     ``begins``, shape (item,), are their first intervals; they become those in which a body comes
     near an obstacle or diverges, H where none does.
     """
-    rows, discs = batch.given[0], batch.given[2]
-    start, inputs = batch.start, batch.inputs
-    n, horizon, moving = len(inputs), inputs.shape[1], len(still.radii)
-    timed = rows.shape[1] > 1
-    acting = batch.laws[0].n_commands + batch.laws[0].n_forces > 0
-    own_discs = np.zeros((BLOCK, discs.shape[1], 3))
-    proposal, transition = np.zeros(BLOCK, np.int64), np.zeros(BLOCK, np.int64)
-    first, until = np.zeros(BLOCK, np.int64), np.zeros(BLOCK, np.int64)
-    states, acted = np.empty((moving, 6)), np.zeros((moving + MORE, ACTED))
-    memory, at = np.zeros((2, batch.slots)), np.full(2, -1)
-    remembered, held = np.zeros((BLOCK, batch.slots)), np.zeros((BLOCK, 2, batch.held))
-    states_at, acted_at = states.ctypes.data, acted.ctypes.data
-    remembered_at, held_at = remembered.ctypes.data, held.ctypes.data
+    lanes, laws = _lanes_of(batch, len(still.radii)), batch.laws[0]
+    bodies, touched, discs = lanes.bodies, lanes.touched, lanes.discs
     for begin in range(0, len(items), BLOCK):
         width = min(BLOCK, len(items) - begin)
-        longest = 0
-        for i in range(BLOCK):
-            place = begin + min(i, width - 1)  # the rest of a block repeats the last
-            item, first[i], until[i] = items[place], begins[place], horizon
-            proposal[i], transition[i] = item // n, item % n
-            longest = max(longest, horizon - first[i])
-            for j in range(discs.shape[1]):
-                for d in range(3):
-                    own_discs[i, j, d] = discs[proposal[i], j, d]
+        longest = _choose(lanes, batch, items, begins, begin)
         for level in range(len(batch.counts)):
-            substeps, weight = batch.counts[level], batch.weights[level]
+            substeps = batch.counts[level]
             step = batch.time_step / substeps
-            bodies = np.zeros((moving, BLOCK * len(BODY)))
-            touched = np.zeros(BLOCK, np.bool_)
-            shifted = False
+            bodies[:], touched[:] = 0.0, False
             for ahead in range(longest):
-                for k in range(moving):
-                    body, wheel = bodies[k], wheels.under[k]
-                    for i in range(BLOCK):
-                        p, t, h = proposal[i], transition[i], min(first[i] + ahead, horizon - 1)
-                        if timed or ahead == 0:
-                            row = rows[p, t * horizon + h if timed else 0, k]
-                            if ahead == 0:
-                                for d in range(6):
-                                    states[k, d] = start[p if len(start) > 1 else 0, t, k, d]
-                                    if h > 0:
-                                        states[k, d] = out[p * n + t, h - 1, k, d]
-                            else:
-                                get_state(body, i, states, k)
-                            shifted |= set_body(body, i, row, wheel, still.normal_gravity, step)
-                            set_state(body, i, states, k)
-                        else:
-                            align(body, i)
-                        force_x, force_y = inputs[t, h, k, 0], inputs[t, h, k, 1]
-                        set_wrench(body, i, force_x, force_y, inputs[t, h, k, 2])
-                for i in range(width if ahead == 0 and batch.slots + batch.held > 0 else 0):
-                    p, t = proposal[i], transition[i]
-                    for k in range(moving):
-                        get_state(bodies[k], i, states, k)
-                    laws = batch.laws[p]
-                    set_memory(batch, laws, p, t, first[i], states, acted, memory, held[i], at)
-                    begin_held(states, laws, acted, held[i])
-                    for slot in range(batch.slots):
-                        remembered[i, slot] = memory[1, slot]
+                _begin_interval(lanes, batch, out, wheels, still, step, ahead)
+                if ahead == 0 and laws.n_slots + laws.n_held > 0:
+                    _begin_laws(lanes, batch, width)
                 for s in range(substeps):
-                    if acting:
-                        for i in range(width):
-                            p, t, h = proposal[i], transition[i], min(first[i] + ahead, horizon - 1)
-                            for k in range(moving):
-                                get_state(bodies[k], i, states, k)
-                            act(
-                                states_at, inputs[t, h].ctypes.data, batch.laws[p], s / substeps,
-                                (s + 1) / substeps, acted_at, remembered_at + 8 * batch.slots * i,
-                                held_at + 16 * batch.held * i, batch.held, False,
-                            )  # fmt: skip
-                            for slot in range(batch.held):
-                                held[i, 0, slot] += step * held[i, 1, slot]
-                            for k in range(moving):
-                                set_wrench(bodies[k], i, acted[k, 6], acted[k, 7], acted[k, 8])
-                    if shifted:
-                        for k in range(moving):
-                            lever(bodies[k])
-                    substep(bodies, wheels, still.gravity, step)
-                    for k in range(moving):
-                        lose(bodies[k], still, touched)
-                    if still.watched:
-                        watch(bodies, still, own_discs, touched)
-                for i in range(width if batch.slots > 0 else 0):
-                    p, t, h = proposal[i], transition[i], min(first[i] + ahead, horizon - 1)
-                    for k in range(moving):
-                        get_state(bodies[k], i, states, k)
-                    laws = batch.laws[p]
-                    inputs_at = inputs[t, h].ctypes.data
-                    slots_at = remembered_at + 8 * batch.slots * i
-                    remember(states, inputs_at, laws, acted, slots_at, held[i])
-                for i in range(width):
-                    item, h = items[begin + i], first[i] + ahead
-                    if touched[i]:
-                        until[i] = min(until[i], h)
-                    for k in range(moving if h < until[i] else 0):
-                        get_state(bodies[k], i, states, k)
-                        for d in range(6):
-                            total = out[item, h, k, d] if level else 0.0
-                            out[item, h, k, d] = total + weight * states[k, d]
+                    if laws.n_commands + laws.n_forces > 0:
+                        _act(lanes, batch, width, ahead, s, substeps)
+                    substep(bodies, touched, discs, wheels, still, step)
+                if laws.n_slots > 0:
+                    _remember(lanes, batch, width, ahead)
+                chosen = items[begin : begin + width]
+                _add(lanes, out, chosen, ahead, batch.weights[level], level == 0)
         for i in range(width):
-            begins[begin + i] = until[i]
+            begins[begin + i] = lanes.until[i]

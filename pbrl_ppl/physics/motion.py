@@ -13,54 +13,37 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.physics.calls import inner
-from pbrl_ppl.physics.joints import LENGTH
-from pbrl_ppl.physics.laws import ACTED, COMMAND, MORE, bound
-from pbrl_ppl.physics.properties import COLUMN
-from pbrl_ppl.physics.tree import (
-    ACROSS,
-    ALONG,
-    BAR,
-    FREE,
-    HINGE,
-    LINK,
-    MOST,
-    PIVOT,
-    RAIL,
-    TURNING,
-    UNDER,
-    Tree,
-)
-from pbrl_ppl.physics.world import RING
+from pbrl_ppl.physics.calls import from_place, inner, numbers_at, rotated, start_of
+from pbrl_ppl.physics.laws import ACTED, COMMAND, MORE, WINDOW, WRENCHES, act, bound
+from pbrl_ppl.physics.tree import FRICTION, KIND, LINK, MOST, POSE, Tree
+from pbrl_ppl.physics.world import COLUMN, JOINT, RING, columns
 
 #: Columns of a link's numbers. Mass, moment, centre of mass from the place of its joint (in its
 #: frame), that place in the parent's frame or the world and in the body's own frame, gravity,
 #: damping; then heading, place and velocity, and the acceleration without that of the speeds.
-(
-    MASS, MOMENT, COM_X, COM_Y, AT_X, AT_Y, OWN_X, OWN_Y, WEIGHT_X, WEIGHT_Y, DAMPING,
-    COS, SIN, X, Y, V_X, V_Y, B_X, B_Y,
-) = range(19)  # fmt: skip
+HAS = columns(
+    "mass moment com_x com_y at_x at_y own_x own_y weight_x weight_y damping"
+    " cos sin x y v_x v_y b_x b_y"
+)
 #: Columns of a row's numbers: its greatest force and the one with which it sticks, its acceleration
 #: without that of the speeds, a wheel's place from the joint's and direction, its greatest force
 #: but for laws that change it; then G.
-BOUND, FORCE, BIAS, W_X, W_Y, W_COS, W_SIN, BASE, G = range(9)
-#: Rows of what each coordinate has: coordinates and speeds now and at the end of a step, natural
-#: sizes, forces Q; then seven slopes (speed, acceleration), and M.
-Q, U, END_Q, END_U, SIZE, LOAD, SLOPES, M = 0, 1, 2, 3, 4, 5, 6, 20
+ROW = columns("bound force bias w_x w_y w_cos w_sin base g")
 #: Rows of a ring's numbers: greatest force of a point and reaction on a ring that holds; twist
 #: where a step begins (and the greatest force but for laws), at its end, and now; then its points,
 #: from the joint's place.
-GRIP, TWIST, TWIST_END, TWIST_NOW, POINTS = range(5)
-#: Columns of a link's pose: heading and slider's direction, less the coordinate of its angle.
-HEADING, AXIS = 4, 5
-#: Modes of a row beside slipping in its positive (1) or negative direction: it sticks, or has no
+RIM = columns("grip twist twist_end twist_now points")
+#: Rows of what each coordinate has: coordinates and speeds now and at the end of a step, natural
+#: sizes, forces Q; then seven slopes (speed, acceleration), and M.
+Q, U, END_Q, END_U, SIZE, LOAD, SLOPES, M = 0, 1, 2, 3, 4, 5, 6, 20
+#: Modes of a row: it sticks, slips in its positive (1) or negative direction (-1), or has no
 #: friction. A ring slides or sticks.
-STICK, SMOOTH, SLIDE = 0, 2, 1
+MODE = columns("stick slide smooth")
+#: Steps of less than this share of an interval are taken as they are.
+SHORTEST = 1e-6
 #: Friction of a ring's point that is slower than this share of its body is less: it may be at rest
 #: for an instant, where its direction jumps. Other points have theirs but for some 1e-6.
 _SLOW = 2e-3
-#: Compliance of what sticks, beside that of the bodies: redundant constraints share their force.
-_SOFT = 1e-11
 
 
 #: Topology of a tree and numbers of one transition: one record, for a call of many arrays would
@@ -70,18 +53,19 @@ WORK = np.dtype(
     # numbers of force laws, and the addresses of what command laws remember and of an interval's
     # inputs
     + [(name, np.int64) for name in ("n_held", "memory", "inputs")]
-    # the interval (s), the error of a step as a share of natural sizes, and that of a way (m)
-    + [(name, np.float64) for name in ("time_step", "tolerance", "length")]
+    # the interval (s), the error of a step as a share of natural sizes, and that of a way (m); the
+    # ends of a piece of the interval in which no command jumps, as shares of it
+    + [(name, np.float64) for name in ("time_step", "tolerance", "length", "low", "high")]
     + [
         ("tree", np.int64, (MOST, 9)),
         ("kinds", np.int64, (MOST, 4)),  # of rows, then rings (-1): link, mode, if that is settled
         ("bodies", np.int64, (MOST,)),  # their links
         ("poses", np.float64, (MOST, 6)),
-        ("links", np.float64, (MOST, B_Y + 1)),
+        ("links", np.float64, (MOST, len(HAS))),
         ("slope", np.float64, (MOST, MOST, 2)),  # derivative of a link's place by each coordinate
-        ("rows", np.float64, (MOST, G + MOST)),
-        ("rings", np.float64, (MOST, POINTS + len(RING), 4)),
-        ("motion", np.float64, (M + MOST, MOST)),
+        ("rows", np.float64, (MOST, ROW.g + MOST)),
+        ("rings", np.float64, (MOST, RIM.points + len(RING), 4)),
+        ("motion", np.float64, (M + MOST, MOST + 1)),
         ("system", np.float64, (4 * MOST, 4 * MOST + 1)),
         ("states", np.float64, (MOST, 6)),
         ("acted", np.float64, (MOST + MORE, ACTED)),  # see `laws.act`
@@ -104,8 +88,8 @@ def work_of(tree: Tree, length: float) -> NDArray[np.void]:
     work["kinds"][0, rows : rows + rings, 1] = tree.rings
     work["motion"][0, SIZE] = 1.0
     for kind, first in tree.links[:, [LINK.kind, LINK.first]]:
-        if kind in (FREE, RAIL):
-            work["motion"][0, SIZE, first : first + 1 + (kind == FREE)] = length
+        if kind in (KIND.free, KIND.rail):
+            work["motion"][0, SIZE, first : first + 1 + (kind == KIND.free)] = length
     return work
 
 
@@ -115,59 +99,72 @@ def set_numbers(work, gravity, normal_gravity, ring, bodies, joints):  # type: i
     for i in range(work.n_links):
         fields, link, joint = work.tree[i], work.links[i], work.tree[i, LINK.joint]
         parent, near, far = fields[LINK.parent], fields[LINK.near], fields[LINK.far]
-        link[OWN_X], link[OWN_Y] = 0.0, 0.0
+        link[HAS.own_x], link[HAS.own_y] = 0.0, 0.0
         if far >= 0:
-            link[OWN_X], link[OWN_Y] = joints[joint, far], joints[joint, far + 1]
+            link[HAS.own_x], link[HAS.own_y] = joints[joint, far], joints[joint, far + 1]
         x, y = 0.0, 0.0
         if near >= 0:
             x, y = joints[joint, near], joints[joint, near + 1]
         if parent < 0:
             at_x, at_y, c, s, _, _ = work.poses[i]
             x, y = at_x + c * x - s * y, at_y + s * x + c * y
-        elif work.tree[parent, LINK.kind] == BAR:
-            x = joints[joint, LENGTH]
+        elif work.tree[parent, LINK.kind] == KIND.bar:
+            x = joints[joint, JOINT.length]
         else:
-            x, y = x - work.links[parent, OWN_X], y - work.links[parent, OWN_Y]
-        link[AT_X], link[AT_Y] = x, y
+            x, y = x - work.links[parent, HAS.own_x], y - work.links[parent, HAS.own_y]
+        link[HAS.at_x], link[HAS.at_y] = x, y
         if fields[LINK.body] < 0:
             continue
         row = bodies[fields[LINK.body]]
-        link[MASS], link[MOMENT] = row[COLUMN.mass], row[COLUMN.moment]
-        link[COM_X], link[COM_Y] = row[COLUMN.com_x] - link[OWN_X], row[COLUMN.com_y] - link[OWN_Y]
-        link[WEIGHT_X] = gravity[0] + row[COLUMN.extra_gravity_x]
-        link[WEIGHT_Y] = gravity[1] + row[COLUMN.extra_gravity_y]
+        link[HAS.mass], link[HAS.moment] = row[COLUMN.mass], row[COLUMN.moment]
+        link[HAS.com_x], link[HAS.com_y] = (
+            row[COLUMN.com_x] - link[HAS.own_x],
+            row[COLUMN.com_y] - link[HAS.own_y],
+        )
+        link[HAS.weight_x] = gravity[0] + row[COLUMN.extra_gravity_x]
+        link[HAS.weight_y] = gravity[1] + row[COLUMN.extra_gravity_y]
         if fields[LINK.owner] >= 0:
-            link[DAMPING] = bodies[fields[LINK.owner], COLUMN.pivot_damping]
+            link[HAS.damping] = bodies[fields[LINK.owner], COLUMN.pivot_damping]
+    _set_friction(work, normal_gravity, ring, bodies)
+
+
+@inner
+def _set_friction(work, normal_gravity, ring, bodies):  # type: ignore[no-untyped-def]
+    """Set the greatest friction of rows and rings, where links have their numbers."""
     for r in range(work.n_kinds):
         kind, i = work.kinds[r, 0], work.kinds[r, 1]
         link, row = work.links[i], bodies[work.tree[i, LINK.body]]
-        load, radius = link[MASS] * normal_gravity, row[COLUMN.patch_radius]
+        load, radius = link[HAS.mass] * normal_gravity, row[COLUMN.patch_radius]
         lever = 0.0
-        for j in range(len(ring) if kind < 0 or kind == UNDER else 0):
-            x, y = ring[j, 0] * radius - link[OWN_X], ring[j, 1] * radius - link[OWN_Y]
+        for j in range(len(ring) if kind < 0 or kind == FRICTION.under else 0):
+            x, y = ring[j, 0] * radius - link[HAS.own_x], ring[j, 1] * radius - link[HAS.own_y]
             lever += math.sqrt(x * x + y * y) / len(ring)
             if kind < 0:
-                point = work.rings[r - work.n_rows, POINTS + j]
+                point = work.rings[r - work.n_rows, RIM.points + j]
                 point[0], point[1] = x, y
         if kind < 0:
             grip = row[COLUMN.patch_mu] * load / len(ring)
-            work.rings[r - work.n_rows, GRIP, 0] = work.rings[r - work.n_rows, TWIST, 3] = grip
+            work.rings[r - work.n_rows, RIM.grip, 0] = work.rings[r - work.n_rows, RIM.twist, 3] = (
+                grip
+            )
             continue
         numbers = work.rows[r]
-        if kind == PIVOT:
-            numbers[BOUND] = bodies[work.tree[i, LINK.owner], COLUMN.pivot_torque]
-        elif kind == UNDER:
-            lever = 1.0 if work.tree[i, LINK.kind] == RAIL else lever
-            numbers[BOUND] = row[COLUMN.patch_mu] * load * lever
-        elif kind == TURNING:
-            numbers[BOUND] = row[COLUMN.turn_torque]
+        if kind == FRICTION.pivot:
+            numbers[ROW.bound] = bodies[work.tree[i, LINK.owner], COLUMN.pivot_torque]
+        elif kind == FRICTION.under:
+            lever = 1.0 if work.tree[i, LINK.kind] == KIND.rail else lever
+            numbers[ROW.bound] = row[COLUMN.patch_mu] * load * lever
+        elif kind == FRICTION.turning:
+            numbers[ROW.bound] = row[COLUMN.turn_torque]
         else:
-            angle = row[COLUMN.w_theta] + (0.5 * math.pi if kind == ACROSS else 0.0)
-            numbers[BOUND] = load * (row[COLUMN.mu_x] if kind == ALONG else row[COLUMN.mu_y])
-            numbers[W_X] = row[COLUMN.w_x] - link[OWN_X]
-            numbers[W_Y] = row[COLUMN.w_y] - link[OWN_Y]
-            numbers[W_COS], numbers[W_SIN] = math.cos(angle), math.sin(angle)
-        numbers[BASE] = numbers[BOUND]
+            angle = row[COLUMN.w_theta] + (0.5 * math.pi if kind == FRICTION.across else 0.0)
+            numbers[ROW.bound] = load * (
+                row[COLUMN.mu_x] if kind == FRICTION.along else row[COLUMN.mu_y]
+            )
+            numbers[ROW.w_x] = row[COLUMN.w_x] - link[HAS.own_x]
+            numbers[ROW.w_y] = row[COLUMN.w_y] - link[HAS.own_y]
+            numbers[ROW.w_cos], numbers[ROW.w_sin] = math.cos(angle), math.sin(angle)
+        numbers[ROW.base] = numbers[ROW.bound]
 
 
 @inner
@@ -176,25 +173,25 @@ def set_coordinates(work, states):  # type: ignore[no-untyped-def]
     tree, motion = work.tree, work.motion
     for i in range(work.n_links):
         parent, body, j = tree[i, LINK.parent], tree[i, LINK.body], tree[i, LINK.first]
-        if tree[i, LINK.kind] == FREE:
+        if tree[i, LINK.kind] == KIND.free:
             for d in range(3):
                 motion[Q, j + d], motion[U, j + d] = states[body, d], states[body, 3 + d]
-        elif tree[i, LINK.kind] == HINGE:
+        elif tree[i, LINK.kind] == KIND.hinge:
             motion[Q, j], motion[U, j] = states[body, 2], states[body, 5]
         else:  # from the joint's place on its parent to the one on its body, or the rod's
-            x, y, v_x, v_y = work.links[i, AT_X], work.links[i, AT_Y], 0.0, 0.0
+            x, y, v_x, v_y = work.links[i, HAS.at_x], work.links[i, HAS.at_y], 0.0, 0.0
             if parent >= 0:
-                x += work.links[parent, OWN_X]
-                y += work.links[parent, OWN_Y]
+                x += work.links[parent, HAS.own_x]
+                y += work.links[parent, HAS.own_y]
                 x, y, v_x, v_y = _seen(states[tree[parent, LINK.body]], x, y)
-            last = i + 1 if tree[i, LINK.kind] == BAR else i
+            last = i + 1 if tree[i, LINK.kind] == KIND.bar else i
             end = work.links[last]
-            far = _seen(states[tree[last, LINK.body]], end[OWN_X], end[OWN_Y])
+            far = _seen(states[tree[last, LINK.body]], end[HAS.own_x], end[HAS.own_y])
             x, y, v_x, v_y = far[0] - x, far[1] - y, far[2] - v_x, far[3] - v_y
-            if tree[i, LINK.kind] == BAR:
+            if tree[i, LINK.kind] == KIND.bar:
                 motion[Q, j], motion[U, j] = math.atan2(y, x), (x * v_y - y * v_x) / (x * x + y * y)
                 continue
-            angle = motion[Q, tree[i, LINK.turn]] + work.poses[i, AXIS]
+            angle = motion[Q, tree[i, LINK.turn]] + work.poses[i, POSE.axis]
             c, s = math.cos(angle), math.sin(angle)
             motion[Q, j], motion[U, j] = c * x + s * y, c * v_x + s * v_y
 
@@ -202,8 +199,7 @@ def set_coordinates(work, states):  # type: ignore[no-untyped-def]
 @inner
 def _seen(state, x, y):  # type: ignore[no-untyped-def]
     """Return place and velocity of a point of a body, given in the body's frame."""
-    c, s = math.cos(state[2]), math.sin(state[2])
-    x, y = c * x - s * y, s * x + c * y
+    x, y = rotated(math.cos(state[2]), math.sin(state[2]), x, y)
     return state[0] + x, state[1] + y, state[3] - state[5] * y, state[4] + state[5] * x
 
 
@@ -219,28 +215,31 @@ def set_places(work, q, u):  # type: ignore[no-untyped-def]
         parent, turn = tree[i, LINK.parent], tree[i, LINK.turn]
         for k in range(n):
             slope[i, k, 0] = slope[i, k, 1] = 0.0
-        x, y, v_x, v_y, b_x, b_y = links[i, AT_X], links[i, AT_Y], 0.0, 0.0, 0.0, 0.0
-        if tree[i, LINK.kind] == FREE:
+        x, y, v_x, v_y, b_x, b_y = links[i, HAS.at_x], links[i, HAS.at_y], 0.0, 0.0, 0.0, 0.0
+        if tree[i, LINK.kind] == KIND.free:
             j = tree[i, LINK.first]
             x, y, v_x, v_y = motion[q, j], motion[q, j + 1], motion[u, j], motion[u, j + 1]
             slope[i, j, 0] = slope[i, j + 1, 1] = 1.0
         elif parent >= 0:
             j = tree[parent, LINK.turn]
-            c, s, omega = links[parent, COS], links[parent, SIN], motion[u, j]
-            x, y = c * x - s * y, s * x + c * y
-            v_x, v_y = links[parent, V_X] - omega * y, links[parent, V_Y] + omega * x
-            b_x = links[parent, B_X] - omega * omega * x
-            b_y = links[parent, B_Y] - omega * omega * y
+            c, s, omega = links[parent, HAS.cos], links[parent, HAS.sin], motion[u, j]
+            x, y = rotated(c, s, x, y)
+            v_x, v_y = links[parent, HAS.v_x] - omega * y, links[parent, HAS.v_y] + omega * x
+            b_x = links[parent, HAS.b_x] - omega * omega * x
+            b_y = links[parent, HAS.b_y] - omega * omega * y
             for k in range(n):
                 slope[i, k, 0], slope[i, k, 1] = slope[parent, k, 0], slope[parent, k, 1]
             slope[i, j, 0] -= y
             slope[i, j, 1] += x
-            x, y = links[parent, X] + x, links[parent, Y] + y
+            x, y = links[parent, HAS.x] + x, links[parent, HAS.y] + y
         angle, omega = motion[q, turn], motion[u, turn]
-        if tree[i, LINK.kind] == RAIL:
+        if tree[i, LINK.kind] == KIND.rail:
             j = tree[i, LINK.first]
             along, rate = motion[q, j], motion[u, j]
-            c, s = math.cos(angle + work.poses[i, AXIS]), math.sin(angle + work.poses[i, AXIS])
+            c, s = (
+                math.cos(angle + work.poses[i, POSE.axis]),
+                math.sin(angle + work.poses[i, POSE.axis]),
+            )
             x, y = x + c * along, y + s * along
             v_x, v_y = v_x + c * rate - s * along * omega, v_y + s * rate + c * along * omega
             b_x -= omega * (2.0 * s * rate + c * along * omega)
@@ -248,14 +247,18 @@ def set_places(work, q, u):  # type: ignore[no-untyped-def]
             slope[i, j, 0], slope[i, j, 1] = c, s
             slope[i, turn, 0] -= s * along
             slope[i, turn, 1] += c * along
-            angle += work.poses[i, HEADING]
+            angle += work.poses[i, POSE.heading]
         c, s = math.cos(angle), math.sin(angle)
-        links[i, COS], links[i, SIN], links[i, X], links[i, Y] = c, s, x, y
-        links[i, V_X], links[i, V_Y], links[i, B_X], links[i, B_Y] = v_x, v_y, b_x, b_y
+        links[i, HAS.cos], links[i, HAS.sin], links[i, HAS.x], links[i, HAS.y] = c, s, x, y
+        links[i, HAS.v_x], links[i, HAS.v_y], links[i, HAS.b_x], links[i, HAS.b_y] = (
+            v_x,
+            v_y,
+            b_x,
+            b_y,
+        )
         k = tree[i, LINK.body]
         if k >= 0:
-            o_x, o_y = links[i, OWN_X], links[i, OWN_Y]
-            o_x, o_y = c * o_x - s * o_y, s * o_x + c * o_y
+            o_x, o_y = rotated(c, s, links[i, HAS.own_x], links[i, HAS.own_y])
             states[k, 0], states[k, 1], states[k, 2] = x - o_x, y - o_y, angle
             states[k, 3], states[k, 4], states[k, 5] = v_x + omega * o_y, v_y - omega * o_x, omega
 
@@ -273,17 +276,16 @@ def set_forces(work, u):  # type: ignore[no-untyped-def]
         i = work.bodies[body]
         if i < 0:
             continue
-        turn, mass = tree[i, LINK.turn], links[i, MASS]
-        c, s, omega = links[i, COS], links[i, SIN], motion[u, turn]
-        x = c * links[i, COM_X] - s * links[i, COM_Y]
-        y = s * links[i, COM_X] + c * links[i, COM_Y]
+        turn, mass = tree[i, LINK.turn], links[i, HAS.mass]
+        c, s, omega = links[i, HAS.cos], links[i, HAS.sin], motion[u, turn]
+        x, y = rotated(c, s, links[i, HAS.com_x], links[i, HAS.com_y])
         # the wrench acts at the body's origin
-        arm_x = x + c * links[i, OWN_X] - s * links[i, OWN_Y]
-        arm_y = y + s * links[i, OWN_X] + c * links[i, OWN_Y]
+        arm_x, arm_y = rotated(c, s, links[i, HAS.own_x], links[i, HAS.own_y])
+        arm_x, arm_y = arm_x + x, arm_y + y
         f_x, f_y = work.acted[body, 6], work.acted[body, 7]
         motion[LOAD, turn] += work.acted[body, 8] - (arm_x * f_y - arm_y * f_x)
-        f_x += mass * (links[i, WEIGHT_X] - links[i, B_X] + omega * omega * x)
-        f_y += mass * (links[i, WEIGHT_Y] - links[i, B_Y] + omega * omega * y)
+        f_x += mass * (links[i, HAS.weight_x] - links[i, HAS.b_x] + omega * omega * x)
+        f_y += mass * (links[i, HAS.weight_y] - links[i, HAS.b_y] + omega * omega * y)
         slope[i, turn, 0] -= y  # that of the centre of mass, for now
         slope[i, turn, 1] += x
         for j in range(n):
@@ -293,13 +295,13 @@ def set_forces(work, u):  # type: ignore[no-untyped-def]
                 motion[M + j, k] += mass * (s_x * slope[i, k, 0] + s_y * slope[i, k, 1])
         slope[i, turn, 0] += y
         slope[i, turn, 1] -= x
-        motion[M + turn, turn] += links[i, MOMENT]
-        if links[i, DAMPING] > 0.0:
+        motion[M + turn, turn] += links[i, HAS.moment]
+        if links[i, HAS.damping] > 0.0:
             rate, j = motion[u, tree[i, LINK.first]], tree[i, LINK.first]
-            if tree[i, LINK.kind] == HINGE and tree[i, LINK.parent] >= 0:
+            if tree[i, LINK.kind] == KIND.hinge and tree[i, LINK.parent] >= 0:
                 rate -= motion[u, tree[tree[i, LINK.parent], LINK.turn]]
-                motion[LOAD, tree[tree[i, LINK.parent], LINK.turn]] += links[i, DAMPING] * rate
-            motion[LOAD, j] -= links[i, DAMPING] * rate
+                motion[LOAD, tree[tree[i, LINK.parent], LINK.turn]] += links[i, HAS.damping] * rate
+            motion[LOAD, j] -= links[i, HAS.damping] * rate
     for j in range(n):
         for k in range(j):
             motion[M + k, j] = motion[M + j, k]
@@ -314,23 +316,25 @@ def set_rows(work, u):  # type: ignore[no-untyped-def]
         kind, i = work.kinds[r, 0], work.kinds[r, 1]
         turn = tree[i, LINK.turn]
         for j in range(n):
-            rows[r, G + j] = 0.0
-        if kind in (PIVOT, UNDER, TURNING):
-            rows[r, G + tree[i, LINK.first if kind != TURNING else LINK.turn]] = 1.0
-            if kind == PIVOT and tree[i, LINK.kind] == HINGE and tree[i, LINK.parent] >= 0:
-                rows[r, G + tree[tree[i, LINK.parent], LINK.turn]] = -1.0
+            rows[r, ROW.g + j] = 0.0
+        if kind in (FRICTION.pivot, FRICTION.under, FRICTION.turning):
+            rows[r, ROW.g + tree[i, LINK.first if kind != FRICTION.turning else LINK.turn]] = 1.0
+            if (
+                kind == FRICTION.pivot
+                and tree[i, LINK.kind] == KIND.hinge
+                and tree[i, LINK.parent] >= 0
+            ):
+                rows[r, ROW.g + tree[tree[i, LINK.parent], LINK.turn]] = -1.0
             continue
-        c, s, omega = links[i, COS], links[i, SIN], motion[u, turn]
-        x = c * rows[r, W_X] - s * rows[r, W_Y]
-        y = s * rows[r, W_X] + c * rows[r, W_Y]
-        n_x = c * rows[r, W_COS] - s * rows[r, W_SIN]
-        n_y = s * rows[r, W_COS] + c * rows[r, W_SIN]
+        c, s, omega = links[i, HAS.cos], links[i, HAS.sin], motion[u, turn]
+        x, y = rotated(c, s, rows[r, ROW.w_x], rows[r, ROW.w_y])
+        n_x, n_y = rotated(c, s, rows[r, ROW.w_cos], rows[r, ROW.w_sin])
         for j in range(n):
-            rows[r, G + j] = n_x * slope[i, j, 0] + n_y * slope[i, j, 1]
-        rows[r, G + turn] += n_y * x - n_x * y
-        v_x, v_y = links[i, V_X] - omega * y, links[i, V_Y] + omega * x
-        b_x, b_y = links[i, B_X] - omega * omega * x, links[i, B_Y] - omega * omega * y
-        rows[r, BIAS] = omega * (n_x * v_y - n_y * v_x) + n_x * b_x + n_y * b_y
+            rows[r, ROW.g + j] = n_x * slope[i, j, 0] + n_y * slope[i, j, 1]
+        rows[r, ROW.g + turn] += n_y * x - n_x * y
+        v_x, v_y = links[i, HAS.v_x] - omega * y, links[i, HAS.v_y] + omega * x
+        b_x, b_y = links[i, HAS.b_x] - omega * omega * x, links[i, HAS.b_y] - omega * omega * y
+        rows[r, ROW.bias] = omega * (n_x * v_y - n_y * v_x) + n_x * b_x + n_y * b_y
 
 
 @inner
@@ -338,37 +342,71 @@ def set_bounds(work, laws, u):  # type: ignore[no-untyped-def]
     """Set the greatest forces of dry friction that laws change, where forces and rows are set."""
     if laws.n_frictions == 0:
         return
-    tree, motion, acted, states = work.tree, work.motion, work.acted, work.states
+    tree, rows, rings, acted = work.tree, work.rows, work.rings, work.acted
+    points = rings.shape[1] - RIM.points
     for r in range(work.n_kinds):
-        kind, i = work.kinds[r, 0], work.kinds[r, 1]
-        turn, body = tree[i, LINK.turn], tree[i, LINK.body]
-        if kind == PIVOT:
-            owner, torque = tree[i, LINK.owner], acted[body, COMMAND + 2]
-            first, speed = tree[i, LINK.first], row_speed(work, r, u)
-            if tree[i, LINK.kind] == RAIL:
+        kind, i, ring = work.kinds[r, 0], work.kinds[r, 1], r - work.n_rows
+        body, under, torque, rest = tree[i, LINK.body], 1, 0.0, 0.0
+        if kind < 0:
+            base = points * rings[ring, RIM.twist, 3]
+            speed = math.sqrt(set_twist(work, ring, i, u, RIM.twist_now))
+        elif kind == FRICTION.pivot:
+            base, torque, speed = rows[r, ROW.base], acted[body, COMMAND + 2], row_speed(work, r, u)
+            first = tree[i, LINK.first]
+            if tree[i, LINK.kind] == KIND.rail:
                 torque = work.slope[i, first, 0] * acted[body, COMMAND]
                 torque += work.slope[i, first, 1] * acted[body, COMMAND + 1]
-            rest = motion[LOAD, first] + work.links[i, DAMPING] * speed - torque
-            work.rows[r, BOUND] = bound(
-                work.rows[r, BASE], laws, owner, 0, states, torque, rest, abs(speed), acted
-            )
-        elif kind == UNDER:
-            x, y = work.links[i, OWN_X], work.links[i, OWN_Y]
-            speed = abs(motion[u, turn]) * math.sqrt(x * x + y * y)
-            work.rows[r, BOUND] = bound(
-                work.rows[r, BASE], laws, body, 1, states, 0.0, 0.0, speed, acted
-            )
-        elif kind < 0:
-            ring = r - work.n_rows
-            points, base = work.rings.shape[1] - POINTS, work.rings[ring, TWIST, 3]
-            speed = math.sqrt(set_twist(work, ring, i, u, TWIST_NOW))
-            most = bound(points * base, laws, body, 1, states, 0.0, 0.0, speed, acted)
-            work.rings[ring, GRIP, 0] = most / points
+            rest = work.motion[LOAD, first] + work.links[i, HAS.damping] * speed - torque
+            body, under, speed = tree[i, LINK.owner], 0, abs(speed)
+        elif kind == FRICTION.under:
+            x, y = work.links[i, HAS.own_x], work.links[i, HAS.own_y]
+            base = rows[r, ROW.base]
+            speed = abs(work.motion[u, tree[i, LINK.turn]]) * math.sqrt(x * x + y * y)
+        else:
+            continue
+        most = bound(base, laws, body, under, work.states, torque, rest, speed, acted)
+        if kind < 0:
+            rings[ring, RIM.grip, 0] = most / points
+        else:
+            rows[r, ROW.bound] = most
 
 
 @inner
-def solve(work, u, a, impulse):  # type: ignore[no-untyped-def]
+def load(work, laws, u, share):  # type: ignore[no-untyped-def]
+    """Set what acts at places that are set and a time: wrenches, forces, and rows of friction."""
+    motion, held, held_at = work.motion, work.n + 1, start_of(work.held)
+    for s in range(work.n_held):
+        work.held[0, s] = motion[u - 1, held + s]
+    if laws.n_commands + laws.n_forces > 0:
+        begin = min(max(work.low + SHORTEST, share), work.high - WINDOW)  # past a jump
+        act(
+            start_of(work.states), numbers_at(work.inputs), laws, begin, begin + WINDOW,
+            start_of(work.acted), numbers_at(work.memory), held_at, from_place(held_at, MOST),
+        )  # fmt: skip
+    for s in range(work.n_held):
+        motion[u, held + s] = work.held[1, s]
+    set_forces(work, u)
+    set_rows(work, u)
+    set_bounds(work, laws, u)
+
+
+@inner
+def set_inputs(work, inputs):  # type: ignore[no-untyped-def]
+    """Set the wrenches of an interval, and the velocities of bodies that follow a path."""
+    work.inputs = inputs.ctypes.data
+    for k in range(work.n_bodies):
+        for w in range(3):
+            work.acted[k, COMMAND + w] = work.acted[k, WRENCHES + w] = inputs[k, w]
+            if work.bodies[k] < 0:
+                work.states[k, 3 + w] = inputs[k, w]
+
+
+@inner
+def solve(work, u, a, impulse, soft=1e-11):  # type: ignore[no-untyped-def]
     """Compute accelerations (row a) and what holds, where forces and rows are set.
+
+    What sticks has a compliance, ``soft`` beside that of the bodies: redundant constraints share
+    their force.
 
     With ``impulse`` the speeds that are left when what sticks has been stopped, in place of both.
     """
@@ -376,13 +414,13 @@ def solve(work, u, a, impulse):  # type: ignore[no-untyped-def]
     n, count = work.n, work.n_rows
     size = n
     for r in range(work.n_kinds):
-        if kinds[r, 2] == STICK:
+        if kinds[r, 2] == MODE.stick:
             size += 1 if r < count else 3
     if size == 1 and not impulse:  # one coordinate that moves
         force = motion[LOAD, 0]
         for r in range(count):
-            if kinds[r, 2] != SMOOTH:
-                force -= kinds[r, 2] * rows[r, BOUND] * rows[r, G]
+            if kinds[r, 2] != MODE.smooth:
+                force -= kinds[r, 2] * rows[r, ROW.bound] * rows[r, ROW.g]
         motion[a, 0] = force / motion[M, 0]
         return
     heavy, at = 0.0, n
@@ -396,36 +434,36 @@ def solve(work, u, a, impulse):  # type: ignore[no-untyped-def]
     for r in range(work.n_kinds):
         i, mode = kinds[r, 1], kinds[r, 2]
         turn = work.tree[i, LINK.turn]
-        if mode == STICK:
+        if mode == MODE.stick:
             for d in range(1 if r < count else 3):
                 for j in range(n, size):
                     system[at, j] = 0.0
                 for j in range(n):
                     value = 1.0 if j == turn else 0.0
                     if r < count:
-                        value = rows[r, G + j]
+                        value = rows[r, ROW.g + j]
                     elif d < 2:
                         value = work.slope[i, j, d]
                     system[j, at], system[at, j] = -value, value
-                system[at, at], system[at, size] = _SOFT / heavy, 0.0
+                system[at, at], system[at, size] = soft / heavy, 0.0
                 if not impulse and r < count:
-                    system[at, size] = -rows[r, BIAS]
+                    system[at, size] = -rows[r, ROW.bias]
                 elif not impulse and d < 2:
-                    system[at, size] = -work.links[i, B_X + d]
+                    system[at, size] = -work.links[i, HAS.b_x + d]
                 at += 1
-        elif not impulse and mode != SMOOTH:
+        elif not impulse and mode != MODE.smooth:
             _resist(work, r, u, size)
     _eliminate(system, size)
     for j in range(n):
         motion[a, j] = system[j, size]
     at = n
     for r in range(work.n_kinds):
-        if kinds[r, 2] == STICK and r < count:
-            rows[r, FORCE] = system[at, size]
+        if kinds[r, 2] == MODE.stick and r < count:
+            rows[r, ROW.force] = system[at, size]
             at += 1
-        elif kinds[r, 2] == STICK:
+        elif kinds[r, 2] == MODE.stick:
             for d in range(3):
-                work.rings[r - count, GRIP, 1 + d] = system[at + d, size]
+                work.rings[r - count, RIM.grip, 1 + d] = system[at + d, size]
             at += 3
 
 
@@ -457,16 +495,15 @@ def _eliminate(system, size):  # type: ignore[no-untyped-def]
 def _sliding(work, ring, i, omega):  # type: ignore[no-untyped-def]
     """Return force and torque, at the place of its joint, on a body whose ring slides."""
     links, rings, f_x, f_y, torque = work.links, work.rings, 0.0, 0.0, 0.0
-    c, s, o_x, o_y = links[i, COS], links[i, SIN], links[i, V_X], links[i, V_Y]
-    x, y = rings[ring, POINTS, 0], rings[ring, POINTS, 1]
+    c, s, o_x, o_y = links[i, HAS.cos], links[i, HAS.sin], links[i, HAS.v_x], links[i, HAS.v_y]
+    x, y = rings[ring, RIM.points, 0], rings[ring, RIM.points, 1]
     slow = _SLOW * _SLOW * (o_x * o_x + o_y * o_y + omega * omega * (x * x + y * y))
-    for j in range(POINTS, rings.shape[1]):
-        x = c * rings[ring, j, 0] - s * rings[ring, j, 1]
-        y = s * rings[ring, j, 0] + c * rings[ring, j, 1]
+    for j in range(RIM.points, rings.shape[1]):
+        x, y = rotated(c, s, rings[ring, j, 0], rings[ring, j, 1])
         v_x, v_y = o_x - omega * y, o_y + omega * x
         square = v_x * v_x + v_y * v_y
         if square > 0.0:
-            scale = -rings[ring, GRIP, 0] / math.sqrt(square + slow)
+            scale = -rings[ring, RIM.grip, 0] / math.sqrt(square + slow)
             f_x += scale * v_x
             f_y += scale * v_y
             torque += scale * (x * v_y - y * v_x)
@@ -479,7 +516,9 @@ def _resist(work, r, u, column):  # type: ignore[no-untyped-def]
     system, slope = work.system, work.slope
     if r < work.n_rows:
         for j in range(work.n):
-            system[j, column] -= work.kinds[r, 2] * work.rows[r, BOUND] * work.rows[r, G + j]
+            system[j, column] -= (
+                work.kinds[r, 2] * work.rows[r, ROW.bound] * work.rows[r, ROW.g + j]
+            )
         return
     i = work.kinds[r, 1]
     turn = work.tree[i, LINK.turn]
@@ -509,16 +548,16 @@ def set_first_slide(work, u, a, tries=30):  # type: ignore[no-untyped-def]
             elif attempt > 0:
                 speed, slow = 0.0, 1e-24
                 for j in range(n):
-                    speed += rows[r, G + j] * motion[a, j]
-                    slow += (_SLOW * rows[r, G + j] * motion[a, j]) ** 2
-                weight = rows[r, BOUND] / math.sqrt(speed * speed + slow)
+                    speed += rows[r, ROW.g + j] * motion[a, j]
+                    slow += (_SLOW * rows[r, ROW.g + j] * motion[a, j]) ** 2
+                weight = rows[r, ROW.bound] / math.sqrt(speed * speed + slow)
                 for j in range(n):
                     for k in range(n):
-                        system[j, k] += weight * rows[r, G + j] * rows[r, G + k]
+                        system[j, k] += weight * rows[r, ROW.g + j] * rows[r, ROW.g + k]
         for r in range(count, work.n_kinds):
             i, ring = work.kinds[r, 1], r - count
-            c, s, turn = work.links[i, COS], work.links[i, SIN], work.tree[i, LINK.turn]
-            if work.kinds[r, 3] == 1 and work.kinds[r, 2] == SLIDE:
+            c, s, turn = work.links[i, HAS.cos], work.links[i, HAS.sin], work.tree[i, LINK.turn]
+            if work.kinds[r, 3] == 1 and work.kinds[r, 2] == MODE.slide:
                 _resist(work, r, u, n)
                 continue
             if attempt == 0:
@@ -527,18 +566,19 @@ def set_first_slide(work, u, a, tries=30):  # type: ignore[no-untyped-def]
             for j in range(n):
                 way = abs(work.slope[i, j, 0]) + abs(work.slope[i, j, 1])
                 if j == turn:
-                    way += math.sqrt(rings[ring, POINTS, 0] ** 2 + rings[ring, POINTS, 1] ** 2)
+                    way += math.sqrt(
+                        rings[ring, RIM.points, 0] ** 2 + rings[ring, RIM.points, 1] ** 2
+                    )
                 slow += (_SLOW * way * motion[a, j]) ** 2
-            for point in range(POINTS, rings.shape[1]):
-                x = c * rings[ring, point, 0] - s * rings[ring, point, 1]
-                y = s * rings[ring, point, 0] + c * rings[ring, point, 1]
+            for point in range(RIM.points, rings.shape[1]):
+                x, y = rotated(c, s, rings[ring, point, 0], rings[ring, point, 1])
                 work.slope[i, turn, 0] -= y
                 work.slope[i, turn, 1] += x
                 v_x, v_y = 0.0, 0.0
                 for j in range(n):
                     v_x += work.slope[i, j, 0] * motion[a, j]
                     v_y += work.slope[i, j, 1] * motion[a, j]
-                weight = rings[ring, GRIP, 0] / math.sqrt(v_x * v_x + v_y * v_y + slow)
+                weight = rings[ring, RIM.grip, 0] / math.sqrt(v_x * v_x + v_y * v_y + slow)
                 for j in range(n):
                     for k in range(n):
                         both = work.slope[i, j, 0] * work.slope[i, k, 0]
@@ -561,7 +601,7 @@ def row_speed(work, r, u):  # type: ignore[no-untyped-def]
     """Return the speed of a row, or its acceleration without the bias, by a row of the motion."""
     speed = 0.0
     for j in range(work.n):
-        speed += work.rows[r, G + j] * work.motion[u, j]
+        speed += work.rows[r, ROW.g + j] * work.motion[u, j]
     return speed
 
 
@@ -569,9 +609,9 @@ def row_speed(work, r, u):  # type: ignore[no-untyped-def]
 def set_twist(work, ring, i, u, field):  # type: ignore[no-untyped-def]
     """Set a ring's twist, its third part times the ring's radius; return its square."""
     rings = work.rings
-    x, y = rings[ring, POINTS, 0], rings[ring, POINTS, 1]
+    x, y = rings[ring, RIM.points, 0], rings[ring, RIM.points, 1]
     turned = work.motion[u, work.tree[i, LINK.turn]] * math.sqrt(x * x + y * y)
-    v_x, v_y = work.links[i, V_X], work.links[i, V_Y]
+    v_x, v_y = work.links[i, HAS.v_x], work.links[i, HAS.v_y]
     rings[ring, field, 0], rings[ring, field, 1], rings[ring, field, 2] = v_x, v_y, turned
     return v_x * v_x + v_y * v_y + turned * turned
 
@@ -585,10 +625,10 @@ def strain(work, ring, i, tries=40):  # type: ignore[no-untyped-def]
     The greatest power of the reaction over that of friction, less one (S. Goyal, A. Ruina and
     J. Papadopoulos, Wear 143, 1991), by reweighted least squares.
     """
-    rings, system, c, s = work.rings, work.system, work.links[i, COS], work.links[i, SIN]
-    grip, f_x, f_y = rings[ring, GRIP, 0], -rings[ring, GRIP, 1], -rings[ring, GRIP, 2]
-    torque, square = -rings[ring, GRIP, 3], 0.0
-    for j in range(POINTS, rings.shape[1]):
+    rings, system, c, s = work.rings, work.system, work.links[i, HAS.cos], work.links[i, HAS.sin]
+    grip, f_x, f_y = rings[ring, RIM.grip, 0], -rings[ring, RIM.grip, 1], -rings[ring, RIM.grip, 2]
+    torque, square = -rings[ring, RIM.grip, 3], 0.0
+    for j in range(RIM.points, rings.shape[1]):
         square = max(square, rings[ring, j, 0] ** 2 + rings[ring, j, 1] ** 2)
     t_x, t_y, rate = f_x, f_y, torque / max(square, 1e-300)
     share, before = -1.0, -1.0
@@ -601,9 +641,8 @@ def strain(work, ring, i, tries=40):  # type: ignore[no-untyped-def]
             for k in range(3):
                 system[j, k] = 0.0
         lost = 0.0
-        for j in range(POINTS, rings.shape[1]):
-            x = c * rings[ring, j, 0] - s * rings[ring, j, 1]
-            y = s * rings[ring, j, 0] + c * rings[ring, j, 1]
+        for j in range(RIM.points, rings.shape[1]):
+            x, y = rotated(c, s, rings[ring, j, 0], rings[ring, j, 1])
             v_x, v_y = t_x - rate * y, t_y + rate * x
             speed = math.sqrt(v_x * v_x + v_y * v_y + _SLOW * _SLOW)
             lost += grip * speed
@@ -614,18 +653,17 @@ def strain(work, ring, i, tries=40):  # type: ignore[no-untyped-def]
             system[1, 2] += weight * x
             system[2, 2] += weight * (x * x + y * y)
         for r in range(work.n_rows):  # of a wheel, or against turning, on the same body
-            if work.kinds[r, 1] == i and work.kinds[r, 0] >= TURNING:
+            if work.kinds[r, 1] == i and work.kinds[r, 0] >= FRICTION.turning:
                 row = work.rows[r]
                 n_x, n_y, lever = 0.0, 0.0, 1.0
-                if work.kinds[r, 0] >= ALONG:
-                    n_x = c * row[W_COS] - s * row[W_SIN]
-                    n_y = s * row[W_COS] + c * row[W_SIN]
-                    x, y = c * row[W_X] - s * row[W_Y], s * row[W_X] + c * row[W_Y]
+                if work.kinds[r, 0] >= FRICTION.along:
+                    n_x, n_y = rotated(c, s, row[ROW.w_cos], row[ROW.w_sin])
+                    x, y = rotated(c, s, row[ROW.w_x], row[ROW.w_y])
                     lever = n_y * x - n_x * y
                 along = n_x * t_x + n_y * t_y + lever * rate
                 speed = math.sqrt(along * along + _SLOW * _SLOW)
-                lost += row[BOUND] * speed
-                weight = row[BOUND] / speed
+                lost += row[ROW.bound] * speed
+                weight = row[ROW.bound] / speed
                 system[0, 0] += weight * n_x * n_x
                 system[0, 1] += weight * n_x * n_y
                 system[1, 1] += weight * n_y * n_y

@@ -1,4 +1,7 @@
-"""The physics of a scene: its engines, and predictions of transitions and of recordings."""
+"""The physics of a scene: its engines, and predictions of transitions and of recordings.
+
+The engine's loops can be compiled before what needs them, or beside it.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +16,12 @@ from numpy.typing import ArrayLike
 from pbrl_ppl.effects import Attached, Effect
 from pbrl_ppl.errors import HistoryError, ParameterError, SimulationError
 from pbrl_ppl.history import History
+from pbrl_ppl.physics import compiled, flow, lockstep
+from pbrl_ppl.physics.calls import compile_beside
 from pbrl_ppl.physics.parts import OneWorld, PartedSimulator, independent_parts, joined_parts
 from pbrl_ppl.physics.settings import PhysicsSettings
 from pbrl_ppl.physics.solids import check_history, check_placement
-from pbrl_ppl.scene import Scene, nearest
+from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall, nearest
 from pbrl_ppl.state import Floats
 
 
@@ -294,3 +299,32 @@ def simulated_recording(physics: Physics, phi: Floats, recorded: History) -> lis
             states[np.ix_([trajectory], rows, ~follows)] = after
         result.append(states)
     return result
+
+
+#: The loops by what moves in them: single bodies, joined ones or bodies on friction, and contacts.
+LOOPS = {
+    "single": lockstep.rollout_free,
+    "joined": flow.rollout_tree,
+    "touching": compiled.rollout_engine,
+}
+
+
+def compile_loops(names: Iterable[str] = tuple(LOOPS)) -> None:
+    """Compile these of `LOOPS`: predict one interval by each, of a puck."""
+    scene = Scene(time_step=0.1, bodies=(Body("puck", Shape.circle(0.1)),))
+    hinge = Joint("hinge", ("world", "puck"), (0, 0), (0, 0))
+    scenes = {
+        "single": scene,
+        "joined": scene.replace(joints=(hinge,)),
+        "touching": scene.replace(walls=(Wall((0.11, -1), (0.11, 1)),)),
+    }
+    for name in names:
+        puck = Transition(scenes[name], {"mass": 1.0, "r": 0.0, "mu_c": 0.0}, check_start=False)
+        puck([0, 0, 0, 0.1 * (name == "touching"), 0, 0, 0, 0, 0, 0])
+
+
+def compile_for_search(scene: Scene) -> None:
+    """Compile beside what follows the loop that a scene does not need, but friction on it does."""
+    if not scene.joints:
+        code = f"from {__name__} import compile_loops; compile_loops(('joined',))"
+        compile_beside(flow.rollout_tree, code)

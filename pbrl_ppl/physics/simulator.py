@@ -20,20 +20,16 @@ from pbrl_ppl.history import fill_joints, joint_coordinates
 from pbrl_ppl.parameters import Layout, differentiate
 from pbrl_ppl.physics import calls, compiled, flow, lockstep
 from pbrl_ppl.physics.calls import pointers, still
-from pbrl_ppl.physics.joints import LENGTH, on_rod
 from pbrl_ppl.physics.laws import law_tables, laws_of
 from pbrl_ppl.physics.motion import work_of
-from pbrl_ppl.physics.properties import EngineInput, EngineProperties
+from pbrl_ppl.physics.properties import EngineInput, EngineProperties, on_rod
 from pbrl_ppl.physics.settings import PhysicsSettings
 from pbrl_ppl.physics.tree import MOST, tree_of
-from pbrl_ppl.physics.world import World
+from pbrl_ppl.physics.world import JOINT, World
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import INPUT, STATE, THETA, VELOCITY, WRENCH, Bools, Floats, Ints
 from pbrl_ppl.threads import in_worker
 
-#: Bodies are near each other within this multiple of their radii: a step of half a radius that
-#: passes through the edge of a bounding circle ends in it.
-_NEAR = 1.04
 #: For each joint of unknown bodies, which of ``scene.joinable`` it holds.
 Joined = tuple[tuple[int, int], ...]
 #: And which rods there are: what worlds differ in.
@@ -43,12 +39,10 @@ _ONE_WORLD: Choice = ((), ())
 
 
 class Batch(NamedTuple):
-    """What the rollouts take: see `compiled.rollout`."""
+    """What the rollouts take: see `compiled.rollout_engine`."""
 
     given: tuple[Floats, ...]
     laws: NDArray[np.void]  # (proposal,), of dtype `laws.LAWS`
-    slots: int
-    held: int
     follows: Bools
     start: Floats
     inputs: Floats
@@ -80,7 +74,8 @@ class Engine:
         if self._name == "chipmunk":
             return
         self._wheels = lockstep.free_wheels(self.world)
-        self._still = still(self.world, _NEAR if self._wheels is None else 1.0)
+        # a tree's step of half a radius that passes through the edge of a circle is to end in it
+        self._still = still(self.world, 1.04 if self._wheels is None else 1.0)
         if self._wheels is None:
             self._tree = tree_of(self.world)
         if self._tree is not None:
@@ -101,14 +96,14 @@ class Engine:
         items, horizon = np.arange(first, last), batch.inputs.shape[1]
         begins = np.zeros(len(items), dtype=np.int64)
         tree = self._tree
-        if tree is not None and batch.held > max(0, MOST - 1 - tree.size):
+        if tree is not None and batch.laws["n_held"].max(initial=0) > max(0, MOST - 1 - tree.size):
             tree = None  # laws' own numbers have no place beside the coordinates
         whole = self._wheels is None and tree is None
         while len(items):
             if self._wheels is not None:
-                lockstep.rollout(self._wheels, self._still, batch, items, begins, out)
+                lockstep.rollout_free(self._wheels, self._still, batch, items, begins, out)
             elif tree is not None:
-                rollout = calls.compiled_beside(flow.rollout)
+                rollout = calls.compiled_beside(flow.rollout_tree)
                 rollout(self._work, self._still, batch, items, begins, out)
             left = begins < horizon
             items, begins = items[left], begins[left]
@@ -121,7 +116,7 @@ class Engine:
                 self.world.check_steps()
             done = 0
             while done < len(items):
-                done += compiled.rollout(
+                done += compiled.rollout_engine(
                     calls.FUNCTIONS, self.pointers, batch, items[done:], begins[done:], whole, out
                 )
                 if done < len(items):  # diverged: that world is spoilt, and the item is lost
@@ -151,13 +146,9 @@ class Simulator:
         self._worlds: OrderedDict[Choice, list[Engine]] = OrderedDict()
         self._lock = threading.Lock()  # the worlds serve one call at a time
 
-    def __getstate__(self) -> PhysicsSettings:
-        """Return the state to pickle, without C objects: another process builds its own."""
-        return self.physics
-
-    def __setstate__(self, physics: PhysicsSettings) -> None:
-        """Restore a pickled simulator."""
-        Simulator.__init__(self, physics)
+    def __reduce__(self) -> tuple[type[Simulator], tuple[PhysicsSettings]]:
+        """Return what to pickle, without C objects: another process builds its own."""
+        return type(self), (self.physics,)
 
     def __call__(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
         """Predict the states after each interval of each transition.
@@ -226,7 +217,7 @@ class Simulator:
         Friction under bodies does not, where its coefficient is zero: a derivative there is not to
         see the difference of two solvers.
         """
-        tied = numbers.joints[:, len(self.physics.scene.joints) :, LENGTH] > 0
+        tied = numbers.joints[:, len(self.physics.scene.joints) :, JOINT.length] > 0
         proposals, joints, _ = numbers.indices.shape
         indices = numbers.indices.reshape(proposals, 2 * joints)
         keys = np.column_stack([tied, indices])
@@ -276,7 +267,8 @@ class Simulator:
             states = _each(states, len(joints))
         for i, position in self._properties.tied:
             moment = self.physics.scene.moving[i].shape.unit_moment
-            states[:, :, i] = on_rod(states[:, :, i], joints[:, position, : LENGTH + 1], moment)
+            rod = joints[:, position, : JOINT.length + 1]
+            states[:, :, i] = on_rod(states[:, :, i], rod, moment)
         return states
 
     def jacobian(self, phi: Floats, start: Floats, actions: Floats, step: float = 1e-5) -> Floats:
@@ -324,17 +316,15 @@ class Simulator:
         return np.array(counts, dtype=np.int64), np.array(weights, dtype=float)
 
     @cached_property
-    def _laws(self) -> tuple[Ints, Ints, Ints, int, int]:
+    def _laws(self) -> list[NDArray[np.void]]:
         return law_tables(self.physics.scene, self.physics.effects)
 
     def _new_world(self, choice: Choice) -> World:
-        joined, there = choice
-        properties = self._properties
+        (joined, there), properties = choice, self._properties
         rods = tuple(compress(properties.tied, there))
-        scene, kinds = self.physics.scene, properties.joints.kinds
+        kinds, discs = properties.joints.kinds, properties.n_discs
         patches, wheels, turners = properties.under
-        discs = properties.n_discs
-        return World(scene, kinds, joined, discs, patches, wheels, turners, rods)
+        return World(self.physics.scene, kinds, joined, discs, patches, wheels, turners, rods)
 
     def _run(
         self,
@@ -350,9 +340,9 @@ class Simulator:
 
         So many engine steps are worth a thread of their own.
         """
-        (*tables, slots, held), time_step = self._laws, self.physics.scene.time_step
+        time_step = self.physics.scene.time_step
         batch = Batch(
-            numbers[:3], laws_of(tables, numbers[3:6], inputs, time_step), slots, held,
+            numbers[:3], laws_of(self._laws, numbers[3:6], inputs, time_step),
             continues_previous(inputs), starts, inputs, time_step, *self.levels,
             self.physics.tolerance,
         )  # fmt: skip

@@ -13,10 +13,9 @@ import pymunk
 from pbrl_ppl.errors import SimulationError
 from pbrl_ppl.history import History, Segments
 from pbrl_ppl.physics.calls import compiled, inner
-from pbrl_ppl.physics.joints import JOINT_KINDS
-from pbrl_ppl.physics.world import engine_shapes
+from pbrl_ppl.physics.world import JOINT_KINDS, engine_shapes
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene
-from pbrl_ppl.state import Bools, Floats, wrapped
+from pbrl_ppl.state import Bools, Floats, Ints, wrapped
 
 Pairs = tuple[tuple[int, int], ...]
 #: Number of poses checked along each body's path.
@@ -27,7 +26,6 @@ _OUTLINE, _SHARE = 0.05, 0.5 / (_POSES - 1)
 
 #: Violation that noise and resting contact may explain, as a share of the smaller body's size.
 ALLOWED = 0.25
-_ORIGIN = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -324,23 +322,28 @@ def overlap(scene: Scene, poses: Floats) -> Floats:
     """
     world, pairs = scenery(scene), _colliding(scene)
     poses = world.with_fixed(poses)
-    deepest = np.full(len(poses), -np.inf)
     if not pairs:
-        return deepest
+        return np.full(len(poses), -np.inf)
     bound = circles(world.solids, pairs, poses)
-    for pair, (i, j) in enumerate(pairs):
-        rows = np.flatnonzero(bound[:, pair] > 0)
-        deep = bound[:, pair].copy()
-        if len(rows):
-            deep[rows] = depth(world.solids[i], poses[rows, i], world.solids[j], poses[rows, j])
-        deepest = np.maximum(deepest, deep)
-    return deepest
+    for pair, rows, depths in _depths(world.solids, pairs, poses, bound > 0):
+        bound[rows, pair] = depths
+    return np.asarray(bound.max(axis=1))
+
+
+def _depths(
+    solids: tuple[Solid, ...], pairs: Pairs, poses: Floats, near: Bools
+) -> Iterator[tuple[int, Ints, Floats]]:
+    """Yield each pair that is near somewhere, where it is, and how deep, by ``near`` (n, pair)."""
+    for pair in np.flatnonzero(near.any(axis=0)):
+        (i, j), rows = pairs[pair], np.flatnonzero(near[:, pair])
+        yield pair, rows, depth(solids[i], poses[rows, i], solids[j], poses[rows, j])
 
 
 def _apart(scene: Scene, poses: Floats) -> Iterator[tuple[int, str]]:
     """Yield the first transition and a message for each known joint with wrong anchors."""
     moving = {body.name: i for i, body in enumerate(scene.moving)}
-    reference = {body.name: body.pose or _ORIGIN for body in scene.bodies} | {WORLD: _ORIGIN}
+    origin = (0.0, 0.0, 0.0)
+    reference = {body.name: body.pose or origin for body in scene.bodies} | {WORLD: origin}
     for joint in scene.joints:
         if not joint.known or joint.bodies is None:
             continue
@@ -403,11 +406,8 @@ def _overlaps(scene: Scene, poses: Floats) -> Iterator[tuple[int, str]]:
     smaller = [ALLOWED * min(solids[i].width, solids[j].width) for i, j in pairs]
     # shapes overlap by no more than their bounding circles
     near = circles(solids, pairs, poses) > np.array(smaller)
-    for pair in np.flatnonzero(near.any(axis=0)):
-        i, j = pairs[pair]
-        a, b, allowed = solids[i], solids[j], smaller[pair]
-        rows = np.flatnonzero(near[:, pair])
-        depths = depth(a, poses[rows, i], b, poses[rows, j])
+    for pair, rows, depths in _depths(solids, pairs, poses, near):
+        a, b, allowed = *(solids[i] for i in pairs[pair]), smaller[pair]
         deep = np.flatnonzero(depths > allowed)
         if len(deep):
             which, whose = f'bodies "{a.name}" and "{b.name}"', "the smaller one's"

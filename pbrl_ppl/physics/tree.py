@@ -9,27 +9,27 @@ ends; a free body has three. Nothing has to hold the joints together, and nothin
 from __future__ import annotations
 
 import math
-from collections import namedtuple
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from pbrl_ppl.physics.joints import A_X, B_X, ROD, SLIDER
-from pbrl_ppl.physics.world import Link, World
+from pbrl_ppl.physics.world import HINGE, JOINT, ROD, SLIDER, Link, World, columns
 from pbrl_ppl.state import Floats, Ints
 
 #: Kinds of links.
-FREE, HINGE, BAR, RAIL = range(4)
+KIND = columns("free hinge bar rail")
 #: Kinds of rows of dry friction: in a hinge or slider, under a body that one leaves one coordinate,
 #: against turning, and along and across a wheel.
-PIVOT, UNDER, TURNING, ALONG, ACROSS = range(5)
+FRICTION = columns("pivot under turning along across")
 #: Columns of a link: the link that it hangs on (-1: the world), its body (-1: a rod), its first
 #: coordinate and that of its angle (of a body that never turns the one after the last, whose speed
 #: is 0 and whose forces count for nothing), its row among all joints (-1: none), the columns of the
 #: anchor on its parent (-1: a rod's end) and of its own (-1: its origin), and the body whose
 #: friction acts in its hinge or slider (-1: none).
-LINK: Any = namedtuple("LINK", "kind parent body first turn joint near far owner")(*range(9))
+LINK = columns("kind parent body first turn joint near far owner")
+#: Columns of a link's pose: those of the fixed body that it hangs on, then its heading in a slider
+#: and the slider's direction, less the coordinate of its angle.
+POSE = columns("x y cos sin heading axis")
 #: Pose of a link that hangs on nothing fixed and in no slider.
 _NOWHERE = (0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 #: Links, coordinates, and rows and rings that a tree may have; a larger one is left to the engine.
@@ -71,7 +71,7 @@ def tree_of(world: World) -> Tree | None:
     A body that follows a path is none of its links. None where joints hold one, close a loop, have
     no such coordinates, or are too many.
     """
-    if not all(link.kind.contact_free for link in world.links):
+    if any(link.kind not in (HINGE, ROD, SLIDER) for link in world.links):
         return None
     left = [(_ends(world, link), link) for link in world.links]
     if any(end >= 0 and world.kinematic[end] for ends, _ in left for end in ends):
@@ -81,7 +81,7 @@ def tree_of(world: World) -> Tree | None:
         ready = [one for one in left if any(end < 0 or end in links.place for end in one[0])]
         if not ready:
             body = next(body for body in moving if body not in links.place)
-            links.add(FREE, -1, body, -1, -1, -1, -1)
+            links.add(KIND.free, -1, body, -1, -1, -1, -1)
             continue
         chosen = min(ready, key=lambda one: min(one[0]) >= 0)  # the world's first
         left.remove(chosen)
@@ -110,14 +110,14 @@ class _Links:
         self, kind: int, parent: int, body: int, *joint: int, pose: tuple[float, ...] = _NOWHERE
     ) -> int:
         """Add a link, the joint's columns as above, and return its number."""
-        turn = self._size + 2 * (kind == FREE)
-        if kind == RAIL:
+        turn = self._size + 2 * (kind == KIND.free)
+        if kind == KIND.rail:
             turn = self._links[parent][LINK.turn] if parent >= 0 else -1
         if body >= 0:
             self.place[body] = len(self._links)
         self._links.append([kind, parent, body, self._size, turn, *joint])
         self._poses.append(pose)
-        self._size += 3 if kind == FREE else 1
+        self._size += 3 if kind == KIND.free else 1
         return len(self._links) - 1
 
     def hang(self, link: Link, holder: int, body: int, turned: bool) -> None:
@@ -126,14 +126,14 @@ class _Links:
         if holder < 0:
             fixed = link.constraint.b if turned else link.constraint.a
             pose = (*fixed.position, math.cos(fixed.angle), math.sin(fixed.angle), 0.0, 0.0)
-        near, far = (B_X, A_X) if turned else (A_X, B_X)
+        near, far = (JOINT.b_x, JOINT.a_x) if turned else (JOINT.a_x, JOINT.b_x)
         if link.kind is ROD:
-            parent = self.add(BAR, parent, -1, link.joint, near, -1, -1, pose=pose)
+            parent = self.add(KIND.bar, parent, -1, link.joint, near, -1, -1, pose=pose)
             pose, near = _NOWHERE, -1
         if link.kind is SLIDER:
             turn = self._turns[body] = self._turns[holder] if holder >= 0 else 0.0
             pose = (*pose[:4], self._references[body] + turn, link.axis + turn)
-        kind = RAIL if link.kind is SLIDER else HINGE
+        kind = KIND.rail if link.kind is SLIDER else KIND.hinge
         self.add(kind, parent, body, link.joint, near, far, link.pivot, pose=pose)
 
     def tree(self, world: World) -> Tree | None:
@@ -158,13 +158,13 @@ class _Links:
     def _friction(self, world: World) -> tuple[list[tuple[int, int]], list[int]]:
         """Return kind and link of each row of dry friction, and the links of the rings."""
         links, place = self._links, self.place
-        rows = [(PIVOT, i) for i, link in enumerate(links) if link[LINK.owner] >= 0]
-        rows += [(TURNING, place[turner.body]) for turner in world.turners]
+        rows = [(FRICTION.pivot, i) for i, link in enumerate(links) if link[LINK.owner] >= 0]
+        rows += [(FRICTION.turning, place[turner.body]) for turner in world.turners]
         for wheel in world.wheels:
-            rows += [(ALONG, place[wheel.body]), (ACROSS, place[wheel.body])]
+            rows += [(FRICTION.along, place[wheel.body]), (FRICTION.across, place[wheel.body])]
         under = [place[patch.body] for patch in world.patches]
-        alone = [i for i in under if links[i][LINK.kind] != FREE and links[i][LINK.parent] < 0]
-        return rows + [(UNDER, i) for i in alone], [i for i in under if i not in alone]
+        alone = [i for i in under if links[i][LINK.kind] != KIND.free and links[i][LINK.parent] < 0]
+        return rows + [(FRICTION.under, i) for i in alone], [i for i in under if i not in alone]
 
 
 def _ends(world: World, link: Link) -> tuple[int, int]:

@@ -24,7 +24,8 @@ from pbrl_ppl.effects.effect import INTERVAL, MEMORY, MOST_MEMORY, TIME
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.history import History
 from pbrl_ppl.physics.physics import Physics
-from pbrl_ppl.physics.properties import COLUMNS, SEEN
+from pbrl_ppl.physics.properties import SEEN
+from pbrl_ppl.physics.world import COLUMNS
 from pbrl_ppl.scene import Body, Scene, Units, body_sizes, units_of
 from pbrl_ppl.state import STATE, STATE_UNITS, Floats
 
@@ -192,12 +193,9 @@ def _applied(effect: Effect, state: Floats, parameters: Floats, body: Body, unit
         stage.law(state.copy(), command, numbers, wrench)
         slots = 3 * stage.memory if isinstance(stage, Command) else getattr(stage, "memory", 0)
         remembered = np.zeros(slots)
-        if isinstance(stage, Command) and stage.remember is not None:
-            stage.remember(state.copy(), command, numbers, remembered)
-        if isinstance(stage, Force) and stage.rate is not None:
-            stage.rate(state.copy(), command, numbers, remembered)
-            if stage.begin is not None:
-                stage.begin(state.copy(), command, numbers, remembered)
+        for name in ("remember", "rate", "begin"):
+            if (law := getattr(stage, name, None)) is not None:
+                law(state.copy(), command, numbers, remembered)
         return np.concatenate([wrench, remembered])
     if isinstance(stage, Properties):
         values = {name: np.ones((1, 1)) for name in (*COLUMNS, *SEEN)}

@@ -1,11 +1,13 @@
-"""The pymunk world of a scene, whose masses, frictions and joint strengths can be set."""
+"""The pymunk world of a scene, the kinds of joints and constraints in it, and what can be set."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections import namedtuple
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from itertools import compress
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pymunk
@@ -13,27 +15,35 @@ from pymunk import autogeometry
 
 from pbrl_ppl.effects import hanging_body
 from pbrl_ppl.errors import SimulationError
-from pbrl_ppl.physics.joints import (
-    A_X,
-    B_X,
-    B_Y,
-    HIGH_X,
-    HIGH_Y,
-    HINGE,
-    JOINT_KINDS,
-    ROD,
-    JointKind,
-    Setting,
-    never_turning,
-)
-from pbrl_ppl.physics.properties import COLUMN
+from pbrl_ppl.parameters import BODY_PARAMETERS, JOINT_ANCHORS
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene, smallest_radius
+from pbrl_ppl.state import Bools, Floats
 
+
+def columns(names: str | Iterable[str]) -> Any:
+    """Return the numbers of columns by their names; a string has spaces between them."""
+    found = namedtuple("Columns", names)
+    return found(*range(len(found._fields)))
+
+
+#: Columns of a body's properties. ``moment`` is about the centre of mass (kg m^2), which is at
+#: ``com_x`` and ``com_y`` of the body's frame (m); ``pivot_torque`` (N m) and ``pivot_damping``
+#: (N m s) act in the body's hinge (along its slider: N and N s/m), ``turn_torque`` (N m) against
+#: any turning of a free one; ``patch_mu`` (1) and ``patch_radius`` (m) describe the friction under
+#: it, ``extra_gravity_x`` and ``extra_gravity_y`` (m/s^2) are added to the scene's gravity.
+COLUMNS = (
+    *BODY_PARAMETERS,
+    *("moment", "pivot_torque", "pivot_damping", "turn_torque", "patch_mu", "patch_radius"),
+    *("extra_gravity_x", "extra_gravity_y", "com_x", "com_y"),
+)
+#: Index of each column, by name.
+COLUMN = columns(COLUMNS)
+#: Columns of a joint's numbers: its anchors and its length; of a slider, the ends of its line in
+#: the first body's frame (m).
+JOINT_COLUMNS = (*JOINT_ANCHORS, "length", "low_x", "low_y", "high_x", "high_y")
+JOINT = columns(JOINT_COLUMNS)
 #: Points of a ring that carry a body's weight, in units of the ring's radius.
 RING = tuple((math.cos(0.25 * i * math.pi), math.sin(0.25 * i * math.pi)) for i in range(8))
-#: A point may stick if its speed is below this multiple of what friction takes away in a substep.
-#: (With 0.1, slow points stick across their direction of motion now and then: predictions jump.)
-STICKING = 1.0
 #: Bounding radius (m) and engine time (s) of the shopping cart, for which the engine's treatment of
 #: overlaps was chosen.
 _CART = math.hypot(0.45, 0.275)
@@ -43,6 +53,89 @@ TINY = 1e-9
 #: Refinement of the substeps near contacts in a scene with hidden discs: a disc's inferred place
 #: must not depend on the substep in which a body stops.
 FINER = 8
+
+
+class Setting(NamedTuple):
+    """A property of a pymunk constraint, the C function that sets it, and the columns it takes.
+
+    The columns are those of a joint's numbers, or of a body's for a constraint of a body. With
+    ``weighted`` the number is multiplied by the body's weight.
+    """
+
+    attribute: str
+    function: str
+    columns: tuple[int, ...]
+    weighted: bool = False
+
+
+@dataclass(frozen=True)
+class EngineJoint:
+    """What a kind of joint is in the engine.
+
+    A new kind is one more entry of :data:`JOINT_KINDS`, and a kind of link in `tree_of`.
+
+    Attributes
+    ----------
+    constraint : callable
+        Makes the pymunk constraint of two bodies, with both anchors at their origins.
+    settings : tuple of Setting
+        Properties of the constraint, in the order in which they are set.
+    gap : callable
+        Distance of the anchors from that in the reference poses (m).
+    friction : str
+        The body's constraints by which friction and damping act in it: see `world`. None without.
+    """
+
+    constraint: Callable[[pymunk.Body, pymunk.Body], pymunk.Constraint]
+    settings: tuple[Setting, ...]
+    gap: Callable[[float], float]
+    friction: str = ""
+
+
+HINGE = EngineJoint(
+    constraint=lambda a, b: pymunk.PivotJoint(a, b, (0, 0), (0, 0)),
+    settings=(
+        Setting("anchor_a", "cpPivotJointSetAnchorA", (JOINT.a_x, JOINT.a_y)),
+        Setting("anchor_b", "cpPivotJointSetAnchorB", (JOINT.b_x, JOINT.b_y)),
+    ),
+    gap=lambda distance: 0.0,
+    friction="pivot",
+)
+ROD = EngineJoint(
+    constraint=lambda a, b: pymunk.PinJoint(a, b, (0, 0), (0, 0)),
+    settings=(
+        Setting("anchor_a", "cpPinJointSetAnchorA", (JOINT.a_x, JOINT.a_y)),
+        Setting("anchor_b", "cpPinJointSetAnchorB", (JOINT.b_x, JOINT.b_y)),
+        Setting("distance", "cpPinJointSetDist", (JOINT.length,)),
+    ),
+    gap=lambda distance: distance,
+)
+#: Right for bodies that never turn alone: see `never_turning`.
+SLIDER = EngineJoint(
+    constraint=lambda a, b: pymunk.GrooveJoint(a, b, (-1, 0), (1, 0), (0, 0)),
+    settings=(
+        Setting("groove_a", "cpGrooveJointSetGrooveA", (JOINT.low_x, JOINT.low_y)),
+        Setting("groove_b", "cpGrooveJointSetGrooveB", (JOINT.high_x, JOINT.high_y)),
+        Setting("anchor_b", "cpGrooveJointSetAnchorB", (JOINT.b_x, JOINT.b_y)),
+    ),
+    gap=lambda distance: 0.0,
+    friction="rail",
+)
+#: Every kind that a scene can declare.
+JOINT_KINDS = {"hinge": HINGE, "slider": SLIDER, "distance": ROD}
+
+
+def never_turning(scene: Scene) -> Bools:
+    """Return the moving bodies that sliders alone tie to what is fixed, shape (body,).
+
+    They keep their reference angles: their moments of inertia do not matter.
+    """
+    reached = {WORLD, *(body.name for body in scene.bodies if body.static)}
+    pairs = [set(joint.bodies or ()) for joint in scene.joints if joint.traits.slides]
+    for _ in pairs:
+        for pair in pairs:
+            reached |= pair if pair & reached else set()
+    return np.array([body.name in reached and not body.kinematic for body in scene.moving])
 
 
 class ConstraintKind(NamedTuple):
@@ -70,8 +163,8 @@ def _motor(column: int) -> ConstraintKind:
 def _on_line(name: str) -> tuple[Setting, ...]:
     """Return the settings of a constraint along a slider's line, to an end that is far away."""
     return (
-        Setting("anchor_a", f"{name}SetAnchorA", (HIGH_X, HIGH_Y)),
-        Setting("anchor_b", f"{name}SetAnchorB", (B_X, B_Y)),
+        Setting("anchor_a", f"{name}SetAnchorA", (JOINT.high_x, JOINT.high_y)),
+        Setting("anchor_b", f"{name}SetAnchorB", (JOINT.b_x, JOINT.b_y)),
     )
 
 
@@ -157,7 +250,7 @@ class Link(NamedTuple):
     """
 
     joint: int
-    kind: JointKind
+    kind: EngineJoint
     constraint: pymunk.Constraint
     pivot: int
     axis: float = 0.0
@@ -170,7 +263,7 @@ class World:
     ----------
     scene : Scene
         Geometry, joints and gravity.
-    kinds : tuple of JointKind
+    kinds : tuple of EngineJoint
         Kind of each of the scene's joints in the engine.
     joined : tuple of (int, int)
         Indices into ``scene.joinable`` of the bodies of each joint of unknown bodies, in the
@@ -188,7 +281,7 @@ class World:
     def __init__(
         self,
         scene: Scene,
-        kinds: tuple[JointKind, ...] = (),
+        kinds: tuple[EngineJoint, ...] = (),
         joined: tuple[tuple[int, int], ...] = (),
         discs: int = 0,
         patches: tuple[int, ...] = (),
@@ -221,10 +314,7 @@ class World:
         self.discs: list[pymunk.Circle] = []
         self._by_name: dict[str, pymunk.Body] = {WORLD: self.space.static_body}
         self._add_fixed()
-        for j in range(discs):
-            away = -self.far, -self.far * (j + 1)
-            self.discs.append(pymunk.Circle(self.space.static_body, 0.0, away))
-            self._add_static(self.discs[j])
+        self._add_discs(discs)
         #: Which bodies follow a path, at the velocities in their actions.
         self.kinematic = np.array([body.kinematic for body in scene.moving])
         self._add_moving(wheels)
@@ -246,14 +336,7 @@ class World:
         self.iterations = 30 if self.chained.any() else 5 if alone else 10
         #: For the near-contact test: radii of bounding circles, and segments with a radius.
         self.radii = np.array([body.shape.bounding_radius for body in scene.moving])
-        fixed = [(*wall.start, *wall.end, 0.0) for wall in scene.walls]
-        fixed += [
-            (*body.pose[:2], *body.pose[:2], body.shape.bounding_radius)
-            for body in scene.bodies
-            if body.static and body.pose is not None
-        ]
-        fixed += [(-self.far, -self.far, -self.far, -self.far, 0.0)] * discs  # the last ones
-        self.obstacles = np.array(fixed, dtype=float).reshape(-1, 5)
+        self.obstacles = self._obstacles(discs)
 
     def check_steps(self) -> None:
         """Refuse sliders on what turns, for which the engine has no right joint.
@@ -328,6 +411,24 @@ class World:
                 for shape in engine_shapes(body, rigid):
                     self._add_static(shape)
 
+    def _add_discs(self, discs: int) -> None:
+        """Add hidden discs, far from everything."""
+        for j in range(discs):
+            away = -self.far, -self.far * (j + 1)
+            self.discs.append(pymunk.Circle(self.space.static_body, 0.0, away))
+            self._add_static(self.discs[j])
+
+    def _obstacles(self, discs: int) -> Floats:
+        """Return what does not move as segments with a radius, shape (obstacle, 5), discs last."""
+        fixed = [(*wall.start, *wall.end, 0.0) for wall in self.scene.walls]
+        fixed += [
+            (*body.pose[:2], *body.pose[:2], body.shape.bounding_radius)
+            for body in self.scene.bodies
+            if body.static and body.pose is not None
+        ]
+        fixed += [(-self.far, -self.far, -self.far, -self.far, 0.0)] * discs
+        return np.array(fixed, dtype=float).reshape(-1, 5)
+
     def _add_static(self, shape: pymunk.Shape) -> None:
         shape.elasticity = shape.friction = 1.0  # the engine multiplies both shapes' values
         self.space.add(shape)
@@ -358,7 +459,7 @@ class World:
         self.space.add(constraint)
 
     def _add_joints(
-        self, kinds: tuple[JointKind, ...], joined: tuple[tuple[int, int], ...]
+        self, kinds: tuple[EngineJoint, ...], joined: tuple[tuple[int, int], ...]
     ) -> None:
         """Add the scene's joints; their anchors and lengths are properties."""
         pairs, names = iter(joined), self.scene.joinable
@@ -380,7 +481,7 @@ class World:
         position: int,
         a: pymunk.Body,
         b: pymunk.Body,
-        kind: JointKind,
+        kind: EngineJoint,
         joint: Joint | None = None,
     ) -> None:
         link = kind.constraint(a, b)
@@ -392,7 +493,7 @@ class World:
             pivot = self.bodies.index(self._by_name[hanging_body(self.scene, joint)])
             self._constrain(kind.friction, pivot, a, b, joint=position)
             if kind is HINGE:
-                column = A_X if a is self.bodies[pivot] else B_X
+                column = JOINT.a_x if a is self.bodies[pivot] else JOINT.b_x
                 self.pivots.append((pivot, position, column))
         axis = self.scene.direction(joint) if joint is not None and joint.axis else 0.0
         self.links.append(Link(position, kind, link, pivot, axis))

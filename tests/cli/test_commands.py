@@ -26,7 +26,7 @@ from pbrl_ppl.cli.terminal import Progress, interruptible
 from pbrl_ppl.errors import ConvergenceWarning, FitError
 from pbrl_ppl.history import History
 from pbrl_ppl.model import physics_model, problem_in
-from pbrl_ppl.physics.table1 import table1
+from pbrl_ppl.physics.settings import table1
 from pbrl_ppl.posterior import PosteriorRecord, completion, group, load_posterior
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.places import MODELS, ROOT

@@ -8,7 +8,7 @@ import pytest
 from pbrl_ppl.effects import attach
 from pbrl_ppl.errors import EffectError, ParameterError
 from pbrl_ppl.history import History
-from pbrl_ppl.physics.joints import on_rod
+from pbrl_ppl.physics.properties import on_rod
 from pbrl_ppl.scene import Joint, Scene, Shape, Wall
 from tests.helpers.worlds import BY_NAME, G, body, predict, simulator, state
 

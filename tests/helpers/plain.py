@@ -24,12 +24,12 @@ from pbrl_ppl.physics.compiled import (
     patch_signal,
     wheel_ends,
 )
-from pbrl_ppl.physics.laws import LATE
-from pbrl_ppl.physics.properties import COLUMN, EngineInput
+from pbrl_ppl.physics.laws import WINDOW
+from pbrl_ppl.physics.properties import EngineInput
 from pbrl_ppl.physics.settings import PhysicsSettings
 from pbrl_ppl.physics.simulator import Choice, continues_previous
 from pbrl_ppl.physics.solids import near_contact
-from pbrl_ppl.physics.world import FINER, RING, World
+from pbrl_ppl.physics.world import COLUMN, FINER, RING, World
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import WRENCH, Floats
 
@@ -274,7 +274,7 @@ class Acting:
     def remember(self, states: Floats, interval: Floats) -> None:
         """Bring what laws remember up to date at the end of an interval."""
         if any(stage.remember is not None for _, stage, _ in self._commands):
-            self(states, interval, LATE, 1.0, after=True)
+            self(states, interval, 1.0 - WINDOW, 1.0, after=True)
 
     def bound(self, base: float, i: int, states: Floats, under: bool, *signal: float) -> float:
         """Return the greatest force of dry friction in a body's hinge or under it; see `laws`."""

@@ -11,7 +11,7 @@ from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.model.declaration import random_variable
 from pbrl_ppl.parameters import BODY_PARAMETERS, WHEEL_PARAMETERS, Prior
 from pbrl_ppl.physics import build_layout
-from pbrl_ppl.physics.table1 import table1
+from pbrl_ppl.physics.settings import table1
 from pbrl_ppl.scene import Body, Scene, Shape
 
 # The paper's Table 1 with a triangle's bounds: x in [-1, 1], y in [-1, 2].

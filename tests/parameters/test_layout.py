@@ -22,7 +22,7 @@ from pbrl_ppl.parameters import (
     stepped,
 )
 from pbrl_ppl.physics import build_layout
-from pbrl_ppl.physics.table1 import table1
+from pbrl_ppl.physics.settings import table1
 from pbrl_ppl.scene import Body, Scene, Shape
 
 pytestmark = pytest.mark.one_stack

@@ -9,7 +9,7 @@ import pymunk
 import pytest
 from pymunk import _chipmunk_cffi
 
-from pbrl_ppl.physics import calls, compilation, compile_for_search, compiled, flow, lockstep
+from pbrl_ppl.physics import calls, compile_for_search, compiled, flow, lockstep, physics
 from pbrl_ppl.physics.calls import SOURCES, disk_cache, sources_digest
 from pbrl_ppl.physics.calls import compiled as decorator
 from pbrl_ppl.scene import Body, Joint, Scene, Shape
@@ -119,7 +119,7 @@ def test_an_older_cache_that_cannot_be_read_is_deleted(module) -> None:
     assert not index.exists()
 
 
-@pytest.mark.parametrize("rollout", [compiled.rollout, lockstep.rollout])
+@pytest.mark.parametrize("rollout", [compiled.rollout_engine, lockstep.rollout_free])
 def test_rollouts_are_cached_by_the_digest(rollout) -> None:
     assert rollout._cache._cache_file._source_stamp == SOURCES
 
@@ -166,10 +166,10 @@ def test_another_process_compiles_what_is_asked_for_later(module, tmp_path, monk
 def test_a_search_compiles_the_loop_of_joined_bodies_beside(monkeypatch) -> None:
     """A scene with a joint needs it at once: another process would only load the package."""
     asked: list = []
-    monkeypatch.setattr(compilation, "compile_beside", lambda loop, code: asked.append(loop))
+    monkeypatch.setattr(physics, "compile_beside", lambda loop, code: asked.append(loop))
     body = Body("puck", Shape.circle(0.1))
     hinge = Joint("hinge", ("world", "puck"), (0.0, 0.0), (0.0, 0.0))
     compile_for_search(Scene(time_step=0.1, bodies=(body,), joints=(hinge,)))
     assert not asked
     compile_for_search(Scene(time_step=0.1, bodies=(body,)))
-    assert asked == [flow.rollout]
+    assert asked == [flow.rollout_tree]

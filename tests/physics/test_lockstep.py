@@ -1,15 +1,12 @@
 """The contact-free fast path of single bodies agrees with the engine."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
 from pbrl_ppl.effects import attach
 from pbrl_ppl.physics import Physics, Simulator, build_layout, compiled, lockstep
-from pbrl_ppl.physics.joints import HINGE, ROD
 from pbrl_ppl.physics.tree import tree_of
-from pbrl_ppl.physics.world import World
+from pbrl_ppl.physics.world import HINGE, ROD, World
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.engines import BOX, proposals
 from tests.helpers.plain import PlainSimulator, simulator_of
@@ -90,15 +87,19 @@ def test_arrays_of_every_layout_use_the_same_machine_code() -> None:
     for name in ("wheel", "walls", "sensor"):
         simulator, phi, start, inputs = case(name)
         expected = simulator(phi, start, inputs)
-        compiled_once = [len(path.signatures) for path in (lockstep.rollout, compiled.rollout)]
+        compiled_once = [
+            len(path.signatures) for path in (lockstep.rollout_free, compiled.rollout_engine)
+        ]
         start.setflags(write=False)
         np.testing.assert_array_equal(simulator(phi, start, np.asfortranarray(inputs)), expected)
         coarse = Simulator(simulator.physics.changed(extrapolate=False))
         assert np.isfinite(coarse(phi, start, inputs)).all()
-        signatures = [len(path.signatures) for path in (lockstep.rollout, compiled.rollout)]
+        signatures = [
+            len(path.signatures) for path in (lockstep.rollout_free, compiled.rollout_engine)
+        ]
         assert signatures == compiled_once
-    assert len(compiled.rollout.signatures) == 1
-    assert len(lockstep.rollout.signatures) == 1
+    assert len(compiled.rollout_engine.signatures) == 1
+    assert len(lockstep.rollout_free.signatures) == 1
 
 
 def test_contacts_are_left_to_the_engine() -> None:
@@ -149,7 +150,5 @@ def test_worlds_of_the_fast_path() -> None:
     assert tree_of(pushed).bodies.tolist() == [0, -1]
     held = pushed.scene.replace(joints=(Joint("hinge", ("a", "finger"), (0.5, 0.0), (-0.5, 0.0)),))
     assert tree_of(World(held, (HINGE,))) is None
-    unknown = dataclasses.replace(HINGE, contact_free=False)
-    assert tree_of(World(two.replace(joints=(joint,)), (unknown,))) is None
     closed = (joint, Joint("distance", ("a", "b"), (0.0, 0.3), (0.0, -0.3)))
     assert tree_of(World(two.replace(joints=closed), (HINGE, ROD))) is None

@@ -43,7 +43,7 @@ def like(sim: Simulator, **options) -> Simulator:
 def engine_items(monkeypatch) -> list[tuple[int, int]]:
     """What goes to the engine: item, and the first of its intervals that do."""
     items: list[tuple[int, int]] = []
-    rollout = compiled.rollout
+    rollout = compiled.rollout_engine
 
     def counted(*arguments):
         chosen, begins = arguments[3].tolist(), arguments[4].tolist()
@@ -51,7 +51,7 @@ def engine_items(monkeypatch) -> list[tuple[int, int]]:
         items.extend(zip(chosen, begins, strict=True))
         return done
 
-    monkeypatch.setattr(compiled, "rollout", counted)
+    monkeypatch.setattr(compiled, "rollout_engine", counted)
     return items
 
 
