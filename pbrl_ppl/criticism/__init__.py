@@ -24,8 +24,6 @@ from .prior_check import PriorCheck as PriorCheck
 from .prior_check import informative_horizon as informative_horizon
 from .prior_check import prior_predictive_check as prior_predictive_check
 from .results import ONE_TRAJECTORY as ONE_TRAJECTORY
-from .results import Added as Added
-from .results import Candidate as Candidate
 from .results import Errors as Errors
 from .results import Estimate as Estimate
 from .results import Law as Law

@@ -7,12 +7,13 @@ from dataclasses import dataclass, field
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.refinement import Declared
-from pbrl_ppl.criticism.results import ONE_TRAJECTORY, Candidate, Law, SearchLength
+from pbrl_ppl.criticism.results import CANDIDATE, NAMED, ONE_TRAJECTORY, Law, SearchLength
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.criticism.search import Search
 from pbrl_ppl.criticism.unexplained import unexplained_acceleration
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.effects import catalogue as full_catalogue
+from pbrl_ppl.files import json_fields
 from pbrl_ppl.history import MOST_TRANSITIONS, History
 from pbrl_ppl.likelihood import is_simulated
 from pbrl_ppl.scene import Scene
@@ -56,10 +57,14 @@ class Attribution:
         """What to know before relying on the laws."""
         said = [ONE_TRAJECTORY] if self.laws and self.trajectories == 1 else []
         for law in self.laws:
-            if law.confounded:
-                others = " or ".join(law.confounded)
+            if law.not_separable_from:
+                others = " or ".join(law.not_separable_from)
                 said.append(f"these data cannot tell {law.effect} on {law.body} from {others}")
         return said
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the contents for JSON."""
+        return json_fields(self) | {"laws": [law.in_json(NAMED) for law in self.laws]}
 
 
 @one_blas_thread
@@ -146,7 +151,7 @@ class Ranking:
 
     Parameters
     ----------
-    candidates : tuple of Candidate
+    candidates : tuple of Law
         Best first.
     mode : dict of str to float
         The declared model's parameters there, by label, SI units.
@@ -156,10 +161,14 @@ class Ranking:
         Engine steps an interval that were needed.
     """
 
-    candidates: tuple[Candidate, ...]
+    candidates: tuple[Law, ...]
     mode: dict[str, float]
     unexplained_acceleration: dict[str, float]
     substeps: int
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the contents for JSON."""
+        return vars(self) | {"candidates": [one.in_json(CANDIDATE) for one in self.candidates]}
 
 
 @one_blas_thread

@@ -24,13 +24,11 @@ from pbrl_ppl.criticism.refinement import Declared, checked_histories, outliers,
 from pbrl_ppl.criticism.results import (
     NOTHING_RECORDED,
     Acceleration,
-    Added,
-    Candidate,
     Errors,
     Estimate,
     KindOfTest,
+    Law,
     Numerical,
-    Part,
     ResidualTest,
     Stage,
     Unexplained,
@@ -82,7 +80,6 @@ from pbrl_ppl.posterior import (
     interval,
     versions,
 )
-from pbrl_ppl.posterior import draws as posterior_draws
 from pbrl_ppl.sampling import sample
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.threads import one_blas_thread
@@ -264,7 +261,7 @@ class _Judged:
     declared: _Model
     revised: _Model
     misfit: Misfit
-    small: tuple[Candidate, ...]
+    small: tuple[Law, ...]
     rollout: int
     simulated: Mapping[str, float]
 
@@ -323,7 +320,7 @@ def _tested(
     simulated = {} if collides else held_out.simulated()
     seconds = (int(test.dataset["n_rows"].max()) - 1) * task.scene.time_step
     # unusual laws that no climb tried are not compiled for a test
-    tried = [one for one in task.missing(innovations) if one in found.signatures]
+    tried = [one for one in task.missing(innovations) if one in found.candidates]
     ranked = rank_candidates(innovations, tried, criteria, task.say)
     misfit = find_misfit(innovations, revised.excess, horizon=horizon, seed=task.seed)
     if not found.laws:  # a missing effect may be why the prior does not explain the data
@@ -432,7 +429,7 @@ def _put_together(task: _Task, judged: _Judged, before: Fit, after: Fit, recorde
     verdict, unexplained = _verdict(
         misfit, judged.found, error_before, error_after, converged, task.criteria
     )
-    added = _added(judged, after)
+    added = tuple(_with_posterior(law, one, after) for one, law in judged.found.laws.items())
     keep_groups(after.posterior, added)
     alone = noise_alone(revised.innovations, revised.excess)
     return Loop(
@@ -443,7 +440,7 @@ def _put_together(task: _Task, judged: _Judged, before: Fit, after: Fit, recorde
             revised.innovations.problem.physics.substeps,
             shift(revised.innovations),
         ),
-        candidates=_explained(judged),
+        candidates=tuple(judged.found.candidates.values()),
         added=added,
         unexplained=unexplained,
         before=error_before,
@@ -463,8 +460,8 @@ def _put_together(task: _Task, judged: _Judged, before: Fit, after: Fit, recorde
         growth=misfit.growth,
         search=judged.found.lengths,
         small=judged.small,
-        lesser=_parts(judged.found.small),
-        hypotheses=_parts(judged.found.hypotheses),
+        lesser=judged.found.lesser,
+        hypotheses=judged.found.hypotheses,
         identifiability=identify(after.posterior, mode=revised.mode),
         loo=_compared(declared.mode, revised.mode, before, after),
         velocities_not_used=cleaned.unused,
@@ -528,12 +525,6 @@ def _compared(declared: Mode, revised: Mode, before: Fit, after: Fit) -> Compari
     return compare(before.posterior, after.posterior) if alike else None
 
 
-def _parts(shares: Mapping[Attached, float]) -> tuple[Part, ...]:
-    """Return laws that are not added, those that take most off first."""
-    parts = [Part(law.effect.name, law.body, share) for law, share in shares.items()]
-    return tuple(sorted(parts, key=lambda one: -one.share))
-
-
 def _verdict(
     misfit: Misfit,
     found: SearchResult,
@@ -571,34 +562,7 @@ def _worse(before: Errors, after: Errors) -> Unexplained:
     return Unexplained("", "", NOTHING_RECORDED, 0.0, float("nan"), sentence)
 
 
-def _explained(judged: _Judged) -> tuple[Candidate, ...]:
-    """Return the candidates with what simulations say of each, and the decision on it."""
-    found, result = judged.found, []
-    groups = {rival: law for law, rivals in found.confounded.items() for rival in rivals}
-    shares = {**found.small, **found.hypotheses}
-    for law, signature in found.signatures.items():
-        why = "takes too little off the error of simulated trajectories"
-        alone = found.tried.get(law)
-        if law in found.laws:
-            why = "added"
-        elif law in shares:
-            why = f"takes {100 * shares[law]:.2g} % off the error of simulated trajectories"
-        elif law in groups:
-            why = f"explains these data as well as {groups[law].effect.name.replace('_', ' ')}"
-        elif law in found.rejected:
-            why = found.rejected[law]
-        result.append(
-            replace(
-                signature.candidate,
-                why=why,
-                simulated_nats=alone[0] if alone else None,
-                simulated_share=alone[1] if alone else None,
-            )
-        )
-    return tuple(result)
-
-
-def keep_groups(posterior: Idata, added: Iterable[Added]) -> None:
+def keep_groups(posterior: Idata, added: Iterable[Law]) -> None:
     """Record in a posterior's attributes which effects its recording cannot separate."""
     groups = tuple(
         tuple(
@@ -611,33 +575,13 @@ def keep_groups(posterior: Idata, added: Iterable[Added]) -> None:
     replace(PosteriorRecord.of(posterior), not_separable=groups).write(posterior)
 
 
-def _added(judged: _Judged, revised: Fit) -> tuple[Added, ...]:
-    """Return the added effects with their posterior."""
-    found, drawn = judged.found, posterior_draws(revised.posterior)
-    effects = judged.revised.mode.problem.physics.effects
-    added = []
-    for law, words in found.laws.items():
-        bodies = [one.body for one in effects if one.effect.name == law.effect.name]
-        estimates = {}
-        for parameter in law.effect.parameters:
-            values = drawn[law.effect.variable(parameter)][:, bodies.index(law.body)]
-            estimates[parameter.name] = Estimate(
-                float(values.mean()), float(values.std()), interval(values), parameter.unit
-            )
-        gained, error = found.gains[law]
-        added.append(
-            Added(
-                effect=words.effect,
-                body=words.body,
-                sentence=words.sentence,
-                statistic=found.signatures[law].candidate.statistic,
-                p_value=found.signatures[law].candidate.p_value,
-                parameters=estimates,
-                not_separable_from=words.confounded,
-                elpd_difference=gained,
-                elpd_difference_se=error,
-                simulated_nats=words.nats,
-                simulated_share=words.share,
-            )
+def _with_posterior(law: Law, attached: Attached, revised: Fit) -> Law:
+    """Return a law with the posterior of its parameters in the revised model."""
+    phi, places = revised.draws[0], revised.problem.layout.places(attached.labels)
+    parameters = {
+        parameter.name: Estimate(
+            float(values.mean()), float(values.std()), interval(values), parameter.unit
         )
-    return tuple(added)
+        for parameter, values in zip(attached.effect.parameters, phi.T[places], strict=True)
+    }
+    return replace(law, parameters=parameters)

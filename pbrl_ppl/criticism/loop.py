@@ -12,15 +12,16 @@ import numpy as np
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.results import (
+    ADDED,
+    ASIDE,
+    CANDIDATE,
     NOTHING_RECORDED,
     Acceleration,
-    Added,
-    Candidate,
     Correlations,
     Errors,
     Growth,
+    Law,
     Numerical,
-    Part,
     ResidualTest,
     Rollout,
     SearchLength,
@@ -29,7 +30,7 @@ from pbrl_ppl.criticism.results import (
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import OutputError
-from pbrl_ppl.files import check_folder, json_fields, json_values, temporary_folder
+from pbrl_ppl.files import check_folder, json_values, temporary_folder
 from pbrl_ppl.history import History, UnusedVelocity
 from pbrl_ppl.modes import FilteredMode
 from pbrl_ppl.posterior import Comparison, Fit, Idata, Identifiability, save_posterior
@@ -57,9 +58,9 @@ class Loop:
         ``adequate``, ``effects-added``, ``unexplained``, or ``not-converged``.
     numerical : Numerical
         Engine substeps, and the numerical error that is left.
-    candidates : tuple of Candidate
+    candidates : tuple of Law
         All candidates, by their score tests at the declared model, best first.
-    added : tuple of Added
+    added : tuple of Law
         Effects added, in order.
     unexplained : Unexplained or None
         Structure that no effect in the catalogue explains.
@@ -87,11 +88,11 @@ class Loop:
         Growth of the revised model's forecast errors.
     search : tuple of SearchLength
         What the search found on pieces of each length.
-    small : tuple of Candidate
+    small : tuple of Law
         Effect that is significant in the innovations and was not added, if there is one.
-    lesser : tuple of Part
+    lesser : tuple of Law
         Laws that simulations show and that are no main ones: they are not added.
-    hypotheses : tuple of Part
+    hypotheses : tuple of Law
         Unusual laws that explain a part of what remains: they are not added.
     identifiability : Identifiability or None
         Which parameters of the revised model the data inform.
@@ -114,8 +115,8 @@ class Loop:
     scene: Scene
     verdict: str
     numerical: Numerical
-    candidates: tuple[Candidate, ...]
-    added: tuple[Added, ...]
+    candidates: tuple[Law, ...]
+    added: tuple[Law, ...]
     unexplained: Unexplained | None
     before: Errors
     after: Errors
@@ -133,9 +134,9 @@ class Loop:
     correlations: Correlations
     growth: Growth
     search: tuple[SearchLength, ...] = ()
-    small: tuple[Candidate, ...] = ()
-    lesser: tuple[Part, ...] = ()
-    hypotheses: tuple[Part, ...] = ()
+    small: tuple[Law, ...] = ()
+    lesser: tuple[Law, ...] = ()
+    hypotheses: tuple[Law, ...] = ()
     identifiability: Identifiability | None = None
     loo: Comparison | None = None
     velocities_not_used: tuple[UnusedVelocity, ...] = ()
@@ -160,12 +161,12 @@ class Loop:
         return self.revised.posterior
 
     @property
-    def accepted(self) -> tuple[Added, ...]:
+    def accepted(self) -> tuple[Law, ...]:
         """Return the added effects, or none without a verdict."""
         return () if self.verdict == NOT_CONVERGED else self.added
 
     @property
-    def rejected(self) -> tuple[Candidate, ...]:
+    def rejected(self) -> tuple[Law, ...]:
         """Return the significant candidates that were not added, best first."""
         present = {(added.effect, added.body) for added in self.added}
         return tuple(
@@ -202,15 +203,16 @@ class Loop:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the contents of ``report.json``; numbers that are not finite become null."""
+        tested = [key for key in CANDIDATE if key not in ("sentence", "units")]
         contents: dict[str, Any] = json_values(
             {
                 "verdict": self.verdict,
                 "numerical": self.numerical,
-                "added": [_fields(added, "sentence") for added in self.added],
-                "candidates": [_fields(item, "sentence", "units") for item in self.candidates],
-                "small": [[candidate.effect, candidate.body] for candidate in self.small],
-                "lesser": self.lesser,
-                "hypotheses": self.hypotheses,
+                "added": [law.in_json(ADDED) for law in self.added],
+                "candidates": [law.in_json(tested) for law in self.candidates],
+                "small": [[law.effect, law.body] for law in self.small],
+                "lesser": [law.in_json(ASIDE) for law in self.lesser],
+                "hypotheses": [law.in_json(ASIDE) for law in self.hypotheses],
                 "search": self.search,
                 "tests": self.tests,
                 "unexplained_acceleration": self.acceleration,
@@ -288,8 +290,3 @@ class Loop:
         except OSError as error:
             raise OutputError(f"{folder}: cannot be written: {error}") from error
         return folder
-
-
-def _fields(value: object, *left_out: str) -> dict[str, object]:
-    """Return the fields of a dataclass by their keys in JSON, without those named."""
-    return {name: item for name, item in json_fields(value).items() if name not in left_out}

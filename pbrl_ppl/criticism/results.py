@@ -1,8 +1,9 @@
-"""Stages of a closed loop and parts of its result: candidates, added effects, tests, errors."""
+"""Stages of a closed loop and parts of its result: laws, tests, errors."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -16,16 +17,38 @@ ONE_TRAJECTORY = (
 )
 
 
+#: Keys of a law in JSON that are not the names of its fields.
+_KEYS = {
+    "looks": "n_grid_points", "caps": "is_upper_limit",
+    "nats": "simulated_nats", "share": "simulated_share", "confounded": "not_separable_from",
+}  # fmt: skip
+#: Keys of a candidate in JSON.
+CANDIDATE = (
+    "effect", "body", "sentence", "statistic", "dof", "p_value", "estimate", "units",
+    "identifiable", "looks", "detectable", "caps", "why", "simulated_nats", "simulated_share",
+)  # fmt: skip
+#: Keys of an added law in JSON.
+ADDED = (
+    "effect", "body", "statistic", "p_value", "parameters", "not_separable_from",
+    "elpd_difference", "elpd_difference_se", "simulated_nats", "simulated_share",
+)  # fmt: skip
+#: Keys of a law of the search in JSON, and of one that it does not add.
+NAMED = ("effect", "body", "sentence", "estimate", "sd", "units", "nats", "share", "confounded")
+ASIDE = ("effect", "body", "share")
+
+
 @dataclass(frozen=True)
-class Candidate:
-    """An effect that the model lacks, and its score test.
+class Law:
+    """A law that the declared model may lack: what each stage of the loop found out about it.
+
+    A candidate has a score test. Simulations give it evidence, alone and to first order or, if the
+    search names it, beside the other laws; the posterior of the revised model gives its parameters.
+    What is not known has its default.
 
     Parameters
     ----------
-    effect, body : str
-        Names of the effect and of the body.
-    sentence : str
-        The effect in words.
+    effect, body, sentence : str
+        Names of the effect and of the body, and the effect in words.
     statistic : float
         Score statistic S; chi-squared with ``dof`` degrees of freedom if the effect is absent.
     dof : int
@@ -34,7 +57,8 @@ class Candidate:
     p_value : float
         P-value of the statistic, corrected for the number of candidates.
     estimate : dict of str to float
-        First estimate of each parameter, from the signature alone.
+        Estimate of each parameter: from the signature alone, or the most probable value by
+        simulations.
     units : dict of str to str
         Unit of each parameter.
     identifiable : float
@@ -49,74 +73,54 @@ class Candidate:
         Whether smaller is stronger, as for a limit: larger ones than ``detectable`` are not seen.
     why : str
         Why the loop added it or did not; empty if it did not decide.
-    simulated_nats, simulated_share : float or None
-        The same candidate by simulation, alone, to first order, on the shortest pieces: net
-        log-evidence (nats), and the share of their error that it takes away; None if it is not
-        among the leading ones.
+    simulated_nats : float or None
+        Log-evidence of simulations for it, less its price (nats): of a law that is named what is
+        lost without it, summed over lengths of pieces; of a candidate alone, to first order, on the
+        shortest pieces; None if it is not among the leading ones.
+    simulated_share : float or None
+        Share of the simulation error (root mean square) that it takes off, on the longest pieces
+        or, of a candidate, on the shortest.
+    sd : dict of str to float
+        Standard deviation of each estimate by simulations, which allows for the residual's
+        correlation.
+    not_separable_from : tuple of str
+        Effects that explain these data as well.
+    parameters : dict of str to Estimate
+        Posterior of each parameter in the revised model.
+    elpd_difference, elpd_difference_se : float
+        Gain of expected log predictive density over the model without it, and its standard error
+        (nats).
     """
 
     effect: str
     body: str
-    sentence: str
-    statistic: float
-    dof: int
-    p_value: float
-    estimate: Mapping[str, float]
-    units: Mapping[str, str]
-    identifiable: float
-    n_grid_points: int = field(default=1, metadata={"key": "looks"})
+    sentence: str = ""
+    statistic: float = math.nan
+    dof: int = 0
+    p_value: float = math.nan
+    estimate: Mapping[str, float] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+    identifiable: float = math.nan
+    n_grid_points: int = 1
     detectable: Mapping[str, float] = field(default_factory=dict)
-    is_upper_limit: bool = field(default=False, metadata={"key": "caps"})
+    is_upper_limit: bool = False
     why: str = ""
     simulated_nats: float | None = None
     simulated_share: float | None = None
+    sd: Mapping[str, float] = field(default_factory=dict)
+    not_separable_from: tuple[str, ...] = ()
+    parameters: Mapping[str, Estimate] = field(default_factory=dict)
+    elpd_difference: float = math.nan
+    elpd_difference_se: float = math.nan
 
+    @property
+    def chance(self) -> float:
+        """The smaller of the p-value and, by simulations, the odds against the effect."""
+        return min(self.p_value, float(np.exp(-(self.simulated_nats or 0.0))))
 
-@dataclass(frozen=True)
-class Law:
-    """A law that the simulation error of trajectories shows.
-
-    Parameters
-    ----------
-    effect, body, sentence : str
-        Names of the effect and of the body, and the effect in words.
-    estimate, sd, units : dict of str to float or str
-        Most probable value of each parameter, its standard deviation, which allows for the
-        residual's correlation, and its unit.
-    nats : float
-        Log-evidence that is lost without it, less its price, summed over lengths of pieces.
-    share : float
-        Share of the simulation error (root mean square) on the longest ones that it takes off.
-    confounded : tuple of str
-        Effects that explain these data as well.
-    """
-
-    effect: str
-    body: str
-    sentence: str
-    estimate: Mapping[str, float]
-    sd: Mapping[str, float]
-    units: Mapping[str, str]
-    nats: float
-    share: float
-    confounded: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Part:
-    """A law that is not added, and the share of the simulation error that it takes off.
-
-    Parameters
-    ----------
-    effect, body : str
-        Names of the effect and of the body.
-    share : float
-        Share of the error (root mean square) on the longest pieces.
-    """
-
-    effect: str
-    body: str
-    share: float
+    def in_json(self, keys: Iterable[str]) -> dict[str, object]:
+        """Return the fields with these keys in JSON."""
+        return {key: getattr(self, _KEYS.get(key, key)) for key in keys}
 
 
 @dataclass(frozen=True)
@@ -273,46 +277,6 @@ class Estimate:
     sd: float
     hdi: tuple[float, float]
     unit: str
-
-
-@dataclass(frozen=True)
-class Added:
-    """An effect that was added to the model, with its posterior and its gain.
-
-    Parameters
-    ----------
-    effect, body, sentence : str
-        Names of the effect and of the body, and the effect in words.
-    statistic, p_value : float
-        Score test at the declared model.
-    parameters : dict of str to Estimate
-        Posterior of each of its parameters.
-    not_separable_from : tuple of str
-        Effects that would explain these data as well.
-    elpd_difference, elpd_difference_se : float
-        Gain of expected log predictive density over the model without it, and its standard error
-        (nats).
-    simulated_nats, simulated_share : float or None
-        What simulations lose without it: net log-evidence, summed over lengths of pieces (nats),
-        and the share of the error on the longest ones.
-    """
-
-    effect: str
-    body: str
-    sentence: str
-    statistic: float
-    p_value: float
-    parameters: Mapping[str, Estimate]
-    not_separable_from: tuple[str, ...]
-    elpd_difference: float
-    elpd_difference_se: float
-    simulated_nats: float | None = None
-    simulated_share: float | None = None
-
-    @property
-    def chance(self) -> float:
-        """The smaller of the p-value and, by simulations, the odds against the effect."""
-        return min(self.p_value, float(np.exp(-(self.simulated_nats or 0.0))))
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
-from pbrl_ppl.criticism.results import Candidate
+from pbrl_ppl.criticism.results import Law
 from pbrl_ppl.criticism.scan import (
     GridPoint,
     detection_limits,
@@ -38,7 +38,7 @@ class Signature:
     ----------
     attached : Attached
         The candidate.
-    candidate : Candidate
+    candidate : Law
         Its test, for the report.
     log_p : float
         Natural logarithm of the p-value before the correction for the number of candidates.
@@ -51,7 +51,7 @@ class Signature:
     """
 
     attached: Attached
-    candidate: Candidate
+    candidate: Law
     log_p: float
     basis: Floats
     direction: Floats
@@ -407,7 +407,7 @@ def _signature(
     effect = attached.effect
     names = [parameter.name for parameter in effect.parameters]
     log_p = min(0.0, evidence.log_p + np.log(max(1, len(tried))))
-    candidate = Candidate(
+    candidate = Law(
         effect=effect.name,
         body=attached.body,
         sentence=effect.sentence,

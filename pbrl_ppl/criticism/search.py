@@ -16,7 +16,7 @@ import numpy as np
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.results import Law, SearchLength, Stage
-from pbrl_ppl.criticism.score import Library, Signature, named_beside
+from pbrl_ppl.criticism.score import Library, named_beside
 from pbrl_ppl.criticism.subsets import Regression, Subset, best_subsets, by_label
 from pbrl_ppl.criticism.table import (
     Table,
@@ -64,24 +64,18 @@ class SearchResult:
     declared, after : Mode
         The declared model and the one with the laws, on the longest pieces.
     laws : dict of Attached to Law
-        The laws with what each is worth there, those of most evidence first.
-    gains : dict of Attached to tuple of float
-        Gain in expected log predictive density by each law, and its standard error (nats).
-    confounded : dict of Attached to tuple of Attached
-        Effects that explain the data as well as a law.
+        The laws with what each is worth there, those that take most of the error off first.
+    candidates : dict of Attached to Law
+        All candidates by their score tests on the shortest pieces, best first, with what each is
+        worth alone to first order and the decision on it.
     lengths : tuple of SearchLength
         What was found at each length of pieces.
-    signatures : dict of Attached to Signature
-        Score test of each candidate, on the shortest pieces, without arrays of several values.
-    tried : dict of Attached to tuple of float
-        What each candidate alone is worth there to first order (nats), and its share of the error.
     rejected : dict of Attached to str
         Why a law that was found on shorter pieces is not among them.
-    small : dict of Attached to float
-        Laws that are there and no main ones, and the share of the error that each takes off.
-    hypotheses : dict of Attached to float
-        Unusual laws that explain a part of what common ones leave, and the share of the error that
-        each takes off to first order.
+    lesser : tuple of Law
+        Laws that are there and no main ones, those that take most of the error off first.
+    hypotheses : tuple of Law
+        Unusual laws that explain a part of what common ones leave, to first order.
     doubt : str
         Why the laws that were found are none: gravity is wrong, or a unit.
     """
@@ -89,14 +83,11 @@ class SearchResult:
     declared: Mode
     after: Mode
     laws: Mapping[Attached, Law] = field(default_factory=dict)
-    gains: Mapping[Attached, tuple[float, float]] = field(default_factory=dict)
-    confounded: Mapping[Attached, tuple[Attached, ...]] = field(default_factory=dict)
+    candidates: Mapping[Attached, Law] = field(default_factory=dict)
     lengths: tuple[SearchLength, ...] = ()
-    signatures: Mapping[Attached, Signature] = field(default_factory=dict)
-    tried: Mapping[Attached, tuple[float, float]] = field(default_factory=dict)
     rejected: Mapping[Attached, str] = field(default_factory=dict)
-    small: Mapping[Attached, float] = field(default_factory=dict)
-    hypotheses: Mapping[Attached, float] = field(default_factory=dict)
+    lesser: tuple[Law, ...] = ()
+    hypotheses: tuple[Law, ...] = ()
     doubt: str = ""
 
     def on(self, whole: Mode) -> SearchResult:
@@ -606,34 +597,68 @@ class Search:
         before = declared if shares else mode
         if shares and is_simulated_mode(before):
             before = with_robust_covariance(before)
-        confounded = dict[Attached, tuple[Attached, ...]]()
+        rivals = dict[Attached, list[Attached]]()
         for law in shares:  # a law of the same physics may have been refitted as well
-            rivals = table.rivals(climb.mode, law, limits.least_nats)
-            confounded[law] = tuple(dict.fromkeys((*climb.same.get(law, ()), *rivals)))
-        laws = {
-            law: law_of(mode, law, climb.earlier.get(law, 0.0), part, confounded[law])
-            for law, part in shares.items()
-        }
+            others = table.rivals(climb.mode, law, limits.least_nats)
+            rivals[law] = [*dict.fromkeys((*climb.same.get(law, ()), *others))]
         named = {name for one in climb.lengths for name in one.accepted}
-        for law in (one for one in climb.earlier if one not in {*laws, *climb.small, *rejected}):
+        for law in (one for one in climb.earlier if one not in {*shares, *climb.small, *rejected}):
             if _name(law) in named:
                 rejected[law] = "longer simulations do not need it"
         for law, why in rejected.items():
             self.say(f"dropped {_name(law)}: {why}")
-        signatures, tried = dict[Attached, Signature](), dict[Attached, tuple[float, float]]()
-        for regression in regressions:
-            for scored in regression.signatures:
-                signatures.setdefault(scored.attached, scored.without_bases())
-            for subset in regression.subsets:
-                for law in subset.laws if len(subset.laws) == 1 else ():
-                    alone_of = subset.nats, 1.0 - float(np.sqrt(1.0 - subset.share))
-                    for one in (law, *regression.same[law]):
-                        tried.setdefault(one, alone_of)
-        gains = {law: elpd_gain(table.without(climb.mode, law), mode) for law in laws}
+        decided = rejected | {
+            rival: f"explains these data as well as {law.effect.name.replace('_', ' ')}"
+            for law, others in rivals.items() for rival in others
+        }  # fmt: skip
+        for law, part in {**climb.small, **hypotheses}.items():
+            decided[law] = f"takes {100 * part:.2g} % off the error of simulated trajectories"
+        decided |= dict.fromkeys(shares, "added")
+        scored = _scored(regressions)
+        laws = dict[Attached, Law]()
+        for law, part in shares.items():
+            gain, error = elpd_gain(table.without(climb.mode, law), mode)
+            laws[law] = replace(
+                law_of(mode, law, scored.get(law)),
+                simulated_nats=climb.earlier.get(law, 0.0),
+                simulated_share=part,
+                not_separable_from=tuple(named_beside(rival, law) for rival in rivals[law]),
+                elpd_difference=gain,
+                elpd_difference_se=error,
+            )
+        too_little = "takes too little off the error of simulated trajectories"
         return SearchResult(
-            before, mode, laws, gains, confounded, tuple(climb.lengths), signatures, tried,
-            rejected, climb.small, hypotheses, doubt,
-        )  # fmt: skip
+            before,
+            mode,
+            laws,
+            {law: replace(one, why=decided.get(law, too_little)) for law, one in scored.items()},
+            tuple(climb.lengths),
+            rejected,
+            _aside(climb.small),
+            _aside(hypotheses),
+            doubt,
+        )
+
+
+def _scored(regressions: Sequence[Regression]) -> dict[Attached, Law]:
+    """Return each candidate's first score test, and what it is worth alone to first order."""
+    laws = dict[Attached, Law]()
+    for regression in regressions:
+        for signature in regression.signatures:
+            laws.setdefault(signature.attached, signature.candidate)
+        for subset in (one for one in regression.subsets if len(one.laws) == 1):
+            part = 1.0 - float(np.sqrt(1.0 - subset.share))
+            for law in (*subset.laws, *regression.same[subset.laws[0]]):
+                if laws[law].simulated_nats is None:
+                    alone = {"simulated_nats": subset.nats, "simulated_share": part}
+                    laws[law] = replace(laws[law], **alone)
+    return laws
+
+
+def _aside(shares: Mapping[Attached, float]) -> tuple[Law, ...]:
+    """Return laws that are not added, those that take the largest shares off first."""
+    by_share = sorted(shares.items(), key=lambda one: -one[1])
+    return tuple(Law(law.effect.name, law.body, simulated_share=part) for law, part in by_share)
 
 
 def _apart(mode: Mode, length: int, *, most: float = 0.5) -> Problem:
@@ -740,23 +765,16 @@ def elpd_gain(before: Mode, after: Mode) -> tuple[float, float]:
     return total, float(np.sqrt(n) * gains.std(ddof=1)) if n > 1 else float("nan")
 
 
-def law_of(
-    mode: Mode, law: Attached, nats: float, part: float, confounded: Sequence[Attached]
-) -> Law:
-    """Return a law of a mode in words and numbers."""
+def law_of(mode: Mode, law: Attached, scored: Law | None = None) -> Law:
+    """Return a law with its sizes at a mode, and its score test if it has one."""
     effect, places = law.effect, mode.problem.layout.places(law.labels)
     sd = np.sqrt(np.diag(mode.covariance)[places])
     names = [parameter.name for parameter in effect.parameters]
-    return Law(
-        effect=effect.name,
-        body=law.body,
-        sentence=effect.sentence,
+    return replace(
+        scored or Law(effect.name, law.body, effect.sentence),
         estimate=dict(zip(names, mode.phi[places].tolist(), strict=True)),
         sd=dict(zip(names, sd.tolist(), strict=True)),
         units={parameter.name: parameter.unit for parameter in effect.parameters},
-        nats=nats,
-        share=part,
-        confounded=tuple(named_beside(rival, law) for rival in confounded),
     )
 
 

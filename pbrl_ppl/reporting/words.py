@@ -12,8 +12,8 @@ from pbrl_ppl.criticism import (
     NOT_CONVERGED,
     ONE_TRAJECTORY,
     UNEXPLAINED,
-    Added,
     Estimate,
+    Law,
     Loop,
     acceleration_in_words,
     share_in_words,
@@ -63,7 +63,7 @@ def _found(loop: Loop) -> str:
     return f"{sentence[0].upper()}{sentence[1:]}"
 
 
-def _named(added: Added) -> str:
+def _named(added: Law) -> str:
     """Write an effect and its body, or the effects that fit as well."""
     others = [plain(name) for name in added.not_separable_from]
     if len(others) > 2:
@@ -71,7 +71,7 @@ def _named(added: Added) -> str:
     return f"{_listed([plain(added.effect), *others], 'or')} on the {plain(added.body)}"
 
 
-def has_size(added: Added) -> bool:
+def has_size(added: Law) -> bool:
     """Return whether an effect's size fits into a headline: one number of one effect."""
     return len(added.parameters) == 1 and not added.not_separable_from
 
@@ -258,12 +258,15 @@ def held_out_in_words(loop: Loop) -> str:
 def left_aside_in_words(loop: Loop) -> list[str]:
     """Return sentences on laws that were found and not added, with their shares of the error."""
     said = [
-        f"{_law(one.effect, one.body)} takes {percent(one.share)} off the error of the longest"
-        " simulations: too little to be added."
+        f"{_law(one.effect, one.body)} takes {percent(one.simulated_share)} off the error of the"
+        " longest simulations: too little to be added."
         for one in loop.lesser
     ]
     if loop.hypotheses:
-        names = [f"{_law(one.effect, one.body)} ({percent(one.share)})" for one in loop.hypotheses]
+        names = [
+            f"{_law(one.effect, one.body)} ({percent(one.simulated_share)})"
+            for one in loop.hypotheses
+        ]
         said.append(
             f"Of what remains one of these would take a part off: {_listed(names, 'or')}; few rigs"
             " have it, so it was not added: declare it to try."

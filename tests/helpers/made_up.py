@@ -9,13 +9,12 @@ import numpy as np
 from pbrl_ppl.criticism.loop import Loop
 from pbrl_ppl.criticism.results import (
     Acceleration,
-    Added,
-    Candidate,
     Correlations,
     Errors,
     Estimate,
     Growth,
     KindOfTest,
+    Law,
     Numerical,
     ResidualTest,
     Rollout,
@@ -78,7 +77,7 @@ def made_up(verdict: str = "effects-added", stuck: bool = False) -> Loop:
     found = verdict == "effects-added"
     grown = {d: r * (3.0 if d in ("vx", "vy") else 1.1) for d, r in noise.items()}
     candidates = tuple(
-        Candidate(
+        Law(
             effect,
             "cart",
             sentence,
@@ -137,16 +136,16 @@ def made_up(verdict: str = "effects-added", stuck: bool = False) -> Loop:
         candidates = tuple(
             replace(c, statistic=c.statistic / 200, p_value=0.37) for c in candidates
         )
-    added = Added(
+    added = Law(
         "linear_drag",
         "cart",
         DRAG,
         419.0,
-        1e-80,
-        {"coefficient": Estimate(3.0, 0.1, (2.81, 3.19), "kg/s")},
-        ("quadratic_drag",),
-        210.0,
-        19.0,
+        p_value=1e-80,
+        parameters={"coefficient": Estimate(3.0, 0.1, (2.81, 3.19), "kg/s")},
+        not_separable_from=("quadratic_drag",),
+        elpd_difference=210.0,
+        elpd_difference_se=19.0,
     )
     remains = Unexplained(
         "cart", "omega", "omega", 0.34, 0.002, "its omega is off in a way that depends on omega"

@@ -7,7 +7,7 @@ import numpy as np
 import xarray as xr
 
 from pbrl_ppl.criticism.loop import Loop
-from pbrl_ppl.criticism.results import Added, Estimate, Unexplained
+from pbrl_ppl.criticism.results import Estimate, Law, Unexplained
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.history import History
 from pbrl_ppl.modes import trajectory_mode
@@ -40,7 +40,10 @@ def revised() -> Loop:
     )
     modes = tuple(trajectory_mode(one.problem, *one.best) for one in (before, after))
     size = Estimate(DRAG, 0.01, (DRAG - 0.02, DRAG + 0.02), "kg/s")
-    added = Added("linear_drag", "puck", "a drag", 99.0, 1e-9, {"coefficient": size}, (), 9.0, 1.0)
+    added = Law(
+        "linear_drag", "puck", statistic=99.0, p_value=1e-9, parameters={"coefficient": size},
+        elpd_difference=9.0, elpd_difference_se=1.0,
+    )  # fmt: skip
     found = made_up()
     return replace(
         found,

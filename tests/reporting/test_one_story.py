@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from pbrl_ppl.criticism.loop import Loop
-from pbrl_ppl.criticism.results import Acceleration, Candidate, Unexplained
+from pbrl_ppl.criticism.results import Acceleration, Law, Unexplained
 from pbrl_ppl.effects import Effect, EffectParameter, catalogue
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
@@ -144,10 +144,10 @@ def test_a_candidate_with_a_large_score_says_why_it_was_not_added() -> None:
     assert "came closest (p < 1e-16); it was not added: changes predictions by 0.2 %." in text
 
 
-def candidate(effect: str, is_upper_limit: bool = False, **sizes: float) -> Candidate:
+def candidate(effect: str, is_upper_limit: bool = False, **sizes: float) -> Law:
     named = {each.name: each for each in catalogue}
     units = {p.name: p.unit for p in named[effect].parameters}
-    return Candidate(
+    return Law(
         effect, "cart", "", 1.0, 1, 0.5, dict.fromkeys(units, 0.25), units, 1.0,
         detectable=sizes, is_upper_limit=is_upper_limit,
     )  # fmt: skip
@@ -173,7 +173,7 @@ def test_limits_of_what_was_not_measured_are_left_out() -> None:
 def test_limits_beyond_the_prior_are_no_limits() -> None:
     findings = made_up()
 
-    def said(one: Candidate) -> str:
+    def said(one: Law) -> str:
         return limits_in_words(one, findings)
 
     # normal, sigma 20 N: 99.9 % are within 3.29 sigma, 65.8 N

@@ -12,7 +12,7 @@ import pytest
 import pbrl_ppl as pp
 from pbrl_ppl.criticism import loop as loop_module
 from pbrl_ppl.criticism.loop import FILES, Loop
-from pbrl_ppl.criticism.results import Errors, Part, SearchLength
+from pbrl_ppl.criticism.results import Errors, Law, SearchLength
 from pbrl_ppl.errors import OutputError
 from pbrl_ppl.history import History, UnusedVelocity
 from pbrl_ppl.parameters import BODY_PARAMETERS
@@ -87,7 +87,8 @@ def with_small() -> Loop:
     law = replace(found.added[0], simulated_nats=480.0, simulated_share=0.8)
     return replace(
         found, added=(replace(law, not_separable_from=()),), search=LENGTHS,
-        lesser=(Part("angular_drag", "cart", 0.1),), hypotheses=(Part("spring", "cart", 0.4),),
+        lesser=(Law("angular_drag", "cart", simulated_share=0.1),),
+        hypotheses=(Law("spring", "cart", simulated_share=0.4),),
     )  # fmt: skip
 
 
