@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
+from pbrl_ppl.criticism.innovations import unexplained_acceleration
 from pbrl_ppl.criticism.refinement import Declared
 from pbrl_ppl.criticism.results import CANDIDATE, NAMED, ONE_TRAJECTORY, Law, SearchLength
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.criticism.search import Search
-from pbrl_ppl.criticism.unexplained import unexplained_acceleration
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.files import json_fields
@@ -74,7 +74,6 @@ def attribute(
     *,
     catalogue: Iterable[Effect] = full_catalogue,
     seed: int = 0,
-    substeps: int | None = None,
     most_transitions: int = MOST_TRANSITIONS,
     criteria: Criteria = DEFAULT,
     progress: Callable[[str], None] | None = None,
@@ -97,8 +96,6 @@ def attribute(
         Effects to consider.
     seed : int
         Seed of the search for the declared model's mode.
-    substeps : int, optional
-        Engine steps an interval to begin with; the scene's by default.
     most_transitions : int
         As of :func:`pbrl_ppl.close_loop`.
     criteria : Criteria
@@ -127,7 +124,7 @@ def attribute(
         [law.effect for law in found.laws]  # ['linear_drag', 'sliding_friction']
     """
     say, catalogue = progress or (lambda stage: None), tuple(catalogue)
-    declared = Declared(scene, catalogue, seed, substeps, criteria, say)
+    declared = Declared(scene, catalogue, seed, criteria, say)
     declared, history = declared.cleaned(history, most_transitions)
     _, found = Search(declared.missing, criteria, say).of(history, declared.mode, seed)
     problem = found.after.problem
@@ -178,7 +175,6 @@ def criticise(
     *,
     catalogue: Iterable[Effect] = full_catalogue,
     seed: int = 0,
-    substeps: int | None = None,
     most_transitions: int = MOST_TRANSITIONS,
     criteria: Criteria = DEFAULT,
     progress: Callable[[str], None] | None = None,
@@ -198,8 +194,6 @@ def criticise(
         Effects to consider.
     seed : int
         Seed of the search for the mode.
-    substeps : int, optional
-        Engine steps an interval to begin with; the scene's by default.
     most_transitions : int
         As of :func:`pbrl_ppl.close_loop`.
     criteria : Criteria
@@ -221,7 +215,7 @@ def criticise(
     """
     say = progress or (lambda stage: None)
     catalogue = tuple(catalogue)
-    declared = Declared(scene, catalogue, seed, substeps, criteria, say)
+    declared = Declared(scene, catalogue, seed, criteria, say)
     declared, history = declared.cleaned(history, most_transitions)
     mode = declared.mode(history)
     say("scoring what the model might lack")

@@ -82,7 +82,7 @@ def compare_models(
 def measured_parameters(candidate: Law, loop: Loop) -> tuple[str, ...]:
     """Return a candidate's parameters without those of state dimensions that were not measured."""
     sensors = {effect.name for effect in loop.catalogue if isinstance(effect.stage, Sensor)}
-    unseen = {*STATE} - {*loop.residuals_after} if candidate.effect in sensors else set()
+    unseen = {*STATE} - {*loop.revised.residuals} if candidate.effect in sensors else set()
     return tuple(name for name in candidate.units if name not in unseen)
 
 
@@ -133,9 +133,10 @@ def error_tables(loop: Loop) -> list[Table]:
     """Tabulate the held-out errors, one interval and a rollout ahead, and overall."""
     errors = dict(zip(models_of(loop), (loop.before, loop.after), strict=False))
     errors["Noise floor"] = loop.noise_floor
+    intervals, seconds = loop.forecasts.horizon, number(loop.rollout_seconds)
     titles = {
         "one_step_rmse": f"One interval ahead, {loop.scene.time_step:g} s",
-        "rollout_rmse": f"{loop.rollout_horizon} intervals ahead, {number(loop.rollout_seconds)} s",
+        "rollout_rmse": f"{intervals} intervals ahead, {seconds} s",
         "simulated_rmse": "Whole trajectories, simulated from initial states fitted to them",
     }
     tables = []
@@ -264,7 +265,7 @@ def search_table(loop: Loop) -> Table:
         "Dropped": lambda one: ", ".join(map(plain, one.dropped)) or "–",
     }
     words = ("Error before", "Accepted", "Dropped")
-    return tabulate("The search by length of pieces", loop.search, columns, words)
+    return tabulate("The search by length of pieces", loop.found.lengths, columns, words)
 
 
 def parameter_table(parameters: Parameters) -> Table:

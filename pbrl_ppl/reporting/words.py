@@ -53,7 +53,7 @@ def _found(loop: Loop) -> str:
     if not loop.added:
         if loop.verdict == UNEXPLAINED:
             return "No effect in the catalogue explains the residual"
-        matters = " that matters" if loop.small or loop.acceleration.remaining else ""
+        matters = " that matters" if loop.found.small or loop.acceleration.remaining else ""
         return f"Nothing{matters} was found missing"
     first, *more = loop.added
     sentence = _listed([_named(one) for one in (first, *more)], "and")
@@ -171,7 +171,7 @@ def remains_in_words(loop: Loop) -> str:
     small = "".join(
         f" There is {plain(one.effect)} on the {plain(one.body)}, which changes predictions by"
         f" less than {100 * loop.criteria.negligible:g} %."
-        for one in loop.small
+        for one in loop.found.small
     )
     return f"{passed}.{small}"
 
@@ -196,15 +196,15 @@ def error_in_words(loop: Loop) -> str:
 
 def caution_in_words(loop: Loop) -> str:
     """Return what to know of added effects of a recording of one trajectory; empty otherwise."""
-    single = bool(loop.added) and loop.provenance.get("trajectories") == 1
+    single = bool(loop.added) and loop.data.provenance.get("trajectories") == 1
     return f"{ONE_TRAJECTORY[0].upper()}{ONE_TRAJECTORY[1:]}." if single else ""
 
 
 def left_out_in_words(loop: Loop) -> str:
     """Return what was left out of the histories, of bad frames the first few one by one."""
-    first, more = loop.bad_frames[:LISTED], len(loop.bad_frames) - LISTED
+    first, more = loop.data.bad_frames[:LISTED], len(loop.data.bad_frames) - LISTED
     rest = f"; and {more} more (report.json lists them)" if more > 0 else ""
-    said = "; ".join((*loop.drawn, *first))
+    said = "; ".join((*loop.data.drawn, *first))
     return f"{said}{rest}." if said else ""
 
 
@@ -260,12 +260,12 @@ def left_aside_in_words(loop: Loop) -> list[str]:
     said = [
         f"{_law(one.effect, one.body)} takes {percent(one.simulated_share)} off the error of the"
         " longest simulations: too little to be added."
-        for one in loop.lesser
+        for one in loop.found.lesser
     ]
-    if loop.hypotheses:
+    if loop.found.hypotheses:
         names = [
             f"{_law(one.effect, one.body)} ({percent(one.simulated_share)})"
-            for one in loop.hypotheses
+            for one in loop.found.hypotheses
         ]
         said.append(
             f"Of what remains one of these would take a part off: {_listed(names, 'or')}; few rigs"

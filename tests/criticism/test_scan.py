@@ -13,13 +13,13 @@ from scipy.stats import binom, chi2, norm
 
 from pbrl_ppl.criticism import scan, score
 from pbrl_ppl.criticism.criteria import DEFAULT
-from pbrl_ppl.criticism.scan import (
+from pbrl_ppl.criticism.score import (
     GridPoint,
     detection_limits,
     each_grid_point,
     is_upper_limit,
+    rank_candidates,
 )
-from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.effects import candidates, catalogue
 from pbrl_ppl.state import STATE
 from tests.helpers.free_puck import BOX, DISC, Disc, box2d, fitted
