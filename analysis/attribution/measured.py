@@ -539,4 +539,5 @@ def picture(found: Loop) -> bytes:
         before=of(shown.before),
         after=of(shown.after),
     )
-    return png(plot_rollout(replace(found, rollout=places)))
+    forecasts = replace(found.forecasts, rollout=places)
+    return png(plot_rollout(replace(found, forecasts=forecasts)))

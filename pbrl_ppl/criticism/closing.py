@@ -156,7 +156,7 @@ def close_loop(
     drawn = partial(drawn_pieces, most=most_transitions, seed=seed)
     (train, said), (test, also), (numbered, _) = map(drawn, (train, test, numbered))
     said = (*thin, *said, *(f"held out: {one}" for one in also))
-    cleaned = _cleaned(task, train, numbered, results.Data(held_out=test, drawn=said))
+    cleaned = _cleaned(task, train, numbered, results.Recordings(held_out=test, drawn=said))
     task = replace(task, scene=with_units(scene, cleaned.train))
     prior = _prior_test(task, cleaned.train)
     declared, found = _searched(task, cleaned)
@@ -198,7 +198,7 @@ class _Cleaned:
 
     train: History
     test: History
-    data: results.Data
+    data: results.Recordings
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,7 +272,7 @@ class _Judged:
     horizon: int
     simulated: Mapping[str, float]
 
-    def compared(self, model: _Tested, fit: Fit, seed: int) -> results.Model:
+    def compared(self, model: _Tested, fit: Fit, seed: int) -> results.ComparedModel:
         """Return a model with its posterior and its held-out errors in units of the revised's."""
         revised, simulated = self.revised, self.simulated
         noise = noise_without_unexplained(revised.innovations, revised.excess)
@@ -280,12 +280,12 @@ class _Judged:
         if simulated and model is not revised:
             simulated = model.held_out.simulated()
         residuals = model.held_out.residuals(revised.held_out)
-        return results.Model(
+        return results.ComparedModel(
             fit, model.innovations, replace(errors, simulated_rmse=simulated), residuals
         )
 
 
-def _cleaned(task: _Task, train: History, test: History, data: results.Data) -> _Cleaned:
+def _cleaned(task: _Task, train: History, test: History, data: results.Recordings) -> _Cleaned:
     """Check the histories and the effects; leave out what no model should be fitted to."""
     train, test, unused, bad_frames = checked_histories(task.scene, train, test)
     for sentence in (*data.drawn, *(column.sentence for column in unused), *bad_frames):

@@ -9,14 +9,12 @@ import numpy as np
 from scipy.special import logsumexp
 
 from pbrl_ppl.criticism.results import Errors, Rollout
-from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History, longest_gap
 from pbrl_ppl.likelihood import (
     FilteredProblem,
     TrajectoryNoise,
     along_trajectories,
     in_pieces,
-    observed_coordinates,
 )
 from pbrl_ppl.modes import MOST_GROWTH, FilteredMode, fit_pieces, growth
 from pbrl_ppl.posterior import Fit
@@ -268,24 +266,8 @@ class HeldOut:
 
     @classmethod
     def of(cls, mode: FilteredMode, history: History) -> HeldOut:
-        """Linearise a fitted model along held-out trajectories.
-
-        Raises
-        ------
-        HistoryError
-            If they measure what the training history does not.
-        """
+        """Linearise a fitted model along held-out trajectories, which measure nothing else."""
         coordinates = mode.problem.likelihood.noise.coordinates
-        measured = observed_coordinates(mode.problem.scene, history).sensors
-        if not set(measured) <= set(coordinates.sensors):
-            names = [
-                ", ".join(STATE[d] for d in dimensions)
-                for dimensions in (measured, coordinates.sensors)
-            ]
-            raise HistoryError(
-                f"test history measures {names[0]}, the training history {names[1]}; they must"
-                " be the same"
-            )
         problem = mode.problem.with_data(history=history, states=None)
         return cls(mode, along_trajectories(problem, mode.phi, mode.sigma, coordinates))
 

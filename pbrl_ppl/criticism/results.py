@@ -505,7 +505,7 @@ class Found:
 
 
 @dataclass(frozen=True, eq=False)
-class Model:
+class ComparedModel:
     """The declared or the revised model, fitted.
 
     Parameters
@@ -546,7 +546,7 @@ class Forecasts:
 
 
 @dataclass(frozen=True, eq=False)
-class Data:
+class Recordings:
     """What was recorded, and what of it was not used.
 
     Parameters
@@ -584,11 +584,11 @@ class Loop:
         Structure that no effect in the catalogue explains.
     numerical : Numerical
         Engine substeps, and the numerical error that is left.
-    data : Data
+    data : Recordings
         What was recorded, and what of it was not used.
     found : Found
         What the search found: candidates and added effects.
-    declared, revised : Model
+    declared, revised : ComparedModel
         Both models with posteriors and held-out errors; they are equal if nothing was added.
     misfit : Misfit
         Tests of the revised model's residual.
@@ -610,10 +610,10 @@ class Loop:
     verdict: str
     unexplained: Unexplained | None
     numerical: Numerical
-    data: Data
+    data: Recordings
     found: Found
-    declared: Model
-    revised: Model
+    declared: ComparedModel
+    revised: ComparedModel
     misfit: Misfit
     acceleration: Acceleration
     forecasts: Forecasts
