@@ -169,8 +169,7 @@ def _p_values(mode: FilteredMode) -> Floats:
     return np.asarray([0.5 * chi2.sf(max(2 * gain, 0.0), 1) for gain in gains])
 
 
-#: Intervals up to which innovations are correlated with earlier ones and with commands; a
-#: correlation counts if it is taken over more pairs than this.
+#: Largest lag of a correlation (intervals), and pairs that one has to be taken over.
 _LAGS, _LEAST_PAIRS = 5, 10
 
 

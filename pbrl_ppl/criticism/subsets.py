@@ -37,9 +37,6 @@ class Subset:
         Log-evidence less its price.
     share : float
         Share of the squared whitened residual that they take away.
-    prices : dict of Attached to float
-        Logarithm of the number of candidates and grid points that each was chosen from, less the
-        logarithm of its prior odds (nats).
     phi : ndarray
         The mode's other parameters by the joint regression, shape (p,).
     """
@@ -47,7 +44,6 @@ class Subset:
     sizes: Mapping[Attached, Floats]
     nats: float
     share: float
-    prices: Mapping[Attached, float]
     phi: Floats
 
     @property
@@ -96,7 +92,11 @@ class Regression:
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """A law linearised at one point, and its columns in the regression."""
+    """A law linearised at one point, its columns in the regression, and its price (nats).
+
+    That is the logarithm of the number of candidates and grid points that it is chosen from, less
+    the logarithm of its prior odds.
+    """
 
     law: Attached
     linear: Linearisation
@@ -215,10 +215,9 @@ class _NormalEquations:
                 return None
             sizes[term.law] = size
         share = min(float(coordinates @ self.towards[columns]) / self.total, 1.0 - 1e-12)
-        prices = {term.law: term.price for term in terms}
-        nats = worth(share, len(columns), self.n) - sum(prices.values())
+        nats = worth(share, len(columns), self.n) - sum(term.price for term in terms)
         phi = self.test.phi - self.absorbed[:, columns] @ coordinates
-        return Subset(sizes, nats, share, prices, phi)
+        return Subset(sizes, nats, share, phi)
 
     def search(self, order: Sequence[int], largest: int, *, beam: int = 12) -> list[Subset]:
         """Return the subsets tried: all of one or two laws, then the best with one more law.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -237,7 +237,7 @@ class Table:
         new = [key for key in moves if key not in self.modes]
         told = f"refitting models on pieces of {near.problem.data.horizon} rows", say
         if not is_simulated_mode(near) or len(new) < 2:
-            in_parallel(lambda key: self.fitted(near, key, moves[key]), new, *told)
+            self._fit(near, new, moves, *told)
             return
         rest = [key for key in new if key not in self.behind]
         first = in_parallel(lambda key: self._refitted(near, key, moves[key], rounds), rest, *told)
@@ -247,8 +247,18 @@ class Table:
         least = max(*values.values(), self.value(near)) - far
         for key in new:
             del self.modes[key]
-        ahead = [key for key in new if values[key] >= least]
-        in_parallel(lambda key: self.fitted(near, key, moves[key]), ahead, *told)
+        self._fit(near, [key for key in new if values[key] >= least], moves, *told)
+
+    def _fit(
+        self,
+        near: Mode,
+        new: Sequence[frozenset[Attached]],
+        moves: Mapping[frozenset[Attached], Mapping[str, float]],
+        *told: Any,
+    ) -> None:
+        """Fit new models at once; they are in the table in their order, not that of the threads."""
+        modes = in_parallel(lambda key: self._refitted(near, key, moves[key]), new, *told)
+        self.modes |= zip(new, modes, strict=True)
 
     def without(self, mode: Mode, law: Attached) -> Mode:
         """Return a model without a law."""

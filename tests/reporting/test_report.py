@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 import pbrl_ppl as pp
-from pbrl_ppl.criticism import FILES, Loop
-from pbrl_ppl.criticism import loop as loop_module
+from pbrl_ppl.criticism import FILES, Loop, results
 from pbrl_ppl.criticism.results import Errors, Law, SearchLength
 from pbrl_ppl.errors import OutputError
 from pbrl_ppl.history import History, UnusedVelocity
@@ -478,7 +477,7 @@ def broken(monkeypatch: pytest.MonkeyPatch) -> None:
         if path.name == "after.nc":
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(loop_module, "save_posterior", fail)
+    monkeypatch.setattr(results, "save_posterior", fail)
 
 
 @pytest.mark.usefixtures("broken")
@@ -498,9 +497,7 @@ def test_failure_leaves_what_was_there(tmp_path: Path) -> None:
 
 
 def test_overwrite(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        loop_module, "save_posterior", lambda posterior, path: path.write_bytes(b"nc")
-    )
+    monkeypatch.setattr(results, "save_posterior", lambda posterior, path: path.write_bytes(b"nc"))
     loop = made_up()
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(OutputError, match=r"is not empty.*overwrite"):
