@@ -623,17 +623,10 @@ class Search:
             decided[law] = f"takes {100 * part:.2g} % off the error of simulated trajectories"
         decided |= dict.fromkeys(shares, "added")
         scored = _scored(regressions)
-        laws = dict[Attached, Law]()
-        for law, part in shares.items():
-            gain, error = elpd_gain(table.without(climb.mode, law), mode)
-            laws[law] = replace(
-                law_of(mode, law, scored.get(law)),
-                simulated_nats=climb.earlier.get(law, 0.0),
-                simulated_share=part,
-                not_separable_from=tuple(named_beside(rival, law) for rival in rivals[law]),
-                elpd_difference=gain,
-                elpd_difference_se=error,
-            )
+        laws = {
+            law: _named(law, scored.get(law), climb, mode, part, rivals[law])
+            for law, part in shares.items()
+        }
         too_little = "takes too little off the error of simulated trajectories"
         return SearchResult(
             before,
@@ -658,8 +651,8 @@ def _scored(regressions: Sequence[Regression]) -> dict[Attached, Law]:
             part = 1.0 - float(np.sqrt(1.0 - subset.share))
             for law in (*subset.laws, *regression.same[subset.laws[0]]):
                 if laws[law].simulated_nats is None:
-                    alone = {"simulated_nats": subset.nats, "simulated_share": part}
-                    laws[law] = replace(laws[law], **alone)
+                    alone = replace(laws[law], simulated_nats=subset.nats, simulated_share=part)
+                    laws[law] = alone
     return laws
 
 
@@ -775,16 +768,32 @@ def elpd_gain(before: Mode, after: Mode) -> tuple[float, float]:
     return total, float(np.sqrt(n) * gains.std(ddof=1)) if n > 1 else float("nan")
 
 
-def law_of(mode: Mode, law: Attached, scored: Law | None = None) -> Law:
-    """Return a law with its sizes at a mode, and its score test if it has one."""
+def _named(
+    law: Attached,
+    scored: Law | None,
+    climb: _Climb,
+    mode: Mode,
+    part: float,
+    rivals: Sequence[Attached],
+) -> Law:
+    """Return a law with its sizes at a mode and what a climb says of it.
+
+    It takes a ``part`` of the error off, has the score test ``scored``, if any, and ``rivals``.
+    """
     effect, places = law.effect, mode.problem.layout.places(law.labels)
     sd = np.sqrt(np.diag(mode.covariance)[places])
     names = [parameter.name for parameter in effect.parameters]
+    gain, error = elpd_gain(climb.table.without(climb.mode, law), mode)
     return replace(
         scored or Law(effect.name, law.body, effect.sentence),
         estimate=dict(zip(names, mode.phi[places].tolist(), strict=True)),
         sd=dict(zip(names, sd.tolist(), strict=True)),
         units={parameter.name: parameter.unit for parameter in effect.parameters},
+        simulated_nats=climb.earlier.get(law, 0.0),
+        simulated_share=part,
+        not_separable_from=tuple(named_beside(rival, law) for rival in rivals),
+        elpd_difference=gain,
+        elpd_difference_se=error,
     )
 
 
