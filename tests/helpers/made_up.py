@@ -32,7 +32,9 @@ from pbrl_ppl.state import STATE, STATE_UNITS
 #: Where a loop's findings are in its records.
 PLACES = {
     **dict.fromkeys(("candidates", "added", "small", "lesser", "hypotheses", "lengths"), "found"),
-    **dict.fromkeys(("provenance", "held_out", "velocities_not_used", "drawn"), "data"),
+    **dict.fromkeys(
+        ("provenance", "held_out", "velocities_not_used", "bad_frames", "drawn"), "data"
+    ),
     **dict.fromkeys(("tests", "correlations", "growth"), "misfit"),
     **dict.fromkeys(("noise_floor", "rollout", "horizon"), "forecasts"),
 }
