@@ -196,8 +196,8 @@ def forecast(
     error = coordinates.wrapped(measured_ends - ends)
     error[np.isfinite(measured_ends) & np.isnan(ends)] = np.inf
     covariance = noise.covariance(sigma)[at - 1]
-    for i in np.flatnonzero(step == 0):
-        covariance[i] = _first_spread(noise, sigma, int(at[i]))
+    for begin in np.flatnonzero(step == 0):
+        covariance[begin] = _first_spread(noise, sigma, int(at[begin]))
     free, touching = coordinates.steps(sigma)
     contact = touching - free  # uncertainty of how bodies part
     pushes = np.zeros((len(coordinates.places), 0))

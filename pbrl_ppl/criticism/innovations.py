@@ -217,7 +217,9 @@ def correlation_tests(
     return (whiteness, commands), found
 
 
-def _lagged(white: Floats, seen: Bools, number: Ints, series: Floats | None) -> tuple[Floats, Ints]:
+def _lagged(
+    white: Floats, seen: Bools, number: Ints, series: Floats | None
+) -> tuple[Floats, Floats]:
     """Return correlations with series some intervals before, or of each coordinate with itself.
 
     And the numbers of pairs, shape (lag, series, coordinate) each.
