@@ -7,6 +7,7 @@ import sys
 import time
 from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import xarray as xr
@@ -60,7 +61,8 @@ def test_a_report_json_has_its_own_posteriors(tmp_path, monkeypatch, renamed) ->
     def save(content: str, overwrite: bool = False) -> None:
         loop = object.__new__(Loop)
         for name in ("declared", "revised"):
-            object.__setattr__(loop, name, type("Fit", (), {"posterior": content}))
+            fit = SimpleNamespace(posterior=content)
+            object.__setattr__(loop, name, SimpleNamespace(fit=fit))
         monkeypatch.setattr(Loop, "to_dict", lambda self: content)
         monkeypatch.setattr(results, "save_posterior", lambda text, path: path.write_text(text))
         loop.save(tmp_path / "out", overwrite, page=content)
