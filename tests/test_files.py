@@ -7,13 +7,13 @@ import sys
 import time
 from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import xarray as xr
 
 from pbrl_ppl import files
-from pbrl_ppl.criticism import Loop
-from pbrl_ppl.criticism import loop as loops
+from pbrl_ppl.criticism import Loop, results
 from pbrl_ppl.errors import OutputError
 from pbrl_ppl.files import check_folder, check_survives, write_atomically, write_text
 
@@ -61,9 +61,10 @@ def test_a_report_json_has_its_own_posteriors(tmp_path, monkeypatch, renamed) ->
     def save(content: str, overwrite: bool = False) -> None:
         loop = object.__new__(Loop)
         for name in ("declared", "revised"):
-            object.__setattr__(loop, name, type("Fit", (), {"posterior": content}))
+            fit = SimpleNamespace(posterior=content)
+            object.__setattr__(loop, name, SimpleNamespace(fit=fit))
         monkeypatch.setattr(Loop, "to_dict", lambda self: content)
-        monkeypatch.setattr(loops, "save_posterior", lambda text, path: path.write_text(text))
+        monkeypatch.setattr(results, "save_posterior", lambda text, path: path.write_text(text))
         loop.save(tmp_path / "out", overwrite, page=content)
 
     save("old")

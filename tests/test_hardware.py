@@ -532,7 +532,7 @@ def test_a_simulated_folder_is_run_as_a_measured_one(
     (found,) = loops
     angle, place = result.errors
     for row, names in ((angle, ["theta"]), (place, ["x", "y"])):
-        assert row["seconds"] == pytest.approx(0.1 * found.rollout_horizon)
+        assert row["seconds"] == pytest.approx(0.1 * found.forecasts.horizon)
         for key in ("before", "after"):
             told = getattr(found, key).rollout_rmse
             assert row[key] == pytest.approx(np.hypot.reduce([told[n] for n in names]), rel=0.02)

@@ -9,9 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pbrl_ppl as pp
+from pbrl_ppl.criticism import DEFAULT
 from pbrl_ppl.criticism.attribution import criticise
-from pbrl_ppl.criticism.refinement import declared_mode
-from pbrl_ppl.effects import attach, catalogue
+from pbrl_ppl.criticism.refinement import Declared
+from pbrl_ppl.effects import catalogue
 from pbrl_ppl.history import with_units
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes.search import profiled
@@ -47,7 +48,7 @@ def fitted():
     """Return the mode of the recorded cart."""
     scene, history = cart()
     scene = with_units(scene, history)
-    return declared_mode(scene, history, attach(scene), 0, None, lambda stage: None)
+    return Declared(scene, tuple(catalogue), 0, DEFAULT, lambda stage: None).mode(history)
 
 
 @cache
@@ -124,7 +125,7 @@ def test_mode_is_that_of_the_similar_rig(scales) -> None:
     there = similar(scene, *scales)
     measured = similar_history(history, scene, *scales)
     there = with_units(there, measured)
-    found = declared_mode(there, measured, attach(there), 0, None, lambda stage: None)
+    found = Declared(there, tuple(catalogue), 0, DEFAULT, lambda stage: None).mode(measured)
     times = similar_phi(np.ones(len(mode.phi)), mode.problem.layout, *scales)
     # judged by the first rig's model: the other mode is as good there
     phi = found.phi / times

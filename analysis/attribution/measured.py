@@ -496,7 +496,7 @@ def errors_ahead(
         problem, drawn = Problem.of(physics, train), draws(posterior)
         phi = problem.layout.to_vectors(drawn, len(drawn["sigma"])).mean(axis=0)
         forecasts.append(_forecasts(problem, phi, test, start_rows))
-    own = found.rollout_horizon * scene.time_step
+    own = found.forecasts.horizon * scene.time_step
     asked = recording.ahead or tuple(Ahead(own, quantity) for quantity in QUANTITIES)
     rows = []
     for each in asked:
@@ -525,7 +525,7 @@ def _forecasts(
 
 def picture(found: Loop) -> bytes:
     """PNG of positions and angle of a held-out trajectory, measured and forecast from its start."""
-    shown = found.rollout
+    shown = found.forecasts.rollout
     columns = [place for place, name in enumerate(shown.names) if name not in _VELOCITIES]
 
     def of(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -539,4 +539,5 @@ def picture(found: Loop) -> bytes:
         before=of(shown.before),
         after=of(shown.after),
     )
-    return png(plot_rollout(replace(found, rollout=places)))
+    forecasts = replace(found.forecasts, rollout=places)
+    return png(plot_rollout(replace(found, forecasts=forecasts)))

@@ -295,7 +295,7 @@ def named(names: list[str]) -> None:
         case, begin = CASES[name], time.monotonic()
         found = pp.attribute(scene(case.rig), recorded(case, 1), seed=1)
         laws = {law.effect: law for law in found.laws}
-        hit = name in laws or name in {one for law in found.laws for one in law.confounded}
+        hit = name in laws or name in {one for law in found.laws for one in law.not_separable_from}
         right += hit
         sizes = {k: f"{v:.4g}" for k, v in laws[name].estimate.items()} if name in laws else {}
         beside = ", ".join(sorted(set(laws) - {name, *case.also})) or "nothing"

@@ -59,7 +59,7 @@ cart
 # refitted. Common laws are tried first, unusual ones only if these leave more than noise.
 
 # %%
-for length in cart.search:
+for length in cart.found.lengths:
     errors = ", ".join(f"{name} {error:.3g}" for name, error in length.error.items())
     print(f"pieces of {length.seconds:.2g} s: added {', '.join(length.accepted) or 'nothing'}")
     print(f"  error before: {errors}")
@@ -166,7 +166,7 @@ if pendulum is not None:
         )
         print(f"added: {added.effect} ({values}); elpd rises by {added.elpd_difference:.0f}")
     print("remains:", pendulum.unexplained.sentence if pendulum.unexplained else "nothing")
-    print("hypotheses:", [f"{one.effect} on {one.body}" for one in pendulum.hypotheses])
+    print("hypotheses:", [f"{one.effect} on {one.body}" for one in pendulum.found.hypotheses])
     print("error before:", pendulum.before.rollout_rmse)
     print("error after: ", pendulum.after.rollout_rmse)
     for name, draw in (("errors", plot_errors), ("rollout", plot_rollout)):

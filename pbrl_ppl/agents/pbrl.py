@@ -106,7 +106,7 @@ def revise(
             before[law].transitions if law in before else problem.segments.n,
             lost,
             share(table.without(mode, law), mode, table.weight),
-            found[law].confounded if law in found else (),
+            found[law].not_separable_from if law in found else (),
         )
         for law, lost in nats.items()
     ]

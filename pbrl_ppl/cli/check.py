@@ -17,7 +17,7 @@ from pbrl_ppl.state import STATE
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from pbrl_ppl.criticism import Attribution, Candidate, Law, PriorCheck
+    from pbrl_ppl.criticism import Attribution, Law, PriorCheck
     from pbrl_ppl.effects import Effect
     from pbrl_ppl.history import History
     from pbrl_ppl.scene import Scene
@@ -214,7 +214,6 @@ def criticise(
     catalogue = reading.catalogue()
     progress("loading the model")
     from pbrl_ppl import criticism
-    from pbrl_ppl.files import json_fields
     from pbrl_ppl.physics import check_history
 
     settings: dict[str, Any] = {
@@ -224,7 +223,7 @@ def criticise(
     }
     if simulate:
         attribution = criticism.attribute(declared, loaded, progress=progress, **settings)
-        return Result(json_fields(attribution), _shown_laws(attribution))
+        return Result(attribution.to_dict(), _shown_laws(attribution))
     check_history(declared, loaded, loaded.segments(1))
     ranking = criticism.criticise(declared, loaded, progress=progress, **settings)
     columns = {"effect": "<", "body": "<", "S": ".1f", "dof": "", "p (corrected)": ".2g"}
@@ -237,12 +236,7 @@ def criticise(
         "small p: the residual looks like that effect's signature; close-loop says whether it is"
         " missing"
     )
-    numbers = {
-        "mode": ranking.mode,
-        "unexplained_acceleration": ranking.unexplained_acceleration,
-        "substeps": ranking.substeps,
-    }
-    return Result({"candidates": ranking.candidates, **numbers}, [candidates, note])
+    return Result(ranking.to_dict(), [candidates, note])
 
 
 def _shown_laws(attribution: Attribution) -> Iterator[str | Table]:
@@ -269,11 +263,11 @@ def _shown_laws(attribution: Attribution) -> Iterator[str | Table]:
 
 def _law_row(law: Law) -> list[object]:
     numbers = ((name, f"{value:.3g} ± {law.sd[name]:.2g}") for name, value in law.estimate.items())
-    share = f"{100 * law.share:.2g} %"
-    return [law.effect, law.body, law.nats, share, sizes(numbers, law.units)]
+    share = f"{100 * (law.simulated_share or 0.0):.2g} %"
+    return [law.effect, law.body, law.simulated_nats, share, sizes(numbers, law.units)]
 
 
-def _candidate_row(one: Candidate) -> list[object]:
+def _candidate_row(one: Law) -> list[object]:
     numbers = ((name, f"{value:.3g}") for name, value in one.estimate.items())
     # where the declared parameters absorb the effect, its size is not identifiable
     seen = sizes(numbers, one.units) if one.statistic > 0 else ""

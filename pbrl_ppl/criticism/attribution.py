@@ -6,13 +6,14 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
+from pbrl_ppl.criticism.innovations import unexplained_acceleration
 from pbrl_ppl.criticism.refinement import Declared
-from pbrl_ppl.criticism.results import ONE_TRAJECTORY, Candidate, Law, SearchLength
+from pbrl_ppl.criticism.results import CANDIDATE, NAMED, ONE_TRAJECTORY, Law, SearchLength
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.criticism.search import Search
-from pbrl_ppl.criticism.unexplained import unexplained_acceleration
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.effects import catalogue as full_catalogue
+from pbrl_ppl.files import json_fields
 from pbrl_ppl.history import MOST_TRANSITIONS, History
 from pbrl_ppl.likelihood import is_simulated
 from pbrl_ppl.scene import Scene
@@ -56,10 +57,14 @@ class Attribution:
         """What to know before relying on the laws."""
         said = [ONE_TRAJECTORY] if self.laws and self.trajectories == 1 else []
         for law in self.laws:
-            if law.confounded:
-                others = " or ".join(law.confounded)
+            if law.not_separable_from:
+                others = " or ".join(law.not_separable_from)
                 said.append(f"these data cannot tell {law.effect} on {law.body} from {others}")
         return said
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the contents for JSON."""
+        return json_fields(self) | {"laws": [law.in_json(NAMED) for law in self.laws]}
 
 
 @one_blas_thread
@@ -69,7 +74,6 @@ def attribute(
     *,
     catalogue: Iterable[Effect] = full_catalogue,
     seed: int = 0,
-    substeps: int | None = None,
     most_transitions: int = MOST_TRANSITIONS,
     criteria: Criteria = DEFAULT,
     progress: Callable[[str], None] | None = None,
@@ -92,8 +96,6 @@ def attribute(
         Effects to consider.
     seed : int
         Seed of the search for the declared model's mode.
-    substeps : int, optional
-        Engine steps an interval to begin with; the scene's by default.
     most_transitions : int
         As of :func:`pbrl_ppl.close_loop`.
     criteria : Criteria
@@ -122,7 +124,7 @@ def attribute(
         [law.effect for law in found.laws]  # ['linear_drag', 'sliding_friction']
     """
     say, catalogue = progress or (lambda stage: None), tuple(catalogue)
-    declared = Declared(scene, catalogue, seed, substeps, criteria, say)
+    declared = Declared(scene, catalogue, seed, criteria, say)
     declared, history = declared.cleaned(history, most_transitions)
     _, found = Search(declared.missing, criteria, say).of(history, declared.mode, seed)
     problem = found.after.problem
@@ -146,7 +148,7 @@ class Ranking:
 
     Parameters
     ----------
-    candidates : tuple of Candidate
+    candidates : tuple of Law
         Best first.
     mode : dict of str to float
         The declared model's parameters there, by label, SI units.
@@ -156,10 +158,14 @@ class Ranking:
         Engine steps an interval that were needed.
     """
 
-    candidates: tuple[Candidate, ...]
+    candidates: tuple[Law, ...]
     mode: dict[str, float]
     unexplained_acceleration: dict[str, float]
     substeps: int
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the contents for JSON."""
+        return vars(self) | {"candidates": [one.in_json(CANDIDATE) for one in self.candidates]}
 
 
 @one_blas_thread
@@ -169,7 +175,6 @@ def criticise(
     *,
     catalogue: Iterable[Effect] = full_catalogue,
     seed: int = 0,
-    substeps: int | None = None,
     most_transitions: int = MOST_TRANSITIONS,
     criteria: Criteria = DEFAULT,
     progress: Callable[[str], None] | None = None,
@@ -189,8 +194,6 @@ def criticise(
         Effects to consider.
     seed : int
         Seed of the search for the mode.
-    substeps : int, optional
-        Engine steps an interval to begin with; the scene's by default.
     most_transitions : int
         As of :func:`pbrl_ppl.close_loop`.
     criteria : Criteria
@@ -212,7 +215,7 @@ def criticise(
     """
     say = progress or (lambda stage: None)
     catalogue = tuple(catalogue)
-    declared = Declared(scene, catalogue, seed, substeps, criteria, say)
+    declared = Declared(scene, catalogue, seed, criteria, say)
     declared, history = declared.cleaned(history, most_transitions)
     mode = declared.mode(history)
     say("scoring what the model might lack")

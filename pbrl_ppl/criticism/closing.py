@@ -6,14 +6,20 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Self
 
 import numpy as np
 
+from pbrl_ppl.criticism import results
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.held_out import HeldOut, example_rollout, longest_rollout, rollout_horizon
-from pbrl_ppl.criticism.loop import ADEQUATE, EFFECTS_ADDED, NOT_CONVERGED, UNEXPLAINED, Loop
+from pbrl_ppl.criticism.innovations import (
+    UnexplainedAcceleration,
+    noise_alone,
+    noise_without_unexplained,
+    unexplained_acceleration,
+)
 from pbrl_ppl.criticism.misfit import (
-    Misfit,
     find_misfit,
     held_out_forecasts,
     score_test,
@@ -21,28 +27,8 @@ from pbrl_ppl.criticism.misfit import (
 )
 from pbrl_ppl.criticism.prior_check import informative_horizon, prior_predictive_check
 from pbrl_ppl.criticism.refinement import Declared, checked_histories, outliers, shift
-from pbrl_ppl.criticism.results import (
-    NOTHING_RECORDED,
-    Acceleration,
-    Added,
-    Candidate,
-    Errors,
-    Estimate,
-    KindOfTest,
-    Numerical,
-    Part,
-    ResidualTest,
-    Stage,
-    Unexplained,
-)
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.criticism.search import Search, SearchResult
-from pbrl_ppl.criticism.unexplained import (
-    UnexplainedAcceleration,
-    noise_alone,
-    noise_without_unexplained,
-    unexplained_acceleration,
-)
 from pbrl_ppl.effects import Attached, Effect
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import (
@@ -55,7 +41,6 @@ from pbrl_ppl.errors import (
 from pbrl_ppl.history import (
     MOST_TRANSITIONS,
     History,
-    UnusedVelocity,
     drawn_pieces,
     thinned,
     with_units,
@@ -82,15 +67,9 @@ from pbrl_ppl.posterior import (
     interval,
     versions,
 )
-from pbrl_ppl.posterior import draws as posterior_draws
 from pbrl_ppl.sampling import WeightsError, sample
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.threads import one_blas_thread
-
-#: Draws of each chain by method, then those where that is not enough.
-_DRAWS = {"importance": (180, 600), "laplace": (60,)}
-#: The same of all other methods.
-_CHAIN_DRAWS = (300, 1000)
 
 
 @one_blas_thread
@@ -101,13 +80,12 @@ def close_loop(
     *,
     catalogue: Iterable[Effect] = full_catalogue,
     seed: int = 0,
-    substeps: int | None = None,
     draws: int | None = None,
     method: str = "importance",
     most_transitions: int = MOST_TRANSITIONS,
     criteria: Criteria = DEFAULT,
     progress: Callable[[str], None] | None = None,
-) -> Loop:
+) -> results.Loop:
     """Fit a model, add the effects that its residual shows, and compare on held-out data.
 
     Parameters
@@ -123,8 +101,6 @@ def close_loop(
         Effects to consider; add your own to the package's.
     seed : int
         The same seed gives the same result.
-    substeps : int, optional
-        Engine steps an interval to begin with; the scene's by default.
     draws : int, optional
         Posterior draws kept of each chain; by default 180 of importance sampling and 300 of chains,
         more where these do not suffice.
@@ -132,7 +108,7 @@ def close_loop(
         Sampler of :func:`pbrl_ppl.fit`; with ``laplace`` the verdict relies on modes.
     most_transitions : int
         Of a history with more, pieces of so many in all are used, drawn by the seed, those with
-        more motion more often; ``Loop.drawn`` says so. Time grows faster than they do.
+        more motion more often; ``Loop.data.drawn`` says so. Time grows faster than they do.
     criteria : Criteria
         Thresholds of the decisions.
     progress : callable, optional
@@ -176,20 +152,22 @@ def close_loop(
         after = float(train.dataset["number"].max()) + 1.0
         numbered = test.numbered(after) if scene.test_is_later else test
     scene, (train, test, numbered), thin = thinned(scene, train, test, numbered)
-    task = _Task(scene, tuple(catalogue), seed, substeps, criteria, say, draws=draws, method=method)
+    task = _Task(scene, tuple(catalogue), seed, criteria, say, draws=draws, method=method)
     drawn = partial(drawn_pieces, most=most_transitions, seed=seed)
     (train, said), (test, also), (numbered, _) = map(drawn, (train, test, numbered))
     said = (*thin, *said, *(f"held out: {one}" for one in also))
-    cleaned = _cleaned(task, train, numbered, said)
+    cleaned = _cleaned(task, train, numbered, results.Recordings(held_out=test, drawn=said))
     task = replace(task, scene=with_units(scene, cleaned.train))
     prior = _prior_test(task, cleaned.train)
     declared, found = _searched(task, cleaned)
-    judged = _tested(task, cleaned, prior, declared, found)
+    say(results.Stage.TEST)
+    fitted = _without_outliers(task, _Fitted.of(cleaned, declared, found))
+    judged = _tested(task, fitted, prior)
     try:
-        return _sampled(task, judged, test)
+        return _sampled(task, judged)
     except KeyboardInterrupt:
         laplace = replace(task, method="laplace")
-        raise LoopInterrupted(partial(_sampled, laplace, judged, test)) from None
+        raise LoopInterrupted(partial(_sampled, laplace, judged)) from None
 
 
 class LoopInterrupted(KeyboardInterrupt):
@@ -201,7 +179,7 @@ class LoopInterrupted(KeyboardInterrupt):
         Returns the loop with Gaussians at the modes in place of samples.
     """
 
-    def __init__(self, finish: Callable[[], Loop]) -> None:
+    def __init__(self, finish: Callable[[], results.Loop]) -> None:
         super().__init__("sampling was interrupted")
         self.finish = finish
 
@@ -220,13 +198,39 @@ class _Cleaned:
 
     train: History
     test: History
-    unused: tuple[UnusedVelocity, ...]
-    bad_frames: tuple[str, ...]
-    drawn: tuple[str, ...]
+    data: results.Recordings
 
 
 @dataclass(frozen=True, eq=False)
-class _Model:
+class _Fitted:
+    """The declared model on cleaned histories, and the laws that it lacks.
+
+    Parameters
+    ----------
+    cleaned : _Cleaned
+        The histories.
+    declared : FilteredMode
+        The declared model.
+    found : SearchResult
+        The laws.
+    innovations : FilteredMode
+        The model with the laws, with whole trajectories filtered.
+    """
+
+    cleaned: _Cleaned
+    declared: FilteredMode
+    found: SearchResult
+    innovations: FilteredMode
+
+    @classmethod
+    def of(cls, cleaned: _Cleaned, declared: FilteredMode, found: SearchResult) -> Self:
+        """Filter the model found."""
+        innovations = filtered_mode(declared, found.after) if found.laws else declared
+        return cls(cleaned, declared, found, innovations)
+
+
+@dataclass(frozen=True, eq=False)
+class _Tested:
     """A model: the mode that is sampled, its innovations, and what these leave unexplained.
 
     Parameters
@@ -247,7 +251,7 @@ class _Model:
     held_out: HeldOut
 
     @classmethod
-    def of(cls, mode: Mode, innovations: FilteredMode, test: History, criteria: Criteria) -> _Model:
+    def of(cls, mode: Mode, innovations: FilteredMode, test: History, criteria: Criteria) -> Self:
         """Test a mode's innovations, and linearise it along the test history."""
         if not is_simulated(mode.problem):  # single transitions
             mode = innovations
@@ -261,23 +265,35 @@ class _Judged:
 
     cleaned: _Cleaned
     found: SearchResult
-    declared: _Model
-    revised: _Model
-    misfit: Misfit
-    small: tuple[Candidate, ...]
-    rollout: int
+    declared: _Tested
+    revised: _Tested
+    misfit: results.Misfit
+    small: tuple[results.Law, ...]
+    horizon: int
     simulated: Mapping[str, float]
 
+    def compared(self, model: _Tested, fit: Fit, seed: int) -> results.ComparedModel:
+        """Return a model with its posterior and its held-out errors in units of the revised's."""
+        revised, simulated = self.revised, self.simulated
+        noise = noise_without_unexplained(revised.innovations, revised.excess)
+        errors = model.held_out.errors(revised.held_out, fit, self.horizon, seed, noise)
+        if simulated and model is not revised:
+            simulated = model.held_out.simulated()
+        residuals = model.held_out.residuals(revised.held_out)
+        return results.ComparedModel(
+            fit, model.innovations, replace(errors, simulated_rmse=simulated), residuals
+        )
 
-def _cleaned(task: _Task, train: History, test: History, drawn: tuple[str, ...]) -> _Cleaned:
+
+def _cleaned(task: _Task, train: History, test: History, data: results.Recordings) -> _Cleaned:
     """Check the histories and the effects; leave out what no model should be fitted to."""
-    cleaned = _Cleaned(*checked_histories(task.scene, train, test), drawn)
-    for sentence in (*drawn, *(column.sentence for column in cleaned.unused), *cleaned.bad_frames):
+    train, test, unused, bad_frames = checked_histories(task.scene, train, test)
+    for sentence in (*data.drawn, *(column.sentence for column in unused), *bad_frames):
         task.say(sentence)
     for effect in task.catalogue:
         if effect not in full_catalogue:
-            try_effect(effect, with_units(task.scene, cleaned.train), cleaned.train)
-    return cleaned
+            try_effect(effect, with_units(task.scene, train), train)
+    return _Cleaned(train, test, replace(data, velocities_not_used=unused, bad_frames=bad_frames))
 
 
 def _searched(task: _Task, cleaned: _Cleaned) -> tuple[FilteredMode, SearchResult]:
@@ -290,32 +306,30 @@ def _searched(task: _Task, cleaned: _Cleaned) -> tuple[FilteredMode, SearchResul
         return mode, search(find_mode(single_transitions(mode.problem), initial=mode.phi))
 
 
-def _tested(
-    task: _Task,
-    cleaned: _Cleaned,
-    prior: ResidualTest,
-    declared: FilteredMode,
-    found: SearchResult,
-) -> _Judged:
-    """Test the innovations of the model found, on the training and on the test history."""
-    task.say(Stage.TEST)
-    criteria = task.criteria
-    innovations = filtered_mode(declared, found.after) if found.laws else declared
-    train, frames = without_measurements(cleaned.train, outliers(innovations, criteria))
-    if frames:  # the data change, not the laws
+def _without_outliers(task: _Task, fitted: _Fitted) -> _Fitted:
+    """Leave out measurements that the model found contradicts; refit it, with the same laws."""
+    cleaned, criteria = fitted.cleaned, task.criteria
+    train, frames = without_measurements(cleaned.train, outliers(fitted.innovations, criteria))
+    if frames:
         task.say("; ".join(map(str, frames)))
-        cleaned = replace(cleaned, train=train, bad_frames=(*cleaned.bad_frames, *map(str, frames)))
-        declared = task.mode(train, declared)
-        found = found.on(declared)
-        innovations = filtered_mode(declared, found.after) if found.laws else declared
-    tested = HeldOut.of(innovations, cleaned.test)
-    off = outliers(replace(innovations, problem=tested.problem), criteria)
-    test, more = without_measurements(cleaned.test, off)
-    said = tuple(f"held out: {frame}" for frame in more)
-    cleaned = replace(cleaned, test=test, bad_frames=(*cleaned.bad_frames, *said))
-    before = revised = _Model.of(found.after, innovations, test, criteria)
+        declared = task.mode(train, fitted.declared)
+        cleaned = replace(cleaned, train=train)
+        fitted = _Fitted.of(cleaned, declared, fitted.found.on(declared))
+    innovations = fitted.innovations
+    held_out = replace(innovations, problem=HeldOut.of(innovations, cleaned.test).problem)
+    test, more = without_measurements(cleaned.test, outliers(held_out, criteria))
+    said = (*map(str, frames), *(f"held out: {frame}" for frame in more))
+    data = replace(cleaned.data, bad_frames=(*cleaned.data.bad_frames, *said))
+    return replace(fitted, cleaned=replace(cleaned, test=test, data=data))
+
+
+def _tested(task: _Task, fitted: _Fitted, prior: results.ResidualTest) -> _Judged:
+    """Test the innovations of the model found, on the training and on the test history."""
+    criteria, cleaned, found = task.criteria, fitted.cleaned, fitted.found
+    innovations, test = fitted.innovations, fitted.cleaned.test
+    before = revised = _Tested.of(found.after, innovations, test, criteria)
     if found.laws:
-        before = _Model.of(found.declared, declared, test, criteria)
+        before = _Tested.of(found.declared, fitted.declared, test, criteria)
     horizon = rollout_horizon(cleaned.train, task.scene)
     rollout = longest_rollout(test, horizon)
     noise, held_out = noise_alone(innovations, revised.excess), revised.held_out
@@ -323,37 +337,39 @@ def _tested(
     simulated = {} if collides else held_out.simulated()
     seconds = (int(test.dataset["n_rows"].max()) - 1) * task.scene.time_step
     # unusual laws that no climb tried are not compiled for a test
-    tried = [one for one in task.missing(innovations) if one in found.signatures]
+    tried = [one for one in task.missing(innovations) if one in found.candidates]
     ranked = rank_candidates(innovations, tried, criteria, task.say)
     misfit = find_misfit(innovations, revised.excess, horizon=horizon, seed=task.seed)
-    if not found.laws:  # a missing effect may be why the prior does not explain the data
-        misfit = misfit.with_test(prior)
-    at_test = replace(innovations, problem=held_out.problem)
-    for test_of in (
-        held_out_forecasts(at_test, noise, rollout, criteria),
+    tests = (
+        *misfit.tests,
+        # a missing effect may be why the prior does not explain the data
+        *(() if found.laws else (prior,)),
+        held_out_forecasts(
+            replace(innovations, problem=held_out.problem), noise, rollout, criteria
+        ),
         simulation_test(
             simulated, held_out.measurement_errors(noise), held_out.motion(), seconds, criteria
         ),
         score_test(innovations, ranked, criteria),
-    ):
-        misfit = misfit.with_test(test_of)
+    )
     small = tuple(one.candidate for one in ranked[:1] if one.candidate.p_value < criteria.try_p)
+    misfit = replace(misfit, tests=tests)
     return _Judged(cleaned, found, before, revised, misfit, small, rollout, simulated)
 
 
-def _sampled(task: _Task, judged: _Judged, recorded: History) -> Loop:
+def _sampled(task: _Task, judged: _Judged) -> results.Loop:
     """Sample the posteriors, compare the models on the test history, and return the verdict."""
-    task.say(Stage.SAMPLE)
+    task.say(results.Stage.SAMPLE)
     declared, revised = judged.declared, judged.revised
     models = [revised] if revised is declared else [declared, revised]
     fits = _fits(task, [model.mode for model in models])
-    task.say(Stage.COMPARE)
-    return _put_together(task, judged, fits[0], fits[-1], recorded)
+    task.say(results.Stage.COMPARE)
+    return _put_together(task, judged, fits[0], fits[-1])
 
 
-def _prior_test(task: _Task, train: History) -> ResidualTest:
+def _prior_test(task: _Task, train: History) -> results.ResidualTest:
     """Test whether the declared prior could have made the data, and warn before the long fit."""
-    task.say(Stage.CHECK_PRIOR)
+    task.say(results.Stage.CHECK_PRIOR)
     problem = Problem.of(
         Physics(task.scene, task.effects, threads=2), train, horizon=informative_horizon(train)
     )
@@ -366,7 +382,7 @@ def _prior_test(task: _Task, train: History) -> ResidualTest:
     if not passed:  # units may be wrong
         hint = "the declared prior does not explain this recording"
         warn(f"{hint}, unless a missing effect is why: {sentence}", PriorWarning)
-    return ResidualTest(KindOfTest.PRIOR, float("nan"), share, passed, sentence)
+    return results.ResidualTest(results.KindOfTest.PRIOR, float("nan"), share, passed, sentence)
 
 
 def _fits(task: _Task, modes: list[Mode]) -> list[Fit]:
@@ -374,8 +390,8 @@ def _fits(task: _Task, modes: list[Mode]) -> list[Fit]:
 
     What the data do not inform is said, and in the report: no conclusion depends on it.
     """
-    results = [_fit(task, mode) for mode in modes]
-    issued = {str(message): message for _, caught in results for message in caught}
+    fits = [_fit(task, mode) for mode in modes]
+    issued = {str(message): message for _, caught in fits for message in caught}
     uninformed = [
         text for text, warning in issued.items() if isinstance(warning, UninformedWarning)
     ]
@@ -384,7 +400,7 @@ def _fits(task: _Task, modes: list[Mode]) -> list[Fit]:
     for text, message in issued.items():
         if text not in uninformed:
             warn(message)
-    return [fitted for fitted, _ in results]
+    return [fitted for fitted, _ in fits]
 
 
 def _fit(task: _Task, mode: Mode) -> tuple[Fit, list[Warning]]:
@@ -392,7 +408,9 @@ def _fit(task: _Task, mode: Mode) -> tuple[Fit, list[Warning]]:
     if is_simulated_mode(mode):
         mode = tempered_mode(mode)
     method = task.method
-    for n in _DRAWS.get(method, _CHAIN_DRAWS) if task.draws is None else (task.draws,):
+    # draws of each chain, then those where that is not enough
+    enough = {"importance": (180, 600), "laplace": (60,)}.get(method, (300, 1000))
+    for n in enough if task.draws is None else (task.draws,):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             draw = partial(
@@ -428,78 +446,50 @@ def _converged(fit: Fit, criteria: Criteria) -> bool:
     return record.max_rhat <= criteria.worst_rhat and record.min_ess >= criteria.least_ess
 
 
-def _put_together(task: _Task, judged: _Judged, before: Fit, after: Fit, recorded: History) -> Loop:
-    """Return the result of the stages; errors are forecasts of ``judged.rollout`` intervals."""
-    cleaned, misfit, rollout = judged.cleaned, judged.misfit, judged.rollout
-    declared, revised = judged.declared, judged.revised
-    held_out = revised.held_out
-    error_before, error_after = _errors(judged, before, after, task.seed)
+def _put_together(task: _Task, judged: _Judged, before: Fit, after: Fit) -> results.Loop:
+    """Return the result of the stages."""
+    declared, revised, found = judged.declared, judged.revised, judged.found
+    last = judged.compared(revised, after, task.seed)
+    first = last if declared is revised else judged.compared(declared, before, task.seed)
     converged = all(_converged(fit, task.criteria) for fit in (before, after))
     verdict, unexplained = _verdict(
-        misfit, judged.found, error_before, error_after, converged, task.criteria
+        judged.misfit, found, first.errors, last.errors, converged, task.criteria
     )
-    added = _added(judged, after)
+    added = tuple(_with_posterior(law, one, after) for one, law in found.laws.items())
     keep_groups(after.posterior, added)
     alone = noise_alone(revised.innovations, revised.excess)
-    return Loop(
+    substeps = task.scene.substeps, revised.innovations.problem.physics.substeps
+    return results.Loop(
         scene=task.scene,
         verdict=verdict,
-        numerical=Numerical(
-            task.scene.substeps,
-            revised.innovations.problem.physics.substeps,
-            shift(revised.innovations),
-        ),
-        candidates=_explained(judged),
-        added=added,
         unexplained=unexplained,
-        before=error_before,
-        after=error_after,
-        noise_floor=held_out.noise_floor(alone, rollout),
-        declared=before,
-        revised=after,
-        innovations=(declared.innovations, revised.innovations),
-        residuals_before=declared.held_out.residuals(held_out),
-        residuals_after=held_out.residuals(held_out),
-        rollout=example_rollout(declared.held_out, held_out),
-        rollout_horizon=rollout,
-        provenance=_provenance(task, judged),
-        tests=misfit.tests,
+        numerical=results.Numerical(*substeps, shift(revised.innovations)),
+        data=replace(judged.cleaned.data, provenance=_provenance(task, judged)),
+        found=results.Found(
+            tuple(found.candidates.values()), added, judged.small,
+            found.lesser, found.hypotheses, found.lengths,
+        ),
+        declared=first,
+        revised=last,
+        misfit=judged.misfit,
         acceleration=_acceleration(declared.excess, revised.excess),
-        correlations=misfit.correlations,
-        growth=misfit.growth,
-        search=judged.found.lengths,
-        small=judged.small,
-        lesser=_parts(judged.found.small),
-        hypotheses=_parts(judged.found.hypotheses),
+        forecasts=results.Forecasts(
+            revised.held_out.noise_floor(alone, judged.horizon),
+            example_rollout(declared.held_out, revised.held_out),
+            judged.horizon,
+        ),
         identifiability=identify(after.posterior, mode=revised.mode),
         loo=_compared(declared.mode, revised.mode, before, after),
-        velocities_not_used=cleaned.unused,
-        bad_frames=cleaned.bad_frames,
-        drawn=cleaned.drawn,
         criteria=task.criteria,
-        held_out=recorded,
         catalogue=task.catalogue,
-    )
+    )  # fmt: skip
 
 
-def _errors(judged: _Judged, before: Fit, after: Fit, seed: int) -> tuple[Errors, Errors]:
-    """Return the held-out errors of both models, in units of the revised model's noise."""
-    declared, revised = judged.declared, judged.revised
-    unit = noise_without_unexplained(revised.innovations, revised.excess)
-
-    def of(model: _Model, fit: Fit, simulated: Mapping[str, float]) -> Errors:
-        errors = model.held_out.errors(revised.held_out, fit, judged.rollout, seed, unit)
-        return replace(errors, simulated_rmse=simulated)
-
-    last = of(revised, after, judged.simulated)
-    if declared is revised:
-        return last, last
-    return of(declared, before, declared.held_out.simulated() if judged.simulated else {}), last
-
-
-def _acceleration(before: UnexplainedAcceleration, after: UnexplainedAcceleration) -> Acceleration:
+def _acceleration(
+    before: UnexplainedAcceleration, after: UnexplainedAcceleration
+) -> results.Acceleration:
     """Return the unexplained acceleration of both models by velocity."""
-    return Acceleration(
+    return results.Acceleration(
         before.by_name(before.size),
         after.by_name(after.size),
         before.by_name(before.relative),
@@ -519,8 +509,8 @@ def _provenance(task: _Task, judged: _Judged) -> dict[str, object]:
         "transitions": train.n_transitions,
         "trajectories": train.n_trajectories,
         "test_transitions": test.n_transitions,
-        "rollout_horizon": judged.rollout,
-        "rollout_seconds": judged.rollout * task.scene.time_step,
+        "rollout_horizon": judged.horizon,
+        "rollout_seconds": judged.horizon * task.scene.time_step,
     }
 
 
@@ -534,20 +524,14 @@ def _compared(declared: Mode, revised: Mode, before: Fit, after: Fit) -> Compari
     return compare(before.posterior, after.posterior) if alike else None
 
 
-def _parts(shares: Mapping[Attached, float]) -> tuple[Part, ...]:
-    """Return laws that are not added, those that take most off first."""
-    parts = [Part(law.effect.name, law.body, share) for law, share in shares.items()]
-    return tuple(sorted(parts, key=lambda one: -one.share))
-
-
 def _verdict(
-    misfit: Misfit,
+    misfit: results.Misfit,
     found: SearchResult,
-    before: Errors,
-    after: Errors,
+    before: results.Errors,
+    after: results.Errors,
     converged: bool,
     criteria: Criteria,
-) -> tuple[str, Unexplained | None]:
+) -> tuple[str, results.Unexplained | None]:
     """Return the verdict and what is unexplained, from tests and held-out errors alone.
 
     What remains beside named laws and is small, so that forecasts are at the noise floor, changes
@@ -555,56 +539,23 @@ def _verdict(
     """
     unexplained, laws = misfit.unexplained, found.laws
     if found.doubt:
-        return UNEXPLAINED, Unexplained("", "", NOTHING_RECORDED, 0.0, float("nan"), found.doubt)
+        return results.UNEXPLAINED, results.Unexplained.somewhere(found.doubt)
     worse = after.normalised_rmse > (1.0 + criteria.negligible) * max(before.normalised_rmse, 1.0)
     if laws and worse:
-        unexplained = _worse(before, after)
-    if not converged:
-        return NOT_CONVERGED, unexplained
-    if (laws and worse) or (unexplained is not None and not (laws and misfit.predicts(criteria))):
-        return UNEXPLAINED, unexplained
-    return (EFFECTS_ADDED if laws else ADEQUATE), unexplained
-
-
-def _worse(before: Errors, after: Errors) -> Unexplained:
-    """Return what is unexplained where the revised model's held-out error is the larger one."""
-    rise = after.normalised_rmse / before.normalised_rmse - 1.0
-    sentence = (
-        "the revised model forecasts the held-out trajectories worse than the declared one: its"
-        f" error is {100 * rise:.2g} % larger, {after.normalised_rmse:.3g} against"
-        f" {before.normalised_rmse:.3g} times the noise"
-    )
-    return Unexplained("", "", NOTHING_RECORDED, 0.0, float("nan"), sentence)
-
-
-def _explained(judged: _Judged) -> tuple[Candidate, ...]:
-    """Return the candidates with what simulations say of each, and the decision on it."""
-    found, result = judged.found, []
-    groups = {rival: law for law, rivals in found.confounded.items() for rival in rivals}
-    shares = {**found.small, **found.hypotheses}
-    for law, signature in found.signatures.items():
-        why = "takes too little off the error of simulated trajectories"
-        alone = found.tried.get(law)
-        if law in found.laws:
-            why = "added"
-        elif law in shares:
-            why = f"takes {100 * shares[law]:.2g} % off the error of simulated trajectories"
-        elif law in groups:
-            why = f"explains these data as well as {groups[law].effect.name.replace('_', ' ')}"
-        elif law in found.rejected:
-            why = found.rejected[law]
-        result.append(
-            replace(
-                signature.candidate,
-                why=why,
-                simulated_nats=alone[0] if alone else None,
-                simulated_share=alone[1] if alone else None,
-            )
+        rise = after.normalised_rmse / before.normalised_rmse - 1.0
+        unexplained = results.Unexplained.somewhere(
+            "the revised model forecasts the held-out trajectories worse than the declared one:"
+            f" its error is {100 * rise:.2g} % larger, {after.normalised_rmse:.3g} against"
+            f" {before.normalised_rmse:.3g} times the noise"
         )
-    return tuple(result)
+    if not converged:
+        return results.NOT_CONVERGED, unexplained
+    if (laws and worse) or (unexplained is not None and not (laws and misfit.predicts(criteria))):
+        return results.UNEXPLAINED, unexplained
+    return (results.EFFECTS_ADDED if laws else results.ADEQUATE), unexplained
 
 
-def keep_groups(posterior: Idata, added: Iterable[Added]) -> None:
+def keep_groups(posterior: Idata, added: Iterable[results.Law]) -> None:
     """Record in a posterior's attributes which effects its recording cannot separate."""
     groups = tuple(
         tuple(
@@ -617,33 +568,13 @@ def keep_groups(posterior: Idata, added: Iterable[Added]) -> None:
     replace(PosteriorRecord.of(posterior), not_separable=groups).write(posterior)
 
 
-def _added(judged: _Judged, revised: Fit) -> tuple[Added, ...]:
-    """Return the added effects with their posterior."""
-    found, drawn = judged.found, posterior_draws(revised.posterior)
-    effects = judged.revised.mode.problem.physics.effects
-    added = []
-    for law, words in found.laws.items():
-        bodies = [one.body for one in effects if one.effect.name == law.effect.name]
-        estimates = {}
-        for parameter in law.effect.parameters:
-            values = drawn[law.effect.variable(parameter)][:, bodies.index(law.body)]
-            estimates[parameter.name] = Estimate(
-                float(values.mean()), float(values.std()), interval(values), parameter.unit
-            )
-        gained, error = found.gains[law]
-        added.append(
-            Added(
-                effect=words.effect,
-                body=words.body,
-                sentence=words.sentence,
-                statistic=found.signatures[law].candidate.statistic,
-                p_value=found.signatures[law].candidate.p_value,
-                parameters=estimates,
-                not_separable_from=words.confounded,
-                elpd_difference=gained,
-                elpd_difference_se=error,
-                simulated_nats=words.nats,
-                simulated_share=words.share,
-            )
+def _with_posterior(law: results.Law, attached: Attached, revised: Fit) -> results.Law:
+    """Return a law with the posterior of its parameters in the revised model."""
+    phi, places = revised.draws[0], revised.problem.layout.places(attached.labels)
+    parameters = {
+        parameter.name: results.Estimate(
+            float(values.mean()), float(values.std()), interval(values), parameter.unit
         )
-    return tuple(added)
+        for parameter, values in zip(attached.effect.parameters, phi.T[places], strict=True)
+    }
+    return replace(law, parameters=parameters)

@@ -9,14 +9,12 @@ import numpy as np
 from scipy.special import logsumexp
 
 from pbrl_ppl.criticism.results import Errors, Rollout
-from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History, longest_gap
 from pbrl_ppl.likelihood import (
     FilteredProblem,
     TrajectoryNoise,
     along_trajectories,
     in_pieces,
-    observed_coordinates,
 )
 from pbrl_ppl.modes import MOST_GROWTH, FilteredMode, fit_pieces, growth
 from pbrl_ppl.posterior import Fit
@@ -38,15 +36,12 @@ class Forecast:
         where the prediction diverges.
     variance : ndarray
         Expected square of the error under measurement noise, shape (start, cell).
-    motion : ndarray
-        Measured change over the forecast, shape (start, cell), SI units; NaN where not measured.
     dimension : ndarray of int
         State dimension of each cell, shape (cell,).
     """
 
     error: Floats
     variance: Floats
-    motion: Floats
     dimension: Ints
 
     def rmse(self) -> dict[str, float]:
@@ -190,7 +185,7 @@ def forecast(
     at = np.concatenate(starts) if starts else np.zeros(0, dtype=np.intp)
     if not len(at):
         none = np.zeros((0, len(coordinates.places)))
-        return Forecast(none, none, none, coordinates.places % len(STATE))
+        return Forecast(none, none, coordinates.places % len(STATE))
     trajectory, step = segments.trajectory[at], segments.step[at]
     every = at[:, None] + np.arange(intervals)
     states = filtered_states(problem, phi, sigma)[trajectory, step]
@@ -200,8 +195,9 @@ def forecast(
     measured_ends = coordinates.of(observed[trajectory, step + intervals])
     error = coordinates.wrapped(measured_ends - ends)
     error[np.isfinite(measured_ends) & np.isnan(ends)] = np.inf
-    motion = measured_ends - coordinates.of(states)
-    covariance = _spread(noise, sigma, at, step)
+    covariance = noise.covariance(sigma)[at - 1]
+    for begin in np.flatnonzero(step == 0):
+        covariance[begin] = _first_spread(noise, sigma, int(at[begin]))
     free, touching = coordinates.steps(sigma)
     contact = touching - free  # uncertainty of how bodies part
     pushes = np.zeros((len(coordinates.places), 0))
@@ -218,15 +214,7 @@ def forecast(
         variance = np.diagonal(covariance, axis1=1, axis2=2) + coordinates.errors(sigma) ** 2
         variance = variance + (pushed**2).sum(axis=2)
     variance = np.where(np.isnan(variance), np.inf, variance)
-    return Forecast(error, variance, motion, coordinates.places % len(STATE))
-
-
-def _spread(noise: TrajectoryNoise, sigma: Floats, at: Ints, step: Ints) -> Floats:
-    """Return the covariance of filtered states before transitions, shape (start, cell, cell)."""
-    after = noise.covariance(sigma)[at - 1]
-    for i in np.flatnonzero(step == 0):
-        after[i] = _first_spread(noise, sigma, int(at[i]))
-    return after
+    return Forecast(error, variance, coordinates.places % len(STATE))
 
 
 def _first_spread(noise: TrajectoryNoise, sigma: Floats, first: int) -> Floats:
@@ -278,24 +266,8 @@ class HeldOut:
 
     @classmethod
     def of(cls, mode: FilteredMode, history: History) -> HeldOut:
-        """Linearise a fitted model along held-out trajectories.
-
-        Raises
-        ------
-        HistoryError
-            If they measure what the training history does not.
-        """
+        """Linearise a fitted model along held-out trajectories, which measure nothing else."""
         coordinates = mode.problem.likelihood.noise.coordinates
-        measured = observed_coordinates(mode.problem.scene, history).sensors
-        if not set(measured) <= set(coordinates.sensors):
-            names = [
-                ", ".join(STATE[d] for d in dimensions)
-                for dimensions in (measured, coordinates.sensors)
-            ]
-            raise HistoryError(
-                f"test history measures {names[0]}, the training history {names[1]}; they must"
-                " be the same"
-            )
         problem = mode.problem.with_data(history=history, states=None)
         return cls(mode, along_trajectories(problem, mode.phi, mode.sigma, coordinates))
 
@@ -378,7 +350,7 @@ class HeldOut:
     def noise_floor(self, sigma: Floats, rollout: int) -> Errors:
         """Return the errors that measurement noise alone makes, at both ends of a forecast.
 
-        ``sigma`` are the noise parameters of :func:`pbrl_ppl.criticism.unexplained.noise_alone`.
+        ``sigma`` are the noise parameters of :func:`pbrl_ppl.criticism.innovations.noise_alone`.
         """
         noise, phi = self.problem.likelihood.noise, self.mode.phi
         at_best, cells = -noise.log_scale(self.mode.sigma).sum(), noise.seen.sum()

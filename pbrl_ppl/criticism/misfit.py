@@ -3,79 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.stats import chi2
 
-from pbrl_ppl.criticism.correlation import correlation_tests
 from pbrl_ppl.criticism.criteria import Criteria
-from pbrl_ppl.criticism.dependence import find_dependence
 from pbrl_ppl.criticism.held_out import forecast
-from pbrl_ppl.criticism.results import (
-    NOTHING_RECORDED,
-    Correlations,
-    Growth,
-    KindOfTest,
-    ResidualTest,
-    Unexplained,
-)
-from pbrl_ppl.criticism.score import Signature
-from pbrl_ppl.criticism.unexplained import (
+from pbrl_ppl.criticism.innovations import (
     UnexplainedAcceleration,
+    correlation_tests,
+    find_dependence,
     innovations_over_steps,
     noise_alone,
 )
+from pbrl_ppl.criticism.results import (
+    Growth,
+    KindOfTest,
+    Misfit,
+    ResidualTest,
+)
+from pbrl_ppl.criticism.score import Signature
 from pbrl_ppl.likelihood import bodies_acceleration
 from pbrl_ppl.modes import FilteredMode
 from pbrl_ppl.state import STATE, STATE_UNITS, Floats, acceleration_unit
 
-#: Shares of the bodies' acceleration from here on are of bodies that hardly accelerate.
+#: Share of the bodies' acceleration above which percentages are omitted.
 LARGEST_SHARE = 0.995
-
-
-@dataclass(frozen=True, eq=False)
-class Misfit:
-    """Tests of a model's residual, and where it has structure that no effect explains.
-
-    Parameters
-    ----------
-    tests : tuple of ResidualTest
-        In the order of the report.
-    unexplained : Unexplained or None
-        Where the structure is strongest; None where all tests are passed.
-    correlations : Correlations
-        Correlations of the innovations.
-    growth : Growth
-        Growth of the forecasts' errors.
-    """
-
-    tests: tuple[ResidualTest, ...]
-    unexplained: Unexplained | None
-    correlations: Correlations
-    growth: Growth
-
-    def predicts(self, criteria: Criteria) -> bool:
-        """Return whether forecasts and simulations are as good as noise lets them be.
-
-        What remains is then small: significant one step ahead, and not over a forecast. Beside an
-        unexplained acceleration forecasts must be near the noise; that none is known to be worse is
-        not enough. A test that is missing is not passed.
-        """
-        tests = {test.name: test for test in self.tests}
-        forecasts = (KindOfTest.FORECASTS, KindOfTest.HELD_OUT)
-        whole = (*forecasts, KindOfTest.SIMULATION)
-        if not all(kind in tests and tests[kind].passed for kind in whole):
-            return False
-        near = all(tests[kind].size < criteria.worse_forecast for kind in forecasts)
-        return near or tests[KindOfTest.ACCELERATION].passed
-
-    def with_test(self, test: ResidualTest) -> Misfit:
-        """Return the misfit with one more test, which is the unexplained one if no other fails."""
-        unexplained = self.unexplained
-        if unexplained is None and not test.passed:
-            unexplained = _unexplained(test)
-        return replace(self, tests=(*self.tests, test), unexplained=unexplained)
 
 
 def find_misfit(
@@ -98,18 +52,7 @@ def find_misfit(
     of_correlation, correlations = correlation_tests(mode, excess.criteria)
     of_forecasts, growth = _forecasts(mode, noise_alone(mode, excess), horizon, excess.criteria)
     tests = (_acceleration(mode, excess), *of_correlation, of_forecasts, of_dependence)
-    failed = [test for test in tests if not test.passed]
-    unexplained = None
-    if failed:
-        unexplained = dependence or _unexplained(failed[0])
-    return Misfit(tests, unexplained, correlations, growth)
-
-
-def _unexplained(test: ResidualTest) -> Unexplained:
-    """Return what a failed test found, which depends on no recorded quantity."""
-    return Unexplained(
-        test.body, test.dimension, NOTHING_RECORDED, test.size, test.p_value, test.sentence
-    )
+    return Misfit(tests, dependence, correlations, growth)
 
 
 def _acceleration(mode: FilteredMode, excess: UnexplainedAcceleration) -> ResidualTest:
@@ -203,13 +146,10 @@ def simulation_test(
         return ResidualTest.untested(
             KindOfTest.SIMULATION, "no simulation is as long as a held-out trajectory"
         )
-    name = max(simulated, key=lambda one: simulated[one] / noise[one])
-    error, times = simulated[name], simulated[name] / noise[name]
     far = {one: size for one, size in simulated.items() if size > criteria.negligible * motion[one]}
     passed = all(size < criteria.worst_simulation * noise[one] for one, size in far.items())
-    if not passed:
-        name = max(far, key=lambda one: far[one] / noise[one])
-        error, times = simulated[name], simulated[name] / noise[name]
+    name = max(simulated if passed else far, key=lambda one: simulated[one] / noise[one])
+    error, times = simulated[name], simulated[name] / noise[name]
     sentence = (
         f"held-out trajectories, simulated over {seconds:.3g} s, are {error:.3g}"
         f" {STATE_UNITS[STATE.index(name)]} off in {name}, {times:.3g} times the measurement noise"

@@ -110,10 +110,7 @@ def prior_predictive_check(
     *,
     draws: int = 400,
     seed: int = 0,
-    fixed: Mapping[str, float] | None = None,
     criteria: PriorCriteria = DEFAULT.prior,
-    chunk: int = 16,
-    slack: float = 0.25,
     least_draws: int = 50,
 ) -> PriorCheck:
     """Compare measured changes over a segment with predictions under the prior.
@@ -132,14 +129,8 @@ def prior_predictive_check(
         and of few draws the largest varies from seed to seed.
     seed : int
         The same seed gives the same answer.
-    fixed : mapping of str to float, optional
-        Parameters that have these values in every draw, by their labels.
     criteria : PriorCriteria
         When the prior could not have made the data.
-    chunk : int
-        Draws simulated at once.
-    slack : float
-        Share of the usual change by which draws may miss where velocities were not measured.
     least_draws : int
         Draws that the check needs.
 
@@ -181,22 +172,19 @@ def prior_predictive_check(
     # of bodies that are seen now and then, the last measured row counts
     steps = np.arange(1, observations.values.shape[1] + 1)[:, None, None]
     last = np.maximum((steps * observations.measured).max(axis=1), 1) - 1
-    measured = _at(observations.values, last)
-    measured = observations.wrapped(measured - first)
+    measured = observations.wrapped(_at(observations.values, last) - first)
     for velocity in unused:
         if (d := STATE.index(velocity.state)) in columns:
             measured[:, history.bodies.index(velocity.body), columns.index(d)] = np.nan
     phi = draw_prior(problem, rng, draws)
-    for label, value in (fixed or {}).items():
-        phi[:, problem.layout.labels.index(label)] = value
-    ends = _predicted_ends(problem, phi, last, chunk)
+    ends = _predicted_ends(problem, phi, last)
     exact = observations.wrapped(ends - first)
     predicted = ends + _noise_of_changes(problem, history) * rng.standard_normal(exact.shape)
-    derived = np.ones(measured.shape[1:])
-    for i, d in enumerate(columns):
-        derived[:, i] = ~recorded[:, d if d >= len(POSE) else d + len(POSE)]
-    dataset = _compare(observations.wrapped(predicted - first), measured, slack * derived)
-    dataset = dataset.merge(_factors(exact, measured))
+    derived = ~recorded[:, [d if d >= len(POSE) else d + len(POSE) for d in columns]]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of what was never measured all is NaN
+        dataset = _compare(observations.wrapped(predicted - first), measured, derived)
+        dataset = dataset.merge(_factors(exact, measured))
     fall = wrong_clock(history, problem.scene)
     coords = {
         "body": [body.name for body in problem.scene.moving],
@@ -213,10 +201,10 @@ def prior_predictive_check(
     )
 
 
-def _predicted_ends(problem: Problem, phi: Floats, last: Ints, chunk: int) -> Floats:
+def _predicted_ends(problem: Problem, phi: Floats, last: Ints, *, chunk: int = 16) -> Floats:
     """Return what is predicted at the last measured rows, (draw, transition, body, state).
 
-    Draws on which the engine diverges are left out.
+    Draws on which the engine diverges are left out; ``chunk`` of them are simulated at once.
 
     Raises
     ------
@@ -256,12 +244,8 @@ def _noise_of_changes(problem: Problem, history: History) -> Floats:
 def _factors(exact: Floats, measured: Floats) -> xr.Dataset:
     """Return quantiles over draws of the ratio of measured (transition, body, state) changes."""
     seen = np.where(np.isfinite(measured), exact, 0.0)
-    square = (seen**2).sum(axis=1)
-    product = (seen * np.nan_to_num(measured)).sum(axis=1)
-    factor = np.divide(product, square, out=np.full_like(square, np.nan), where=square > 0)
-    some = np.isfinite(factor).any(axis=0)
-    quantiles = np.nanquantile(np.where(some, factor, 0.0), QUANTILES, axis=0)
-    quantiles = np.where(some, quantiles, np.nan)
+    factor = (seen * np.nan_to_num(measured)).sum(axis=1) / (seen**2).sum(axis=1)
+    quantiles = np.nanquantile(factor, QUANTILES, axis=0)
     return xr.Dataset({"factor": (("quantile", "body", "state"), quantiles)})
 
 
@@ -322,9 +306,8 @@ def informative_horizon(history: History, signal: float = 5.0) -> int:
     noise = _mean_square(places, angle, 1, 3) / 20.0
     changes = np.array([_mean_square(places, angle, step, 1) for step in steps])
     informative = changes >= signal**2 * noise
-    moves = (informative & (changes > 0.0)).any(
-        axis=0
-    )  # what never moves beyond its noise does not decide
+    # what never moves beyond its noise does not decide
+    moves = (informative & (changes > 0.0)).any(axis=0)
     enough = informative[:, moves].all(axis=1) & moves.any()
     return steps[int(enough.argmax())] if enough.any() else steps[-1]
 
@@ -338,11 +321,8 @@ def _mean_square(values: Floats, angle: Bools, steps: int, order: int) -> Floats
     for _ in range(order):
         change = change[:, steps:] - change[:, :-steps]
         change = np.where(angle[:, None], wrapped(change), change)
-    if not change.size:
-        return np.zeros(len(values))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # means of no measurements
-        return np.asarray(np.nan_to_num(np.nanmean(change**2, axis=1)))
+    count = (~np.isnan(change)).sum(axis=1)
+    return np.asarray(np.nansum(change**2, axis=1) / np.maximum(count, 1))
 
 
 def _measurement_noise(
@@ -378,40 +358,36 @@ def _measurement_noise(
     return noises
 
 
-def _compare(predicted: Floats, measured: Floats, slack: Floats) -> xr.Dataset:
+def _compare(
+    predicted: Floats, measured: Floats, derived: Bools, *, slack: float = 0.25
+) -> xr.Dataset:
     """Return summaries of changes (draw, transition, body, state), and (transition, body, state).
 
-    Draws reach measurements within ``slack``, a share of the usual change, shape (body, state).
+    Where velocities are ``derived``, shape (body, state), draws reach measurements within ``slack``
+    of the usual change.
     """
     seen = np.isfinite(measured)
     low, high = np.quantile(predicted, [QUANTILES[0], QUANTILES[-1]], axis=0)
     inside = (measured >= low) & (measured <= high)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # means of no measurements
-        slack = slack * np.sqrt(np.nanmean(measured**2, axis=0))
-    low_end, high_end = predicted.min(axis=0) - slack, predicted.max(axis=0) + slack
+    near = slack * derived * np.sqrt(np.nanmean(measured**2, axis=0))
+    low_end, high_end = predicted.min(axis=0) - near, predicted.max(axis=0) + near
     farther = np.maximum(measured - high_end, low_end - measured)
     beyond = farther > 0.0
-    total = np.maximum(seen.sum(axis=0), 1)
+    count = seen.sum(axis=0)
     # cells that were not measured count on neither side
     pooled = np.where(seen, predicted, np.nan).reshape(-1, *measured.shape[1:])
     dims = ("body", "state")
-    some = seen.any(axis=0)
-    safe = np.where(some, 1.0, np.nan)
-    pooled, cells = (np.where(some, values, 0.0) for values in (pooled, measured))
-    predicted_quantiles = np.nanquantile(pooled, QUANTILES, axis=0) * safe
-    measured_quantiles = np.nanquantile(cells, QUANTILES, axis=0) * safe
     return xr.Dataset(
         {
-            "predicted": (("quantile", *dims), predicted_quantiles),
-            "measured": (("quantile", *dims), measured_quantiles),
-            "predicted_sd": (dims, np.nanstd(pooled, axis=0) * safe),
-            "measured_sd": (dims, np.nanstd(cells, axis=0) * safe),
-            "predicted_extent": (dims, np.nanquantile(np.abs(pooled), HDI_PROB, axis=0) * safe),
-            "measured_largest": (dims, np.nanmax(np.abs(cells), axis=0) * safe),
-            "share_inside": (dims, inside.sum(axis=0) / total * safe),
-            "share_beyond": (dims, beyond.sum(axis=0) / total * safe),
+            "predicted": (("quantile", *dims), np.nanquantile(pooled, QUANTILES, axis=0)),
+            "measured": (("quantile", *dims), np.nanquantile(measured, QUANTILES, axis=0)),
+            "predicted_sd": (dims, np.nanstd(pooled, axis=0)),
+            "measured_sd": (dims, np.nanstd(measured, axis=0)),
+            "predicted_extent": (dims, np.nanquantile(np.abs(pooled), HDI_PROB, axis=0)),
+            "measured_largest": (dims, np.nanmax(np.abs(measured), axis=0)),
+            "share_inside": (dims, inside.sum(axis=0) / count),
+            "share_beyond": (dims, beyond.sum(axis=0) / count),
             "largest_beyond": (dims, np.nanmax(np.where(seen, farther, 0.0), axis=0).clip(0.0)),
-            "cells": (dims, seen.sum(axis=0)),
+            "cells": (dims, count),
         }
     ).transpose("body", "state", "quantile")

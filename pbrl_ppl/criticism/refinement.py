@@ -10,8 +10,8 @@ import numpy as np
 from scipy.stats import norm
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
+from pbrl_ppl.criticism.innovations import unexplained_acceleration, without_acceleration
 from pbrl_ppl.criticism.results import Stage
-from pbrl_ppl.criticism.unexplained import unexplained_acceleration, without_acceleration
 from pbrl_ppl.effects import Attached, Effect, attach, candidates
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import (
@@ -35,7 +35,7 @@ from pbrl_ppl.modes import (
     trajectory_mode,
 )
 from pbrl_ppl.physics import Physics
-from pbrl_ppl.scene import Scene, check_substeps
+from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE, Floats, Ints
 
 
@@ -183,21 +183,15 @@ class Declared:
         With natural units of the recording.
     catalogue : tuple of Effect
         Effects that are tried, and where declared ones are looked up.
-    seed, substeps, criteria, say
+    seed, criteria, say
         As of :func:`pbrl_ppl.close_loop`; ``say`` is its ``progress``.
     """
 
     scene: Scene
     catalogue: tuple[Effect, ...]
     seed: int
-    substeps: int | None
     criteria: Criteria
     say: Callable[[str], None]
-
-    def __post_init__(self) -> None:
-        """Check the substeps."""
-        if self.substeps is not None:
-            check_substeps(self.substeps)
 
     @property
     def effects(self) -> tuple[Attached, ...]:
@@ -232,28 +226,11 @@ class Declared:
         self.say(Stage.FIT)
         if of_part is not None:
             return mode_of_more(Problem.of(of_part.problem.physics, train), of_part)
-        return declared_mode(
-            self.scene, train, self.effects, self.seed, self.substeps, self.say, self.criteria
-        )
-
-
-def declared_mode(
-    scene: Scene,
-    history: History,
-    effects: tuple[Attached, ...],
-    seed: int,
-    substeps: int | None,
-    say: Callable[[str], None],
-    criteria: Criteria = DEFAULT,
-) -> FilteredMode:
-    """Return the declared model's mode on whole trajectories, with enough substeps."""
-    steps = scene.substeps if substeps is None else substeps
-    problem = Problem.of(Physics(scene, effects, steps, threads=2), history)
-    if substeps is None:
+        problem = Problem.of(Physics(self.scene, self.effects, threads=2), train)
         physics = problem.physics
         problem = problem.with_physics(substeps=max(physics.substeps, physics.fine_enough))
-    mode = find_mode(single_transitions(problem), seed=seed)
-    return with_enough_substeps(trajectory_mode(problem, mode.phi), say, criteria)
+        mode = find_mode(single_transitions(problem), seed=self.seed)
+        return with_enough_substeps(trajectory_mode(problem, mode.phi), self.say, self.criteria)
 
 
 def with_enough_substeps(

@@ -1,31 +1,73 @@
-"""Stages of a closed loop and parts of its result: candidates, added effects, tests, errors."""
+"""Result of a closed loop: what its stages found, and the files that it is saved in."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from pathlib import Path
+from typing import Any, Self
 
 import numpy as np
 
+from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
+from pbrl_ppl.effects import Effect
+from pbrl_ppl.effects import catalogue as full_catalogue
+from pbrl_ppl.errors import OutputError
+from pbrl_ppl.files import check_folder, json_values, temporary_folder
+from pbrl_ppl.history import History, UnusedVelocity
+from pbrl_ppl.modes import FilteredMode
+from pbrl_ppl.posterior import Comparison, Fit, Idata, Identifiability, save_posterior
+from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats
 
+#: The verdicts. NOT_CONVERGED: chains disagree; no verdict.
+ADEQUATE, EFFECTS_ADDED, UNEXPLAINED = "adequate", "effects-added", "unexplained"
+NOT_CONVERGED = "not-converged"
+#: Files of a saved loop and its report.
+FILES = ("report.html", "report.json", "before.nc", "after.nc")
+#: The file that is written last: where it is, the others belong to it.
+DONE = "report.json"
 #: What to know of effects that a recording of one trajectory shows.
 ONE_TRAJECTORY = (
     "a single trajectory cannot tell a law from a lasting random force: record a second one"
 )
 
 
+#: Keys of a law in JSON that are not the names of its fields.
+_KEYS = {
+    "looks": "n_grid_points", "caps": "is_upper_limit",
+    "nats": "simulated_nats", "share": "simulated_share", "confounded": "not_separable_from",
+}  # fmt: skip
+#: Keys of a candidate in JSON.
+CANDIDATE = (
+    "effect", "body", "sentence", "statistic", "dof", "p_value", "estimate", "units",
+    "identifiable", "looks", "detectable", "caps", "why", "simulated_nats", "simulated_share",
+)  # fmt: skip
+#: Keys of an added law in JSON.
+ADDED = (
+    "effect", "body", "statistic", "p_value", "parameters", "not_separable_from",
+    "elpd_difference", "elpd_difference_se", "simulated_nats", "simulated_share",
+)  # fmt: skip
+#: Keys of a law of the search in JSON, and of one that it does not add.
+NAMED = ("effect", "body", "sentence", "estimate", "sd", "units", "nats", "share", "confounded")
+ASIDE = ("effect", "body", "share")
+
+
 @dataclass(frozen=True)
-class Candidate:
-    """An effect that the model lacks, and its score test.
+class Law:
+    """A law that the declared model may lack: what each stage of the loop found out about it.
+
+    A candidate has a score test. Simulations give it evidence, alone and to first order or, if the
+    search names it, beside the other laws; the posterior of the revised model gives its parameters.
+    What is not known has its default.
 
     Parameters
     ----------
-    effect, body : str
-        Names of the effect and of the body.
-    sentence : str
-        The effect in words.
+    effect, body, sentence : str
+        Names of the effect and of the body, and the effect in words.
     statistic : float
         Score statistic S; chi-squared with ``dof`` degrees of freedom if the effect is absent.
     dof : int
@@ -34,7 +76,8 @@ class Candidate:
     p_value : float
         P-value of the statistic, corrected for the number of candidates.
     estimate : dict of str to float
-        First estimate of each parameter, from the signature alone.
+        Estimate of each parameter: from the signature alone, or the most probable value by
+        simulations.
     units : dict of str to str
         Unit of each parameter.
     identifiable : float
@@ -49,74 +92,54 @@ class Candidate:
         Whether smaller is stronger, as for a limit: larger ones than ``detectable`` are not seen.
     why : str
         Why the loop added it or did not; empty if it did not decide.
-    simulated_nats, simulated_share : float or None
-        The same candidate by simulation, alone, to first order, on the shortest pieces: net
-        log-evidence (nats), and the share of their error that it takes away; None if it is not
-        among the leading ones.
+    simulated_nats : float or None
+        Log-evidence of simulations for it, less its price (nats): of a law that is named what is
+        lost without it, summed over lengths of pieces; of a candidate alone, to first order, on the
+        shortest pieces; None if it is not among the leading ones.
+    simulated_share : float or None
+        Share of the simulation error (root mean square) that it takes off, on the longest pieces
+        or, of a candidate, on the shortest.
+    sd : dict of str to float
+        Standard deviation of each estimate by simulations, which allows for the residual's
+        correlation.
+    not_separable_from : tuple of str
+        Effects that explain these data as well.
+    parameters : dict of str to Estimate
+        Posterior of each parameter in the revised model.
+    elpd_difference, elpd_difference_se : float
+        Gain of expected log predictive density over the model without it, and its standard error
+        (nats).
     """
 
     effect: str
     body: str
-    sentence: str
-    statistic: float
-    dof: int
-    p_value: float
-    estimate: Mapping[str, float]
-    units: Mapping[str, str]
-    identifiable: float
-    n_grid_points: int = field(default=1, metadata={"key": "looks"})
+    sentence: str = ""
+    statistic: float = math.nan
+    dof: int = 0
+    p_value: float = math.nan
+    estimate: Mapping[str, float] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+    identifiable: float = math.nan
+    n_grid_points: int = 1
     detectable: Mapping[str, float] = field(default_factory=dict)
-    is_upper_limit: bool = field(default=False, metadata={"key": "caps"})
+    is_upper_limit: bool = False
     why: str = ""
     simulated_nats: float | None = None
     simulated_share: float | None = None
+    sd: Mapping[str, float] = field(default_factory=dict)
+    not_separable_from: tuple[str, ...] = ()
+    parameters: Mapping[str, Estimate] = field(default_factory=dict)
+    elpd_difference: float = math.nan
+    elpd_difference_se: float = math.nan
 
+    @property
+    def chance(self) -> float:
+        """The smaller of the p-value and, by simulations, the odds against the effect."""
+        return min(self.p_value, float(np.exp(-(self.simulated_nats or 0.0))))
 
-@dataclass(frozen=True)
-class Law:
-    """A law that the simulation error of trajectories shows.
-
-    Parameters
-    ----------
-    effect, body, sentence : str
-        Names of the effect and of the body, and the effect in words.
-    estimate, sd, units : dict of str to float or str
-        Most probable value of each parameter, its standard deviation, which allows for the
-        residual's correlation, and its unit.
-    nats : float
-        Log-evidence that is lost without it, less its price, summed over lengths of pieces.
-    share : float
-        Share of the simulation error (root mean square) on the longest ones that it takes off.
-    confounded : tuple of str
-        Effects that explain these data as well.
-    """
-
-    effect: str
-    body: str
-    sentence: str
-    estimate: Mapping[str, float]
-    sd: Mapping[str, float]
-    units: Mapping[str, str]
-    nats: float
-    share: float
-    confounded: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Part:
-    """A law that is not added, and the share of the simulation error that it takes off.
-
-    Parameters
-    ----------
-    effect, body : str
-        Names of the effect and of the body.
-    share : float
-        Share of the error (root mean square) on the longest pieces.
-    """
-
-    effect: str
-    body: str
-    share: float
+    def in_json(self, keys: Iterable[str]) -> dict[str, object]:
+        """Return the fields with these keys in JSON."""
+        return {key: getattr(self, _KEYS.get(key, key)) for key in keys}
 
 
 @dataclass(frozen=True)
@@ -276,46 +299,6 @@ class Estimate:
 
 
 @dataclass(frozen=True)
-class Added:
-    """An effect that was added to the model, with its posterior and its gain.
-
-    Parameters
-    ----------
-    effect, body, sentence : str
-        Names of the effect and of the body, and the effect in words.
-    statistic, p_value : float
-        Score test at the declared model.
-    parameters : dict of str to Estimate
-        Posterior of each of its parameters.
-    not_separable_from : tuple of str
-        Effects that would explain these data as well.
-    elpd_difference, elpd_difference_se : float
-        Gain of expected log predictive density over the model without it, and its standard error
-        (nats).
-    simulated_nats, simulated_share : float or None
-        What simulations lose without it: net log-evidence, summed over lengths of pieces (nats),
-        and the share of the error on the longest ones.
-    """
-
-    effect: str
-    body: str
-    sentence: str
-    statistic: float
-    p_value: float
-    parameters: Mapping[str, Estimate]
-    not_separable_from: tuple[str, ...]
-    elpd_difference: float
-    elpd_difference_se: float
-    simulated_nats: float | None = None
-    simulated_share: float | None = None
-
-    @property
-    def chance(self) -> float:
-        """The smaller of the p-value and, by simulations, the odds against the effect."""
-        return min(self.p_value, float(np.exp(-(self.simulated_nats or 0.0))))
-
-
-@dataclass(frozen=True)
 class Numerical:
     """Engine substeps declared and used, and the shift of results if those used are doubled."""
 
@@ -427,6 +410,60 @@ class Unexplained:
     p_value: float
     sentence: str
 
+    @classmethod
+    def found_by(cls, test: ResidualTest) -> Self:
+        """Return what a failed test found, which depends on no recorded quantity."""
+        place = test.body, test.dimension
+        return cls(*place, NOTHING_RECORDED, test.size, test.p_value, test.sentence)
+
+    @classmethod
+    def somewhere(cls, sentence: str) -> Self:
+        """Return what a sentence says of no place."""
+        return cls("", "", NOTHING_RECORDED, 0.0, math.nan, sentence)
+
+
+@dataclass(frozen=True, eq=False)
+class Misfit:
+    """Tests of a model's residual, and where it has structure that no effect explains.
+
+    Parameters
+    ----------
+    tests : tuple of ResidualTest
+        In the order of the report.
+    dependence : Unexplained or None
+        The recorded quantity that the residual depends on; None if it depends on none.
+    correlations : Correlations
+        Correlations of the innovations.
+    growth : Growth
+        Growth of the forecasts' errors.
+    """
+
+    tests: tuple[ResidualTest, ...]
+    dependence: Unexplained | None
+    correlations: Correlations
+    growth: Growth
+
+    @property
+    def unexplained(self) -> Unexplained | None:
+        """Return the dependence, or else what the first test found that failed; None if none."""
+        failed = (Unexplained.found_by(test) for test in self.tests if not test.passed)
+        return self.dependence or next(failed, None)
+
+    def predicts(self, criteria: Criteria) -> bool:
+        """Return whether forecasts and simulations are as good as noise lets them be.
+
+        What remains is then small: significant one step ahead, and not over a forecast. Beside an
+        unexplained acceleration forecasts must be near the noise; that none is known to be worse is
+        not enough. A test that is missing is not passed.
+        """
+        tests = {test.name: test for test in self.tests}
+        forecasts = (KindOfTest.FORECASTS, KindOfTest.HELD_OUT)
+        whole = (*forecasts, KindOfTest.SIMULATION)
+        if not all(kind in tests and tests[kind].passed for kind in whole):
+            return False
+        near = all(tests[kind].size < criteria.worse_forecast for kind in forecasts)
+        return near or tests[KindOfTest.ACCELERATION].passed
+
 
 class Stage(StrEnum):
     """A stage of closing the loop, in their order: a name for programs, a sentence for people."""
@@ -437,3 +474,330 @@ class Stage(StrEnum):
     TEST = "testing the residual"
     SAMPLE = "sampling the posteriors"
     COMPARE = "comparing errors on held-out data"
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What the search found.
+
+    Parameters
+    ----------
+    candidates : tuple of Law
+        All candidates, by their score tests at the declared model, best first.
+    added : tuple of Law
+        Effects added, in order.
+    small : tuple of Law
+        Effect that is significant in the innovations and was not added, if there is one.
+    lesser : tuple of Law
+        Laws that simulations show and that are no main ones: they are not added.
+    hypotheses : tuple of Law
+        Unusual laws that explain a part of what remains: they are not added.
+    lengths : tuple of SearchLength
+        What was found on pieces of each length.
+    """
+
+    candidates: tuple[Law, ...]
+    added: tuple[Law, ...]
+    small: tuple[Law, ...] = ()
+    lesser: tuple[Law, ...] = ()
+    hypotheses: tuple[Law, ...] = ()
+    lengths: tuple[SearchLength, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class ComparedModel:
+    """The declared or the revised model, fitted.
+
+    Parameters
+    ----------
+    fit : Fit
+        The model with its posterior.
+    innovations : FilteredMode
+        The model with whole trajectories filtered, which the tests are made with.
+    errors : Errors
+        Held-out errors.
+    residuals : dict of str to ndarray
+        Held-out residuals in units of noise per state dimension, 1-d arrays.
+    """
+
+    fit: Fit
+    innovations: FilteredMode
+    errors: Errors
+    residuals: Mapping[str, Floats]
+
+
+@dataclass(frozen=True, eq=False)
+class Forecasts:
+    """Held-out forecasts.
+
+    Parameters
+    ----------
+    noise_floor : Errors
+        Errors of the noise alone.
+    rollout : Rollout
+        One held-out trajectory.
+    horizon : int
+        Intervals of ``rollout_rmse``.
+    """
+
+    noise_floor: Errors
+    rollout: Rollout
+    horizon: int
+
+
+@dataclass(frozen=True, eq=False)
+class Recordings:
+    """What was recorded, and what of it was not used.
+
+    Parameters
+    ----------
+    provenance : dict
+        Seed, versions, hash of the data, number of transitions, horizons.
+    held_out : History, optional
+        The held-out trajectories; reports animate them.
+    velocities_not_used : tuple of UnusedVelocity
+        Velocity columns that were computed from positions or lag them.
+    bad_frames : tuple of str
+        A sentence for each single bad frame that was left out, of either history.
+    drawn : tuple of str
+        A sentence on each history that was too long to be used as a whole.
+    """
+
+    provenance: Mapping[str, object] = field(default_factory=dict)
+    held_out: History | None = None
+    velocities_not_used: tuple[UnusedVelocity, ...] = ()
+    bad_frames: tuple[str, ...] = ()
+    drawn: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Loop:
+    """Result of :func:`pbrl_ppl.close_loop`: the verdict, and what each stage found.
+
+    Parameters
+    ----------
+    scene : Scene
+        The declared scene.
+    verdict : str
+        ``adequate``, ``effects-added``, ``unexplained``, or ``not-converged``.
+    unexplained : Unexplained or None
+        Structure that no effect in the catalogue explains.
+    numerical : Numerical
+        Engine substeps, and the numerical error that is left.
+    data : Recordings
+        What was recorded, and what of it was not used.
+    found : Found
+        What the search found: candidates and added effects.
+    declared, revised : ComparedModel
+        Both models with posteriors and held-out errors; they are equal if nothing was added.
+    misfit : Misfit
+        Tests of the revised model's residual.
+    acceleration : Acceleration
+        Unexplained acceleration of both models.
+    forecasts : Forecasts
+        Held-out forecasts beside the noise floor.
+    identifiability : Identifiability or None
+        Which parameters of the revised model the data inform.
+    loo : Comparison or None
+        Leave-one-out cross-validation of both models on the data they were fitted to.
+    criteria : Criteria
+        Thresholds of the decisions.
+    catalogue : tuple of Effect
+        Where the names of effects are looked up.
+    """
+
+    scene: Scene
+    verdict: str
+    unexplained: Unexplained | None
+    numerical: Numerical
+    data: Recordings
+    found: Found
+    declared: ComparedModel
+    revised: ComparedModel
+    misfit: Misfit
+    acceleration: Acceleration
+    forecasts: Forecasts
+    identifiability: Identifiability | None = None
+    loo: Comparison | None = None
+    criteria: Criteria = DEFAULT
+    catalogue: tuple[Effect, ...] = tuple(full_catalogue)
+
+    def __repr__(self) -> str:
+        added = [f"{one.effect} on {one.body}" for one in self.added]
+        return f"Loop(verdict={self.verdict!r}, added={added})"
+
+    @property
+    def candidates(self) -> tuple[Law, ...]:
+        """All candidates, by their score tests at the declared model, best first."""
+        return self.found.candidates
+
+    @property
+    def added(self) -> tuple[Law, ...]:
+        """Effects added, in order."""
+        return self.found.added
+
+    @property
+    def before(self) -> Errors:
+        """Held-out errors of the declared model."""
+        return self.declared.errors
+
+    @property
+    def after(self) -> Errors:
+        """Held-out errors of the revised model."""
+        return self.revised.errors
+
+    @property
+    def noise_floor(self) -> Errors:
+        """Held-out errors of the noise alone."""
+        return self.forecasts.noise_floor
+
+    @property
+    def tests(self) -> tuple[ResidualTest, ...]:
+        """Tests of the revised model's residual."""
+        return self.misfit.tests
+
+    @property
+    def held_out(self) -> History | None:
+        """The held-out trajectories."""
+        return self.data.held_out
+
+    @property
+    def posterior_before(self) -> Idata:
+        """Posterior of the declared model, an InferenceData or a DataTree."""
+        return self.declared.fit.posterior
+
+    @property
+    def posterior_after(self) -> Idata:
+        """Posterior of the revised model; that of the declared one if nothing was added."""
+        return self.revised.fit.posterior
+
+    @property
+    def accepted(self) -> tuple[Law, ...]:
+        """Return the added effects, or none without a verdict."""
+        return () if self.verdict == NOT_CONVERGED else self.added
+
+    @property
+    def rejected(self) -> tuple[Law, ...]:
+        """Return the significant candidates that were not added, best first."""
+        present = {(added.effect, added.body) for added in self.added}
+        return tuple(
+            one
+            for one in self.candidates
+            if one.why
+            and one.p_value < self.criteria.try_p
+            and (one.effect, one.body) not in present
+        )
+
+    @property
+    def diverges(self) -> bool:
+        """Return whether held-out forecasts of the revised model diverge."""
+        return any(np.isposinf(far) for far in self.after.rollout_rmse.values())
+
+    @property
+    def forecasts_at_noise(self) -> bool:
+        """Return whether all held-out errors are near those that noise alone makes."""
+        most, floor = self.criteria.worse_forecast, self.noise_floor.rollout_rmse
+        errors = self.after.rollout_rmse.items()
+        near = all(error < most * floor.get(name, 0.0) for name, error in errors)
+        return near and self.after.normalised_rmse < most
+
+    @property
+    def depends_on_records(self) -> bool:
+        """Return whether the residual depends on a recorded quantity."""
+        left = self.unexplained
+        return left is not None and left.depends_on != NOTHING_RECORDED
+
+    @property
+    def rollout_seconds(self) -> float:
+        """Return how far ahead rollouts predict (s)."""
+        return self.forecasts.horizon * self.scene.time_step
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the contents of ``report.json``; numbers that are not finite become null."""
+        tested = [key for key in CANDIDATE if key not in ("sentence", "units")]
+        contents: dict[str, Any] = json_values(
+            {
+                "verdict": self.verdict,
+                "numerical": self.numerical,
+                "added": [law.in_json(ADDED) for law in self.added],
+                "candidates": [law.in_json(tested) for law in self.candidates],
+                "small": [[law.effect, law.body] for law in self.found.small],
+                "lesser": [law.in_json(ASIDE) for law in self.found.lesser],
+                "hypotheses": [law.in_json(ASIDE) for law in self.found.hypotheses],
+                "search": self.found.lengths,
+                "tests": self.tests,
+                "unexplained_acceleration": self.acceleration,
+                "unexplained": self.unexplained,
+                "error": {
+                    "before": self.before,
+                    "after": self.after,
+                    "noise_floor": self.noise_floor,
+                },
+                "identifiability": self.identifiability and self.identifiability.to_dict(),
+                "loo": self.loo and self.loo.to_dict(),
+                "velocities_not_used": self.data.velocities_not_used,
+                "bad_frames": self.data.bad_frames,
+                "drawn": self.data.drawn,
+                "provenance": self.data.provenance,
+            }
+        )
+        return contents
+
+    def save(self, folder: str | Path, overwrite: bool = False, *, page: str = "") -> Path:
+        """Write report.json, before.nc and after.nc, all or nothing.
+
+        Of an earlier result in the folder ``report.json`` is removed first, and the new one is
+        written last: where it is, the files belong together, even if the process was killed.
+
+        Parameters
+        ----------
+        folder : str or pathlib.Path
+            Made if missing; other files in it are left alone.
+        overwrite : bool
+            Whether a folder that is not empty may be written to.
+        page : str
+            HTML of the report, written as report.html with the other files; none if empty.
+
+        Returns
+        -------
+        pathlib.Path
+            The folder.
+
+        Raises
+        ------
+        OutputError
+            If the folder cannot be written, or is not empty and ``overwrite`` is false.
+
+        Examples
+        --------
+        ::
+
+            loop.save("out")
+            pp.report(loop, "out/report.html")
+        """
+        folder = Path(folder)
+        nearest = check_folder(folder, overwrite, FILES)
+        try:
+            # on the same file system as the folder, so that only a rename is left at the end
+            with temporary_folder(nearest) as temporary:
+                made = temporary / "result"
+                made.mkdir()
+                if page:
+                    (made / "report.html").write_text(page, encoding="utf-8")
+                save_posterior(self.posterior_before, made / "before.nc")
+                save_posterior(self.posterior_after, made / "after.nc")
+                text = json.dumps(self.to_dict(), indent=1, allow_nan=False)
+                (made / DONE).write_text(text + "\n", encoding="utf-8")
+                if nearest == folder:
+                    # it may be a mount or a working directory: fill it, do not replace it
+                    (folder / DONE).unlink(missing_ok=True)
+                    for name in sorted((file.name for file in made.iterdir()), key=DONE.__eq__):
+                        (made / name).replace(folder / name)
+                else:
+                    folder.parent.mkdir(parents=True, exist_ok=True)
+                    made.rename(folder)
+        except OutputError:
+            raise
+        except OSError as error:
+            raise OutputError(f"{folder}: cannot be written: {error}") from error
+        return folder

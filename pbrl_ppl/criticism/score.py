@@ -1,33 +1,210 @@
-"""Score tests of candidate effects, with signatures from the simulator."""
+"""Score tests of candidate effects, with signatures from the simulator, and detection limits."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.stats import chi2, norm
 
-from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
-from pbrl_ppl.criticism.results import Candidate
-from pbrl_ppl.criticism.scan import (
-    GridPoint,
-    detection_limits,
-    each_grid_point,
-    is_upper_limit,
-)
-from pbrl_ppl.effects import Attached
+from pbrl_ppl.criticism.criteria import DEFAULT, Criteria, ResidualCriteria
+from pbrl_ppl.criticism.results import Law
+from pbrl_ppl.effects import Attached, Effect
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import Mode, posterior_slopes
 from pbrl_ppl.parameters import box, prior_residual, prior_slopes
 from pbrl_ppl.state import Floats, Ints
 from pbrl_ppl.threads import Say, in_parallel, silent
 
-#: Where the declared parameters leave less than this share of a signature they absorb it.
-ABSORBED = 1e-3
-#: A change below this, in units of noise, is the engine's rounding.
-VISIBLE = 1e-3
+
+@dataclass(frozen=True, eq=False)
+class GridPoint:
+    """An effect at one grid point of its scan.
+
+    Parameters
+    ----------
+    values : ndarray
+        The effect's parameters, shape (q,), those that are not scanned at their null value.
+    signature : ndarray
+        Change of the whitened prediction, shape (n, columns): the derivative by each parameter that
+        is not scanned, or the whole change where all are.
+    columns : tuple of int
+        The parameter of each column; empty for a whole change.
+    """
+
+    values: Floats
+    signature: Floats
+    columns: tuple[int, ...]
+
+    @property
+    def place(self) -> GridPoint:
+        """Return the grid point without its signature."""
+        return replace(self, signature=self.signature[:0].copy())
+
+    @property
+    def proposed(self) -> Floats:
+        """Return the grid point as a scan proposes it, shape (q,), NaN for what is not scanned."""
+        point = self.values.astype(float)
+        point[list(self.columns)] = np.nan
+        return point
+
+
+def each_grid_point(
+    mode: Mode,
+    candidate: Attached,
+    proposed: Floats | None = None,
+    *,
+    at_once: int = 8,
+    most_values: int = 4_000_000,
+) -> Iterator[GridPoint]:
+    """Simulate a candidate at grid points, a few at a time, for each holds a value a measurement.
+
+    Parameters
+    ----------
+    mode : Mode
+        Mode of the model that lacks the effect.
+    candidate : Attached
+        An effect with a ``scan``.
+    proposed : ndarray, optional
+        The grid points, shape (point, q); by default all that its scan proposes, simulated with as
+        few engine steps as tell them apart.
+    at_once : int
+        Grid points that are simulated in one call, at most.
+    most_values : int
+        Measurements times grid points in one call, at most.
+
+    Yields
+    ------
+    GridPoint
+        The grid points that change a prediction.
+    """
+    effect, problem = candidate.effect, mode.problem
+    if effect.scan is None:
+        return
+    body = problem.scene.body(candidate.body)
+    enlarged = problem.with_physics(effects=(*problem.physics.effects, candidate)).medium
+    of_scan = proposed is None
+    if proposed is None:
+        proposed, enlarged = effect.scan(problem.scene, problem.data.history, body), enlarged.coarse
+    declared = enlarged.layout.places(problem.layout.labels)
+    places = enlarged.layout.places(candidate.labels)
+    null = np.array(effect.null)
+
+    def whitened(points: Floats) -> Floats:
+        phi = np.zeros((len(points), enlarged.layout.size))
+        phi[:, declared] = mode.phi
+        phi[:, places] = points
+        return -enlarged.whitened(phi, mode.sigma).reshape(len(points), -1)
+
+    free = np.isnan(proposed)
+    steps = 1e-3 * np.array([parameter.prior.scale for parameter in effect.parameters])
+    lower, upper = np.array([p.prior.support for p in effect.parameters]).T
+    # one-sided where the null is the least that there can be
+    ahead, behind = np.minimum(null + steps, upper) - null, np.maximum(null - steps, lower) - null
+    if of_scan:  # one side will do to choose from
+        behind = np.where(ahead > 0.0, 0.0, behind)
+    nothing = whitened(null[None])
+    at_once = max(1, min(at_once, most_values // max(mode.whitened_residual.size, 1)))
+    for begin in range(0, len(proposed), at_once):
+        part = slice(begin, begin + at_once)
+        points, plan = _points(proposed[part], free[part], null, (ahead, behind))
+        states = np.vstack([nothing, whitened(points)])
+        for values, columns, rows in plan:
+            if columns:
+                ends = states[rows].reshape(len(columns), 2, -1)
+                width = (ahead - behind)[list(columns)]
+                signature = ((ends[:, 0] - ends[:, 1]) / width[:, None]).T
+            else:
+                signature = (states[rows] - states[0]).T
+            signature = np.nan_to_num(signature, posinf=0.0, neginf=0.0)  # where it diverged
+            if np.any(signature):
+                yield GridPoint(values, signature, columns)
+
+
+def _points(
+    proposed: Floats, free: Floats, null: Floats, steps: tuple[Floats, Floats]
+) -> tuple[Floats, list[tuple[Floats, tuple[int, ...], list[int]]]]:
+    """Return points to simulate, and each grid point's values, free columns and rows of states.
+
+    Row 0 is that at the null value, where no column has an effect.
+    """
+    points: list[Floats] = []
+    plan = []
+    for row, unknown in zip(proposed, free, strict=True):
+        values = np.where(unknown, null, row)
+        columns = tuple(int(i) for i in np.flatnonzero(unknown))
+        rows = []
+        for column in columns:
+            for step in steps:
+                moved = values.copy()
+                moved[column] += step[column]
+                if step[column] != 0.0:
+                    points.append(moved)
+                rows.append(len(points) if step[column] != 0.0 else 0)
+        if not columns:
+            points.append(values)
+            rows = [len(points)]
+        plan.append((values, columns, rows))
+    return np.array(points), plan
+
+
+def detection_limits(
+    effect: Effect,
+    points: Sequence[GridPoint],
+    units: Sequence[Floats],
+    candidates: int,
+    criteria: ResidualCriteria,
+) -> dict[str, float]:
+    """Return the smallest detectable sizes of an effect, the other parameters at null values.
+
+    Of a scanned one each is at its best grid point. For a whole change by a single parameter, as by
+    a threshold, it is the detectable value nearest to the null value; a whole change by several,
+    such as an obstacle's place, has no size.
+
+    Parameters
+    ----------
+    effect : Effect
+        The effect.
+    points : sequence of GridPoint
+        Its grid points.
+    units : sequence of ndarray
+        Change of the prediction by one unit of each column of a grid point, or all of a whole
+        change, in units of noise.
+    candidates : int
+        Number of tests that the p-value is corrected for, beside the grid points.
+    criteria : ResidualCriteria
+        P-value and power of the limit.
+    """
+    tried = candidates * len(points)
+    names = [parameter.name for parameter in effect.parameters]
+    limits: dict[str, float] = {}
+    whole = [
+        (point.values, unit) for point, unit in zip(points, units, strict=True) if not point.columns
+    ]
+    if whole and len(names) == 1:
+        null = effect.null[0]
+        seen = [values[0] for values, unit in whole if unit[0] >= _needed(tried, criteria)]
+        limits[names[0]] = float(min(seen, key=lambda value: abs(value - null), default=np.inf))
+    for point, unit in zip(points, units, strict=True):
+        with np.errstate(divide="ignore"):
+            sizes = _needed(tried, criteria) / unit
+        for column, size in zip(point.columns, sizes, strict=False):
+            limits[names[column]] = min(limits.get(names[column], np.inf), float(size))
+    return limits
+
+
+def is_upper_limit(effect: Effect, points: Sequence[GridPoint]) -> bool:
+    """Return whether smaller is stronger, as for a limit: grid points below the null value."""
+    return bool(points) and all(
+        not point.columns and point.values[0] < effect.null[0] for point in points
+    )
+
+
+def _needed(tried: int, criteria: ResidualCriteria) -> float:
+    """Return the detectable change in units of noise, for a two-sided test."""
+    return float(norm.isf(criteria.detection_p / 2 / tried) + norm.ppf(criteria.detection_power))
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +215,7 @@ class Signature:
     ----------
     attached : Attached
         The candidate.
-    candidate : Candidate
+    candidate : Law
         Its test, for the report.
     log_p : float
         Natural logarithm of the p-value before the correction for the number of candidates.
@@ -51,7 +228,7 @@ class Signature:
     """
 
     attached: Attached
-    candidate: Candidate
+    candidate: Law
     log_p: float
     basis: Floats
     direction: Floats
@@ -181,22 +358,40 @@ class Library:
     def scored(
         self, attached: Attached, candidates: int, without: tuple[Attached, ...] = ()
     ) -> Signature:
-        """Return the score test of one of so many candidates; a whole change has one sign."""
-        test = self.test(without)
+        """Return the score test of one of so many candidates; a whole change has one sign.
+
+        Its p-value is corrected for grid points and candidates.
+        """
+        test, effect = self.test(without), attached.effect
         points, tried, units = self.points(attached)
         judged = [(test.at(point, attached), point) for point in points]
         judged.sort(key=lambda one: one[0].log_p)
-        best, values = _none(len(test.residual)), np.array(attached.effect.null)
+        best, values = test.nothing(1), np.array(effect.null)
         if judged:
             best, point = judged[0]
             values = point.values.copy()
             for column, size in zip(point.columns, best.size, strict=False):
                 values[column] += size
+        names = [parameter.name for parameter in effect.parameters]
+        log_p = min(0.0, best.log_p + np.log(max(1, len(tried))))
+        candidate = Law(
+            effect=effect.name,
+            body=attached.body,
+            sentence=effect.sentence,
+            statistic=best.statistic,
+            dof=best.basis.shape[1] or best.size.size,  # directions that are seen
+            p_value=float(min(1.0, np.exp(log_p) * candidates)),
+            estimate=dict(zip(names, values.tolist(), strict=True)),
+            units={parameter.name: parameter.unit for parameter in effect.parameters},
+            identifiable=best.share,
+            n_grid_points=len(tried),
+            detectable=detection_limits(effect, tried, units, candidates, self.criteria.residual),
+            is_upper_limit=is_upper_limit(effect, tried),
+        )
         linear = tuple(
-            one.about(point) for one, point in judged
-            if one.statistic > 0 or attached.effect.scan is None
-        )  # fmt: skip
-        return _signature(attached, best, values, test, candidates, tried, units, linear)
+            one.about(point) for one, point in judged if one.statistic > 0 or effect.scan is None
+        )
+        return Signature(attached, candidate, log_p, best.basis, best.direction, linear)
 
     def forget(self, attached: Attached) -> None:
         """Let go of a candidate's derivatives, which take much memory in long recordings."""
@@ -292,12 +487,6 @@ class _Evidence:
         return Linearisation(point.values, point.columns, self.basis, self.back, self.absorbed)
 
 
-def _none(n: int) -> _Evidence:
-    """Return no evidence for one column, over n whitened residuals."""
-    nothing = np.zeros(1), np.zeros((n, 0)), np.zeros(n), np.zeros(1)
-    return _Evidence(0.0, 0.0, 0.0, *nothing, np.zeros((1, 0)), np.zeros((0, 0)))
-
-
 @dataclass(frozen=True, eq=False)
 class ScoreTest:
     """Score tests of candidates at one mode.
@@ -331,10 +520,24 @@ class ScoreTest:
         missing = len(self.residual) - len(point.signature)
         rows, columns = np.pad(point.signature, ((0, missing), (0, 0))), list(point.columns)
         sides = null_sides(attached)[columns] if columns else np.ones(1, dtype=np.intp)
-        scales = _scales(attached)[columns] if columns else np.ones(1)
-        return self.evidence(rows, sides, scales)
+        typical = np.array([parameter.prior.sigma for parameter in attached.effect.parameters])
+        return self.evidence(rows, sides, typical[columns] if columns else np.ones(1))
 
-    def evidence(self, signature: Floats, sides: Ints, scales: Floats) -> _Evidence:
+    def nothing(self, columns: int, share: float = 0.0) -> _Evidence:
+        """Return no evidence for a signature of which this share is not absorbed."""
+        n, none = len(self.residual), np.zeros(columns)
+        basis, back, absorbed = (np.zeros((size, 0)) for size in (n, columns, len(self.phi)))
+        return _Evidence(0.0, 0.0, share, none, basis, np.zeros(n), none, back, absorbed)
+
+    def evidence(
+        self,
+        signature: Floats,
+        sides: Ints,
+        scales: Floats,
+        *,
+        absorbed_below: float = 1e-3,
+        visible: float = 1e-3,
+    ) -> _Evidence:
         """Return the score test of a signature.
 
         Parameters
@@ -345,37 +548,38 @@ class ScoreTest:
             1 (or -1) where a column's size can only be positive (or negative), shape (columns,).
         scales : ndarray
             Typical sizes, shape (columns,): directions that are invisible at these are left out.
+        absorbed_below : float
+            Share of a signature that declared parameters have to leave, or they absorb it.
+        visible : float
+            Least change in units of noise: a smaller one is the engine's rounding.
         """
         signature = signature * scales
         projected = self.left(signature)
         total = (signature**2).sum()
         share = float((projected**2).sum() / total) if total > 0 else 0.0
-        n, columns = signature.shape
-        size, statistic, log_p = np.zeros(columns), 0.0, 0.0
-        unit = np.zeros(columns)
-        basis, direction, back = np.zeros((n, 0)), np.zeros(n), np.zeros((columns, 0))
-        absorbed = np.zeros((len(self.phi), 0))
-        if share > ABSORBED:
-            u, s, vt = np.linalg.svd(projected, full_matrices=False)
-            whole = np.linalg.norm(signature @ vt.T, axis=0)  # before the projection
-            keep = (s > 1e-6 * s.max()) & (s >= min(VISIBLE, s.max()))
-            keep &= s**2 > ABSORBED * whole**2
-            basis = u[:, keep]
-            unit = np.sqrt((projected**2).sum(axis=0)) / scales
-            coordinates = basis.T @ self.residual
-            along = vt[keep].T / s[keep]
-            back, absorbed = scales[:, None] * along, self.back @ (self.q.T @ (signature @ along))
-            size = back @ coordinates
-            statistic = float(coordinates @ coordinates)
-            log_p = float(chi2.logsf(statistic, max(1, int(keep.sum()))))
-            seen = int(np.argmax(np.abs(vt[0])))
-            if sides[seen] and keep.sum() == 1 and np.abs(vt[0, seen]) > 1 - 1e-6:
-                # it can only have one sign: half the p-value, and no evidence for the other sign
-                allowed = sides[seen] * size[seen] > 0
-                statistic = statistic if allowed else 0.0
-                log_p = log_p + np.log(0.5) if allowed else 0.0
-            if statistic > 0:
-                direction = basis @ coordinates / np.sqrt(statistic)
+        if not share > absorbed_below:
+            return self.nothing(signature.shape[1], share)
+        u, s, vt = np.linalg.svd(projected, full_matrices=False)
+        whole = np.linalg.norm(signature @ vt.T, axis=0)  # before the projection
+        keep = (s > 1e-6 * s.max()) & (s >= min(visible, s.max()))
+        keep &= s**2 > absorbed_below * whole**2
+        basis = u[:, keep]
+        unit = np.sqrt((projected**2).sum(axis=0)) / scales
+        coordinates = basis.T @ self.residual
+        along = vt[keep].T / s[keep]
+        back, absorbed = scales[:, None] * along, self.back @ (self.q.T @ (signature @ along))
+        size = back @ coordinates
+        statistic = float(coordinates @ coordinates)
+        log_p = float(chi2.logsf(statistic, max(1, int(keep.sum()))))
+        seen = int(np.argmax(np.abs(vt[0])))
+        if sides[seen] and keep.sum() == 1 and np.abs(vt[0, seen]) > 1 - 1e-6:
+            # it can only have one sign: half the p-value, and no evidence for the other sign
+            allowed = sides[seen] * size[seen] > 0
+            statistic = statistic if allowed else 0.0
+            log_p = log_p + np.log(0.5) if allowed else 0.0
+        direction = np.zeros(len(u))
+        if statistic > 0:
+            direction = basis @ coordinates / np.sqrt(statistic)
         return _Evidence(statistic, log_p, share, size, basis, direction, unit, back, absorbed)
 
 
@@ -383,45 +587,6 @@ def null_sides(attached: Attached) -> Ints:
     """Return the side of its null value on which each parameter must be; 0 if on any."""
     supports = [(p.null, *p.prior.support) for p in attached.effect.parameters]
     return np.array([int(null == low) - int(null == high) for null, low, high in supports])
-
-
-def _scales(attached: Attached) -> Floats:
-    """Return the typical sizes of an effect's parameters under their priors."""
-    return np.array([parameter.prior.sigma for parameter in attached.effect.parameters])
-
-
-def _signature(
-    attached: Attached,
-    evidence: _Evidence,
-    values: Floats,
-    test: ScoreTest,
-    candidates: int,
-    tried: Sequence[GridPoint],
-    units: Sequence[Floats],
-    linear: tuple[Linearisation, ...] = (),
-) -> Signature:
-    """Return a candidate's signature, its p-value corrected for grid points and candidates.
-
-    ``units`` are the changes by one unit of each column of the grid points that were ``tried``.
-    """
-    effect = attached.effect
-    names = [parameter.name for parameter in effect.parameters]
-    log_p = min(0.0, evidence.log_p + np.log(max(1, len(tried))))
-    candidate = Candidate(
-        effect=effect.name,
-        body=attached.body,
-        sentence=effect.sentence,
-        statistic=evidence.statistic,
-        dof=evidence.basis.shape[1] or evidence.size.size,  # directions that are seen
-        p_value=float(min(1.0, np.exp(log_p) * candidates)),
-        estimate=dict(zip(names, values.tolist(), strict=True)),
-        units={parameter.name: parameter.unit for parameter in effect.parameters},
-        identifiable=evidence.share,
-        n_grid_points=len(tried),
-        detectable=detection_limits(effect, tried, units, candidates, test.criteria.residual),
-        is_upper_limit=is_upper_limit(effect, tried),
-    )
-    return Signature(attached, candidate, log_p, evidence.basis, evidence.direction, linear)
 
 
 def same_physics(first: Signature, second: Signature, cosine: float = 0.9999) -> bool:

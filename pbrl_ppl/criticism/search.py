@@ -16,7 +16,7 @@ import numpy as np
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.results import Law, SearchLength, Stage
-from pbrl_ppl.criticism.score import Library, Signature, named_beside
+from pbrl_ppl.criticism.score import Library, named_beside
 from pbrl_ppl.criticism.subsets import Regression, Subset, best_subsets, by_label
 from pbrl_ppl.criticism.table import (
     Table,
@@ -47,12 +47,7 @@ from pbrl_ppl.modes import (
     with_robust_covariance,
 )
 from pbrl_ppl.state import Bools, Floats
-from pbrl_ppl.threads import in_parallel
-
-#: Least ratio of the predicted to the required fall of the error for a refit.
-_PREDICTED = 0.7
-#: Evidence to first order from which on a law is not tried without (nats).
-_CLEAR = 30.0
+from pbrl_ppl.threads import Say, in_parallel, silent
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,24 +59,18 @@ class SearchResult:
     declared, after : Mode
         The declared model and the one with the laws, on the longest pieces.
     laws : dict of Attached to Law
-        The laws with what each is worth there, those of most evidence first.
-    gains : dict of Attached to tuple of float
-        Gain in expected log predictive density by each law, and its standard error (nats).
-    confounded : dict of Attached to tuple of Attached
-        Effects that explain the data as well as a law.
+        The laws with what each is worth there, those that take most of the error off first.
+    candidates : dict of Attached to Law
+        All candidates by their score tests on the shortest pieces, best first, with what each is
+        worth alone to first order and the decision on it.
     lengths : tuple of SearchLength
         What was found at each length of pieces.
-    signatures : dict of Attached to Signature
-        Score test of each candidate, on the shortest pieces, without arrays of several values.
-    tried : dict of Attached to tuple of float
-        What each candidate alone is worth there to first order (nats), and its share of the error.
     rejected : dict of Attached to str
         Why a law that was found on shorter pieces is not among them.
-    small : dict of Attached to float
-        Laws that are there and no main ones, and the share of the error that each takes off.
-    hypotheses : dict of Attached to float
-        Unusual laws that explain a part of what common ones leave, and the share of the error that
-        each takes off to first order.
+    lesser : tuple of Law
+        Laws that are there and no main ones, those that take most of the error off first.
+    hypotheses : tuple of Law
+        Unusual laws that explain a part of what common ones leave, to first order.
     doubt : str
         Why the laws that were found are none: gravity is wrong, or a unit.
     """
@@ -89,14 +78,11 @@ class SearchResult:
     declared: Mode
     after: Mode
     laws: Mapping[Attached, Law] = field(default_factory=dict)
-    gains: Mapping[Attached, tuple[float, float]] = field(default_factory=dict)
-    confounded: Mapping[Attached, tuple[Attached, ...]] = field(default_factory=dict)
+    candidates: Mapping[Attached, Law] = field(default_factory=dict)
     lengths: tuple[SearchLength, ...] = ()
-    signatures: Mapping[Attached, Signature] = field(default_factory=dict)
-    tried: Mapping[Attached, tuple[float, float]] = field(default_factory=dict)
     rejected: Mapping[Attached, str] = field(default_factory=dict)
-    small: Mapping[Attached, float] = field(default_factory=dict)
-    hypotheses: Mapping[Attached, float] = field(default_factory=dict)
+    lesser: tuple[Law, ...] = ()
+    hypotheses: tuple[Law, ...] = ()
     doubt: str = ""
 
     def on(self, whole: Mode) -> SearchResult:
@@ -106,16 +92,19 @@ class SearchResult:
         """
         data = whole.problem.data
 
-        def refitted(mode: Mode) -> Mode:
+        def on_all(mode: Mode) -> Mode:
             problem = mode.problem.with_data(history=data.history, breaks=None)
             if not is_simulated_mode(mode):
                 return find_mode(problem, initial=mode.phi)
             pieces = in_pieces(problem, mode.problem.data.horizon, data.smoothed_states)
             return with_robust_covariance(fit_pieces_closely(pieces, mode.phi))
 
-        after = refitted(self.after)
-        declared = after if self.declared is self.after else refitted(self.declared)
-        return replace(self, declared=declared, after=after)
+        return self.refitted(on_all)
+
+    def refitted(self, fitted: Callable[[Mode], Mode]) -> SearchResult:
+        """Return the same laws with their models refitted; without laws these are one."""
+        modes = in_parallel(fitted, [self.declared, self.after] if self.laws else [self.after])
+        return replace(self, declared=modes[0], after=modes[-1])
 
 
 @dataclass(eq=False)
@@ -192,11 +181,17 @@ class Search:
         Thresholds.
     say : callable
         Called with what was found, and with what is done now.
+    predicted : float
+        Least ratio of predicted to required error reduction for a refit.
+    clear : float
+        Evidence above which drop-one refits are skipped (nats).
     """
 
     missing: Callable[[Mode], Sequence[Attached]]
     criteria: Criteria = DEFAULT
-    say: Callable[[str], None] = field(default=lambda sentence: None)
+    say: Say = silent
+    predicted: float = 0.7
+    clear: float = 30.0
 
     def __call__(self, mode: Mode, laws: Mapping[Attached, Floats] | None = None) -> SearchResult:
         """Return the laws that a model's simulation error shows.
@@ -421,7 +416,7 @@ class Search:
         climb.modes.append(mode)
         for law in laws:
             nats = climb.first_order.get(law, 0.0)
-            if nats < _CLEAR:
+            if nats < self.clear:
                 nats = table.value(mode) - table.value(table.without(mode, law))
             climb.earlier[law] = climb.earlier.get(law, 0.0) + nats
         data, names = mode.problem.data, mode.problem.observations.names
@@ -448,7 +443,7 @@ class Search:
 
         ``instead``: laws in the place of all that the climb has, which may stand in for one.
         """
-        limits, least = self.criteria.search, 1.0 - (1.0 - _PREDICTED * least_share) ** 2
+        limits, least = self.criteria.search, 1.0 - (1.0 - self.predicted * least_share) ** 2
         least /= max(int(moving(climb.mode).sum()), 1)  # one dimension may show it alone
         for one in regression.signatures:
             climb.table.points[one.attached] = one.candidate.n_grid_points
@@ -484,25 +479,24 @@ class Search:
         """Return the best model without a law or with another one in its place, or the same."""
         moves: dict[frozenset[Attached], Mapping[str, float]] = {}
         for law in climb.laws:
-            rest, others = frozenset(climb.laws) - {law}, candidates
-            if law.effect.unusual:
-                others = self._candidates(library.mode, climb.unusual)
+            rest, labels = frozenset(climb.laws) - {law}, _labels(library.mode, law)
+            unusual = law.effect.unusual
+            others = self._candidates(library.mode, climb.unusual) if unusual else candidates
             instead = best_subsets(library, [law, *others], (law,), largest=1, say=self.say)
             groups = [{first, *more} for first, more in instead.same.items()]
             same = next((group for group in groups if law in group), {law})
             climb.same[law] = tuple(one for one in others if one in same)
-            own = max((one.nats for one in instead.subsets if same & {*one.laws}), default=0.0)
+            own = max((one.nats for one in instead.subsets if one.laws[0] in same), default=0.0)
             climb.first_order[law] = own
-            labels = _labels(library.mode, law)
-            if own < _CLEAR:
-                others = library.test((law,)).phi.tolist()
-                moves[rest] = dict(zip(labels, others, strict=True))
+            if own < self.clear:
+                left = library.test((law,)).phi.tolist()
+                moves[rest] = dict(zip(labels, left, strict=True))
             swaps = [
                 one for one in instead.subsets
-                if one.nats > 0.5 * max(own, 0.0) and not same & {*one.laws}
+                if one.nats > 0.5 * max(own, 0.0) and one.laws[0] not in same
             ]  # fmt: skip
-            alike = [one for one in instead.subsets if are_alike(law, *one.laws)]
-            for one in () if law.effect.unusual else alike:  # a simpler one that is nearly as good
+            alike = [one for one in instead.subsets if are_alike(law, one.laws[0])]
+            for one in () if unusual else alike:  # a simpler one that is nearly as good
                 simple = climb.table.fitted(climb.mode, rest | {*one.laws}, one.begin(labels))
                 more = share(simple, climb.mode, climb.table.weight)
                 if more < self.criteria.search.least_share:
@@ -520,7 +514,6 @@ class Search:
         """Return the best of some models, of those nearly as good the smallest; or the same."""
         table, now, laws = climb.table, climb.mode, frozenset(climb.laws)
         least, most = self.criteria.search.least_nats, self.criteria.far_out
-        good = list[tuple[float, Mode, float]]()
         table.race(now, moves, self.say)
         fair = {  # a law of an impossible size takes no others with it
             key - {law}: _without(begin, law)
@@ -530,40 +523,46 @@ class Search:
         }  # fmt: skip
         moves = {**moves, **fair}
         table.race(now, {key: begin for key, begin in fair.items() if len(key) > len(laws)})
-        weight, here, top = table.weight, table.value(now), 0.0
-        for key in (one for one in moves if one in table.modes and one != laws):
-            mode = table.modes[key]
-            gain = table.value(mode) - here
-            if key < laws:
-                gain -= sum(climb.earlier.get(law, 0.0) for law in laws - key)
-            else:
-                # in a law's place one of more parameters follows whatever else is missing
-                flexible = len(key) <= len(laws) and len(mode.phi) > len(now.phi)
-                needed_share = max(least_share, self.criteria.search.least_share * flexible)
-                if climb.last and len(key) > len(laws) + 1:  # no handful of small ones at the end
-                    needed_share = self.criteria.search.main_share
-                if share(now, mode, weight) < needed_share or far_out(mode, key) >= most:
-                    continue
-            top = max(top, gain)
-            needed = 0.0 if key < laws else least
-            if not key < laws and len(key) <= len(laws) and len(mode.phi) < len(now.phi):
-                needed = -least  # of two that are nearly as good the simpler one
-            if gain >= needed:
-                good.append((gain, mode, needed))
-        near = [one for one in good if one[0] > top - least]
+        judged = [
+            (*gain, table.modes[key]) for key in moves if key in table.modes and key != laws
+            if (gain := self._gain(climb, key, least_share))
+        ]  # fmt: skip
+        top = max([0.0, *(gain for gain, *_ in judged)])
+        near = [one for one in judged if one[0] >= one[1] and one[0] > top - least]
         if not near:
             return now
-        _, mode, needed = min(near, key=lambda one: (len(one[1].phi), -one[0]))
-        # friction makes the top rough: the better model may only have been climbed from elsewhere
+        _, needed, mode = min(near, key=lambda one: (len(one[2].phi), -one[0]))
+        # repeatability of refits: friction has kinks, and the better model may only have been
+        # climbed from elsewhere
         kept = by_label({law: sizes_of(now, law) for law in laws})
         again = refit(mode, now.problem.physics.effects, kept)
-        if table.value(again) > here:
+        if table.value(again) > table.value(now):
             table.modes[laws] = climb.mode = again
             if table.value(mode) - table.value(again) < needed:
                 return again
         if new := [law for law in table.laws(mode) if law not in laws]:
             self.say(f"simulations name {' and '.join(map(_name, new))}")
         return mode
+
+    def _gain(
+        self, climb: _Climb, key: frozenset[Attached], least_share: float
+    ) -> tuple[float, float] | None:
+        """Return what a model with other laws gains, and has to gain (nats); None if it is none."""
+        limits, table, now, laws = self.criteria.search, climb.table, climb.mode, {*climb.laws}
+        mode = table.modes[key]
+        gain = table.value(mode) - table.value(now)
+        if key < laws:
+            return gain - sum(climb.earlier.get(law, 0.0) for law in laws - key), 0.0
+        # in a law's place one of more parameters follows whatever else is missing
+        larger, more = len(key) > len(laws), len(mode.phi) - len(now.phi)
+        needed_share = max(least_share, limits.least_share * (not larger and more > 0))
+        if climb.last and len(key) > len(laws) + 1:  # no handful of small ones at the end
+            needed_share = limits.main_share
+        taken = share(now, mode, table.weight)
+        if taken < needed_share or far_out(mode, key) >= self.criteria.far_out:
+            return None
+        # of two that are nearly as good the simpler one
+        return gain, -limits.least_nats if not larger and more < 0 else limits.least_nats
 
     def _leave_out(self, climb: _Climb) -> None:
         """Leave out laws without evidence, and those that take less off than a main law."""
@@ -606,34 +605,61 @@ class Search:
         before = declared if shares else mode
         if shares and is_simulated_mode(before):
             before = with_robust_covariance(before)
-        confounded = dict[Attached, tuple[Attached, ...]]()
+        rivals = dict[Attached, list[Attached]]()
         for law in shares:  # a law of the same physics may have been refitted as well
-            rivals = table.rivals(climb.mode, law, limits.least_nats)
-            confounded[law] = tuple(dict.fromkeys((*climb.same.get(law, ()), *rivals)))
-        laws = {
-            law: law_of(mode, law, climb.earlier.get(law, 0.0), part, confounded[law])
-            for law, part in shares.items()
-        }
+            others = table.rivals(climb.mode, law, limits.least_nats)
+            rivals[law] = [*dict.fromkeys((*climb.same.get(law, ()), *others))]
         named = {name for one in climb.lengths for name in one.accepted}
-        for law in (one for one in climb.earlier if one not in {*laws, *climb.small, *rejected}):
+        for law in (one for one in climb.earlier if one not in {*shares, *climb.small, *rejected}):
             if _name(law) in named:
                 rejected[law] = "longer simulations do not need it"
         for law, why in rejected.items():
             self.say(f"dropped {_name(law)}: {why}")
-        signatures, tried = dict[Attached, Signature](), dict[Attached, tuple[float, float]]()
-        for regression in regressions:
-            for scored in regression.signatures:
-                signatures.setdefault(scored.attached, scored.without_bases())
-            for subset in regression.subsets:
-                for law in subset.laws if len(subset.laws) == 1 else ():
-                    alone_of = subset.nats, 1.0 - float(np.sqrt(1.0 - subset.share))
-                    for one in (law, *regression.same[law]):
-                        tried.setdefault(one, alone_of)
-        gains = {law: elpd_gain(table.without(climb.mode, law), mode) for law in laws}
+        decided = rejected | {
+            rival: f"explains these data as well as {law.effect.name.replace('_', ' ')}"
+            for law, others in rivals.items() for rival in others
+        }  # fmt: skip
+        for law, part in {**climb.small, **hypotheses}.items():
+            decided[law] = f"takes {100 * part:.2g} % off the error of simulated trajectories"
+        decided |= dict.fromkeys(shares, "added")
+        scored = _scored(regressions)
+        laws = {
+            law: _named(law, scored.get(law), climb, mode, part, rivals[law])
+            for law, part in shares.items()
+        }
+        too_little = "takes too little off the error of simulated trajectories"
         return SearchResult(
-            before, mode, laws, gains, confounded, tuple(climb.lengths), signatures, tried,
-            rejected, climb.small, hypotheses, doubt,
-        )  # fmt: skip
+            before,
+            mode,
+            laws,
+            {law: replace(one, why=decided.get(law, too_little)) for law, one in scored.items()},
+            tuple(climb.lengths),
+            rejected,
+            _aside(climb.small),
+            _aside(hypotheses),
+            doubt,
+        )
+
+
+def _scored(regressions: Sequence[Regression]) -> dict[Attached, Law]:
+    """Return each candidate's first score test, and what it is worth alone to first order."""
+    laws = dict[Attached, Law]()
+    for regression in regressions:
+        for signature in regression.signatures:
+            laws.setdefault(signature.attached, signature.candidate)
+        for subset in (one for one in regression.subsets if len(one.laws) == 1):
+            part = 1.0 - float(np.sqrt(1.0 - subset.share))
+            for law in (*subset.laws, *regression.same[subset.laws[0]]):
+                if laws[law].simulated_nats is None:
+                    alone = replace(laws[law], simulated_nats=subset.nats, simulated_share=part)
+                    laws[law] = alone
+    return laws
+
+
+def _aside(shares: Mapping[Attached, float]) -> tuple[Law, ...]:
+    """Return laws that are not added, those that take the largest shares off first."""
+    by_share = sorted(shares.items(), key=lambda one: -one[1])
+    return tuple(Law(law.effect.name, law.body, simulated_share=part) for law, part in by_share)
 
 
 def _apart(mode: Mode, length: int, *, most: float = 0.5) -> Problem:
@@ -678,7 +704,7 @@ def _with_contacts(
     if contacts is None:
         return found
 
-    def refitted(mode: Mode) -> Mode:
+    def with_contacts(mode: Mode) -> Mode:
         if not is_simulated_mode(mode):
             return mode
         data, states = mode.problem.data, simulated_states(mode)
@@ -686,9 +712,8 @@ def _with_contacts(
         physics = problem.physics.changed(substeps=whole.problem.physics.substeps)
         problem = replace(problem, physics=physics.in_parts(data.history))
         known = problem.layout.from_layout(whole.problem.layout, whole.phi)
-        phi = np.where(informed(mode), mode.phi, known)
         pieces = in_pieces(problem, shortest, states)
-        fitted = fit_pieces(pieces, phi)
+        fitted = fit_pieces(pieces, _informed_or(known, mode))
         # a collision that the engine does not have stays left out
         off = np.abs(fitted.problem.residual(fitted.phi)).max(axis=(1, 2)) > far_out * mode.sigma
         segments, breaks = pieces.segments, np.zeros_like(contacts)
@@ -697,12 +722,15 @@ def _with_contacts(
             breaks[rows] = contacts[rows]
         pieces = in_pieces(problem.with_data(breaks=breaks), data.horizon, states)
         longer = fit_pieces_closely(pieces, fitted.phi)
-        fitted = fitted if growth(longer.problem) > MOST_GROWTH else longer
-        fitted = with_robust_covariance(fitted)
-        return replace(fitted, phi=np.where(informed(fitted), fitted.phi, known))
+        last = with_robust_covariance(fitted if growth(longer.problem) > MOST_GROWTH else longer)
+        return replace(last, phi=_informed_or(known, last))
 
-    declared, after = in_parallel(refitted, [found.declared, found.after])
-    return replace(found, declared=declared if found.laws else after, after=after)
+    return found.refitted(with_contacts)
+
+
+def _informed_or(known: Floats, mode: Mode) -> Floats:
+    """Return a mode's parameters, known ones where its data do not inform them, shape (p,)."""
+    return np.where(informed(mode), mode.phi, known)
 
 
 def _carried(mode: Mode, length: int) -> SimulatedMode:
@@ -740,23 +768,32 @@ def elpd_gain(before: Mode, after: Mode) -> tuple[float, float]:
     return total, float(np.sqrt(n) * gains.std(ddof=1)) if n > 1 else float("nan")
 
 
-def law_of(
-    mode: Mode, law: Attached, nats: float, part: float, confounded: Sequence[Attached]
+def _named(
+    law: Attached,
+    scored: Law | None,
+    climb: _Climb,
+    mode: Mode,
+    part: float,
+    rivals: Sequence[Attached],
 ) -> Law:
-    """Return a law of a mode in words and numbers."""
+    """Return a law with its sizes at a mode and what a climb says of it.
+
+    It takes a ``part`` of the error off, has the score test ``scored``, if any, and ``rivals``.
+    """
     effect, places = law.effect, mode.problem.layout.places(law.labels)
     sd = np.sqrt(np.diag(mode.covariance)[places])
     names = [parameter.name for parameter in effect.parameters]
-    return Law(
-        effect=effect.name,
-        body=law.body,
-        sentence=effect.sentence,
+    gain, error = elpd_gain(climb.table.without(climb.mode, law), mode)
+    return replace(
+        scored or Law(effect.name, law.body, effect.sentence),
         estimate=dict(zip(names, mode.phi[places].tolist(), strict=True)),
         sd=dict(zip(names, sd.tolist(), strict=True)),
         units={parameter.name: parameter.unit for parameter in effect.parameters},
-        nats=nats,
-        share=part,
-        confounded=tuple(named_beside(rival, law) for rival in confounded),
+        simulated_nats=climb.earlier.get(law, 0.0),
+        simulated_share=part,
+        not_separable_from=tuple(named_beside(rival, law) for rival in rivals),
+        elpd_difference=gain,
+        elpd_difference_se=error,
     )
 
 
@@ -811,32 +848,15 @@ def _structures(subset: Subset) -> set[Attached]:
     return {law for law in subset.laws if isinstance(law.effect.stage, Structure)}
 
 
-def _is_lost(shorter: Mode, mode: SimulatedMode) -> bool:
+def _is_lost(shorter: Mode, mode: SimulatedMode, *, far: float = 0.2, more: float = 3.0) -> bool:
     """Return whether pieces are too long to tell a law from.
 
     Their initial states are magnified, or the error nears the motion's size, where it is out of
-    phase.
+    phase: from this share of the motion and multiple of the ``shorter`` pieces' error on.
     """
-    values = mode.problem.observations.values
-    return growth(mode.problem) > MOST_GROWTH or is_out_of_phase(mode.sigma, shorter.sigma, values)
-
-
-def is_out_of_phase(
-    error: Floats, shorter: Floats, values: Floats, *, far: float = 0.2, more: float = 3.0
-) -> bool:
-    """Return whether a simulation error nears the size of the motion.
-
-    Parameters
-    ----------
-    error, shorter : ndarray
-        Errors on pieces and on shorter ones, shape (state,), SI units.
-    values : ndarray
-        Measurements, shape (piece, H, body, state), SI units.
-    far, more : float
-        Share of the motion, and multiple of the shorter pieces' error, from which it does.
-    """
-    motion = np.nanstd(values, axis=(0, 1, 2))
-    return bool(((error > far * motion) & (error > more * shorter)).any())
+    motion = np.nanstd(mode.problem.observations.values, axis=(0, 1, 2))
+    out_of_phase = (mode.sigma > far * motion) & (mode.sigma > more * shorter.sigma)
+    return growth(mode.problem) > MOST_GROWTH or bool(out_of_phase.any())
 
 
 def _name(law: Attached) -> str:

@@ -24,11 +24,6 @@ from pbrl_ppl.effects import Attached
 from pbrl_ppl.state import Floats, Ints
 from pbrl_ppl.threads import Say, in_parallel, silent
 
-#: A whole change, as by an obstacle, is of size 1: it is at least this share of it in a subset.
-_LEAST_CHANGE = 0.5
-#: A scanned effect's linearisations are tried jointly, this many of each set of laws' leaders.
-_MOST_POINTS = 3
-
 
 @dataclass(frozen=True, eq=False)
 class Subset:
@@ -42,9 +37,6 @@ class Subset:
         Log-evidence less its price.
     share : float
         Share of the squared whitened residual that they take away.
-    prices : dict of Attached to float
-        Logarithm of the number of candidates and grid points that each was chosen from, less the
-        logarithm of its prior odds (nats).
     phi : ndarray
         The mode's other parameters by the joint regression, shape (p,).
     """
@@ -52,7 +44,6 @@ class Subset:
     sizes: Mapping[Attached, Floats]
     nats: float
     share: float
-    prices: Mapping[Attached, float]
     phi: Floats
 
     @property
@@ -76,12 +67,8 @@ def by_label(sizes: Mapping[Attached, Floats]) -> dict[str, float]:
 
 def worth(share: float, columns: int, n: float) -> float:
     """Return the log-evidence (nats) of columns that take a share of n squared residuals away."""
-    return 0.5 * n * fall(share) - 0.5 * columns * float(np.log(n))
-
-
-def fall(share: float) -> float:
-    """Return by how much a logarithm falls without a share of its number."""
-    return -float(np.log(max(1.0 - share, 1e-15)))  # of exact data nothing is left
+    left = max(1.0 - share, 1e-15)  # of exact data nothing is left
+    return -0.5 * n * float(np.log(left)) - 0.5 * columns * float(np.log(n))
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,18 +92,26 @@ class Regression:
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """A law linearised at one point, and its columns in the regression."""
+    """A law linearised at one point, its columns in the regression, and its price (nats).
+
+    That is the logarithm of the number of candidates and grid points that it is chosen from, less
+    the logarithm of its prior odds.
+    """
 
     law: Attached
     linear: Linearisation
     columns: Ints
     price: float
 
-    def sizes(self, coordinates: Floats, most: float) -> Floats | None:
-        """Return the law's parameters; None where one breaks a sign, or a whole change its size."""
+    def sizes(self, coordinates: Floats, most: float, *, least: float = 0.5) -> Floats | None:
+        """Return the law's parameters; None where one breaks a sign, or a whole change its size.
+
+        ``most``: prior scales from the linearisation at which sizes are clipped.
+        ``least``: smallest size of a whole change, as by an obstacle, which is of size 1.
+        """
         change = self.linear.back @ coordinates
         free = list(self.linear.columns)
-        if not free and not _LEAST_CHANGE < change[0] < 1.0 / _LEAST_CHANGE:
+        if not free and not least < change[0] < 1.0 / least:
             return None
         if len(free) == 1 and null_sides(self.law)[free[0]] * change[0] < 0:
             return None
@@ -131,11 +126,8 @@ def best_subsets(
     candidates: Sequence[Attached],
     without: tuple[Attached, ...] = (),
     *,
-    leaders: int = 14,
-    beside: int = 8,
-    beam: int = 12,
     largest: int = 3,
-    independent: float = 1e-5,
+    points: int = 3,
     say: Say = silent,
 ) -> Regression:
     """Search the subsets of a few laws that explain the residual of a mode.
@@ -153,16 +145,10 @@ def best_subsets(
         Effects to choose from.
     without : tuple of Attached
         Laws of the model that are left out, to first order.
-    leaders : int
-        Candidates that take most of the residual away, of which subsets are made.
-    beside : int
-        Further ones, which take most away beside the first.
-    beam : int
-        Subsets of each size that are enlarged.
     largest : int
         Laws in a subset, at most.
-    independent : float
-        Least ratio of the eigenvalues of a subset's normal equations.
+    points : int
+        Grid points kept per candidate.
     say : callable
         Called with how many candidates are linearised.
     """
@@ -175,97 +161,69 @@ def best_subsets(
     distinct, same = _distinct(signatures, candidates)
     if not distinct or total <= 0.0:
         return Regression((), same, tuple(signatures))
-    leading = _leading(distinct, residual, leaders, beside)
     terms: list[Term] = []
     width = 0
-    for signature in leading:
+    for signature in _leading(distinct, residual):
         law = signature.attached
         price = np.log(len(distinct) * signature.candidate.n_grid_points) - law.effect.log_odds
-        for linear in signature.linear[:_MOST_POINTS]:
+        for linear in signature.linear[:points]:
             columns = np.arange(width, width + linear.basis.shape[1])
             terms.append(Term(law, linear, columns, float(price)))
             width += len(columns)
-    test, far_out = library.test(without), library.criteria.far_out
-    equations = _NormalEquations.of(tuple(terms), test, n, far_out, independent)
     order = {law: place for place, law in enumerate(candidates)}
-    tried = equations.search([order[term.law] for term in terms], beam, largest)
+    equations = _NormalEquations(terms, library.test(without), n)
+    tried = equations.search([order[term.law] for term in terms], largest)
     best = sorted(tried, key=lambda subset: -subset.nats)
     return Regression(tuple(best), same, tuple(signatures))
 
 
-@dataclass(frozen=True, eq=False)
 class _NormalEquations:
     """Normal equations of the regression of a residual on the columns of terms.
 
     Parameters
     ----------
-    terms : tuple of Term
-        Laws at one point each.
-    gram, towards : ndarray
-        Products of all columns with each other and with the residual, shapes (column, column) and
-        (column,).
-    absorbed : ndarray
-        Change of the mode's parameters with each column, shape (p, column).
-    phi : ndarray
-        These parameters without the columns, shape (p,).
-    total : float
-        Squared size of the residual.
+    terms : sequence of Term
+        Laws at one point each, the columns of which are in their order.
+    test : ScoreTest
+        The residual, and the mode's parameters without the columns.
     n : float
         Measurements over their autocorrelation times.
-    far_out : float
-        Prior scales beyond which sizes are clipped.
-    independent : float
-        Least ratio of the eigenvalues of a subset's equations.
     """
 
-    terms: tuple[Term, ...]
-    gram: Floats
-    towards: Floats
-    absorbed: Floats
-    phi: Floats
-    total: float
-    n: float
-    far_out: float
-    independent: float
-
-    @classmethod
-    def of(
-        cls, terms: tuple[Term, ...], test: ScoreTest, n: float, far_out: float, independent: float
-    ) -> _NormalEquations:
-        """Return the equations of terms, the columns of which are in their order."""
+    def __init__(self, terms: Sequence[Term], test: ScoreTest, n: float) -> None:
+        self.terms, self.test, self.n = terms, test, n
         basis, residual = np.hstack([term.linear.basis for term in terms]), test.residual
-        absorbed = np.hstack([term.linear.absorbed for term in terms])
-        total = float(residual @ residual)
-        return cls(
-            terms, basis.T @ basis, basis.T @ residual, absorbed, test.phi, total,
-            n, far_out, independent,
-        )  # fmt: skip
+        self.gram, self.towards = basis.T @ basis, basis.T @ residual
+        self.absorbed = np.hstack([term.linear.absorbed for term in terms])
+        self.total = float(residual @ residual)
 
-    def solved(self, chosen: Sequence[int]) -> Subset | None:
-        """Return the subset of some terms; None if they are collinear, or a size is impossible."""
+    def solved(self, chosen: Sequence[int], *, independent: float = 1e-5) -> Subset | None:
+        """Return the subset of some terms; None if they are collinear, or a size is impossible.
+
+        ``independent``: least ratio of the eigenvalues of a subset's equations.
+        """
         terms = [self.terms[i] for i in chosen]
         columns = np.concatenate([term.columns for term in terms])
         values, vectors = np.linalg.eigh(self.gram[np.ix_(columns, columns)])
-        if values[0] < self.independent * values[-1]:
+        if values[0] < independent * values[-1]:
             return None
         coordinates = vectors @ ((vectors.T @ self.towards[columns]) / values)
-        sizes, begin = {}, 0
-        for term in terms:
-            end = begin + len(term.columns)
-            size = term.sizes(coordinates[begin:end], self.far_out)
+        ends, sizes = np.cumsum([len(term.columns) for term in terms]), dict[Attached, Floats]()
+        for term, part in zip(terms, np.split(coordinates, ends[:-1]), strict=True):
+            size = term.sizes(part, self.test.criteria.far_out)
             if size is None:
                 return None
-            sizes[term.law], begin = size, end
+            sizes[term.law] = size
         share = min(float(coordinates @ self.towards[columns]) / self.total, 1.0 - 1e-12)
-        prices = {term.law: term.price for term in terms}
-        nats = worth(share, len(columns), self.n) - sum(prices.values())
-        phi = self.phi - self.absorbed[:, columns] @ coordinates
-        return Subset(sizes, nats, share, prices, phi)
+        nats = worth(share, len(columns), self.n) - sum(term.price for term in terms)
+        phi = self.test.phi - self.absorbed[:, columns] @ coordinates
+        return Subset(sizes, nats, share, phi)
 
-    def search(self, order: Sequence[int], beam: int, largest: int) -> list[Subset]:
+    def search(self, order: Sequence[int], largest: int, *, beam: int = 12) -> list[Subset]:
         """Return the subsets tried: all of one or two laws, then the best with one more law.
 
-        ``order`` is the place of each term's law in the catalogue.
+        ``order`` is the place of each term's law in the catalogue, ``beam`` the number of subsets
+        of each size that are enlarged.
         """
         level: dict[tuple[int, ...], Subset] = {
             (i,): one for i in range(len(self.terms)) if (one := self.solved((i,))) is not None
@@ -276,15 +234,10 @@ class _NormalEquations:
             best = sorted(level, key=lambda chosen: -level[chosen].nats)
             for chosen in best if len(next(iter(level), ())) == 1 else best[:beam]:
                 laws = {self.terms[i].law for i in chosen}
-                for i, term in enumerate(self.terms):
+                for i in (i for i, term in enumerate(self.terms) if term.law not in laws):
                     more = tuple(sorted((*chosen, i), key=lambda i: (order[i], i)))
-                    if term.law in laws or more in tried or more in grown:
-                        continue
-                    if (one := self.solved(more)) is not None:
-                        grown[more] = one
-            if not grown:
-                break
-            tried |= grown
+                    if more not in tried and (one := self.solved(more)) is not None:
+                        grown[more] = tried[more] = one
             level = grown
         return list(tried.values())
 
@@ -317,14 +270,14 @@ def _distinct(
 
 
 def _leading(
-    distinct: Sequence[Signature], residual: Floats, leaders: int, beside: int
+    distinct: Sequence[Signature], residual: Floats, *, leaders: int = 14, beside: int = 8
 ) -> list[Signature]:
     """Return the candidates that take most away, alone and beside the first of them."""
 
-    def taken(signature: Signature, residual: Floats) -> float:
+    def taken(signature: Signature) -> float:
         return float(((signature.basis.T @ residual) ** 2).sum())
 
-    leading = sorted(distinct, key=lambda one: -taken(one, residual))[:leaders]
+    leading = sorted(distinct, key=taken, reverse=True)[:leaders]
     first = leading[0].basis
     left = residual - first @ (first.T @ residual)
 
@@ -333,5 +286,5 @@ def _leading(
         q, r = np.linalg.qr(rest)
         return float(((q[:, np.abs(np.diag(r)) > 1e-3].T @ left) ** 2).sum())
 
-    second = sorted(distinct, key=lambda one: -taken_beside(one))[:beside]
+    second = sorted(distinct, key=taken_beside, reverse=True)[:beside]
     return list(dict.fromkeys([*leading, *second]))

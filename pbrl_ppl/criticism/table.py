@@ -228,27 +228,34 @@ class Table:
         say: Say = silent,
         *,
         rounds: int = 2,
+        most_rounds: int = 8,
         far: float = 30.0,
     ) -> None:
         """Fit models at once, from where their parameters begin, by their labels.
 
-        Those that are ``far`` behind the best after a few ``rounds`` (nats) are given up.
+        Those that are ``far`` behind the best after a few ``rounds`` (nats) are given up, others
+        take at most ``most_rounds``.
         """
-        new = [key for key in moves if key not in self.modes]
         told = f"refitting models on pieces of {near.problem.data.horizon} rows", say
+
+        def fits(keys: list[frozenset[Attached]], most: int) -> dict[frozenset[Attached], Mode]:
+            """Return models in the order of their keys, not that in which threads end."""
+            modes = in_parallel(
+                lambda key: self._refitted(near, key, moves[key], most), keys, *told
+            )
+            return dict(zip(keys, modes, strict=True))
+
+        new = [key for key in moves if key not in self.modes]
         if not is_simulated_mode(near) or len(new) < 2:
-            in_parallel(lambda key: self.fitted(near, key, moves[key]), new, *told)
+            self.modes |= fits(new, most_rounds)
             return
-        rest = [key for key in new if key not in self.behind]
-        first = in_parallel(lambda key: self._refitted(near, key, moves[key], rounds), rest, *told)
-        self.behind |= dict(zip(rest, first, strict=True))
+        self.behind |= fits([key for key in new if key not in self.behind], rounds)
         self.modes |= (tried := {key: self.behind[key] for key in new})
         values = {key: self.value(mode) for key, mode in tried.items()}
         least = max(*values.values(), self.value(near)) - far
         for key in new:
             del self.modes[key]
-        ahead = [key for key in new if values[key] >= least]
-        in_parallel(lambda key: self.fitted(near, key, moves[key]), ahead, *told)
+        self.modes |= fits([key for key in new if values[key] >= least], most_rounds)
 
     def without(self, mode: Mode, law: Attached) -> Mode:
         """Return a model without a law."""

@@ -336,7 +336,7 @@ def _depths(
     """Yield each pair that is near somewhere, where it is, and how deep, by ``near`` (n, pair)."""
     for pair in np.flatnonzero(near.any(axis=0)):
         (i, j), rows = pairs[pair], np.flatnonzero(near[:, pair])
-        yield pair, rows, depth(solids[i], poses[rows, i], solids[j], poses[rows, j])
+        yield int(pair), rows, depth(solids[i], poses[rows, i], solids[j], poses[rows, j])
 
 
 def _apart(scene: Scene, poses: Floats) -> Iterator[tuple[int, str]]:

@@ -22,7 +22,7 @@ from pbrl_ppl.state import Bools, Floats
 
 def columns(names: str | Iterable[str]) -> Any:
     """Return the numbers of columns by their names; a string has spaces between them."""
-    found = namedtuple("Columns", names)
+    found = namedtuple("Columns", names)  # type: ignore[misc]
     return found(*range(len(found._fields)))
 
 

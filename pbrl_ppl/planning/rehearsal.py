@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
-from pbrl_ppl.criticism.scan import each_grid_point
-from pbrl_ppl.criticism.score import Library, named_beside, null_sides
+from pbrl_ppl.criticism.score import Library, each_grid_point, named_beside, null_sides
 from pbrl_ppl.criticism.subsets import Term, worth
 from pbrl_ppl.criticism.table import shown_fall, weights
 from pbrl_ppl.effects import Attached, Effect, attach, candidates, is_pivoted

@@ -123,12 +123,12 @@ def _models(loop: Loop, before: T, after: T) -> list[tuple[str, T, str]]:
 
 def plot_residuals(loop: Loop, width: float = style.WIDE) -> Figure:
     """Plot held-out residuals of each state dimension in units of noise, before and after."""
-    names = list(loop.residuals_before)
+    names = list(loop.declared.residuals)
     figure, (axes,) = style.blank_figure(width, 3.6)
     edge = float(norm.ppf(0.5 + HDI_PROB / 2))
     axes.axhspan(-edge, edge, color=style.BAND, zorder=0)
     axes.axhline(0.0, color="black", linewidth=0.8, zorder=1)
-    models = _models(loop, loop.residuals_before, loop.residuals_after)
+    models = _models(loop, loop.declared.residuals, loop.revised.residuals)
     for i, (_, residuals, colour) in enumerate(models):
         places = np.arange(len(names)) + 0.36 * (i - (len(models) - 1) / 2)
         values = [np.asarray(residuals[name], dtype=float) for name in names]
@@ -156,7 +156,7 @@ def plot_errors(loop: Loop, width: float = style.WIDE) -> Figure:
     """Plot held-out errors one step ahead and at the end of a rollout, before and after."""
     titles = {
         "one_step_rmse": "one step ahead",
-        "rollout_rmse": f"{loop.rollout_horizon} steps ahead",
+        "rollout_rmse": f"{loop.forecasts.horizon} steps ahead",
     }
     kinds = [kind for kind in titles if getattr(loop.before, kind)]
     height = 1.2 + 0.42 * max((len(getattr(loop.before, kind)) for kind in kinds), default=1)
@@ -188,7 +188,7 @@ def plot_errors(loop: Loop, width: float = style.WIDE) -> Figure:
 
 def plot_rollout(loop: Loop, width: float = style.WIDE) -> Figure:
     """Plot one held-out trajectory: measured, and predicted before and after."""
-    rollout = loop.rollout
+    rollout = loop.forecasts.rollout
     count = len(rollout.names)
     columns = min(count, 2)
     figure, panels = style.blank_figure(width, 1.9, count, columns, spare=0.8)
@@ -258,7 +258,7 @@ def plot_correlations(loop: Loop, width: float = style.WIDE, most: int = 4) -> F
 
     Noise alone puts any curve of a panel outside the band once in 100 times.
     """
-    found = loop.correlations
+    found = loop.misfit.correlations
     pairs = found.pairs[found.pairs > 1].min(initial=found.pairs.max(initial=1))  # the fewest
     panels_of = {"with itself": (found.own, 1, pairs, list(found.cells))}
     if found.commands:
@@ -286,7 +286,7 @@ def plot_correlations(loop: Loop, width: float = style.WIDE, most: int = 4) -> F
 
 def plot_growth(loop: Loop, width: float = style.WIDE) -> Figure:
     """Plot errors of forecasts over their length, as multiples of the error from noise alone."""
-    growth = loop.growth
+    growth = loop.misfit.growth
     figure, (axes,) = style.blank_figure(width, 3.2)
     axes.axhline(1.0, color="black", linewidth=0.8)
     axes.set_prop_cycle(style.LINES + cycler(marker=list("ooss^^")))

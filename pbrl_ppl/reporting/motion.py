@@ -53,7 +53,7 @@ def held_out_motions(loop: Loop, most: int = 6, most_rows: int = 3000) -> list[M
     """
     if loop.held_out is None:
         return []
-    first_mode, last_mode = loop.innovations
+    first_mode, last_mode = loop.declared.innovations, loop.revised.innovations
     before = _predicted(first_mode, loop.held_out)
     after = before if last_mode is first_mode else _predicted(last_mode, loop.held_out)
     dataset = loop.held_out.dataset

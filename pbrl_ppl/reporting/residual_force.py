@@ -87,7 +87,7 @@ def find_laws(loop: Loop, most: int = 3, least: float = 0.02) -> list[ForceLaw]:
     remains = loop.unexplained
     if remains is None or not remains.body or remains.depends_on not in QUANTITIES:
         return []
-    problem, phi = loop.innovations[-1].problem, loop.innovations[-1].phi
+    problem, phi = loop.revised.innovations.problem, loop.revised.innovations.phi
     body = [moving.name for moving in problem.scene.moving].index(remains.body)
     residual = _residual_force(problem, phi, body, remains.dimension)
     if residual is None:

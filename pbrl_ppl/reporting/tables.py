@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 import xarray as xr
 
-from pbrl_ppl.criticism import Candidate, Errors, Loop, SearchLength
+from pbrl_ppl.criticism import Errors, Law, Loop, SearchLength
 from pbrl_ppl.effects import Sensor
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.posterior import Comparison, Identifiability, interval, scalars
@@ -79,14 +79,14 @@ def compare_models(
     return PageTable(caption, ("Measure", *models), rows)
 
 
-def measured_parameters(candidate: Candidate, loop: Loop) -> tuple[str, ...]:
+def measured_parameters(candidate: Law, loop: Loop) -> tuple[str, ...]:
     """Return a candidate's parameters without those of state dimensions that were not measured."""
     sensors = {effect.name for effect in loop.catalogue if isinstance(effect.stage, Sensor)}
-    unseen = {*STATE} - {*loop.residuals_after} if candidate.effect in sensors else set()
+    unseen = {*STATE} - {*loop.revised.residuals} if candidate.effect in sensors else set()
     return tuple(name for name in candidate.units if name not in unseen)
 
 
-def limits_in_words(candidate: Candidate, loop: Loop) -> str:
+def limits_in_words(candidate: Law, loop: Loop) -> str:
     """Return the detection limit of each parameter as text; empty where there is none.
 
     A limit beyond what the effect's prior allows is left out: no plausible size would be found.
@@ -133,9 +133,10 @@ def error_tables(loop: Loop) -> list[PageTable]:
     """Tabulate the held-out errors, one interval and a rollout ahead, and overall."""
     errors = dict(zip(models_of(loop), (loop.before, loop.after), strict=False))
     errors["Noise floor"] = loop.noise_floor
+    intervals, seconds = loop.forecasts.horizon, number(loop.rollout_seconds)
     titles = {
         "one_step_rmse": f"One interval ahead, {loop.scene.time_step:g} s",
-        "rollout_rmse": f"{loop.rollout_horizon} intervals ahead, {number(loop.rollout_seconds)} s",
+        "rollout_rmse": f"{intervals} intervals ahead, {seconds} s",
         "simulated_rmse": "Whole trajectories, simulated from initial states fitted to them",
     }
     tables = []
@@ -225,7 +226,7 @@ def candidate_table(loop: Loop) -> PageTable:
     """Tabulate the candidates: scores, the search's regression for each alone, the decision."""
     added = {(effect.effect, effect.body) for effect in loop.added}
 
-    def estimate(one: Candidate) -> str:
+    def estimate(one: Law) -> str:
         return ", ".join(
             f"{plain(name)} {quantity(one.estimate[name], one.units[name])}"
             for name in measured_parameters(one, loop)
@@ -264,7 +265,7 @@ def search_table(loop: Loop) -> PageTable:
         "Dropped": lambda one: ", ".join(map(plain, one.dropped)) or "–",
     }
     words = ("Error before", "Accepted", "Dropped")
-    return tabulate("The search by length of pieces", loop.search, columns, words)
+    return tabulate("The search by length of pieces", loop.found.lengths, columns, words)
 
 
 def parameter_table(parameters: Parameters) -> PageTable:

@@ -12,8 +12,8 @@ from pbrl_ppl.criticism import (
     NOT_CONVERGED,
     ONE_TRAJECTORY,
     UNEXPLAINED,
-    Added,
     Estimate,
+    Law,
     Loop,
     acceleration_in_words,
     share_in_words,
@@ -47,7 +47,7 @@ def _found(loop: Loop) -> str:
     if not loop.added:
         if loop.verdict == UNEXPLAINED:
             return "No effect in the catalogue explains the residual"
-        matters = " that matters" if loop.small or loop.acceleration.remaining else ""
+        matters = " that matters" if loop.found.small or loop.acceleration.remaining else ""
         return f"Nothing{matters} was found missing"
     first, *more = loop.added
     sentence = _listed([_named(one) for one in (first, *more)], "and")
@@ -57,7 +57,7 @@ def _found(loop: Loop) -> str:
     return f"{sentence[0].upper()}{sentence[1:]}"
 
 
-def _named(added: Added) -> str:
+def _named(added: Law) -> str:
     """Write an effect and its body, or the effects that fit as well."""
     others = [plain(name) for name in added.not_separable_from]
     if len(others) > 2:
@@ -65,7 +65,7 @@ def _named(added: Added) -> str:
     return f"{_listed([plain(added.effect), *others], 'or')} on the {plain(added.body)}"
 
 
-def has_size(added: Added) -> bool:
+def has_size(added: Law) -> bool:
     """Return whether an effect's size fits into a headline: one number of one effect."""
     return len(added.parameters) == 1 and not added.not_separable_from
 
@@ -174,7 +174,7 @@ def remains_in_words(loop: Loop) -> str:
     small = "".join(
         f" There is {plain(one.effect)} on the {plain(one.body)}, which changes predictions by"
         f" less than {100 * loop.criteria.negligible:g} %."
-        for one in loop.small
+        for one in loop.found.small
     )
     return f"{passed}.{small}"
 
@@ -199,15 +199,15 @@ def error_in_words(loop: Loop) -> str:
 
 def caution_in_words(loop: Loop) -> str:
     """Return what to know of added effects of a recording of one trajectory; empty otherwise."""
-    single = bool(loop.added) and loop.provenance.get("trajectories") == 1
+    single = bool(loop.added) and loop.data.provenance.get("trajectories") == 1
     return f"{ONE_TRAJECTORY[0].upper()}{ONE_TRAJECTORY[1:]}." if single else ""
 
 
 def left_out_in_words(loop: Loop) -> str:
     """Return what was left out of the histories, of bad frames the first few one by one."""
-    first, more = loop.bad_frames[:LISTED], len(loop.bad_frames) - LISTED
+    first, more = loop.data.bad_frames[:LISTED], len(loop.data.bad_frames) - LISTED
     rest = f"; and {more} more (report.json lists them)" if more > 0 else ""
-    said = "; ".join((*loop.drawn, *first))
+    said = "; ".join((*loop.data.drawn, *first))
     return f"{said}{rest}." if said else ""
 
 
@@ -262,12 +262,15 @@ def held_out_in_words(loop: Loop) -> str:
 def left_aside_in_words(loop: Loop) -> list[str]:
     """Return sentences on laws that were found and not added, with their shares of the error."""
     said = [
-        f"{_law(one.effect, one.body)} takes {percent(one.share)} off the error of the longest"
-        " simulations: too little to be added."
-        for one in loop.lesser
+        f"{_law(one.effect, one.body)} takes {percent(one.simulated_share)} off the error of the"
+        " longest simulations: too little to be added."
+        for one in loop.found.lesser
     ]
-    if loop.hypotheses:
-        names = [f"{_law(one.effect, one.body)} ({percent(one.share)})" for one in loop.hypotheses]
+    if loop.found.hypotheses:
+        names = [
+            f"{_law(one.effect, one.body)} ({percent(one.simulated_share)})"
+            for one in loop.found.hypotheses
+        ]
         said.append(
             f"Of what remains one of these would take a part off: {_listed(names, 'or')}; few rigs"
             " have it, so it was not added: declare it to try."

@@ -12,7 +12,7 @@ import pytest
 
 from pbrl_ppl import criticism
 from pbrl_ppl.cli import main
-from pbrl_ppl.criticism.loop import FILES, Loop
+from pbrl_ppl.criticism import FILES, Loop
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.errors import ConvergenceWarning, HistoryError
 from tests.helpers.made_up import made_up

@@ -541,7 +541,7 @@ def test_advice_is_of_no_language() -> None:
     Excepted are reprs, the code that a report shows, and the messages about effects, which are
     written in Python.
     """
-    python = {"criticism/loop.py", "reporting/many.py", "reporting/reports.py",
+    python = {"criticism/results.py", "reporting/many.py", "reporting/reports.py",
               "effects/effect.py", "physics/trial.py"}  # fmt: skip
     advice = re.compile(r"\b[a-z_]+=(True|False|None|'\w*')?(?=[\s,;.)]|$)")
     package = ROOT / "pbrl_ppl"

@@ -1,7 +1,5 @@
 """Single bad frames are left out of both histories, named, and stay so in posterior files."""
 
-from dataclasses import replace
-
 import numpy as np
 
 from pbrl_ppl.criticism.attribution import criticise
@@ -12,7 +10,7 @@ from pbrl_ppl.posterior import recorded, recording
 from pbrl_ppl.reporting import in_brief, render
 from tests.helpers.free_puck import DISC, Disc, fitted, searched
 from tests.helpers.histories import simulated_history
-from tests.helpers.made_up import made_up
+from tests.helpers.made_up import changed, made_up
 from tests.helpers.places import MODELS, load
 
 
@@ -94,7 +92,7 @@ def test_criticise_says_which() -> None:
 
 def test_the_report_says_which() -> None:
     sentence = "x of puck at t = 0.8 s of trajectory 1 is off by 0.3 m and left out (1 of 105 rows)"
-    findings = replace(made_up(), bad_frames=(sentence,) * 9)
+    findings = changed(made_up(), bad_frames=(sentence,) * 9)
     assert sentence in render(findings)
     assert f"Left out: {sentence}" in "\n".join(in_brief(findings, "out"))
     assert findings.to_dict()["bad_frames"] == [sentence] * 9

@@ -12,11 +12,10 @@ import pytest
 import pbrl_ppl as pp
 from pbrl_ppl.criticism import close_loop
 from pbrl_ppl.criticism.criteria import DEFAULT
-from pbrl_ppl.criticism.dependence import find_dependence
+from pbrl_ppl.criticism.innovations import find_dependence, unexplained_acceleration
 from pbrl_ppl.criticism.misfit import find_misfit
 from pbrl_ppl.criticism.refinement import with_enough_substeps
 from pbrl_ppl.criticism.results import KindOfTest
-from pbrl_ppl.criticism.unexplained import unexplained_acceleration
 from pbrl_ppl.effects import attach
 from pbrl_ppl.likelihood import Problem, bodies_acceleration, smoothed
 from pbrl_ppl.modes import Mode, find_mode, trajectory_mode

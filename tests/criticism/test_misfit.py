@@ -10,14 +10,14 @@ import pytest
 from scipy.stats import binom
 
 from pbrl_ppl.criticism.criteria import DEFAULT
-from pbrl_ppl.criticism.dependence import _kernels
-from pbrl_ppl.criticism.misfit import find_misfit
-from pbrl_ppl.criticism.results import KindOfTest, ResidualTest
-from pbrl_ppl.criticism.unexplained import (
+from pbrl_ppl.criticism.innovations import (
     UnexplainedAcceleration,
+    _kernels,
     noise_alone,
     unexplained_acceleration,
 )
+from pbrl_ppl.criticism.misfit import find_misfit
+from pbrl_ppl.criticism.results import KindOfTest, ResidualTest
 from tests.helpers.free_puck import BOX, DISC, Disc, box2d, fitted
 from tests.helpers.histories import NOISE
 
@@ -61,9 +61,12 @@ def test_clean_data_of_another_engine_pass(make_history) -> None:
     assert found.unexplained is None
     assert not found.predicts(DEFAULT)  # a test that is missing is not passed
     for kind in (KindOfTest.HELD_OUT, KindOfTest.SIMULATION):
-        found = found.with_test(ResidualTest(kind, 0.5, 0.0, True, "as expected"))
+        found = replace(
+            found, tests=(*found.tests, ResidualTest(kind, 0.5, 0.0, True, "as expected"))
+        )
     assert found.predicts(DEFAULT)
-    failed = found.with_test(ResidualTest(KindOfTest.SIMULATION, 0.5, 9.0, False, "far off"))
+    far_off = ResidualTest(KindOfTest.SIMULATION, 0.5, 9.0, False, "far off")
+    failed = replace(found, tests=(*found.tests, far_off))
     assert not failed.predicts(DEFAULT)
     assert {test.name for test in found.tests if test.tested} == {
         *RATES,

@@ -39,5 +39,5 @@ def test_a_real_pivot_rubs(shared_data) -> None:
     assert {"pivot_damping", "pivot_friction"} & {one.effect for one in found.added}
     assert found.verdict in ("effects-added", "unexplained")
     assert found.posterior_after.attrs["max_rhat"] <= 1.02
-    assert found.rollout_horizon == 50  # 1 s
+    assert found.forecasts.horizon == 50  # 1 s
     assert found.after.rollout_rmse["theta"] <= 0.0020

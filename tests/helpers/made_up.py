@@ -6,17 +6,21 @@ from typing import Any
 import arviz as az
 import numpy as np
 
-from pbrl_ppl.criticism.loop import Loop
 from pbrl_ppl.criticism.results import (
     Acceleration,
-    Added,
-    Candidate,
+    ComparedModel,
     Correlations,
     Errors,
     Estimate,
+    Forecasts,
+    Found,
     Growth,
     KindOfTest,
+    Law,
+    Loop,
+    Misfit,
     Numerical,
+    Recordings,
     ResidualTest,
     Rollout,
     Unexplained,
@@ -24,6 +28,16 @@ from pbrl_ppl.criticism.results import (
 from pbrl_ppl.posterior import Fit
 from pbrl_ppl.scene import Body, Scene, Shape
 from pbrl_ppl.state import STATE, STATE_UNITS
+
+#: Where a loop's findings are in its records.
+PLACES = {
+    **dict.fromkeys(("candidates", "added", "small", "lesser", "hypotheses", "lengths"), "found"),
+    **dict.fromkeys(
+        ("provenance", "held_out", "velocities_not_used", "bad_frames", "drawn"), "data"
+    ),
+    **dict.fromkeys(("tests", "correlations", "growth"), "misfit"),
+    **dict.fromkeys(("noise_floor", "rollout", "horizon"), "forecasts"),
+}
 
 DRAG = "a force against the motion that grows with the speed"
 
@@ -58,6 +72,20 @@ def made_up_errors(times: float) -> Errors:
     return Errors(grown, far, normalised_rmse=times, elpd=3000.0 - 300.0 * times)
 
 
+def changed(loop: Loop, **values: Any) -> Loop:
+    """Return a loop with other findings, by their names in whichever of its records holds them."""
+    for name, value in values.items():
+        if name in ("before", "after"):
+            place = "declared" if name == "before" else "revised"
+            loop = replace(loop, **{place: replace(getattr(loop, place), errors=value)})
+        elif name in PLACES:
+            record = replace(getattr(loop, PLACES[name]), **{name: value})
+            loop = replace(loop, **{PLACES[name]: record})
+        else:
+            loop = replace(loop, **{name: value})
+    return loop
+
+
 def made_up(verdict: str = "effects-added", stuck: bool = False) -> Loop:
     """Small findings of each verdict, without a fit."""
     rng = np.random.default_rng(0)
@@ -78,7 +106,7 @@ def made_up(verdict: str = "effects-added", stuck: bool = False) -> Loop:
     found = verdict == "effects-added"
     grown = {d: r * (3.0 if d in ("vx", "vy") else 1.1) for d, r in noise.items()}
     candidates = tuple(
-        Candidate(
+        Law(
             effect,
             "cart",
             sentence,
@@ -137,62 +165,50 @@ def made_up(verdict: str = "effects-added", stuck: bool = False) -> Loop:
         candidates = tuple(
             replace(c, statistic=c.statistic / 200, p_value=0.37) for c in candidates
         )
-    added = Added(
+    added = Law(
         "linear_drag",
         "cart",
         DRAG,
         419.0,
-        1e-80,
-        {"coefficient": Estimate(3.0, 0.1, (2.81, 3.19), "kg/s")},
-        ("quadratic_drag",),
-        210.0,
-        19.0,
+        p_value=1e-80,
+        parameters={"coefficient": Estimate(3.0, 0.1, (2.81, 3.19), "kg/s")},
+        not_separable_from=("quadratic_drag",),
+        elpd_difference=210.0,
+        elpd_difference_se=19.0,
     )
     remains = Unexplained(
         "cart", "omega", "omega", 0.34, 0.002, "its omega is off in a way that depends on omega"
     )
-    fit = Fit(None, made_up_posterior(stuck))  # a problem is not made up
+    fit = Fit(None, made_up_posterior(stuck))  # a problem is not made up, nor is a mode
     before = made_up_errors(2.4 if verdict != "adequate" else 1.01)
+    after = made_up_errors(1.02) if found else before
+    correlations = Correlations(
+        ("vx of cart", "omega of cart"),
+        0.1 * rng.normal(size=(5, 2)),
+        np.full((5, 2), 200),
+        ("force_x on cart", "torque on cart"),
+        0.1 * rng.normal(size=(6, 2, 2)),
+    )
+    growth = Growth(
+        np.array([0.1, 0.5, 1.0]),
+        tuple({"x": 0.01 * i, "omega": 0.02 * i} for i in (1, 2, 4)),
+        tuple({"x": 0.01 * i, "omega": 0.02 * i} for i in (1, 1.5, 2)),
+    )
+    predicted = off.T if found else wrapped.T
+    rollout = Rollout("cart", time, STATE, STATE_UNITS, measured.T, predicted, wrapped.T)
+    versions = {"pymc": "5.28"}
     return Loop(
         scene=scene,
         verdict=verdict,
-        numerical=Numerical(10, 40, 0.83) if found else Numerical(10, 10, 0.012),
-        candidates=candidates,
-        added=(added,) if found else (),
         unexplained=remains if verdict == "unexplained" else None,
-        before=before,
-        after=made_up_errors(1.02) if found else before,
-        noise_floor=made_up_errors(1.0),
-        declared=fit,
-        revised=fit,
-        innovations=(None, None),  # nor is a mode
-        residuals_before=noise if verdict == "adequate" else grown,
-        residuals_after=noise if found else grown,
-        rollout=Rollout(
-            "cart",
-            time,
-            STATE,
-            STATE_UNITS,
-            measured.T,
-            off.T if found else wrapped.T,
-            wrapped.T,
-        ),
-        rollout_horizon=20,
-        provenance={"seed": 1, "versions": {"pymc": "5.28"}, "data_sha256": "ab" * 32},
-        tests=made_up_tests(verdict),
+        numerical=Numerical(10, 40, 0.83) if found else Numerical(10, 10, 0.012),
+        data=Recordings({"seed": 1, "versions": versions, "data_sha256": "ab" * 32}),
+        found=Found(candidates, (added,) if found else ()),
+        declared=ComparedModel(fit, None, before, noise if verdict == "adequate" else grown),
+        revised=ComparedModel(fit, None, after, noise if found else grown),
+        misfit=Misfit(made_up_tests(verdict), None, correlations, growth),
         acceleration=made_up_acceleration(verdict),
-        correlations=Correlations(
-            ("vx of cart", "omega of cart"),
-            0.1 * rng.normal(size=(5, 2)),
-            np.full((5, 2), 200),
-            ("force_x on cart", "torque on cart"),
-            0.1 * rng.normal(size=(6, 2, 2)),
-        ),
-        growth=Growth(
-            np.array([0.1, 0.5, 1.0]),
-            tuple({"x": 0.01 * i, "omega": 0.02 * i} for i in (1, 2, 4)),
-            tuple({"x": 0.01 * i, "omega": 0.02 * i} for i in (1, 1.5, 2)),
-        ),
+        forecasts=Forecasts(made_up_errors(1.0), rollout, 20),
     )
 
 

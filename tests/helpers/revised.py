@@ -6,8 +6,7 @@ from functools import cache
 import numpy as np
 import xarray as xr
 
-from pbrl_ppl.criticism.loop import Loop
-from pbrl_ppl.criticism.results import Added, Estimate, Unexplained
+from pbrl_ppl.criticism.results import Estimate, Law, Loop, Unexplained
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.history import History
 from pbrl_ppl.model import physics_model
@@ -16,7 +15,7 @@ from pbrl_ppl.posterior import Fit
 from pbrl_ppl.posterior.store import from_groups, groups
 from pbrl_ppl.sampling import fit
 from tests.helpers.free_puck import DISC, Disc
-from tests.helpers.made_up import made_up
+from tests.helpers.made_up import changed, made_up
 
 DRAG = 0.8
 
@@ -41,16 +40,18 @@ def revised() -> Loop:
     )
     modes = tuple(trajectory_mode(one.problem, *one.best) for one in (before, after))
     size = Estimate(DRAG, 0.01, (DRAG - 0.02, DRAG + 0.02), "kg/s")
-    added = Added("linear_drag", "puck", "a drag", 99.0, 1e-9, {"coefficient": size}, (), 9.0, 1.0)
+    added = Law(
+        "linear_drag", "puck", statistic=99.0, p_value=1e-9, parameters={"coefficient": size},
+        elpd_difference=9.0, elpd_difference_se=1.0,
+    )  # fmt: skip
     found = made_up()
-    return replace(
+    return changed(
         found,
         scene=DISC,
         candidates=tuple(replace(one, body="puck") for one in found.candidates),
         added=(added,),
-        declared=before,
-        revised=after,
-        innovations=modes,
+        declared=replace(found.declared, fit=before, innovations=modes[0]),
+        revised=replace(found.revised, fit=after, innovations=modes[1]),
         held_out=test,
     )
 
@@ -58,17 +59,16 @@ def revised() -> Loop:
 def unexplained() -> Loop:
     """The same where no effect has a name."""
     left = Unexplained("puck", "vx", "velocity x", 0.5, 0.001, "vx of puck depends on velocity x")
-    before = revised().declared
-    found = made_up("unexplained")
-    return replace(
+    known, found = revised(), made_up("unexplained")
+    model = {"fit": known.declared.fit, "innovations": known.declared.innovations}
+    return changed(
         found,
         scene=DISC,
         candidates=tuple(replace(one, body="puck") for one in found.candidates),
         unexplained=left,
-        declared=before,
-        revised=before,
-        innovations=revised().innovations[:1] * 2,
-        held_out=revised().held_out,
+        declared=replace(found.declared, **model),
+        revised=replace(found.revised, **model),
+        held_out=known.held_out,
     )
 
 
@@ -76,26 +76,25 @@ def unexplained() -> Loop:
 def diverging() -> Loop:
     """The same as revised, with a drag that pushes, so that the revised model diverges."""
     found = revised()
-    before, after = found.innovations
+    after = found.revised.innovations
     drag = after.problem.layout.labels.index("linear_drag_coefficient[puck]")
     far_off = np.where(np.arange(len(after.phi)) == drag, -60.0, after.phi)
     datasets = groups(found.posterior_after)
     draws = datasets["posterior"]
     name = "linear_drag_coefficient"
     pushed = draws.assign({name: xr.full_like(draws[name], -60.0)})
-    rollout, far = found.rollout, {name: float("inf") for name in found.after.rollout_rmse}
+    rollout, far = found.forecasts.rollout, dict.fromkeys(found.after.rollout_rmse, np.inf)
     lost = rollout.after.copy()
     lost[12:] = np.nan
     growth = replace(
-        found.growth, error=(*found.growth.error[:2], dict.fromkeys(("x", "omega"), np.inf))
+        found.misfit.growth,
+        error=(*found.misfit.growth.error[:2], dict.fromkeys(("x", "omega"), np.inf)),
     )
-    return replace(
+    attrs = dict(found.posterior_after.attrs)
+    fit = Fit(found.revised.fit.problem, from_groups(datasets | {"posterior": pushed}, attrs))
+    return changed(
         found,
-        revised=Fit(
-            found.revised.problem,
-            from_groups(datasets | {"posterior": pushed}, dict(found.posterior_after.attrs)),
-        ),
-        innovations=(before, replace(after, phi=far_off)),
+        revised=replace(found.revised, fit=fit, innovations=replace(after, phi=far_off)),
         after=replace(found.after, rollout_rmse=far),
         rollout=replace(rollout, after=lost),
         growth=growth,
@@ -107,7 +106,7 @@ def every_verdict() -> dict[str, Loop]:
     added, left, nothing = revised(), unexplained(), made_up("adequate")
     worse = replace(added.after, normalised_rmse=1.8)
     return {
-        "adequate": replace(
+        "adequate": changed(
             left,
             verdict="adequate",
             unexplained=None,
@@ -118,7 +117,7 @@ def every_verdict() -> dict[str, Loop]:
         ),
         "effects-added": added,
         "unexplained": left,
-        "unexplained-beside": replace(
+        "unexplained-beside": changed(
             added,
             verdict="unexplained",
             unexplained=left.unexplained,

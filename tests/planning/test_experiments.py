@@ -10,7 +10,7 @@ import pytest
 import pbrl_ppl as pp
 from pbrl_ppl.cli import main
 from pbrl_ppl.criticism.closing import keep_groups
-from pbrl_ppl.criticism.results import Added, Law
+from pbrl_ppl.criticism.results import Law
 from pbrl_ppl.errors import EffectError, GoalError, PosteriorError
 from pbrl_ppl.planning import predicted_path
 from pbrl_ppl.planning.experiments import (
@@ -52,7 +52,7 @@ def posterior_of(frame: pd.DataFrame, effect: str):
     )
     idata = pp.fit(model, method="laplace", draws=50, seed=1, progress=False)
     others = tuple(name for name in DRAGS if name != effect)
-    keep_groups(idata, [Added(effect, "puck", "a drag", 1.0, 1.0, {}, others, 1.0, 1.0)])
+    keep_groups(idata, [Law(effect, "puck", not_separable_from=others)])
     return idata
 
 
@@ -77,7 +77,7 @@ def test_the_suggested_experiment_separates_what_a_first_recording_cannot(
     """The truth is Box2D's; the suggestion is made where the other drag is taken for it."""
     first = at_one_speed(make_history, 1, **{truth: SIZE})
     law = selected(first)
-    assert {law.effect, *law.confounded} == {*DRAGS}
+    assert {law.effect, *law.not_separable_from} == {*DRAGS}
     if truth == "linear_drag":
         known = posterior_of(first, "quadratic_drag")
         suggestion = pp.suggest_actions(known, REST, BOUNDS, steps=12, seed=1)
@@ -86,7 +86,7 @@ def test_the_suggested_experiment_separates_what_a_first_recording_cannot(
     second = record(make_history, suggestion.start[0], wrenches, 6, 1, **{truth: SIZE})
     law = selected(pd.concat([first, second], ignore_index=True))
     assert law.effect == truth
-    assert law.confounded == ()
+    assert law.not_separable_from == ()
 
 
 @pytest.mark.one_stack

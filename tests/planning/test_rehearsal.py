@@ -100,9 +100,9 @@ def test_confounded_laws_are_worth_as_much() -> None:
     assert law.named == "pivot_damping" and "pivot_damping" in law.confounded
     assert "angular_drag" in law_of(rehearsal, "pivot_damping").confounded
     history = recorded(PENDULUM, rehearsal, law, 3.0)
-    assert "angular_drag" in found(PENDULUM, history)["pivot_damping"].confounded
+    assert "angular_drag" in found(PENDULUM, history)["pivot_damping"].not_separable_from
     worth = [
-        attribute(PENDULUM, history, catalogue=[effect]).laws[0].nats
+        attribute(PENDULUM, history, catalogue=[effect]).laws[0].simulated_nats
         for effect in named("pivot_damping", "angular_drag")
     ]
     assert abs(worth[0] - worth[1]) < 3.0

@@ -5,14 +5,14 @@ from dataclasses import replace
 
 import pytest
 
-from pbrl_ppl.criticism.loop import Loop
+from pbrl_ppl.criticism import Loop
 from pbrl_ppl.criticism.results import Estimate
 from pbrl_ppl.reporting import in_brief, render
 from pbrl_ppl.reporting.loop_plots import plot_errors, plot_growth, plot_rollout
 from pbrl_ppl.reporting.tables import acceleration_table, error_tables
 from pbrl_ppl.reporting.words import gains_in_words, number, remains_in_words, verdict_in_words
 from tests.helpers.html import Page
-from tests.helpers.made_up import made_up
+from tests.helpers.made_up import changed, made_up
 from tests.helpers.revised import every_verdict
 
 pytestmark = pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning")
@@ -73,7 +73,7 @@ def agrees_with_json(loop: Loop, said: str) -> None:
 
 def test_effects_with_forecasts_at_the_noise_are_not_called_a_failure() -> None:
     beside = every_verdict()["unexplained-beside"]
-    near = replace(beside, after=every_verdict()["effects-added"].after)
+    near = changed(beside, after=every_verdict()["effects-added"].after)
     assert verdict_in_words(near).endswith(
         "is still unexplained, but forecasts are as good as the noise allows."
     )
@@ -83,11 +83,11 @@ def test_effects_with_forecasts_at_the_noise_are_not_called_a_failure() -> None:
 def test_what_remains_without_a_place_names_the_failed_test() -> None:
     loop = made_up("unexplained")
     left = replace(loop.unexplained, body="", dimension="", depends_on="nothing that was recorded")
-    assert verdict_in_words(replace(loop, unexplained=left)).endswith(
+    assert verdict_in_words(changed(loop, unexplained=left)).endswith(
         "; the model fails the test of unexplained acceleration."
     )
     passed = tuple(replace(test, passed=True) for test in loop.tests)
-    assert verdict_in_words(replace(loop, unexplained=left, tests=passed)).endswith(
+    assert verdict_in_words(changed(loop, unexplained=left, tests=passed)).endswith(
         "; held-out forecasts became worse."
     )
 
@@ -96,11 +96,11 @@ def test_sizes_of_several_parameters_are_below_the_headline() -> None:
     loop = every_verdict()["effects-added"]
     size = Estimate(0.2, 0.01, (0.18, 0.22), "N")
     force = replace(loop.added[0], effect="constant_force", parameters={"x": size, "y": size})
-    assert verdict_in_words(replace(loop, added=(force,))).startswith(
+    assert verdict_in_words(changed(loop, added=(force,))).startswith(
         "Constant force on the puck: held-out error "
     )
     many = replace(force, not_separable_from=("a_b", "c", "d"))
-    assert verdict_in_words(replace(loop, added=(many,))).startswith(
+    assert verdict_in_words(changed(loop, added=(many,))).startswith(
         "Constant force or one of 3 others that fit as well on the puck: "
     )
 
@@ -113,7 +113,7 @@ def test_bodies_that_hardly_accelerate_have_no_percentage() -> None:
         relative_before=sizes | {"vx": 300.6}, relative_after=sizes | {"vx": 300.6},
         certain_after={"vx": True, "vy": False, "omega": False},
     )  # fmt: skip
-    loop = replace(loop, acceleration=still)
+    loop = changed(loop, acceleration=still)
     assert verdict_in_words(loop).endswith(
         "; what remains, 0.4 m/s² in vx, is no more than the engine's error."
     )
@@ -142,12 +142,12 @@ def test_lines_that_end_early_say_why() -> None:
     panels = plot_rollout(loop).axes
     notes = [[text.get_text() for text in axes.texts] for axes in panels]
     assert all(note == ["after: diverged after 1.1 s"] for note in notes)
-    measured = loop.rollout.measured.copy()
+    measured = loop.forecasts.rollout.measured.copy()
     measured[20:, 0], measured[:, 1] = float("nan"), float("nan")
-    seen = replace(loop.rollout, measured=measured, after=loop.rollout.before)
+    seen = replace(loop.forecasts.rollout, measured=measured, after=loop.forecasts.rollout.before)
     notes = [
         [text.get_text() for text in axes.texts]
-        for axes in plot_rollout(replace(loop, rollout=seen)).axes
+        for axes in plot_rollout(changed(loop, rollout=seen)).axes
     ]
     assert notes[:3] == [["not measured after 1.9 s"], ["not measured"], []]
     (axes,) = plot_growth(loop).axes

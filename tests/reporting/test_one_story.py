@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from pbrl_ppl.criticism.loop import Loop
-from pbrl_ppl.criticism.results import Acceleration, Candidate, Unexplained
+from pbrl_ppl.criticism import Loop
+from pbrl_ppl.criticism.results import Acceleration, Law, Unexplained
 from pbrl_ppl.effects import Effect, EffectParameter, catalogue
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
@@ -18,7 +18,7 @@ from pbrl_ppl.reporting.words import (
     verdict_in_words,
 )
 from tests.helpers.html import Page
-from tests.helpers.made_up import made_up
+from tests.helpers.made_up import changed, made_up
 from tests.helpers.revised import revised, unexplained
 
 pytestmark = [
@@ -36,7 +36,7 @@ def text_of(findings: Loop) -> str:
 def nearest() -> Loop:
     """Unexplained, with the nearest effect in the model."""
     left = made_up("unexplained")
-    return replace(
+    return changed(
         made_up(),
         verdict="unexplained",
         unexplained=left.unexplained,
@@ -49,7 +49,7 @@ def with_acceleration(findings: Loop, **sizes: tuple[float, bool]) -> Loop:
     """Findings with these relative accelerations left, each significant or not."""
     shares = {name: share for name, (share, _) in sizes.items()}
     sure = {name: certain for name, (_, certain) in sizes.items()}
-    return replace(findings, acceleration=Acceleration(shares, shares, shares, shares, sure))
+    return changed(findings, acceleration=Acceleration(shares, shares, shares, shares, sure))
 
 
 def test_negligible_acceleration_is_in_the_headline() -> None:
@@ -88,14 +88,14 @@ def test_a_held_out_error_that_the_verdict_does_not_lead_to_expect_is_explained(
     for verdict, model in (("adequate", "declared"), ("effects-added", "revised")):
         findings = made_up(verdict)
         for error, told in ((3.0, True), (1.2, False)):
-            far = replace(findings, after=replace(findings.after, normalised_rmse=error))
+            far = changed(findings, after=replace(findings.after, normalised_rmse=error))
             said = f"the held-out ones differ from the {model} model by 3.00 times the noise"
             assert (said in text_of(far)) == told
             assert any(said in line for line in in_brief(far, "out")) == told
 
 
 def test_intervals_without_a_verdict_are_left_out() -> None:
-    stuck = replace(made_up(), verdict="not-converged")
+    stuck = changed(made_up(), verdict="not-converged")
     text = text_of(stuck)
     for claim in ("How sure.", "How large.", "with 94 % probability", "Adding linear drag"):
         assert claim not in text
@@ -114,7 +114,7 @@ def test_certainty_comes_from_simulations_where_they_named_an_effect() -> None:
     findings = made_up()
     doubtful = replace(findings.added[0], p_value=0.02)
     sure = replace(doubtful, simulated_nats=120.0, simulated_share=0.5)
-    texts = [text_of(replace(findings, added=(one,))) for one in (doubtful, sure)]
+    texts = [text_of(changed(findings, added=(one,))) for one in (doubtful, sure)]
     assert "Not sure" in texts[0] and "As good as certain" in texts[1]
     assert "takes 50 % off the declared model's error in the longest simulations, 120" in texts[1]
 
@@ -126,28 +126,28 @@ def test_dependence_is_shown_only_where_its_test_failed() -> None:
     left = Unexplained(
         "puck", "vx", "nothing that was recorded", 3.1, 0.0, "after 1 s vx of Puck is off"
     )
-    passed = text_of(replace(unexplained(), unexplained=left))
+    passed = text_of(changed(unexplained(), unexplained=left))
     assert "The residual depends on no recorded quantity: record more quantities" in passed
     assert "R² =" not in passed and "velocity x" not in passed
     assert "After 1 s vx of Puck is off." in passed  # with its capitals
     assert "310 %" not in passed  # a factor is no share
     assert "What remains. After 1 s vx of Puck is off (p < 1e-16)." in passed
     # a test that names no body has no p-value
-    nowhere = text_of(replace(unexplained(), unexplained=replace(left, body="")))
+    nowhere = text_of(changed(unexplained(), unexplained=replace(left, body="")))
     assert "What remains. After 1 s vx of Puck is off." in nowhere
 
 
 def test_a_candidate_with_a_large_score_says_why_it_was_not_added() -> None:
     findings = made_up("adequate")
     first = replace(findings.candidates[0], p_value=1e-20, why="changes predictions by 0.2 %")
-    text = text_of(replace(findings, candidates=(first, *findings.candidates[1:])))
+    text = text_of(changed(findings, candidates=(first, *findings.candidates[1:])))
     assert "came closest (p < 1e-16); it was not added: changes predictions by 0.2 %." in text
 
 
-def candidate(effect: str, is_upper_limit: bool = False, **sizes: float) -> Candidate:
+def candidate(effect: str, is_upper_limit: bool = False, **sizes: float) -> Law:
     named = {each.name: each for each in catalogue}
     units = {p.name: p.unit for p in named[effect].parameters}
-    return Candidate(
+    return Law(
         effect, "cart", "", 1.0, 1, 0.5, dict.fromkeys(units, 0.25), units, 1.0,
         detectable=sizes, is_upper_limit=is_upper_limit,
     )  # fmt: skip
@@ -155,25 +155,27 @@ def candidate(effect: str, is_upper_limit: bool = False, **sizes: float) -> Cand
 
 def test_limits_of_what_was_not_measured_are_left_out() -> None:
     findings = made_up()
-    seen = {name: findings.residuals_after[name] for name in ("x", "y", "theta")}
-    blind = replace(findings, residuals_after=seen)
+    seen = {name: findings.revised.residuals[name] for name in ("x", "y", "theta")}
+    blind = changed(findings, revised=replace(findings.revised, residuals=seen))
     bias = candidate("sensor_bias", x=0.01, y=0.01, theta=0.02, vx=0.3, vy=0.3, omega=0.1)
     positions = "x 0.0100 m, y 0.0100 m, theta 0.0200 rad"
     assert limits_in_words(bias, blind) == positions
     velocities = "vx 0.300 m/s, vy 0.300 m/s, omega 0.100 rad/s"
     assert limits_in_words(bias, findings) == f"{positions}, {velocities}"
-    text = text_of(replace(blind, candidates=(bias,)))
+    text = text_of(changed(blind, candidates=(bias,)))
     assert "x 0.250 m, y 0.250 m, theta 0.250 rad 100 %" in text  # estimates too
     # a coordinate of another effect is no measurement
     offset = candidate("com_offset", x=0.01, y=0.02)
-    kept = limits_in_words(offset, replace(findings, residuals_after={}))
+    kept = limits_in_words(
+        offset, changed(findings, revised=replace(findings.revised, residuals={}))
+    )
     assert kept == "x 0.0100 m, y 0.0200 m"
 
 
 def test_limits_beyond_the_prior_are_no_limits() -> None:
     findings = made_up()
 
-    def said(one: Candidate) -> str:
+    def said(one: Law) -> str:
         return limits_in_words(one, findings)
 
     # normal, sigma 20 N: 99.9 % are within 3.29 sigma, 65.8 N
@@ -190,14 +192,14 @@ def test_limits_beyond_the_prior_are_no_limits() -> None:
     assert said(candidate("saturation", True, limit=0.1)) == "no plausible size"
     # of an effect that is looked up nowhere the size alone is known
     assert limits_in_words(
-        candidate("dead_zone", threshold=1e4), replace(findings, catalogue=())
+        candidate("dead_zone", threshold=1e4), changed(findings, catalogue=())
     ) == ("threshold 10,000 N")
     own = Effect(
         "dead_zone", (EffectParameter("threshold", "N", Prior("half_normal", sigma=1e5)),), "",
         "", catalogue[0].stage,
     )  # fmt: skip
     assert limits_in_words(
-        candidate("dead_zone", threshold=1e4), replace(findings, catalogue=(own,))
+        candidate("dead_zone", threshold=1e4), changed(findings, catalogue=(own,))
     ) == ("threshold 10,000 N")
 
 
@@ -215,7 +217,7 @@ def test_gains_name_what_changed() -> None:
 
 
 def test_the_terminal_has_ten_lines_and_says_where_and_what_next() -> None:
-    five = replace(made_up(), added=made_up().added * 5)
+    five = changed(made_up(), added=made_up().added * 5)
     verdicts = ("adequate", "effects-added", "unexplained", "not-converged")
     every = {verdict: in_brief(made_up(verdict), "out") for verdict in verdicts}
     assert max(map(len, every.values())) <= 6 and len(in_brief(five, "out")) <= 10
@@ -230,12 +232,12 @@ def test_the_terminal_has_ten_lines_and_says_where_and_what_next() -> None:
     assert "  Its omega is off in a way that depends on omega (p = 0.0020)." in every["unexplained"]
     assert "plots the residual against omega" in every["unexplained"][-2]
     assert "--draws" in every["not-converged"][-2]
-    alone = replace(made_up(), added=(replace(made_up().added[0], not_separable_from=()),))
+    alone = changed(made_up(), added=(replace(made_up().added[0], not_separable_from=()),))
     assert in_brief(alone, "out")[-2] == (
         "Next: open the report; plan and update with the posterior after.nc."
     )
     left = replace(made_up("unexplained").unexplained, depends_on="nothing that was recorded")
-    nowhere = in_brief(replace(made_up("unexplained"), unexplained=replace(left, body="")), "out")
+    nowhere = in_brief(changed(made_up("unexplained"), unexplained=replace(left, body="")), "out")
     assert "  Its omega is off in a way that depends on omega." in nowhere
     assert nowhere[-2] == "Next: open the report; record more quantities, or longer."
 
@@ -244,7 +246,7 @@ def test_the_error_far_ahead_is_of_the_dimension_that_changed_most() -> None:
     """In its unit, with what noise alone makes."""
     findings = made_up()
     far = findings.before.rollout_rmse | {"theta": 0.3}
-    findings = replace(findings, before=replace(findings.before, rollout_rmse=far))
+    findings = changed(findings, before=replace(findings.before, rollout_rmse=far))
     said = "Held-out error of theta 2.00 s ahead: 0.300 -> 0.0163 rad, 94.6 % less"
     assert f"{said} (noise floor 0.0160 rad)." in in_brief(findings, "out")
 
@@ -256,7 +258,7 @@ def test_a_dimension_that_does_not_move_is_not_shown() -> None:
     after = {"x": 0.1, "omega": 2.21e-9}
     still = loop.held_out.dataset["observed"].copy()
     still[..., 5] = 0.0
-    loop = replace(
+    loop = changed(
         loop,
         before=replace(loop.before, simulated_rmse={}, rollout_rmse=far),
         after=replace(loop.after, simulated_rmse={}, rollout_rmse=after),
@@ -267,7 +269,7 @@ def test_a_dimension_that_does_not_move_is_not_shown() -> None:
 
 def test_effects_of_one_trajectory_are_told_with_caution() -> None:
     findings = made_up()
-    one = replace(findings, provenance={**findings.provenance, "trajectories": 1})
+    one = changed(findings, provenance={**findings.data.provenance, "trajectories": 1})
     said = "A single trajectory cannot tell a law from a lasting random force"
     assert said in text_of(one) and any(said in line for line in in_brief(one, "out"))
     assert said not in text_of(findings)

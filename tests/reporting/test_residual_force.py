@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pbrl_ppl.criticism.dependence import FEATURES, PRODUCTS
+from pbrl_ppl.criticism.innovations import FEATURES, PRODUCTS
 from pbrl_ppl.criticism.results import Unexplained, diverged_after
 from pbrl_ppl.history import History
 from pbrl_ppl.model import physics_model
@@ -18,7 +18,7 @@ from pbrl_ppl.reporting.residual_force import bin_means, find_laws
 from pbrl_ppl.sampling import fit
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.free_puck import DISC, Disc
-from tests.helpers.made_up import made_up
+from tests.helpers.made_up import changed, made_up
 from tests.helpers.revised import DRAG, diverging, recordings, revised, unexplained
 
 pytestmark = pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning")
@@ -45,15 +45,15 @@ def test_the_law_that_is_wanted_is_the_drag() -> None:
     # where the test of dependence passed, or names another quantity, nothing speaks against it
     left = Unexplained("puck", "y", "nothing that was recorded", 0.5, 0.001, "y is off")
     for other in (left, replace(left, body=""), replace(left, depends_on="colour")):
-        assert find_laws(replace(unexplained(), unexplained=other)) == []
+        assert find_laws(changed(unexplained(), unexplained=other)) == []
     named = replace(left, depends_on="velocity y")
-    others = find_laws(replace(unexplained(), unexplained=named))
+    others = find_laws(changed(unexplained(), unexplained=named))
     assert (others[0].quantity, others[0].residual.dimension) == ("velocity y", "vy")
 
 
 def test_a_law_may_follow_whatever_an_error_may_depend_on() -> None:
     left = replace(unexplained().unexplained, depends_on="position x × velocity x")
-    laws = find_laws(replace(unexplained(), unexplained=left), most=100)
+    laws = find_laws(changed(unexplained(), unexplained=left), most=100)
     named = {law.quantity: law for law in laws}
     assert set(named) <= {*FEATURES, *PRODUCTS}
     x, v = (named[name].x for name in ("position x", "velocity x"))
@@ -135,7 +135,11 @@ def test_motions_start_from_velocities_fitted_to_the_first_rows() -> None:
     fitted = fit(model, method="laplace", seed=1, draws=20, progress=False)
     found = Fit.of(fitted)
     mode = trajectory_mode(found.problem, *found.best)
-    findings = replace(unexplained(), innovations=(mode, mode), held_out=history)
+    findings = unexplained()
+    models = {
+        name: replace(getattr(findings, name), innovations=mode) for name in ("declared", "revised")
+    }
+    findings = changed(findings, held_out=history, **models)
     truth = states.groupby("trajectory")["x"].last().to_numpy()
     off = [
         float(motion.before[-1, 0, 0] - truth[int(motion.name)])
