@@ -161,7 +161,7 @@ def test_close_loop_without_a_verdict_exits_with_3(
 def test_absurd_numbers_are_refused_at_once(capsys: pytest.CaptureFixture[str]) -> None:
     text = Path("train.csv").read_text()
     Path("train.csv").write_text(text.replace("puck,2,", "puck,1e300,"))
-    assert "history train.csv row 4: x is 1e+300" in fails(
+    assert 'history train.csv row 4: x of body "puck" is 1e+300' in fails(
         capsys, "check", "scene.toml", "train.csv"
     )
     Path("train.csv").write_text(text)

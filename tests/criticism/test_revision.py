@@ -402,7 +402,7 @@ def test_weights_that_do_not_suffice_leave_gaussians(monkeypatch) -> None:
         return SimpleNamespace(record=SimpleNamespace(**held, max_rhat=1.02, min_ess=350.0))
 
     monkeypatch.setattr("pbrl_ppl.criticism.closing.sample", weighted)
-    mode = _Mode(SimpleNamespace(likelihood=None))
+    mode = _Mode(SimpleNamespace(likelihood=SimpleNamespace(name="transitions")))
     task = SimpleNamespace(method="importance", seed=1, draws=None, criteria=DEFAULT, say=print)
     with pytest.warns(ConvergenceWarning, match="do not suffice; the draws are from the Gaussian"):
         (fitted,) = loop_module._fits(task, [mode])
@@ -420,7 +420,7 @@ def test_only_chains_are_said_not_to_converge(method, said, monkeypatch) -> None
         return SimpleNamespace(record=SimpleNamespace(**held))
 
     monkeypatch.setattr("pbrl_ppl.criticism.closing.sample", unconverged)
-    mode = _Mode(SimpleNamespace(likelihood=None))
+    mode = _Mode(SimpleNamespace(likelihood=SimpleNamespace(name="transitions")))
     task = SimpleNamespace(method=method, seed=1, draws=None, criteria=DEFAULT, say=print)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
