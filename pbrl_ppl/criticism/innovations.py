@@ -13,7 +13,7 @@ import numpy as np
 from scipy.stats import chi2, rankdata
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
-from pbrl_ppl.criticism.results import Correlations, KindOfTest, ResidualTest, Unexplained
+from pbrl_ppl.criticism.results import KindOfTest, ResidualTest, Unexplained
 from pbrl_ppl.likelihood import Problem, bodies_acceleration
 from pbrl_ppl.modes import NOTHING, FilteredMode, profile_sigma
 from pbrl_ppl.state import STATE, WRENCH, Bools, Floats, Ints
@@ -173,9 +173,7 @@ def _p_values(mode: FilteredMode) -> Floats:
 _LAGS, _LEAST_PAIRS = 5, 10
 
 
-def correlation_tests(
-    mode: FilteredMode, criteria: Criteria = DEFAULT
-) -> tuple[tuple[ResidualTest, ...], Correlations]:
+def correlation_tests(mode: FilteredMode, criteria: Criteria) -> tuple[ResidualTest, ResidualTest]:
     """Test whiteness over lags, and correlation with present and past commands.
 
     Parameters
@@ -187,10 +185,8 @@ def correlation_tests(
 
     Returns
     -------
-    tests : tuple of ResidualTest
-        Of whiteness and of commands; untested where the data cannot fail.
-    correlations : Correlations
-        For a picture.
+    whiteness, commands : ResidualTest
+        Untested where the data cannot fail.
     """
     noise = mode.problem.likelihood.noise
     white, seen = mode.whitened_residual, noise.seen
@@ -205,16 +201,13 @@ def correlation_tests(
         p_value = float(chi2.sf((pairs * own**2)[enough].sum(), int(enough.sum())))
         whiteness = _test(own, enough, p_value, share, cells, [], criteria)
     series, names = _commands(mode)
-    driven = np.zeros((0, 0, len(cells)))
     commands = ResidualTest.untested(KindOfTest.COMMANDS, few if names else "no command varies")
-    if names:
-        driven, of_commands = _lagged(white, seen, number, series)
-        regressed = _regression_p_value(white, seen, number, series)
-        if regressed is not None:
-            enough = of_commands > _LEAST_PAIRS
-            commands = _test(driven, enough, regressed, share, cells, names, criteria)
-    found = Correlations(tuple(cells), own[:, 0], pairs[:, 0], tuple(names), driven)
-    return (whiteness, commands), found
+    regressed = _regression_p_value(white, seen, number, series) if names else None
+    if regressed is not None:
+        driven, pairs = _lagged(white, seen, number, series)
+        enough = pairs > _LEAST_PAIRS
+        commands = _test(driven, enough, regressed, share, cells, names, criteria)
+    return whiteness, commands
 
 
 def _lagged(
@@ -319,43 +312,28 @@ def _test(
 
 #: Recorded quantities that a residual may depend on, with their units.
 FEATURES = {
-    "position x": "m",
-    "position y": "m",
-    "velocity x": "m/s",
-    "velocity y": "m/s",
-    "commanded force x": "N",
-    "commanded force y": "N",
-    "orientation (cosine)": "1",
-    "orientation (sine)": "1",
-    "forward speed": "m/s",
-    "sideways speed": "m/s",
-    "angular speed": "rad/s",
-    "speed": "m/s",
-    "commanded forward force": "N",
-    "commanded sideways force": "N",
-    "commanded torque": "N m",
-    "forward force commanded before": "N",
-    "sideways force commanded before": "N",
-    "torque commanded before": "N m",
-    "time": "s",
-}
+    "position x": "m", "position y": "m", "velocity x": "m/s", "velocity y": "m/s",
+    "commanded force x": "N", "commanded force y": "N",
+    "orientation (cosine)": "1", "orientation (sine)": "1",
+    "forward speed": "m/s", "sideways speed": "m/s", "angular speed": "rad/s", "speed": "m/s",
+    "commanded forward force": "N", "commanded sideways force": "N", "commanded torque": "N m",
+    "forward force commanded before": "N", "sideways force commanded before": "N",
+    "torque commanded before": "N m", "time": "s",
+}  # fmt: skip
 #: Forces that depend on two quantities together: a spinning body's lift, a force that fades with
 #: speed, an actuator with memory, a floor that is rough in places.
 PRODUCTS = {
     " × ".join(pair): pair
     for pair in (
-        ("angular speed", "forward speed"),
-        ("angular speed", "sideways speed"),
+        ("angular speed", "forward speed"), ("angular speed", "sideways speed"),
         ("commanded forward force", "forward speed"),
-        ("commanded sideways force", "sideways speed"),
-        ("commanded torque", "angular speed"),
+        ("commanded sideways force", "sideways speed"), ("commanded torque", "angular speed"),
         ("commanded forward force", "forward force commanded before"),
         ("commanded sideways force", "sideways force commanded before"),
         ("commanded torque", "torque commanded before"),
-        ("position x", "velocity x"),
-        ("position y", "velocity y"),
+        ("position x", "velocity x"), ("position y", "velocity y"),
     )
-}
+}  # fmt: skip
 #: All of these with their units, in the order of the columns of :func:`recorded_quantities`.
 QUANTITIES = FEATURES | {name: f"{FEATURES[a]} {FEATURES[b]}" for name, (a, b) in PRODUCTS.items()}
 
@@ -368,23 +346,14 @@ def folds(mode: FilteredMode, least: int = 8) -> Ints:
     """
     segments = mode.problem.segments
     trajectory, step = segments.trajectory, segments.step
-    count = len(np.unique(trajectory))
-    if count >= least:
-        return np.unique(trajectory, return_inverse=True)[1].astype(np.intp)
-    runs = -(-least // count)
+    runs = -(-least // len(np.unique(trajectory)))
     length = np.array([(trajectory == t).sum() for t in trajectory])
     run = np.minimum(step * runs // np.maximum(length, 1), runs - 1)
     return np.unique(trajectory * runs + run, return_inverse=True)[1].astype(np.intp)
 
 
 def find_dependence(
-    mode: FilteredMode,
-    criteria: Criteria,
-    *,
-    seed: int = 0,
-    permutations_a_body: int = 500,
-    least_transitions: int = 20,
-    most_transitions: int = 1500,
+    mode: FilteredMode, criteria: Criteria, *, seed: int = 0
 ) -> tuple[ResidualTest, Unexplained | None]:
     """Test whether the innovations of a fitted model depend on state, action or time.
 
@@ -400,12 +369,6 @@ def find_dependence(
         Thresholds of significant and of negligible.
     seed : int
         Seed of the permutations and the folds.
-    permutations_a_body : int
-        By default the smallest p-value is a fifth of the significance.
-    least_transitions : int
-        Transitions that the test needs.
-    most_transitions : int
-        Transitions of the test, at most: more take long and change nothing.
 
     Returns
     -------
@@ -417,11 +380,11 @@ def find_dependence(
     rng = np.random.default_rng(seed)
     problem = mode.problem
     n, limits = problem.segments.n, criteria.residual
-    if n < least_transitions:
+    if n < 20:
         return ResidualTest.untested(KindOfTest.DEPENDENCE, "too few transitions"), None
     tests = len(problem.scene.dynamic)
-    permutations = permutations_a_body * tests - 1
-    chosen = np.sort(rng.permutation(n)[:most_transitions])
+    permutations = 500 * tests - 1  # the smallest p-value is a fifth of the significance
+    chosen = np.sort(rng.permutation(n)[:1500])  # more take long and change nothing
     places = mode.problem.likelihood.noise.coordinates.places
     innovations = mode.whitened_residual[chosen]
     groups = folds(mode)[chosen]
@@ -436,7 +399,7 @@ def find_dependence(
             innovations[:, of_body], places[of_body] % len(STATE), features
         )
         y = y - y.mean(axis=0)
-        smoother = _cross_validated(_summed(features), groups, rng)
+        smoother = _cross_validated(np.asarray(sum(_kernels(features))), groups, rng)
         shares = _explained(smoother, y)
         null = np.array(
             [_explained(smoother, y[rng.permutation(len(y))]).max() for _ in range(permutations)]
@@ -502,25 +465,15 @@ def _kernels(features: Floats) -> Iterator[Floats]:
         yield np.exp(-0.5 * (difference / 0.2) ** 2) * moves / max(int(varies.sum()), 1)
 
 
-def _summed(features: Floats) -> Floats:
-    """Return the kernel of all quantities together, shape (n, n)."""
-    kernel = np.zeros((len(features), len(features)))
-    for term in _kernels(features):
-        kernel += term
-    return kernel
-
-
-def _cross_validated(
-    kernel: Floats, groups: Ints, rng: np.random.Generator, *, parts: int = 5
-) -> Floats:
+def _cross_validated(kernel: Floats, groups: Ints, rng: np.random.Generator) -> Floats:
     """Return the matrix that predicts each transition from those of other groups.
 
     The ridge of the regression is 1, over the kernel's variance of each term; groups are left out
-    in so many ``parts``.
+    in five parts.
     """
     smoother = np.zeros_like(kernel)
     names = rng.permutation(np.unique(groups))
-    for left_out in np.array_split(names, min(parts, len(names))):
+    for left_out in np.array_split(names, min(5, len(names))):
         out = np.isin(groups, left_out)
         inner = kernel[np.ix_(~out, ~out)] + np.eye(int((~out).sum()))
         smoother[np.ix_(out, ~out)] = np.linalg.solve(inner, kernel[np.ix_(~out, out)]).T
@@ -537,7 +490,7 @@ def _describe(
     body: str, dimension: str, features: Floats, y: Floats, share: float, p_value: float
 ) -> Unexplained:
     """Return the dependence with the quantity that contributes most to the regression."""
-    weights = np.linalg.solve(_summed(features) + np.eye(len(y)), y)
+    weights = np.linalg.solve(sum(_kernels(features)) + np.eye(len(y)), y)
     parts = [np.var(kernel @ weights) for kernel in _kernels(features)]
     name = list(QUANTITIES)[int(np.argmax(parts))]
     return Unexplained(

@@ -40,9 +40,6 @@ class PriorCheck:
         With the dims body, state and quantile, in the units of the states:
 
         - ``predicted`` and ``measured`` (body, state, quantile): changes, all cells pooled;
-        - ``predicted_sd`` and ``measured_sd`` (body, state);
-        - ``predicted_extent`` (body, state): 94 % of the predicted changes are at most so large;
-        - ``measured_largest`` (body, state): the largest measured change;
         - ``share_inside`` (body, state): share of the measured cells inside the central 94 % of
           their own predictions;
         - ``share_beyond`` (body, state): share that lies beyond all of them;
@@ -106,12 +103,7 @@ class PriorCheck:
 
 
 def prior_predictive_check(
-    model: object,
-    *,
-    draws: int = 400,
-    seed: int = 0,
-    criteria: PriorCriteria = DEFAULT.prior,
-    least_draws: int = 50,
+    model: object, *, draws: int = 400, seed: int = 0, criteria: PriorCriteria = DEFAULT.prior
 ) -> PriorCheck:
     """Compare measured changes over a segment with predictions under the prior.
 
@@ -131,8 +123,6 @@ def prior_predictive_check(
         The same seed gives the same answer.
     criteria : PriorCriteria
         When the prior could not have made the data.
-    least_draws : int
-        Draws that the check needs.
 
     Returns
     -------
@@ -160,8 +150,8 @@ def prior_predictive_check(
         from pbrl_ppl.model import problem_in  # PyMC takes seconds to load
 
         problem = problem_in(model)
-    if draws < least_draws:
-        raise ValueError(f"draws is {draws}, expected at least {least_draws}")
+    if draws < 50:
+        raise ValueError(f"draws is {draws}, expected at least 50")
     rng = np.random.default_rng(seed)
     observations, segments = problem.observations, problem.segments
     columns = list(observations.columns)
@@ -325,18 +315,12 @@ def _mean_square(values: Floats, angle: Bools, steps: int, order: int) -> Floats
     return np.asarray(np.nansum(change**2, axis=1) / np.maximum(count, 1))
 
 
-def _measurement_noise(
-    history: History, stated: Mapping[str, float], *, still: float = 2.0, least_intervals: int = 4
-) -> Floats:
+def _measurement_noise(history: History, stated: Mapping[str, float]) -> Floats:
     """Return the measurement noise of each state, shape (body, state); 0 where it is unknown.
 
     It is the stated one, or an estimate; of a coordinate that never moves beyond its noise the one
-    that third differences show.
-
-    ``still``: a coordinate that never moves has mean square changes of at most this many times
-    those of its noise.
-
-    ``least_intervals``: that holds over all times and up to this many intervals or more.
+    that third differences show: over all times, up to four intervals or more, its mean square
+    changes are at most twice those of its noise.
     """
     noises = measurement_noise(history)
     observed = history.dataset["observed"].to_numpy()
@@ -348,7 +332,7 @@ def _measurement_noise(
             column = observed[:, :, body, d]
             noise = float(_mean_square(column, angle, 1, 3).mean()) / 20.0
             largest = max(float(_mean_square(column, angle, step, 1).mean()) for step in steps)
-            if half >= least_intervals and largest <= 2.0 * still * noise:
+            if half >= 4 and largest <= 2.0 * 2.0 * noise:
                 noises[body, d] = max(noises[body, d], np.sqrt(noise))
             if name in stated and np.isfinite(column).any():
                 if name in POSE and np.isnan(observed[:, :, body, d + len(POSE)]).all():
@@ -358,18 +342,16 @@ def _measurement_noise(
     return noises
 
 
-def _compare(
-    predicted: Floats, measured: Floats, derived: Bools, *, slack: float = 0.25
-) -> xr.Dataset:
+def _compare(predicted: Floats, measured: Floats, derived: Bools) -> xr.Dataset:
     """Return summaries of changes (draw, transition, body, state), and (transition, body, state).
 
-    Where velocities are ``derived``, shape (body, state), draws reach measurements within ``slack``
+    Where velocities are ``derived``, shape (body, state), draws reach measurements within a quarter
     of the usual change.
     """
     seen = np.isfinite(measured)
     low, high = np.quantile(predicted, [QUANTILES[0], QUANTILES[-1]], axis=0)
     inside = (measured >= low) & (measured <= high)
-    near = slack * derived * np.sqrt(np.nanmean(measured**2, axis=0))
+    near = 0.25 * derived * np.sqrt(np.nanmean(measured**2, axis=0))
     low_end, high_end = predicted.min(axis=0) - near, predicted.max(axis=0) + near
     farther = np.maximum(measured - high_end, low_end - measured)
     beyond = farther > 0.0
@@ -381,10 +363,6 @@ def _compare(
         {
             "predicted": (("quantile", *dims), np.nanquantile(pooled, QUANTILES, axis=0)),
             "measured": (("quantile", *dims), np.nanquantile(measured, QUANTILES, axis=0)),
-            "predicted_sd": (dims, np.nanstd(pooled, axis=0)),
-            "measured_sd": (dims, np.nanstd(measured, axis=0)),
-            "predicted_extent": (dims, np.nanquantile(np.abs(pooled), HDI_PROB, axis=0)),
-            "measured_largest": (dims, np.nanmax(np.abs(measured), axis=0)),
             "share_inside": (dims, inside.sum(axis=0) / count),
             "share_beyond": (dims, beyond.sum(axis=0) / count),
             "largest_beyond": (dims, np.nanmax(np.where(seen, farther, 0.0), axis=0).clip(0.0)),

@@ -216,9 +216,8 @@ class Search:
             states = mode.problem.data.smoothed_states
             short = fit_pieces(in_pieces(_apart(mode, lengths[0]), lengths[0], states), mode.phi)
         declared = short.problem.physics.effects
-        table = Table(
-            declared, max(len(self._candidates(short, single)), 1), {}, {frozenset(): short}
-        )
+        tried = max(len(self._candidates(short, single)), 1)
+        table = Table(declared, tried, modes={frozenset(): short})
         common = best = _Climb(
             table.fitted(short, laws or {}, by_label(laws or {})), table, unusual=single
         )
@@ -284,10 +283,7 @@ class Search:
         return found, {law: alone[law] for law in leading if alone[law] >= limits.main_share}
 
     def of(
-        self,
-        train: History,
-        fit: Callable[[History, FilteredMode | None], FilteredMode],
-        seed: int,
+        self, train: History, fit: Callable[[History, FilteredMode | None], FilteredMode], seed: int
     ) -> tuple[FilteredMode, SearchResult]:
         """Return the declared model's mode, and the laws that it lacks.
 
@@ -587,10 +583,7 @@ class Search:
             climb.small.pop(law, None)
 
     def _result(
-        self,
-        climb: _Climb,
-        regressions: Sequence[Regression],
-        hypotheses: Mapping[Attached, float],
+        self, climb: _Climb, regressions: Sequence[Regression], hypotheses: Mapping[Attached, float]
     ) -> SearchResult:
         """Return what a table says of its best model and of what was tried."""
         table, mode, limits = climb.table, climb.mode, self.criteria.search
@@ -691,14 +684,10 @@ def _apart(mode: Mode, length: int, *, most: float = 0.5) -> Problem:
     return problem.with_data(breaks=breaks)
 
 
-def _with_contacts(
-    found: SearchResult, whole: Mode, shortest: int, *, far_out: float = 5.0
-) -> SearchResult:
+def _with_contacts(found: SearchResult, whole: Mode, shortest: int) -> SearchResult:
     """Return the result with its models fitted to contacts as well, which have parameters, too.
 
     These begin where the ``whole`` trajectories have them.
-
-    ``far_out``: errors of collisions above this many noise sizes are those of the engine.
     """
     contacts = found.after.problem.data.breaks
     if contacts is None:
@@ -714,8 +703,8 @@ def _with_contacts(
         known = problem.layout.from_layout(whole.problem.layout, whole.phi)
         pieces = in_pieces(problem, shortest, states)
         fitted = fit_pieces(pieces, _informed_or(known, mode))
-        # a collision that the engine does not have stays left out
-        off = np.abs(fitted.problem.residual(fitted.phi)).max(axis=(1, 2)) > far_out * mode.sigma
+        # a collision that the engine does not have, five times the noise off, stays left out
+        off = np.abs(fitted.problem.residual(fitted.phi)).max(axis=(1, 2)) > 5.0 * mode.sigma
         segments, breaks = pieces.segments, np.zeros_like(contacts)
         for i in np.flatnonzero(off.any(axis=1)):
             rows = segments.trajectory[i], slice(segments.step[i], segments.step[i] + shortest)
@@ -738,36 +727,6 @@ def _carried(mode: Mode, length: int) -> SimulatedMode:
     return fit_pieces(in_pieces(mode.problem, length, simulated_states(mode)), mode.phi)
 
 
-def elpd_gain(before: Mode, after: Mode) -> tuple[float, float]:
-    """Return the gain in expected log predictive density, and its standard error.
-
-    The gain in log-density at the modes, less one nat for each further parameter that the data
-    inform (to first order that of leave-one-out cross-validation: M. Stone, Journal of the Royal
-    Statistical Society B 39, 1977). Both count correlated residuals as ``after`` does. The error is
-    that of a sum over pieces or transitions; NaN for a single one.
-    """
-
-    def densities(mode: Mode) -> Floats:
-        problem = mode.problem
-        residual = problem.residual(mode.phi)
-        if not (is_simulated(problem) and is_simulated_mode(after)):
-            return np.asarray(problem.log_density(residual, mode.sigma, mode.phi))
-        likelihood = problem.likelihood
-        initial, tau = likelihood.initial_states, np.array(after.problem.likelihood.tau)
-        rows, begin = likelihood.unwhitened(residual, mode.sigma)
-        sensed = initial.column >= 0
-        of_start = np.eye(len(mode.sigma))[initial.column[sensed]]
-        square = (rows**2).sum((1, 2)) + begin[:, sensed] ** 2 @ of_start
-        count = initial.seen.sum((1, 2)) + np.isfinite(initial.begin)[:, sensed] @ of_start
-        density = count * np.log(mode.sigma) + 0.5 * square / mode.sigma**2
-        return np.asarray(-(density / tau).sum(axis=1))
-
-    gains = densities(after) - densities(before)
-    paid = max(int(informed(after).sum()) - int(informed(before).sum()), 0)
-    n, total = len(gains), float(gains.sum()) - paid
-    return total, float(np.sqrt(n) * gains.std(ddof=1)) if n > 1 else float("nan")
-
-
 def _named(
     law: Attached,
     scored: Law | None,
@@ -783,7 +742,6 @@ def _named(
     effect, places = law.effect, mode.problem.layout.places(law.labels)
     sd = np.sqrt(np.diag(mode.covariance)[places])
     names = [parameter.name for parameter in effect.parameters]
-    gain, error = elpd_gain(climb.table.without(climb.mode, law), mode)
     return replace(
         scored or Law(effect.name, law.body, effect.sentence),
         estimate=dict(zip(names, mode.phi[places].tolist(), strict=True)),
@@ -792,8 +750,6 @@ def _named(
         simulated_nats=climb.earlier.get(law, 0.0),
         simulated_share=part,
         not_separable_from=tuple(named_beside(rival, law) for rival in rivals),
-        elpd_difference=gain,
-        elpd_difference_se=error,
     )
 
 

@@ -437,8 +437,6 @@ def test_save_writes_the_contract(tmp_path: Path) -> None:
         "p_value",
         "parameters",
         "not_separable_from",
-        "elpd_difference",
-        "elpd_difference_se",
         "simulated_nats",
         "simulated_share",
     ]
