@@ -154,8 +154,8 @@ def close_loop(
     try:
         return _sampled(task, judged)
     except KeyboardInterrupt:
-        laplace = replace(task, method="laplace")
-        raise LoopInterrupted(partial(_sampled, laplace, judged)) from None
+        finish = partial(_sampled, replace(task, method="laplace"), judged)
+        raise LoopInterrupted(finish) from None
 
 
 class LoopInterrupted(KeyboardInterrupt):
@@ -338,16 +338,6 @@ def _tested(task: _Task, fitted: _Fitted, prior: results.ResidualTest) -> _Judge
     return _Judged(fitted, before, revised, misfit, small, rollout, simulated)
 
 
-def _sampled(task: _Task, judged: _Judged) -> results.Loop:
-    """Sample the posteriors, compare the models on the test history, and return the verdict."""
-    task.say(results.Stage.SAMPLE)
-    declared, revised = judged.declared, judged.revised
-    models = [revised] if revised is declared else [declared, revised]
-    fits = _fits(task, [model.mode for model in models])
-    task.say(results.Stage.COMPARE)
-    return _put_together(task, judged, fits[0], fits[-1])
-
-
 def _prior_test(task: _Task, train: History) -> results.ResidualTest:
     """Test whether the declared prior could have made the data, and warn before the long fit."""
     task.say(results.Stage.CHECK_PRIOR)
@@ -424,9 +414,14 @@ def _converged(fit: Fit, criteria: Criteria) -> bool:
     return record.max_rhat <= criteria.worst_rhat and record.min_ess >= criteria.least_ess
 
 
-def _put_together(task: _Task, judged: _Judged, before: Fit, after: Fit) -> results.Loop:
-    """Return the result of the stages."""
+def _sampled(task: _Task, judged: _Judged) -> results.Loop:
+    """Sample the posteriors, compare the models on the test history, and return the result."""
+    task.say(results.Stage.SAMPLE)
     declared, revised, found = judged.declared, judged.revised, judged.fitted.found
+    models = [revised] if revised is declared else [declared, revised]
+    fits = _fits(task, [model.mode for model in models])
+    before, after = fits[0], fits[-1]
+    task.say(results.Stage.COMPARE)
     last = judged.compared(revised, after, task.seed)
     first = last if declared is revised else judged.compared(declared, before, task.seed)
     converged = all(_converged(fit, task.criteria) for fit in (before, after))
@@ -435,7 +430,8 @@ def _put_together(task: _Task, judged: _Judged, before: Fit, after: Fit) -> resu
     )
     added = tuple(_with_posterior(law, one, after) for one, law in found.laws.items())
     keep_groups(after.posterior, added)
-    alone = noise_alone(revised.innovations, revised.excess)
+    old, new = declared.excess, revised.excess
+    alone = noise_alone(revised.innovations, new)
     substeps = task.scene.substeps, revised.innovations.problem.physics.substeps
     return results.Loop(
         scene=task.scene,
@@ -450,7 +446,11 @@ def _put_together(task: _Task, judged: _Judged, before: Fit, after: Fit) -> resu
         declared=first,
         revised=last,
         misfit=judged.misfit,
-        acceleration=_acceleration(declared.excess, revised.excess),
+        acceleration=results.Acceleration(
+            old.by_name(old.size), new.by_name(new.size),
+            old.by_name(old.relative), new.by_name(new.relative),
+            dict(zip(new.names, new.certain.tolist(), strict=True)),
+        ),
         forecasts=results.Forecasts(
             revised.held_out.noise_floor(alone, judged.horizon),
             example_rollout(declared.held_out, revised.held_out),
@@ -461,19 +461,6 @@ def _put_together(task: _Task, judged: _Judged, before: Fit, after: Fit) -> resu
         criteria=task.criteria,
         catalogue=task.catalogue,
     )  # fmt: skip
-
-
-def _acceleration(
-    before: UnexplainedAcceleration, after: UnexplainedAcceleration
-) -> results.Acceleration:
-    """Return the unexplained acceleration of both models by velocity."""
-    return results.Acceleration(
-        before.by_name(before.size),
-        after.by_name(after.size),
-        before.by_name(before.relative),
-        after.by_name(after.relative),
-        dict(zip(after.names, after.certain.tolist(), strict=True)),
-    )
 
 
 def _provenance(task: _Task, judged: _Judged) -> dict[str, object]:

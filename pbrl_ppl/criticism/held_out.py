@@ -322,8 +322,7 @@ class HeldOut:
         fitted = fit_pieces(pieces, self.mode.phi, initial_states_alone=True)
         if growth(fitted.problem) > MOST_GROWTH:
             return {}
-        names = fitted.problem.observations.names
-        return dict(zip(names, fitted.sigma.tolist(), strict=True))
+        return dict(zip(fitted.problem.observations.names, fitted.sigma.tolist(), strict=True))
 
     def noise_floor(self, sigma: Floats, rollout: int) -> Errors:
         """Return the errors that measurement noise alone makes, at both ends of a forecast.
@@ -344,9 +343,8 @@ class HeldOut:
         """Return the standard deviation of each state dimension's motion, in its unit."""
         states = self.problem.data.smoothed_states.copy()
         states[..., THETA] = np.unwrap(states[..., THETA], axis=1)
-        rows = (
-            np.arange(states.shape[1]) < self.problem.data.history.dataset["n_rows"].values[:, None]
-        )
+        n_rows = self.problem.data.history.dataset["n_rows"].to_numpy()
+        rows = np.arange(states.shape[1]) < n_rows[:, None]
         sizes = np.nanmax(np.std(states[rows], axis=0), axis=0)
         return dict(zip(STATE, sizes.tolist(), strict=True))
 

@@ -86,8 +86,7 @@ def unexplained_acceleration(
     mode: FilteredMode, criteria: Criteria = DEFAULT
 ) -> UnexplainedAcceleration:
     """Return the acceleration that a fitted model leaves unexplained."""
-    noise = mode.problem.likelihood.noise
-    coordinates = noise.coordinates
+    coordinates = mode.problem.likelihood.noise.coordinates
     size = mode.sigma[coordinates.accelerations]
     relative = size / np.maximum(bodies_acceleration(mode.problem), 1e-300)
     names = tuple(STATE[d] for d in coordinates.rates)
@@ -101,10 +100,8 @@ def noise_alone(mode: FilteredMode, excess: UnexplainedAcceleration) -> Floats:
 
     Few data do not tell measurement noise from process noise: the mode gives all to one of them.
     """
-    places = mode.problem.likelihood.noise.coordinates.accelerations
-    pairs = zip(places, excess.certain, strict=True)
-    negligible = [place for place, certain in pairs if not certain]
-    return _without(mode, negligible, mode.problem.residual(mode.phi))
+    places = np.array(mode.problem.likelihood.noise.coordinates.accelerations)
+    return _without(mode, places[~excess.certain], mode.problem.residual(mode.phi))
 
 
 def noise_without_unexplained(mode: FilteredMode, excess: UnexplainedAcceleration) -> Floats:
@@ -191,43 +188,35 @@ def correlation_tests(mode: FilteredMode, criteria: Criteria) -> tuple[ResidualT
     noise = mode.problem.likelihood.noise
     white, seen = mode.whitened_residual, noise.seen
     number = np.cumsum(noise.first.astype(np.intp))
-    share = innovations_over_steps(mode)
-    scene, places = mode.problem.scene, noise.coordinates.places
-    cells = [f"{STATE[p % len(STATE)]} of {scene.moving[p // len(STATE)].name}" for p in places]
-    own, pairs = _lagged(white, seen, number, None)
+    own, pairs = _lagged(white, seen, number, range(1, _LAGS + 1), white[:, None], seen[:, None])
     few, enough = "too few pairs of intervals", pairs > _LEAST_PAIRS
     whiteness = ResidualTest.untested(KindOfTest.WHITENESS, few)
     if enough.any():  # the sum of squares is chi-squared if nothing is missing
         p_value = float(chi2.sf((pairs * own**2)[enough].sum(), int(enough.sum())))
-        whiteness = _test(own, enough, p_value, share, cells, [], criteria)
+        whiteness = _test(mode, own, enough, p_value, [], criteria)
     series, names = _commands(mode)
     commands = ResidualTest.untested(KindOfTest.COMMANDS, few if names else "no command varies")
     regressed = _regression_p_value(white, seen, number, series) if names else None
     if regressed is not None:
-        driven, pairs = _lagged(white, seen, number, series)
-        enough = pairs > _LEAST_PAIRS
-        commands = _test(driven, enough, regressed, share, cells, names, criteria)
+        known = np.ones((len(series), 1, 1), dtype=bool)
+        driven, pairs = _lagged(white, seen, number, range(_LAGS + 1), series[..., None], known)
+        commands = _test(mode, driven, pairs > _LEAST_PAIRS, regressed, names, criteria)
     return whiteness, commands
 
 
 def _lagged(
-    white: Floats, seen: Bools, number: Ints, series: Floats | None
+    white: Floats, seen: Bools, number: Ints, lags: range, series: Floats, known: Bools
 ) -> tuple[Floats, Floats]:
-    """Return correlations with series some intervals before, or of each coordinate with itself.
+    """Return correlations with series (transition, series, coordinate) some intervals before.
 
     And the numbers of pairs, shape (lag, series, coordinate) each.
     """
     values, pairs = [], []
-    for lag in range(1 if series is None else 0, _LAGS + 1):
+    for lag in lags:
         end = max(len(number) - lag, 0)
         same = number[lag:] == number[:end]
-        later, counts = white[lag:][same][:, None], seen[lag:][same][:, None]
-        if series is None:
-            earlier = white[:end][same][:, None]
-            counts = counts & seen[:end][same][:, None]
-        else:
-            earlier = series[:end][same][:, :, None]
-        products = later * earlier * counts
+        counts = seen[lag:][same][:, None] & known[:end][same]
+        products = white[lag:][same][:, None] * series[:end][same] * counts
         n = np.broadcast_to(counts, products.shape).sum(axis=0)
         values.append(products.sum(axis=0) / np.maximum(n, 1))
         pairs.append(n)
@@ -274,26 +263,26 @@ def _regression_p_value(white: Floats, seen: Bools, number: Ints, commands: Floa
 
 
 def _test(
+    mode: FilteredMode,
     values: Floats,
     enough: Bools,
     p_value: float,
-    share: Floats,
-    cells: list[str],
     names: list[str],
     criteria: Criteria,
 ) -> ResidualTest:
     """Return the test of correlations with commands, or of whiteness if there are no names.
 
-    It fails where they are significant, and one is large relative to the noise and to the motion:
-    ``share`` is the size of innovations over the change in a step, shape (coordinate,). ``enough``
-    tells which were taken over enough pairs.
+    It fails where they are significant, and one is large relative to the noise and to the motion.
+    ``enough`` tells which were taken over enough pairs.
     """
+    share = innovations_over_steps(mode)
     size = np.where(enough, np.abs(values), 0.0)
     large = (size**2 > criteria.residual.correlation_share) & (size * share > criteria.negligible)
     passed = p_value > criteria.false_alarm or not large.any()
     weighted = size if passed else size * share
     lag, series, cell = map(int, np.unravel_index(int(np.argmax(weighted)), size.shape))
-    worst = float(values[lag, series, cell])
+    worst, body, dimension = float(values[lag, series, cell]), "", ""
+    place = mode.problem.likelihood.noise.coordinates.places[cell]
     lag += not names
     intervals = f"{lag} interval{'s' * (lag > 1)}"
     if not names:
@@ -304,9 +293,12 @@ def _test(
         other = names[series].replace("_", " ")
         when = f"{intervals} before" if lag else "of the same interval"
     if not passed:
-        sentence = f"the error of {cells[cell]} is correlated with {other} {when} ({worst:.2f})"
+        body = mode.problem.scene.moving[place // len(STATE)].name
+        dimension = STATE[place % len(STATE)]
+        sentence = (
+            f"the error of {dimension} of {body} is correlated with {other} {when} ({worst:.2f})"
+        )
     name = KindOfTest.COMMANDS if names else KindOfTest.WHITENESS
-    dimension, _, body = ("" if passed else cells[cell]).partition(" of ")
     return ResidualTest(name, p_value, abs(worst), passed, sentence, body, dimension)
 
 
@@ -386,7 +378,6 @@ def find_dependence(
     permutations = 500 * tests - 1  # the smallest p-value is a fifth of the significance
     chosen = np.sort(rng.permutation(n)[:1500])  # more take long and change nothing
     places = mode.problem.likelihood.noise.coordinates.places
-    innovations = mode.whitened_residual[chosen]
     groups = folds(mode)[chosen]
     relative = innovations_over_steps(mode)
     best: Unexplained | None = None
@@ -396,7 +387,7 @@ def find_dependence(
         features = recorded_quantities(problem, i)[chosen]
         of_body = np.flatnonzero(places // len(STATE) == i)
         y, names, of = _in_both_frames(
-            innovations[:, of_body], places[of_body] % len(STATE), features
+            mode.whitened_residual[chosen][:, of_body], places[of_body] % len(STATE), features
         )
         y = y - y.mean(axis=0)
         smoother = _cross_validated(np.asarray(sum(_kernels(features))), groups, rng)
@@ -493,14 +484,8 @@ def _describe(
     weights = np.linalg.solve(sum(_kernels(features)) + np.eye(len(y)), y)
     parts = [np.var(kernel @ weights) for kernel in _kernels(features)]
     name = list(QUANTITIES)[int(np.argmax(parts))]
-    return Unexplained(
-        body=body,
-        dimension=dimension,
-        depends_on=name,
-        share=float(share),
-        p_value=min(1.0, p_value),
-        sentence=(
-            f"the error of {dimension} of {body} depends on its {name}: a regression predicts"
-            f" {share:.0%} of its variance, and no effect in the catalogue does"
-        ),
+    sentence = (
+        f"the error of {dimension} of {body} depends on its {name}: a regression predicts"
+        f" {share:.0%} of its variance, and no effect in the catalogue does"
     )
+    return Unexplained(body, dimension, name, float(share), min(1.0, p_value), sentence)

@@ -197,16 +197,15 @@ def forecast_test(
             body = mode.problem.scene.moving[place // len(STATE)].name
     passed = p_value > criteria.false_alarm or worst < criteria.worse_forecast
     seconds = longest * mode.problem.scene.time_step
-    sentence = f"errors of forecasts of {seconds:g} s are those of noise"
-    if not passed:
-        sentence = f"within {seconds:g} s forecasts of {name} of {body} diverge"
-    if not passed and np.isfinite(worst):
+    if passed:
+        body, name, sentence = "", "", f"errors of forecasts of {seconds:g} s are those of noise"
+    elif np.isfinite(worst):
         sentence = (
             f"after {seconds:g} s the error of {name} of {body} is {worst:.1f} times what noise and"
             f" {100 * criteria.negligible:g} % of the bodies' acceleration make"
         )
-    if passed:
-        body = name = ""
+    else:
+        sentence = f"within {seconds:g} s forecasts of {name} of {body} diverge"
     kind = KindOfTest.HELD_OUT if held_out else KindOfTest.FORECASTS
     sentence = "held out: " * held_out + sentence
     return ResidualTest(kind, p_value, worst, passed, sentence, body, name)

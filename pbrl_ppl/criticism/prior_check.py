@@ -166,15 +166,13 @@ def prior_predictive_check(
     for velocity in unused:
         if (d := STATE.index(velocity.state)) in columns:
             measured[:, history.bodies.index(velocity.body), columns.index(d)] = np.nan
-    phi = draw_prior(problem, rng, draws)
-    ends = _predicted_ends(problem, phi, last)
+    ends = _predicted_ends(problem, draw_prior(problem, rng, draws), last)
     exact = observations.wrapped(ends - first)
     predicted = ends + _noise_of_changes(problem, history) * rng.standard_normal(exact.shape)
     derived = ~recorded[:, [d if d >= len(POSE) else d + len(POSE) for d in columns]]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # of what was never measured all is NaN
-        dataset = _compare(observations.wrapped(predicted - first), measured, derived)
-        dataset = dataset.merge(_factors(exact, measured))
+        dataset = _compare(observations.wrapped(predicted - first), exact, measured, derived)
     fall = wrong_clock(history, problem.scene)
     coords = {
         "body": [body.name for body in problem.scene.moving],
@@ -231,14 +229,6 @@ def _noise_of_changes(problem: Problem, history: History) -> Floats:
     )
 
 
-def _factors(exact: Floats, measured: Floats) -> xr.Dataset:
-    """Return quantiles over draws of the ratio of measured (transition, body, state) changes."""
-    seen = np.where(np.isfinite(measured), exact, 0.0)
-    factor = (seen * np.nan_to_num(measured)).sum(axis=1) / (seen**2).sum(axis=1)
-    quantiles = np.nanquantile(factor, QUANTILES, axis=0)
-    return xr.Dataset({"factor": (("quantile", "body", "state"), quantiles)})
-
-
 def _unit(factor: xr.DataArray, beyond: float = 1.5) -> tuple[str, str]:
     """Return how many times as large measured changes are, and a hint if a unit has that factor.
 
@@ -249,17 +239,17 @@ def _unit(factor: xr.DataArray, beyond: float = 1.5) -> tuple[str, str]:
     low, middle, high = (float(factor[i]) for i in (0, len(QUANTILES) // 2, -1))
     if not low > 0:  # nothing was predicted, or motion the other way
         return "", ""
-    over, size = ("", middle) if middle > 1 else ("1/", 1 / middle)
-    if middle <= 1:
-        low, high = 1 / high, 1 / low
+    over = "" if middle > 1 else "1/"
+    if over:
+        low, middle, high = 1 / high, 1 / middle, 1 / low
     if low < 1:
         return "", ""
-    words = f"{over}{size:.2g} times as much as"
+    words = f"{over}{middle:.2g} times as much as"
     low, high = low / beyond, high * beyond
-    near = [factor_of_units for factor_of_units in _UNITS if low < factor_of_units < high]
+    near = [unit for unit in _UNITS if low < unit < high]
     if low < 1 or not near:
         return words, ""
-    best = min(near, key=lambda factor_of_units: abs(np.log(factor_of_units / size)))
+    best = min(near, key=lambda unit: abs(np.log(unit / middle)))
     return words, f" (a factor near {over}{_UNITS[best]}: units?)"
 
 
@@ -342,20 +332,19 @@ def _measurement_noise(history: History, stated: Mapping[str, float]) -> Floats:
     return noises
 
 
-def _compare(predicted: Floats, measured: Floats, derived: Bools) -> xr.Dataset:
+def _compare(predicted: Floats, exact: Floats, measured: Floats, derived: Bools) -> xr.Dataset:
     """Return summaries of changes (draw, transition, body, state), and (transition, body, state).
 
-    Where velocities are ``derived``, shape (body, state), draws reach measurements within a quarter
-    of the usual change.
+    ``exact`` changes are predicted ones without noise. Where velocities are ``derived``, shape
+    (body, state), draws reach measurements within a quarter of the usual change.
     """
     seen = np.isfinite(measured)
     low, high = np.quantile(predicted, [QUANTILES[0], QUANTILES[-1]], axis=0)
-    inside = (measured >= low) & (measured <= high)
     near = 0.25 * derived * np.sqrt(np.nanmean(measured**2, axis=0))
     low_end, high_end = predicted.min(axis=0) - near, predicted.max(axis=0) + near
     farther = np.maximum(measured - high_end, low_end - measured)
-    beyond = farther > 0.0
-    count = seen.sum(axis=0)
+    count, known = seen.sum(axis=0), np.where(seen, exact, 0.0)
+    factor = (known * np.nan_to_num(measured)).sum(axis=1) / (known**2).sum(axis=1)
     # cells that were not measured count on neither side
     pooled = np.where(seen, predicted, np.nan).reshape(-1, *measured.shape[1:])
     dims = ("body", "state")
@@ -363,9 +352,10 @@ def _compare(predicted: Floats, measured: Floats, derived: Bools) -> xr.Dataset:
         {
             "predicted": (("quantile", *dims), np.nanquantile(pooled, QUANTILES, axis=0)),
             "measured": (("quantile", *dims), np.nanquantile(measured, QUANTILES, axis=0)),
-            "share_inside": (dims, inside.sum(axis=0) / count),
-            "share_beyond": (dims, beyond.sum(axis=0) / count),
+            "share_inside": (dims, ((measured >= low) & (measured <= high)).sum(axis=0) / count),
+            "share_beyond": (dims, (farther > 0.0).sum(axis=0) / count),
             "largest_beyond": (dims, np.nanmax(np.where(seen, farther, 0.0), axis=0).clip(0.0)),
             "cells": (dims, count),
+            "factor": (("quantile", *dims), np.nanquantile(factor, QUANTILES, axis=0)),
         }
     ).transpose("body", "state", "quantile")

@@ -85,12 +85,11 @@ def checked_histories(
         np.isfinite(history.dataset["observed"].to_numpy()).any(axis=(0, 1))
         for history in (train, test)
     )
-    if (tested & ~known).any():
-        missing = ", ".join(
-            f"{STATE[d]} of {scene.moving[body].name}" for body, d in np.argwhere(tested & ~known)
-        )
+    where = np.argwhere(tested & ~known)
+    if len(where):
+        missing = (f"{STATE[d]} of {scene.moving[body].name}" for body, d in where)
         raise HistoryError(
-            f"test history measures {missing}, which the training history does"
+            f"test history measures {', '.join(missing)}, which the training history does"
             " not; leave those columns empty, or measure them in both"
         )
     held_out = [] if same else [f"held out: {frame}" for frame in more]

@@ -653,6 +653,7 @@ class Loop:
     def to_dict(self) -> dict[str, Any]:
         """Return the contents of ``report.json``; numbers that are not finite become null."""
         tested = [key for key in CANDIDATE if key not in ("sentence", "units")]
+        errors = {"before": self.before, "after": self.after, "noise_floor": self.noise_floor}
         contents: dict[str, Any] = json_values(
             {
                 "verdict": self.verdict,
@@ -666,11 +667,7 @@ class Loop:
                 "tests": self.tests,
                 "unexplained_acceleration": self.acceleration,
                 "unexplained": self.unexplained,
-                "error": {
-                    "before": self.before,
-                    "after": self.after,
-                    "noise_floor": self.noise_floor,
-                },
+                "error": errors,
                 "identifiability": self.identifiability and self.identifiability.to_dict(),
                 "loo": self.loo and self.loo.to_dict(),
                 "velocities_not_used": self.data.velocities_not_used,

@@ -39,11 +39,6 @@ class GridPoint:
     columns: tuple[int, ...]
 
     @property
-    def place(self) -> GridPoint:
-        """Return the grid point without its signature."""
-        return replace(self, signature=self.signature[:0].copy())
-
-    @property
     def proposed(self) -> Floats:
         """Return the grid point as a scan proposes it, shape (q,), NaN for what is not scanned."""
         point = self.values.astype(float)
@@ -78,12 +73,16 @@ def each_grid_point(
         return
     body = problem.scene.body(candidate.body)
     enlarged = problem.with_physics(effects=(*problem.physics.effects, candidate)).medium
-    of_scan = proposed is None
-    if proposed is None:
+    null = np.array(effect.null)
+    steps = 1e-3 * np.array([parameter.prior.scale for parameter in effect.parameters])
+    lower, upper = np.array([p.prior.support for p in effect.parameters]).T
+    # one-sided where the null is the least that there can be
+    ahead, behind = np.minimum(null + steps, upper) - null, np.maximum(null - steps, lower) - null
+    if proposed is None:  # one side will do to choose from
         proposed, enlarged = effect.scan(problem.scene, problem.data.history, body), enlarged.coarse
+        behind = np.where(ahead > 0.0, 0.0, behind)
     declared = enlarged.layout.places(problem.layout.labels)
     places = enlarged.layout.places(candidate.labels)
-    null = np.array(effect.null)
 
     def whitened(points: Floats) -> Floats:
         phi = np.zeros((len(points), enlarged.layout.size))
@@ -91,18 +90,10 @@ def each_grid_point(
         phi[:, places] = points
         return -enlarged.whitened(phi, mode.sigma).reshape(len(points), -1)
 
-    free = np.isnan(proposed)
-    steps = 1e-3 * np.array([parameter.prior.scale for parameter in effect.parameters])
-    lower, upper = np.array([p.prior.support for p in effect.parameters]).T
-    # one-sided where the null is the least that there can be
-    ahead, behind = np.minimum(null + steps, upper) - null, np.maximum(null - steps, lower) - null
-    if of_scan:  # one side will do to choose from
-        behind = np.where(ahead > 0.0, 0.0, behind)
     nothing = whitened(null[None])
     at_once = max(1, min(8, most_values // max(mode.whitened_residual.size, 1)))
     for begin in range(0, len(proposed), at_once):
-        part = slice(begin, begin + at_once)
-        points, plan = _points(proposed[part], free[part], null, (ahead, behind))
+        points, plan = _points(proposed[begin : begin + at_once], null, (ahead, behind))
         states = np.vstack([nothing, whitened(points)])
         for values, columns, rows in plan:
             if columns:
@@ -117,7 +108,7 @@ def each_grid_point(
 
 
 def _points(
-    proposed: Floats, free: Floats, null: Floats, steps: tuple[Floats, Floats]
+    proposed: Floats, null: Floats, steps: tuple[Floats, Floats]
 ) -> tuple[Floats, list[tuple[Floats, tuple[int, ...], list[int]]]]:
     """Return points to simulate, and each grid point's values, free columns and rows of states.
 
@@ -125,9 +116,9 @@ def _points(
     """
     points: list[Floats] = []
     plan = []
-    for row, unknown in zip(proposed, free, strict=True):
-        values = np.where(unknown, null, row)
-        columns = tuple(int(i) for i in np.flatnonzero(unknown))
+    for row in proposed:
+        values = np.where(np.isnan(row), null, row)
+        columns = tuple(np.flatnonzero(np.isnan(row)).tolist())
         rows = []
         for column in columns:
             for step in steps:
@@ -170,7 +161,8 @@ def detection_limits(
     criteria : ResidualCriteria
         P-value and power of the limit.
     """
-    tried = candidates * len(points)
+    tail = criteria.detection_p / 2 / max(candidates * len(points), 1)  # of a two-sided test
+    needed = float(norm.isf(tail) + norm.ppf(criteria.detection_power))
     names = [parameter.name for parameter in effect.parameters]
     limits: dict[str, float] = {}
     whole = [
@@ -178,11 +170,11 @@ def detection_limits(
     ]
     if whole and len(names) == 1:
         null = effect.null[0]
-        seen = [values[0] for values, unit in whole if unit[0] >= _needed(tried, criteria)]
+        seen = [values[0] for values, unit in whole if unit[0] >= needed]
         limits[names[0]] = float(min(seen, key=lambda value: abs(value - null), default=np.inf))
     for point, unit in zip(points, units, strict=True):
         with np.errstate(divide="ignore"):
-            sizes = _needed(tried, criteria) / unit
+            sizes = needed / unit
         for column, size in zip(point.columns, sizes, strict=False):
             limits[names[column]] = min(limits.get(names[column], np.inf), float(size))
     return limits
@@ -193,11 +185,6 @@ def is_upper_limit(effect: Effect, points: Sequence[GridPoint]) -> bool:
     return bool(points) and all(
         not point.columns and point.values[0] < effect.null[0] for point in points
     )
-
-
-def _needed(tried: int, criteria: ResidualCriteria) -> float:
-    """Return the detectable change in units of noise, for a two-sided test."""
-    return float(norm.isf(criteria.detection_p / 2 / tried) + norm.ppf(criteria.detection_power))
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,10 +214,6 @@ class Signature:
     direction: Floats
     linear: tuple[Linearisation, ...]
 
-    def without_bases(self) -> Signature:
-        """Return the test with its direction, without arrays of several values a row."""
-        return replace(self, basis=self.basis[:0].copy(), linear=())
-
 
 def rank_candidates(
     mode: Mode, candidates: Sequence[Attached], criteria: Criteria = DEFAULT, say: Say = silent
@@ -242,9 +225,9 @@ def rank_candidates(
     library = Library(mode, criteria=criteria)
 
     def score(attached: Attached) -> Signature:
-        signature = library.scored(attached, len(candidates)).without_bases()
+        signature = library.scored(attached, len(candidates))
         library.forget(attached)
-        return signature
+        return replace(signature, basis=signature.basis[:0].copy(), linear=())
 
     # p-values of the same physics differ by rounding
     scored = in_parallel(score, candidates, f"scoring {len(candidates)} laws", say)
@@ -376,7 +359,8 @@ class Library:
                 tests, judged = [test, self.test(self.laws)][: 1 + bool(self.laws)], []
                 for point in each_grid_point(mode, attached):
                     scores = [one.at(point, attached) for one in tests]
-                    judged.append(([one.log_p for one in scores], point.place, scores[0].unit))
+                    place = replace(point, signature=point.signature[:0].copy())
+                    judged.append(([one.log_p for one in scores], place, scores[0].unit))
                 leading: dict[int, Floats] = {}
                 for i in range(len(tests)):
                     for one in sorted(judged, key=lambda one: one[0][i])[:4]:

@@ -218,9 +218,8 @@ class Search:
         declared = short.problem.physics.effects
         tried = max(len(self._candidates(short, single)), 1)
         table = Table(declared, tried, modes={frozenset(): short})
-        common = best = _Climb(
-            table.fitted(short, laws or {}, by_label(laws or {})), table, unusual=single
-        )
+        begun = table.fitted(short, laws or {}, by_label(laws or {}))
+        common = best = _Climb(begun, table, unusual=single)
         self._climb(common, lengths)
         self._leave_out(common)
         hypotheses: Mapping[Attached, float] = {}
@@ -230,10 +229,9 @@ class Search:
             i, hypotheses = self._promised(common, lost)
             if i is not None:
                 self.say("common laws leave more than the noise: trying unusual ones")
-                tried = len(self._candidates(short, True))
-                begun = common.modes[i]
-                names = frozenset(table.laws(begun))
-                table = Table(declared, tried, {**common.table.points}, {names: begun})
+                tried, begun = len(self._candidates(short, True)), common.modes[i]
+                modes = {frozenset(table.laws(begun)): begun}
+                table = Table(declared, tried, {**common.table.points}, modes)
                 more = _Climb(begun, table, True, common.noise, lengths=common.lengths[:i])
                 self._climb(more, lengths[i:], common.modes[i:])
                 common.regressions.append(more.regressions[0])
@@ -315,10 +313,9 @@ class Search:
 
     def _is_complete(self, more: _Climb, common: _Climb) -> bool:
         """Return whether unusual laws explain all that common ones leave, or most of it."""
-        unusual = any(law.effect.unusual for law in more.laws)
-        if not unusual or more.mode.problem.data.horizon < common.mode.problem.data.horizon:
-            return False
         plain, rows = common.mode, more.mode.problem.data.horizon
+        if not any(law.effect.unusual for law in more.laws) or rows < plain.problem.data.horizon:
+            return False
         if is_simulated_mode(plain) and plain.problem.data.horizon < rows:
             plain = _carried(plain, rows)
         return self._explains(more, plain)
@@ -356,13 +353,12 @@ class Search:
                 )
                 climb.mode = longer
             climb.last = bool(i) and length == lengths[-1]
-            self._improve(climb, beside[i] if i < len(beside) else None)
+            plain = beside[i] if i < len(beside) else None
+            self._improve(climb, plain)
             if not climb.noise.size:
                 climb.noise = climb.mode.sigma
-            if i < len(beside):
-                better = share(beside[i], climb.mode, weights(climb.mode))
-                if better < limits.least_share:
-                    break
+            if plain and share(plain, climb.mode, weights(climb.mode)) < limits.least_share:
+                break
 
     def _linearised(self, climb: _Climb) -> tuple[Library, list[Attached]]:
         """Return derivatives at a climb's model, and candidates beside at most one unusual law."""
@@ -458,15 +454,13 @@ class Search:
         # friction has kinks, by which a regression underrates it
         everyday = [one for one in subsets if all(law.effect.log_odds == 0 for law in one.laws)]
         proposals += {len(one.laws): one for one in reversed(everyday)}.values()
-        moves = {
-            frozenset((*climb.laws, *one.laws)): one.begin(climb.mode.problem.layout.labels)
-            for one in proposals
-        }
+        labels = climb.mode.problem.layout.labels
+        moves = {frozenset((*climb.laws, *one.laws)): one.begin(labels) for one in proposals}
         for subset in proposals:  # a spring has the constant torque of its anchor
             kin = [law for law in climb.laws if any(_are_kin(law, new) for new in subset.laws)]
             if kin and any(law.effect.unusual for law in subset.laws):
-                begin = subset.begin(climb.mode.problem.layout.labels)
-                moves[frozenset((*climb.laws, *subset.laws)) - {*kin}] = _without(begin, *kin)
+                laws = frozenset((*climb.laws, *subset.laws)) - {*kin}
+                moves[laws] = _without(subset.begin(labels), *kin)
         for subset in instead.subsets[: limits.singles] if instead and climb.laws else ():
             moves.setdefault(frozenset(subset.laws), subset.begin(_labels(climb.mode, *climb.laws)))
         return self._best(climb, moves, least_share)
@@ -620,17 +614,11 @@ class Search:
             law: _named(law, scored.get(law), climb, mode, part, rivals[law])
             for law, part in shares.items()
         }
-        too_little = "takes too little off the error of simulated trajectories"
+        little = "takes too little off the error of simulated trajectories"
+        tried = {law: replace(one, why=decided.get(law, little)) for law, one in scored.items()}
+        aside = _aside(climb.small), _aside(hypotheses)
         return SearchResult(
-            before,
-            mode,
-            laws,
-            {law: replace(one, why=decided.get(law, too_little)) for law, one in scored.items()},
-            tuple(climb.lengths),
-            rejected,
-            _aside(climb.small),
-            _aside(hypotheses),
-            doubt,
+            before, mode, laws, tried, tuple(climb.lengths), rejected, *aside, doubt
         )
 
 
@@ -643,9 +631,8 @@ def _scored(regressions: Sequence[Regression]) -> dict[Attached, Law]:
         for subset in (one for one in regression.subsets if len(one.laws) == 1):
             part = 1.0 - float(np.sqrt(1.0 - subset.share))
             for law in (*subset.laws, *regression.same[subset.laws[0]]):
-                if laws[law].simulated_nats is None:
-                    alone = replace(laws[law], simulated_nats=subset.nats, simulated_share=part)
-                    laws[law] = alone
+                if (one := laws[law]).simulated_nats is None:
+                    laws[law] = replace(one, simulated_nats=subset.nats, simulated_share=part)
     return laws
 
 

@@ -170,8 +170,8 @@ def best_subsets(
     order = {law: place for place, law in enumerate(candidates)}
     equations = _NormalEquations(terms, library.test(without), n)
     tried = equations.search([order[term.law] for term in terms], largest)
-    best = sorted(tried, key=lambda subset: -subset.nats)
-    return Regression(tuple(best), same, tuple(signatures))
+    tried.sort(key=lambda subset: -subset.nats)
+    return Regression(tuple(tried), same, tuple(signatures))
 
 
 class _NormalEquations:
