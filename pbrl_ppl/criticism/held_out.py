@@ -49,12 +49,9 @@ class Forecast:
 
     def _by_dimension(self, square: Floats) -> dict[str, float]:
         """Return root mean squares by state dimension."""
-        result = {}
-        for d in np.unique(self.dimension):
-            columns = square[:, self.dimension == d]
-            if not np.isnan(columns).all():
-                result[STATE[d]] = float(np.sqrt(np.nanmean(columns)))
-        return result
+        columns = {STATE[d]: square[:, self.dimension == d] for d in np.unique(self.dimension)}
+        seen = {name: each for name, each in columns.items() if not np.isnan(each).all()}
+        return {name: float(np.sqrt(np.nanmean(each))) for name, each in seen.items()}
 
 
 def filtered_states(problem: FilteredProblem, phi: Floats, sigma: Floats) -> Floats:

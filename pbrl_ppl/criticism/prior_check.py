@@ -174,13 +174,9 @@ def prior_predictive_check(
         warnings.simplefilter("ignore", RuntimeWarning)  # of what was never measured all is NaN
         dataset = _compare(observations.wrapped(predicted - first), exact, measured, derived)
     fall = wrong_clock(history, problem.scene)
-    coords = {
-        "body": [body.name for body in problem.scene.moving],
-        "state": list(observations.names),
-        "quantile": list(QUANTILES),
-    }
+    bodies, states = [body.name for body in problem.scene.moving], list(observations.names)
     return PriorCheck(
-        dataset.assign_coords(coords),
+        dataset.assign_coords(body=bodies, state=states, quantile=list(QUANTILES)),
         problem.data.horizon * problem.scene.time_step,
         draws,
         draws - len(ends),

@@ -750,12 +750,11 @@ def _weightless(mode: Mode, law: Attached, *, least: float = 0.9) -> str:
     known = dict(body.known).get("mass")
     mass = known or mode.phi[mode.problem.layout.index("mass", body.owner)]
     share = float(-(force @ gravity) / (mass * (gravity @ gravity)))
-    if not least < share <= 1.0:
-        return ""
-    return (
+    why = (
         f"{law.body} falls with {100 * (1 - share):.2g} % of gravity: a wrong gravity, or a wrong"
         " unit of time or length"
     )
+    return why if least < share <= 1.0 else ""
 
 
 def are_alike(law: Attached, other: Attached) -> bool:
