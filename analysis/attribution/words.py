@@ -93,7 +93,7 @@ def told(row: Row) -> str:
         )
     for one in row.added:
         estimates = {name: (e["mean"], e["hdi"]) for name, e in one["parameters"].items()}
-        lines.append(f"added {_name(one)}: {estimates}, elpd +{one['elpd_difference']:.1f}")
+        lines.append(f"added {_name(one)}: {estimates}")
     if found["small"]:
         lines.append(f"too small to matter: {found['small']}")
     for test in found["tests"]:

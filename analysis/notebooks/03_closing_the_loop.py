@@ -81,16 +81,13 @@ figure
 # ### The added effect
 #
 # Its evidence, summed over lengths of pieces, and the share of the declared model's error on the
-# longest ones that it takes off, at least a fifth. Then the rise of the expected log predictive
-# density (elpd), to first order that of leave-one-out cross-validation.
+# longest ones that it takes off, at least a fifth.
 
 # %%
 for added in cart.added:
     print(f"{added.effect} on {added.body}: {added.sentence}")
     share = 100 * added.simulated_share
     print(f"  {added.simulated_nats:.0f} nats, {share:.0f} % off the simulation error")
-    gain, se = added.elpd_difference, added.elpd_difference_se
-    print(f"  elpd rises by {gain:.0f} (standard error {se:.0f})")
     for name, found in added.parameters.items():
         low, high = found.hdi
         print(f"  {name}: {found.mean:.3f} {found.unit}, 94 % interval {low:.3f} to {high:.3f}")
@@ -164,7 +161,7 @@ if pendulum is not None:
         values = ", ".join(
             f"{name} {found.mean:.3g} {found.unit}" for name, found in added.parameters.items()
         )
-        print(f"added: {added.effect} ({values}); elpd rises by {added.elpd_difference:.0f}")
+        print(f"added: {added.effect} ({values}); {added.simulated_nats:.0f} nats")
     print("remains:", pendulum.unexplained.sentence if pendulum.unexplained else "nothing")
     print("hypotheses:", [f"{one.effect} on {one.body}" for one in pendulum.found.hypotheses])
     print("error before:", pendulum.before.rollout_rmse)
@@ -211,7 +208,7 @@ if block is not None:
         values = ", ".join(
             f"{name} {found.mean:.3g} {found.unit}" for name, found in added.parameters.items()
         )
-        print(f"added: {added.effect} ({values}); elpd rises by {added.elpd_difference:.0f}")
+        print(f"added: {added.effect} ({values}); {added.simulated_nats:.0f} nats")
     print("remains:", block.unexplained.sentence if block.unexplained else "nothing")
     for label, errors in (("before", block.before), ("after", block.after)):
         last = errors.rollout_rmse

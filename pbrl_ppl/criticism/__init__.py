@@ -27,7 +27,6 @@ from .results import Law as Law
 from .results import Loop as Loop
 from .results import SearchLength as SearchLength
 from .results import Stage as Stage
-from .results import Unexplained as Unexplained
 from .results import diverged_after as diverged_after
 from .score import rank_candidates as rank_candidates
 from .search import Search as Search

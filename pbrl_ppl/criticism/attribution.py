@@ -17,7 +17,7 @@ from pbrl_ppl.files import json_fields
 from pbrl_ppl.history import MOST_TRANSITIONS, History
 from pbrl_ppl.likelihood import is_simulated
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.threads import one_blas_thread
+from pbrl_ppl.threads import one_blas_thread, silent
 
 
 @dataclass(frozen=True)
@@ -123,10 +123,9 @@ def attribute(
         found = pp.attribute(scene, history)
         [law.effect for law in found.laws]  # ['linear_drag', 'sliding_friction']
     """
-    say, catalogue = progress or (lambda stage: None), tuple(catalogue)
-    declared = Declared(scene, catalogue, seed, criteria, say)
+    declared = Declared(scene, tuple(catalogue), seed, criteria, progress or silent)
     declared, history = declared.cleaned(history, most_transitions)
-    _, found = Search(declared.missing, criteria, say).of(history, declared.mode, seed)
+    _, found = Search(declared.missing, criteria, declared.say).of(history, declared.mode, seed)
     problem = found.after.problem
     names = problem.observations.names
     times = problem.likelihood.tau if is_simulated(problem) else (1.0,) * len(names)
@@ -213,13 +212,11 @@ def criticise(
     EffectError
         If the scene declares an unknown effect.
     """
-    say = progress or (lambda stage: None)
-    catalogue = tuple(catalogue)
-    declared = Declared(scene, catalogue, seed, criteria, say)
+    declared = Declared(scene, tuple(catalogue), seed, criteria, progress or silent)
     declared, history = declared.cleaned(history, most_transitions)
     mode = declared.mode(history)
-    say("scoring what the model might lack")
-    ranked = rank_candidates(mode, declared.missing(mode), criteria, say)
+    declared.say("scoring what the model might lack")
+    ranked = rank_candidates(mode, declared.missing(mode), criteria, declared.say)
     excess = unexplained_acceleration(mode, criteria)
     return Ranking(
         tuple(signature.candidate for signature in ranked),

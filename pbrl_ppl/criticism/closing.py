@@ -19,25 +19,14 @@ from pbrl_ppl.criticism.innovations import (
     noise_without_unexplained,
     unexplained_acceleration,
 )
-from pbrl_ppl.criticism.misfit import (
-    find_misfit,
-    held_out_forecasts,
-    score_test,
-    simulation_test,
-)
+from pbrl_ppl.criticism.misfit import find_misfit, forecast_test, score_test, simulation_test
 from pbrl_ppl.criticism.prior_check import informative_horizon, prior_predictive_check
 from pbrl_ppl.criticism.refinement import Declared, checked_histories, outliers, shift
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.criticism.search import Search, SearchResult
 from pbrl_ppl.effects import Attached, Effect
 from pbrl_ppl.effects import catalogue as full_catalogue
-from pbrl_ppl.errors import (
-    ConvergenceWarning,
-    HistoryError,
-    PriorWarning,
-    UninformedWarning,
-    warn,
-)
+from pbrl_ppl.errors import ConvergenceWarning, HistoryError, PriorWarning, UninformedWarning, warn
 from pbrl_ppl.history import (
     MOST_TRANSITIONS,
     History,
@@ -147,27 +136,26 @@ def close_loop(
     compile_for_search(scene)
     if test is None:
         train, test = train.split(0.25, seed)
-        numbered = test
-    else:  # an effect from some trajectory on still acts in a later test
-        after = float(train.dataset["number"].max()) + 1.0
-        numbered = test.numbered(after) if scene.test_is_later else test
-    scene, (train, test, numbered), thin = thinned(scene, train, test, numbered)
+    elif scene.test_is_later:  # an effect from some trajectory on still acts
+        test = test.numbered(float(train.dataset["number"].max()) + 1.0)
+    scene, (train, test), thin = thinned(scene, train, test)
     task = _Task(scene, tuple(catalogue), seed, criteria, say, draws=draws, method=method)
-    drawn = partial(drawn_pieces, most=most_transitions, seed=seed)
-    (train, said), (test, also), (numbered, _) = map(drawn, (train, test, numbered))
+    train, said = drawn_pieces(train, most_transitions, seed)
+    test, also = drawn_pieces(test, most_transitions, seed)
     said = (*thin, *said, *(f"held out: {one}" for one in also))
-    cleaned = _cleaned(task, train, numbered, results.Recordings(held_out=test, drawn=said))
-    task = replace(task, scene=with_units(scene, cleaned.train))
-    prior = _prior_test(task, cleaned.train)
-    declared, found = _searched(task, cleaned)
+    train, test, data = _cleaned(task, train, test, said)
+    task = replace(task, scene=with_units(scene, train))
+    prior = _prior_test(task, train)
+    declared, found = _searched(task, train)
     say(results.Stage.TEST)
-    fitted = _without_outliers(task, _Fitted.of(cleaned, declared, found))
+    fitted = _Fitted(train, test, data, declared, found, _filtered(declared, found))
+    fitted = _without_outliers(task, fitted)
     judged = _tested(task, fitted, prior)
     try:
         return _sampled(task, judged)
     except KeyboardInterrupt:
-        laplace = replace(task, method="laplace")
-        raise LoopInterrupted(partial(_sampled, laplace, judged)) from None
+        finish = partial(_sampled, replace(task, method="laplace"), judged)
+        raise LoopInterrupted(finish) from None
 
 
 class LoopInterrupted(KeyboardInterrupt):
@@ -193,22 +181,15 @@ class _Task(Declared):
 
 
 @dataclass(frozen=True, eq=False)
-class _Cleaned:
-    """Training and test history as they are used, and what of them is not."""
-
-    train: History
-    test: History
-    data: results.Recordings
-
-
-@dataclass(frozen=True, eq=False)
 class _Fitted:
-    """The declared model on cleaned histories, and the laws that it lacks.
+    """The declared model, and the laws that it lacks.
 
     Parameters
     ----------
-    cleaned : _Cleaned
-        The histories.
+    train, test : History
+        The histories as they are used.
+    data : Recordings
+        What of them is not.
     declared : FilteredMode
         The declared model.
     found : SearchResult
@@ -217,16 +198,12 @@ class _Fitted:
         The model with the laws, with whole trajectories filtered.
     """
 
-    cleaned: _Cleaned
+    train: History
+    test: History
+    data: results.Recordings
     declared: FilteredMode
     found: SearchResult
     innovations: FilteredMode
-
-    @classmethod
-    def of(cls, cleaned: _Cleaned, declared: FilteredMode, found: SearchResult) -> Self:
-        """Filter the model found."""
-        innovations = filtered_mode(declared, found.after) if found.laws else declared
-        return cls(cleaned, declared, found, innovations)
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,8 +240,7 @@ class _Tested:
 class _Judged:
     """The declared and the revised model with the tests of the latter's residual."""
 
-    cleaned: _Cleaned
-    found: SearchResult
+    fitted: _Fitted
     declared: _Tested
     revised: _Tested
     misfit: results.Misfit
@@ -279,58 +255,64 @@ class _Judged:
         errors = model.held_out.errors(revised.held_out, fit, self.horizon, seed, noise)
         if simulated and model is not revised:
             simulated = model.held_out.simulated()
-        residuals = model.held_out.residuals(revised.held_out)
-        return results.ComparedModel(
-            fit, model.innovations, replace(errors, simulated_rmse=simulated), residuals
-        )
+        errors = replace(errors, simulated_rmse=simulated)
+        return results.ComparedModel(fit, model.innovations, errors)
 
 
-def _cleaned(task: _Task, train: History, test: History, data: results.Recordings) -> _Cleaned:
+def _cleaned(
+    task: _Task, train: History, test: History, drawn: tuple[str, ...]
+) -> tuple[History, History, results.Recordings]:
     """Check the histories and the effects; leave out what no model should be fitted to."""
+    data = results.Recordings(held_out=test, drawn=drawn)
     train, test, unused, bad_frames = checked_histories(task.scene, train, test)
-    for sentence in (*data.drawn, *(column.sentence for column in unused), *bad_frames):
+    for sentence in (*drawn, *(column.sentence for column in unused), *bad_frames):
         task.say(sentence)
     for effect in task.catalogue:
         if effect not in full_catalogue:
             try_effect(effect, with_units(task.scene, train), train)
-    return _Cleaned(train, test, replace(data, velocities_not_used=unused, bad_frames=bad_frames))
+    return train, test, replace(data, velocities_not_used=unused, bad_frames=bad_frames)
 
 
-def _searched(task: _Task, cleaned: _Cleaned) -> tuple[FilteredMode, SearchResult]:
+def _searched(task: _Task, train: History) -> tuple[FilteredMode, SearchResult]:
     """Fit the declared model, and search for the laws that it lacks."""
     search = Search(task.missing, task.criteria, task.say)
     try:
-        return search.of(cleaned.train, task.mode, task.seed)
+        return search.of(train, task.mode, task.seed)
     except HistoryError:  # initial states could follow all that was measured
-        mode = task.mode(cleaned.train)
+        mode = task.mode(train)
         return mode, search(find_mode(single_transitions(mode.problem), initial=mode.phi))
+
+
+def _filtered(declared: FilteredMode, found: SearchResult) -> FilteredMode:
+    """Return the model found, with whole trajectories filtered."""
+    return filtered_mode(declared, found.after) if found.laws else declared
 
 
 def _without_outliers(task: _Task, fitted: _Fitted) -> _Fitted:
     """Leave out measurements that the model found contradicts; refit it, with the same laws."""
-    cleaned, criteria = fitted.cleaned, task.criteria
-    train, frames = without_measurements(cleaned.train, outliers(fitted.innovations, criteria))
+    test, data, criteria = fitted.test, fitted.data, task.criteria
+    train, frames = without_measurements(fitted.train, outliers(fitted.innovations, criteria))
     if frames:
         task.say("; ".join(map(str, frames)))
         declared = task.mode(train, fitted.declared)
-        cleaned = replace(cleaned, train=train)
-        fitted = _Fitted.of(cleaned, declared, fitted.found.on(declared))
+        found = fitted.found.on(declared)
+        fitted = _Fitted(train, test, data, declared, found, _filtered(declared, found))
     innovations = fitted.innovations
-    held_out = replace(innovations, problem=HeldOut.of(innovations, cleaned.test).problem)
-    test, more = without_measurements(cleaned.test, outliers(held_out, criteria))
+    held_out = replace(innovations, problem=HeldOut.of(innovations, test).problem)
+    test, more = without_measurements(test, outliers(held_out, criteria))
     said = (*map(str, frames), *(f"held out: {frame}" for frame in more))
-    data = replace(cleaned.data, bad_frames=(*cleaned.data.bad_frames, *said))
-    return replace(fitted, cleaned=replace(cleaned, test=test, data=data))
+    data = replace(data, bad_frames=(*data.bad_frames, *said))
+    return replace(fitted, test=test, data=data)
 
 
 def _tested(task: _Task, fitted: _Fitted, prior: results.ResidualTest) -> _Judged:
     """Test the innovations of the model found, on the training and on the test history."""
-    criteria, cleaned, found = task.criteria, fitted.cleaned, fitted.found
-    innovations, test = fitted.innovations, fitted.cleaned.test
+    criteria, found, test = task.criteria, fitted.found, fitted.test
+    innovations = fitted.innovations
     before = revised = _Tested.of(found.after, innovations, test, criteria)
     if found.laws:
         before = _Tested.of(found.declared, fitted.declared, test, criteria)
-    horizon = rollout_horizon(cleaned.train, task.scene)
+    horizon = rollout_horizon(fitted.train, task.scene)
     rollout = longest_rollout(test, horizon)
     noise, held_out = noise_alone(innovations, revised.excess), revised.held_out
     collides = revised.mode.problem.data.breaks is not None
@@ -339,14 +321,13 @@ def _tested(task: _Task, fitted: _Fitted, prior: results.ResidualTest) -> _Judge
     # unusual laws that no climb tried are not compiled for a test
     tried = [one for one in task.missing(innovations) if one in found.candidates]
     ranked = rank_candidates(innovations, tried, criteria, task.say)
+    ahead = replace(innovations, problem=held_out.problem)
     misfit = find_misfit(innovations, revised.excess, horizon=horizon, seed=task.seed)
     tests = (
         *misfit.tests,
         # a missing effect may be why the prior does not explain the data
         *(() if found.laws else (prior,)),
-        held_out_forecasts(
-            replace(innovations, problem=held_out.problem), noise, rollout, criteria
-        ),
+        forecast_test(ahead, noise, rollout, criteria, held_out=True),
         simulation_test(
             simulated, held_out.measurement_errors(noise), held_out.motion(), seconds, criteria
         ),
@@ -354,17 +335,7 @@ def _tested(task: _Task, fitted: _Fitted, prior: results.ResidualTest) -> _Judge
     )
     small = tuple(one.candidate for one in ranked[:1] if one.candidate.p_value < criteria.try_p)
     misfit = replace(misfit, tests=tests)
-    return _Judged(cleaned, found, before, revised, misfit, small, rollout, simulated)
-
-
-def _sampled(task: _Task, judged: _Judged) -> results.Loop:
-    """Sample the posteriors, compare the models on the test history, and return the verdict."""
-    task.say(results.Stage.SAMPLE)
-    declared, revised = judged.declared, judged.revised
-    models = [revised] if revised is declared else [declared, revised]
-    fits = _fits(task, [model.mode for model in models])
-    task.say(results.Stage.COMPARE)
-    return _put_together(task, judged, fits[0], fits[-1])
+    return _Judged(fitted, before, revised, misfit, small, rollout, simulated)
 
 
 def _prior_test(task: _Task, train: History) -> results.ResidualTest:
@@ -392,13 +363,10 @@ def _fits(task: _Task, modes: list[Mode]) -> list[Fit]:
     """
     fits = [_fit(task, mode) for mode in modes]
     issued = {str(message): message for _, caught in fits for message in caught}
-    uninformed = [
-        text for text, warning in issued.items() if isinstance(warning, UninformedWarning)
-    ]
-    for sentence in uninformed:
-        task.say(sentence)
     for text, message in issued.items():
-        if text not in uninformed:
+        if isinstance(message, UninformedWarning):
+            task.say(text)
+        else:
             warn(message)
     return [fitted for fitted, _ in fits]
 
@@ -430,8 +398,8 @@ def _fit(task: _Task, mode: Mode) -> tuple[Fit, list[Warning]]:
         task.say(f"{n} draws of each chain are too few")
     # of the last fit; draws from a Gaussian are no chains that converge
     unheeded: tuple[type[Warning], ...] = (ConvergenceWarning,) if method == "laplace" else ()
-    kept = [warning.message for warning in caught if not issubclass(warning.category, unheeded)]
-    return fitted, [message for message in kept if isinstance(message, Warning)]
+    messages = [one.message for one in caught if not issubclass(one.category, unheeded)]
+    return fitted, [message for message in messages if isinstance(message, Warning)]
 
 
 def _converged(fit: Fit, criteria: Criteria) -> bool:
@@ -446,25 +414,31 @@ def _converged(fit: Fit, criteria: Criteria) -> bool:
     return record.max_rhat <= criteria.worst_rhat and record.min_ess >= criteria.least_ess
 
 
-def _put_together(task: _Task, judged: _Judged, before: Fit, after: Fit) -> results.Loop:
-    """Return the result of the stages."""
-    declared, revised, found = judged.declared, judged.revised, judged.found
+def _sampled(task: _Task, judged: _Judged) -> results.Loop:
+    """Sample the posteriors, compare the models on the test history, and return the result."""
+    task.say(results.Stage.SAMPLE)
+    declared, revised, found = judged.declared, judged.revised, judged.fitted.found
+    models = [revised] if revised is declared else [declared, revised]
+    fits = _fits(task, [model.mode for model in models])
+    before, after = fits[0], fits[-1]
+    task.say(results.Stage.COMPARE)
     last = judged.compared(revised, after, task.seed)
     first = last if declared is revised else judged.compared(declared, before, task.seed)
     converged = all(_converged(fit, task.criteria) for fit in (before, after))
     verdict, unexplained = _verdict(
-        judged.misfit, found, first.errors, last.errors, converged, task.criteria
+        judged, first.errors.normalised_rmse, last.errors.normalised_rmse, converged, task.criteria
     )
     added = tuple(_with_posterior(law, one, after) for one, law in found.laws.items())
     keep_groups(after.posterior, added)
-    alone = noise_alone(revised.innovations, revised.excess)
+    old, new = declared.excess, revised.excess
+    alone = noise_alone(revised.innovations, new)
     substeps = task.scene.substeps, revised.innovations.problem.physics.substeps
     return results.Loop(
         scene=task.scene,
         verdict=verdict,
         unexplained=unexplained,
         numerical=results.Numerical(*substeps, shift(revised.innovations)),
-        data=replace(judged.cleaned.data, provenance=_provenance(task, judged)),
+        data=replace(judged.fitted.data, provenance=_provenance(task, judged)),
         found=results.Found(
             tuple(found.candidates.values()), added, judged.small,
             found.lesser, found.hypotheses, found.lengths,
@@ -472,7 +446,11 @@ def _put_together(task: _Task, judged: _Judged, before: Fit, after: Fit) -> resu
         declared=first,
         revised=last,
         misfit=judged.misfit,
-        acceleration=_acceleration(declared.excess, revised.excess),
+        acceleration=results.Acceleration(
+            old.by_name(old.size), new.by_name(new.size),
+            old.by_name(old.relative), new.by_name(new.relative),
+            dict(zip(new.names, new.certain.tolist(), strict=True)),
+        ),
         forecasts=results.Forecasts(
             revised.held_out.noise_floor(alone, judged.horizon),
             example_rollout(declared.held_out, revised.held_out),
@@ -485,22 +463,9 @@ def _put_together(task: _Task, judged: _Judged, before: Fit, after: Fit) -> resu
     )  # fmt: skip
 
 
-def _acceleration(
-    before: UnexplainedAcceleration, after: UnexplainedAcceleration
-) -> results.Acceleration:
-    """Return the unexplained acceleration of both models by velocity."""
-    return results.Acceleration(
-        before.by_name(before.size),
-        after.by_name(after.size),
-        before.by_name(before.relative),
-        after.by_name(after.relative),
-        dict(zip(after.names, after.certain.tolist(), strict=True)),
-    )
-
-
 def _provenance(task: _Task, judged: _Judged) -> dict[str, object]:
     """Return what the result was made with and of."""
-    train, test = judged.cleaned.train, judged.revised.held_out.problem.data.history
+    train, test = judged.fitted.train, judged.fitted.test
     return {
         "seed": task.seed,
         "versions": versions(),
@@ -525,32 +490,27 @@ def _compared(declared: Mode, revised: Mode, before: Fit, after: Fit) -> Compari
 
 
 def _verdict(
-    misfit: results.Misfit,
-    found: SearchResult,
-    before: results.Errors,
-    after: results.Errors,
-    converged: bool,
-    criteria: Criteria,
+    judged: _Judged, before: float, after: float, converged: bool, criteria: Criteria
 ) -> tuple[str, results.Unexplained | None]:
     """Return the verdict and what is unexplained, from tests and held-out errors alone.
 
     What remains beside named laws and is small, so that forecasts are at the noise floor, changes
     no verdict; nor does an error below the noise, which says nothing of either model.
     """
+    misfit, found = judged.misfit, judged.fitted.found
     unexplained, laws = misfit.unexplained, found.laws
     if found.doubt:
         return results.UNEXPLAINED, results.Unexplained.somewhere(found.doubt)
-    worse = after.normalised_rmse > (1.0 + criteria.negligible) * max(before.normalised_rmse, 1.0)
-    if laws and worse:
-        rise = after.normalised_rmse / before.normalised_rmse - 1.0
+    worse = bool(laws) and after > (1.0 + criteria.negligible) * max(before, 1.0)
+    if worse:
         unexplained = results.Unexplained.somewhere(
             "the revised model forecasts the held-out trajectories worse than the declared one:"
-            f" its error is {100 * rise:.2g} % larger, {after.normalised_rmse:.3g} against"
-            f" {before.normalised_rmse:.3g} times the noise"
+            f" its error is {100 * (after / before - 1.0):.2g} % larger, {after:.3g} against"
+            f" {before:.3g} times the noise"
         )
     if not converged:
         return results.NOT_CONVERGED, unexplained
-    if (laws and worse) or (unexplained is not None and not (laws and misfit.predicts(criteria))):
+    if worse or (unexplained is not None and not (laws and misfit.predicts(criteria))):
         return results.UNEXPLAINED, unexplained
     return (results.EFFECTS_ADDED if laws else results.ADEQUATE), unexplained
 

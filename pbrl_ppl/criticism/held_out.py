@@ -10,12 +10,7 @@ from scipy.special import logsumexp
 
 from pbrl_ppl.criticism.results import Errors, Rollout
 from pbrl_ppl.history import History, longest_gap
-from pbrl_ppl.likelihood import (
-    FilteredProblem,
-    TrajectoryNoise,
-    along_trajectories,
-    in_pieces,
-)
+from pbrl_ppl.likelihood import FilteredProblem, TrajectoryNoise, along_trajectories, in_pieces
 from pbrl_ppl.modes import MOST_GROWTH, FilteredMode, fit_pieces, growth
 from pbrl_ppl.posterior import Fit
 from pbrl_ppl.scene import Scene, motion_time, state_sizes
@@ -54,12 +49,9 @@ class Forecast:
 
     def _by_dimension(self, square: Floats) -> dict[str, float]:
         """Return root mean squares by state dimension."""
-        result = {}
-        for d in np.unique(self.dimension):
-            columns = square[:, self.dimension == d]
-            if not np.isnan(columns).all():
-                result[STATE[d]] = float(np.sqrt(np.nanmean(columns)))
-        return result
+        columns = {STATE[d]: square[:, self.dimension == d] for d in np.unique(self.dimension)}
+        seen = {name: each for name, each in columns.items() if not np.isnan(each).all()}
+        return {name: float(np.sqrt(np.nanmean(each))) for name, each in seen.items()}
 
 
 def filtered_states(problem: FilteredProblem, phi: Floats, sigma: Floats) -> Floats:
@@ -277,25 +269,8 @@ class HeldOut:
         model = unit.problem.with_physics(effects=physics.effects, substeps=physics.substeps)
         return model.whitened(self.mode.phi, unit.mode.sigma, model.physics.one_world)
 
-    def residuals(self, unit: HeldOut) -> dict[str, Floats]:
-        """Return innovations in units of another model's noise, by state dimension."""
-        noise = unit.problem.likelihood.noise
-        z = self.whitened(unit)
-        dimension, seen = noise.coordinates.places % len(STATE), noise.seen
-        return {
-            STATE[d]: z[:, dimension == d][seen[:, dimension == d]]
-            for d in np.unique(dimension)
-            if seen[:, dimension == d].any()
-        }
-
     def errors(
-        self,
-        unit: HeldOut,
-        fit: Fit,
-        rollout: int,
-        seed: int,
-        noise: Floats,
-        most_draws: int = 100,
+        self, unit: HeldOut, fit: Fit, rollout: int, seed: int, noise: Floats, most_draws: int = 100
     ) -> Errors:
         """Return the model's errors.
 
@@ -344,8 +319,7 @@ class HeldOut:
         fitted = fit_pieces(pieces, self.mode.phi, initial_states_alone=True)
         if growth(fitted.problem) > MOST_GROWTH:
             return {}
-        names = fitted.problem.observations.names
-        return dict(zip(names, fitted.sigma.tolist(), strict=True))
+        return dict(zip(fitted.problem.observations.names, fitted.sigma.tolist(), strict=True))
 
     def noise_floor(self, sigma: Floats, rollout: int) -> Errors:
         """Return the errors that measurement noise alone makes, at both ends of a forecast.
@@ -366,9 +340,8 @@ class HeldOut:
         """Return the standard deviation of each state dimension's motion, in its unit."""
         states = self.problem.data.smoothed_states.copy()
         states[..., THETA] = np.unwrap(states[..., THETA], axis=1)
-        rows = (
-            np.arange(states.shape[1]) < self.problem.data.history.dataset["n_rows"].values[:, None]
-        )
+        n_rows = self.problem.data.history.dataset["n_rows"].to_numpy()
+        rows = np.arange(states.shape[1]) < n_rows[:, None]
         sizes = np.nanmax(np.std(states[rows], axis=0), axis=0)
         return dict(zip(STATE, sizes.tolist(), strict=True))
 
@@ -385,25 +358,23 @@ def example_rollout(declared: HeldOut, revised: HeldOut) -> Rollout:
     length = int(dataset["n_rows"].min()) - 1
     measured = dataset["observed"].to_numpy()[0, : length + 1]
     columns = [d for d in range(len(STATE)) if np.isfinite(measured[..., d]).any()]
-    sensors = revised.mode.problem.likelihood.noise.coordinates.sensors
-    noise = dict(zip(sensors, revised.mode.sigma.tolist(), strict=False))
-    sizes = state_sizes(scene)
+    noise, sizes = revised.measurement_errors(revised.mode.sigma), state_sizes(scene)
     seen = measured[..., columns]
     with np.errstate(invalid="ignore"):  # one body may lack what was measured of another
         spread = np.fmax.reduce(seen, axis=0) - np.fmin.reduce(seen, axis=0)
-    spread /= [noise.get(d, float(sizes[d])) for d in columns]
+    spread /= [noise.get(STATE[d], float(sizes[d])) for d in columns]
     free = np.array([not body.kinematic for body in scene.moving])
     body = int(np.argmax(np.where(free, np.nansum(spread, axis=1), -1.0)))
-    predicted = []
-    for model in (declared, revised):
-        whole = whole_rollouts(model.problem, model.mode.phi, model.mode.sigma)[0]
-        predicted.append(whole[: length + 1, body][:, columns])
+    before, after = (
+        whole_rollouts(model.problem, model.mode.phi, model.mode.sigma)[0][: length + 1, body]
+        for model in (declared, revised)
+    )
     return Rollout(
         body=scene.moving[body].name,
         time=np.arange(length + 1, dtype=float) * scene.time_step,
         names=tuple(STATE[d] for d in columns),
         units=tuple(STATE_UNITS[d] for d in columns),
         measured=measured[:, body][:, columns],
-        before=predicted[0],
-        after=predicted[1],
+        before=before[:, columns],
+        after=after[:, columns],
     )

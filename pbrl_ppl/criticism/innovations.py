@@ -13,7 +13,7 @@ import numpy as np
 from scipy.stats import chi2, rankdata
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
-from pbrl_ppl.criticism.results import Correlations, KindOfTest, ResidualTest, Unexplained
+from pbrl_ppl.criticism.results import KindOfTest, ResidualTest, Unexplained
 from pbrl_ppl.likelihood import Problem, bodies_acceleration
 from pbrl_ppl.modes import NOTHING, FilteredMode, profile_sigma
 from pbrl_ppl.state import STATE, WRENCH, Bools, Floats, Ints
@@ -86,8 +86,7 @@ def unexplained_acceleration(
     mode: FilteredMode, criteria: Criteria = DEFAULT
 ) -> UnexplainedAcceleration:
     """Return the acceleration that a fitted model leaves unexplained."""
-    noise = mode.problem.likelihood.noise
-    coordinates = noise.coordinates
+    coordinates = mode.problem.likelihood.noise.coordinates
     size = mode.sigma[coordinates.accelerations]
     relative = size / np.maximum(bodies_acceleration(mode.problem), 1e-300)
     names = tuple(STATE[d] for d in coordinates.rates)
@@ -101,10 +100,8 @@ def noise_alone(mode: FilteredMode, excess: UnexplainedAcceleration) -> Floats:
 
     Few data do not tell measurement noise from process noise: the mode gives all to one of them.
     """
-    places = mode.problem.likelihood.noise.coordinates.accelerations
-    pairs = zip(places, excess.certain, strict=True)
-    negligible = [place for place, certain in pairs if not certain]
-    return _without(mode, negligible, mode.problem.residual(mode.phi))
+    places = np.array(mode.problem.likelihood.noise.coordinates.accelerations)
+    return _without(mode, places[~excess.certain], mode.problem.residual(mode.phi))
 
 
 def noise_without_unexplained(mode: FilteredMode, excess: UnexplainedAcceleration) -> Floats:
@@ -173,9 +170,7 @@ def _p_values(mode: FilteredMode) -> Floats:
 _LAGS, _LEAST_PAIRS = 5, 10
 
 
-def correlation_tests(
-    mode: FilteredMode, criteria: Criteria = DEFAULT
-) -> tuple[tuple[ResidualTest, ...], Correlations]:
+def correlation_tests(mode: FilteredMode, criteria: Criteria) -> tuple[ResidualTest, ResidualTest]:
     """Test whiteness over lags, and correlation with present and past commands.
 
     Parameters
@@ -187,54 +182,41 @@ def correlation_tests(
 
     Returns
     -------
-    tests : tuple of ResidualTest
-        Of whiteness and of commands; untested where the data cannot fail.
-    correlations : Correlations
-        For a picture.
+    whiteness, commands : ResidualTest
+        Untested where the data cannot fail.
     """
     noise = mode.problem.likelihood.noise
     white, seen = mode.whitened_residual, noise.seen
     number = np.cumsum(noise.first.astype(np.intp))
-    share = innovations_over_steps(mode)
-    scene, places = mode.problem.scene, noise.coordinates.places
-    cells = [f"{STATE[p % len(STATE)]} of {scene.moving[p // len(STATE)].name}" for p in places]
-    own, pairs = _lagged(white, seen, number, None)
+    own, pairs = _lagged(white, seen, number, range(1, _LAGS + 1), white[:, None], seen[:, None])
     few, enough = "too few pairs of intervals", pairs > _LEAST_PAIRS
     whiteness = ResidualTest.untested(KindOfTest.WHITENESS, few)
     if enough.any():  # the sum of squares is chi-squared if nothing is missing
         p_value = float(chi2.sf((pairs * own**2)[enough].sum(), int(enough.sum())))
-        whiteness = _test(own, enough, p_value, share, cells, [], criteria)
+        whiteness = _test(mode, own, enough, p_value, [], criteria)
     series, names = _commands(mode)
-    driven = np.zeros((0, 0, len(cells)))
     commands = ResidualTest.untested(KindOfTest.COMMANDS, few if names else "no command varies")
-    if names:
-        driven, of_commands = _lagged(white, seen, number, series)
-        regressed = _regression_p_value(white, seen, number, series)
-        if regressed is not None:
-            enough = of_commands > _LEAST_PAIRS
-            commands = _test(driven, enough, regressed, share, cells, names, criteria)
-    found = Correlations(tuple(cells), own[:, 0], pairs[:, 0], tuple(names), driven)
-    return (whiteness, commands), found
+    regressed = _regression_p_value(white, seen, number, series) if names else None
+    if regressed is not None:
+        known = np.ones((len(series), 1, 1), dtype=bool)
+        driven, pairs = _lagged(white, seen, number, range(_LAGS + 1), series[..., None], known)
+        commands = _test(mode, driven, pairs > _LEAST_PAIRS, regressed, names, criteria)
+    return whiteness, commands
 
 
 def _lagged(
-    white: Floats, seen: Bools, number: Ints, series: Floats | None
+    white: Floats, seen: Bools, number: Ints, lags: range, series: Floats, known: Bools
 ) -> tuple[Floats, Floats]:
-    """Return correlations with series some intervals before, or of each coordinate with itself.
+    """Return correlations with series (transition, series, coordinate) some intervals before.
 
     And the numbers of pairs, shape (lag, series, coordinate) each.
     """
     values, pairs = [], []
-    for lag in range(1 if series is None else 0, _LAGS + 1):
+    for lag in lags:
         end = max(len(number) - lag, 0)
         same = number[lag:] == number[:end]
-        later, counts = white[lag:][same][:, None], seen[lag:][same][:, None]
-        if series is None:
-            earlier = white[:end][same][:, None]
-            counts = counts & seen[:end][same][:, None]
-        else:
-            earlier = series[:end][same][:, :, None]
-        products = later * earlier * counts
+        counts = seen[lag:][same][:, None] & known[:end][same]
+        products = white[lag:][same][:, None] * series[:end][same] * counts
         n = np.broadcast_to(counts, products.shape).sum(axis=0)
         values.append(products.sum(axis=0) / np.maximum(n, 1))
         pairs.append(n)
@@ -281,26 +263,26 @@ def _regression_p_value(white: Floats, seen: Bools, number: Ints, commands: Floa
 
 
 def _test(
+    mode: FilteredMode,
     values: Floats,
     enough: Bools,
     p_value: float,
-    share: Floats,
-    cells: list[str],
     names: list[str],
     criteria: Criteria,
 ) -> ResidualTest:
     """Return the test of correlations with commands, or of whiteness if there are no names.
 
-    It fails where they are significant, and one is large relative to the noise and to the motion:
-    ``share`` is the size of innovations over the change in a step, shape (coordinate,). ``enough``
-    tells which were taken over enough pairs.
+    It fails where they are significant, and one is large relative to the noise and to the motion.
+    ``enough`` tells which were taken over enough pairs.
     """
+    share = innovations_over_steps(mode)
     size = np.where(enough, np.abs(values), 0.0)
     large = (size**2 > criteria.residual.correlation_share) & (size * share > criteria.negligible)
     passed = p_value > criteria.false_alarm or not large.any()
     weighted = size if passed else size * share
     lag, series, cell = map(int, np.unravel_index(int(np.argmax(weighted)), size.shape))
-    worst = float(values[lag, series, cell])
+    worst, body, dimension = float(values[lag, series, cell]), "", ""
+    place = mode.problem.likelihood.noise.coordinates.places[cell]
     lag += not names
     intervals = f"{lag} interval{'s' * (lag > 1)}"
     if not names:
@@ -311,51 +293,39 @@ def _test(
         other = names[series].replace("_", " ")
         when = f"{intervals} before" if lag else "of the same interval"
     if not passed:
-        sentence = f"the error of {cells[cell]} is correlated with {other} {when} ({worst:.2f})"
+        body = mode.problem.scene.moving[place // len(STATE)].name
+        dimension = STATE[place % len(STATE)]
+        sentence = (
+            f"the error of {dimension} of {body} is correlated with {other} {when} ({worst:.2f})"
+        )
     name = KindOfTest.COMMANDS if names else KindOfTest.WHITENESS
-    dimension, _, body = ("" if passed else cells[cell]).partition(" of ")
     return ResidualTest(name, p_value, abs(worst), passed, sentence, body, dimension)
 
 
 #: Recorded quantities that a residual may depend on, with their units.
 FEATURES = {
-    "position x": "m",
-    "position y": "m",
-    "velocity x": "m/s",
-    "velocity y": "m/s",
-    "commanded force x": "N",
-    "commanded force y": "N",
-    "orientation (cosine)": "1",
-    "orientation (sine)": "1",
-    "forward speed": "m/s",
-    "sideways speed": "m/s",
-    "angular speed": "rad/s",
-    "speed": "m/s",
-    "commanded forward force": "N",
-    "commanded sideways force": "N",
-    "commanded torque": "N m",
-    "forward force commanded before": "N",
-    "sideways force commanded before": "N",
-    "torque commanded before": "N m",
-    "time": "s",
-}
+    "position x": "m", "position y": "m", "velocity x": "m/s", "velocity y": "m/s",
+    "commanded force x": "N", "commanded force y": "N",
+    "orientation (cosine)": "1", "orientation (sine)": "1",
+    "forward speed": "m/s", "sideways speed": "m/s", "angular speed": "rad/s", "speed": "m/s",
+    "commanded forward force": "N", "commanded sideways force": "N", "commanded torque": "N m",
+    "forward force commanded before": "N", "sideways force commanded before": "N",
+    "torque commanded before": "N m", "time": "s",
+}  # fmt: skip
 #: Forces that depend on two quantities together: a spinning body's lift, a force that fades with
 #: speed, an actuator with memory, a floor that is rough in places.
 PRODUCTS = {
     " × ".join(pair): pair
     for pair in (
-        ("angular speed", "forward speed"),
-        ("angular speed", "sideways speed"),
+        ("angular speed", "forward speed"), ("angular speed", "sideways speed"),
         ("commanded forward force", "forward speed"),
-        ("commanded sideways force", "sideways speed"),
-        ("commanded torque", "angular speed"),
+        ("commanded sideways force", "sideways speed"), ("commanded torque", "angular speed"),
         ("commanded forward force", "forward force commanded before"),
         ("commanded sideways force", "sideways force commanded before"),
         ("commanded torque", "torque commanded before"),
-        ("position x", "velocity x"),
-        ("position y", "velocity y"),
+        ("position x", "velocity x"), ("position y", "velocity y"),
     )
-}
+}  # fmt: skip
 #: All of these with their units, in the order of the columns of :func:`recorded_quantities`.
 QUANTITIES = FEATURES | {name: f"{FEATURES[a]} {FEATURES[b]}" for name, (a, b) in PRODUCTS.items()}
 
@@ -368,23 +338,14 @@ def folds(mode: FilteredMode, least: int = 8) -> Ints:
     """
     segments = mode.problem.segments
     trajectory, step = segments.trajectory, segments.step
-    count = len(np.unique(trajectory))
-    if count >= least:
-        return np.unique(trajectory, return_inverse=True)[1].astype(np.intp)
-    runs = -(-least // count)
+    runs = -(-least // len(np.unique(trajectory)))
     length = np.array([(trajectory == t).sum() for t in trajectory])
     run = np.minimum(step * runs // np.maximum(length, 1), runs - 1)
     return np.unique(trajectory * runs + run, return_inverse=True)[1].astype(np.intp)
 
 
 def find_dependence(
-    mode: FilteredMode,
-    criteria: Criteria,
-    *,
-    seed: int = 0,
-    permutations_a_body: int = 500,
-    least_transitions: int = 20,
-    most_transitions: int = 1500,
+    mode: FilteredMode, criteria: Criteria, *, seed: int = 0
 ) -> tuple[ResidualTest, Unexplained | None]:
     """Test whether the innovations of a fitted model depend on state, action or time.
 
@@ -400,12 +361,6 @@ def find_dependence(
         Thresholds of significant and of negligible.
     seed : int
         Seed of the permutations and the folds.
-    permutations_a_body : int
-        By default the smallest p-value is a fifth of the significance.
-    least_transitions : int
-        Transitions that the test needs.
-    most_transitions : int
-        Transitions of the test, at most: more take long and change nothing.
 
     Returns
     -------
@@ -417,13 +372,12 @@ def find_dependence(
     rng = np.random.default_rng(seed)
     problem = mode.problem
     n, limits = problem.segments.n, criteria.residual
-    if n < least_transitions:
+    if n < 20:
         return ResidualTest.untested(KindOfTest.DEPENDENCE, "too few transitions"), None
     tests = len(problem.scene.dynamic)
-    permutations = permutations_a_body * tests - 1
-    chosen = np.sort(rng.permutation(n)[:most_transitions])
+    permutations = 500 * tests - 1  # the smallest p-value is a fifth of the significance
+    chosen = np.sort(rng.permutation(n)[:1500])  # more take long and change nothing
     places = mode.problem.likelihood.noise.coordinates.places
-    innovations = mode.whitened_residual[chosen]
     groups = folds(mode)[chosen]
     relative = innovations_over_steps(mode)
     best: Unexplained | None = None
@@ -433,10 +387,10 @@ def find_dependence(
         features = recorded_quantities(problem, i)[chosen]
         of_body = np.flatnonzero(places // len(STATE) == i)
         y, names, of = _in_both_frames(
-            innovations[:, of_body], places[of_body] % len(STATE), features
+            mode.whitened_residual[chosen][:, of_body], places[of_body] % len(STATE), features
         )
         y = y - y.mean(axis=0)
-        smoother = _cross_validated(_summed(features), groups, rng)
+        smoother = _cross_validated(np.asarray(sum(_kernels(features))), groups, rng)
         shares = _explained(smoother, y)
         null = np.array(
             [_explained(smoother, y[rng.permutation(len(y))]).max() for _ in range(permutations)]
@@ -502,25 +456,15 @@ def _kernels(features: Floats) -> Iterator[Floats]:
         yield np.exp(-0.5 * (difference / 0.2) ** 2) * moves / max(int(varies.sum()), 1)
 
 
-def _summed(features: Floats) -> Floats:
-    """Return the kernel of all quantities together, shape (n, n)."""
-    kernel = np.zeros((len(features), len(features)))
-    for term in _kernels(features):
-        kernel += term
-    return kernel
-
-
-def _cross_validated(
-    kernel: Floats, groups: Ints, rng: np.random.Generator, *, parts: int = 5
-) -> Floats:
+def _cross_validated(kernel: Floats, groups: Ints, rng: np.random.Generator) -> Floats:
     """Return the matrix that predicts each transition from those of other groups.
 
     The ridge of the regression is 1, over the kernel's variance of each term; groups are left out
-    in so many ``parts``.
+    in five parts.
     """
     smoother = np.zeros_like(kernel)
     names = rng.permutation(np.unique(groups))
-    for left_out in np.array_split(names, min(parts, len(names))):
+    for left_out in np.array_split(names, min(5, len(names))):
         out = np.isin(groups, left_out)
         inner = kernel[np.ix_(~out, ~out)] + np.eye(int((~out).sum()))
         smoother[np.ix_(out, ~out)] = np.linalg.solve(inner, kernel[np.ix_(~out, out)]).T
@@ -537,17 +481,11 @@ def _describe(
     body: str, dimension: str, features: Floats, y: Floats, share: float, p_value: float
 ) -> Unexplained:
     """Return the dependence with the quantity that contributes most to the regression."""
-    weights = np.linalg.solve(_summed(features) + np.eye(len(y)), y)
+    weights = np.linalg.solve(sum(_kernels(features)) + np.eye(len(y)), y)
     parts = [np.var(kernel @ weights) for kernel in _kernels(features)]
     name = list(QUANTITIES)[int(np.argmax(parts))]
-    return Unexplained(
-        body=body,
-        dimension=dimension,
-        depends_on=name,
-        share=float(share),
-        p_value=min(1.0, p_value),
-        sentence=(
-            f"the error of {dimension} of {body} depends on its {name}: a regression predicts"
-            f" {share:.0%} of its variance, and no effect in the catalogue does"
-        ),
+    sentence = (
+        f"the error of {dimension} of {body} depends on its {name}: a regression predicts"
+        f" {share:.0%} of its variance, and no effect in the catalogue does"
     )
+    return Unexplained(body, dimension, name, float(share), min(1.0, p_value), sentence)

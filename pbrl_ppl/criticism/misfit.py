@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -17,12 +16,7 @@ from pbrl_ppl.criticism.innovations import (
     innovations_over_steps,
     noise_alone,
 )
-from pbrl_ppl.criticism.results import (
-    Growth,
-    KindOfTest,
-    Misfit,
-    ResidualTest,
-)
+from pbrl_ppl.criticism.results import KindOfTest, Misfit, ResidualTest
 from pbrl_ppl.criticism.score import Signature
 from pbrl_ppl.likelihood import bodies_acceleration
 from pbrl_ppl.modes import FilteredMode
@@ -49,10 +43,10 @@ def find_misfit(
         Seed of the permutations.
     """
     of_dependence, dependence = find_dependence(mode, excess.criteria, seed=seed)
-    of_correlation, correlations = correlation_tests(mode, excess.criteria)
-    of_forecasts, growth = _forecasts(mode, noise_alone(mode, excess), horizon, excess.criteria)
-    tests = (_acceleration(mode, excess), *of_correlation, of_forecasts, of_dependence)
-    return Misfit(tests, dependence, correlations, growth)
+    correlations = correlation_tests(mode, excess.criteria)
+    forecasts = forecast_test(mode, noise_alone(mode, excess), horizon, excess.criteria)
+    tests = (_acceleration(mode, excess), *correlations, forecasts, of_dependence)
+    return Misfit(tests, dependence)
 
 
 def _acceleration(mode: FilteredMode, excess: UnexplainedAcceleration) -> ResidualTest:
@@ -107,18 +101,6 @@ def share_in_words(relative: float) -> str:
     if relative < LARGEST_SHARE:
         return f"{100 * relative:.2g} % of the bodies' acceleration"
     return "more than the bodies' acceleration itself"
-
-
-def held_out_forecasts(
-    mode: FilteredMode, sigma: Floats, horizon: int, criteria: Criteria
-) -> ResidualTest:
-    """Return the test of forecasts on held-out trajectories.
-
-    Arguments as of :func:`find_misfit`; ``mode`` has the problem of the held-out trajectories, and
-    ``sigma`` is the noise alone.
-    """
-    test, _ = _forecasts(mode, sigma, horizon, criteria)
-    return replace(test, name=KindOfTest.HELD_OUT, sentence=f"held out: {test.sentence}")
 
 
 def simulation_test(
@@ -182,26 +164,18 @@ def score_test(mode: FilteredMode, ranked: Sequence[Signature], criteria: Criter
     )
 
 
-def _forecasts(
-    mode: FilteredMode,
-    sigma: Floats,
-    horizon: int,
-    criteria: Criteria,
-    *,
-    most_lengths: int = 6,
-    most_error: float = 3.0,
-) -> tuple[ResidualTest, Growth]:
+def forecast_test(
+    mode: FilteredMode, sigma: Floats, horizon: int, criteria: Criteria, *, held_out: bool = False
+) -> ResidualTest:
     """Return the test of forecasts' errors against those of noise and a negligible acceleration.
 
-    A picture shows their growth over at most ``most_lengths`` lengths. An error counts for no more
-    than ``most_error`` times its expected size: a single one that a bad frame or a grazing contact
-    spoils is no misfit.
+    Arguments as of :func:`find_misfit`; ``sigma`` is the noise alone, and ``held_out`` tells that
+    the mode's problem is of held-out trajectories. An error counts for no more than three times
+    its expected size: a single one that a bad frame or a grazing contact spoils is no misfit.
     """
     noise = mode.problem.likelihood.noise
     lengths = np.diff(np.append(np.flatnonzero(noise.first), len(noise.first)))
     longest = min(horizon, int(lengths.max()))
-    steps = np.unique(np.geomspace(1, longest, min(longest, most_lengths)).round().astype(int))
-    every = [forecast(mode.problem, mode.phi, sigma, int(n)) for n in steps]
     allowed = criteria.negligible * bodies_acceleration(mode.problem)
     last = forecast(mode.problem, mode.phi, sigma, longest, allowed=allowed)
     worst, p_value, name, body = 0.0, 1.0, "", ""
@@ -214,7 +188,7 @@ def _forecasts(
         if not z.size:
             continue
         # forecasts overlap by half, so half of them count
-        total = np.minimum(z, most_error**2).sum() / 2
+        total = np.minimum(z, 3.0**2).sum() / 2
         chance = len(dimensions) * float(chi2.sf(total, max(z.size / 2, 1)))
         if np.sqrt(z.mean()) > worst:
             worst, p_value, name = float(np.sqrt(z.mean())), min(1.0, chance), STATE[d]
@@ -222,22 +196,16 @@ def _forecasts(
             place = int(noise.coordinates.places[column])
             body = mode.problem.scene.moving[place // len(STATE)].name
     passed = p_value > criteria.false_alarm or worst < criteria.worse_forecast
-    dt = mode.problem.scene.time_step
-    seconds = longest * dt
-    sentence = f"errors of forecasts of {seconds:g} s are those of noise"
-    if not passed:
-        sentence = f"within {seconds:g} s forecasts of {name} of {body} diverge"
-    if not passed and np.isfinite(worst):
+    seconds = longest * mode.problem.scene.time_step
+    if passed:
+        body, name, sentence = "", "", f"errors of forecasts of {seconds:g} s are those of noise"
+    elif np.isfinite(worst):
         sentence = (
             f"after {seconds:g} s the error of {name} of {body} is {worst:.1f} times what noise and"
             f" {100 * criteria.negligible:g} % of the bodies' acceleration make"
         )
-    growth = Growth(
-        steps * dt,
-        tuple(rollout.rmse() for rollout in every),
-        tuple(rollout.floor() for rollout in every),
-    )
-    if passed:
-        body = name = ""
-    test = ResidualTest(KindOfTest.FORECASTS, p_value, worst, passed, sentence, body, name)
-    return test, growth
+    else:
+        sentence = f"within {seconds:g} s forecasts of {name} of {body} diverge"
+    kind = KindOfTest.HELD_OUT if held_out else KindOfTest.FORECASTS
+    sentence = "held out: " * held_out + sentence
+    return ResidualTest(kind, p_value, worst, passed, sentence, body, name)

@@ -40,9 +40,6 @@ class PriorCheck:
         With the dims body, state and quantile, in the units of the states:
 
         - ``predicted`` and ``measured`` (body, state, quantile): changes, all cells pooled;
-        - ``predicted_sd`` and ``measured_sd`` (body, state);
-        - ``predicted_extent`` (body, state): 94 % of the predicted changes are at most so large;
-        - ``measured_largest`` (body, state): the largest measured change;
         - ``share_inside`` (body, state): share of the measured cells inside the central 94 % of
           their own predictions;
         - ``share_beyond`` (body, state): share that lies beyond all of them;
@@ -106,12 +103,7 @@ class PriorCheck:
 
 
 def prior_predictive_check(
-    model: object,
-    *,
-    draws: int = 400,
-    seed: int = 0,
-    criteria: PriorCriteria = DEFAULT.prior,
-    least_draws: int = 50,
+    model: object, *, draws: int = 400, seed: int = 0, criteria: PriorCriteria = DEFAULT.prior
 ) -> PriorCheck:
     """Compare measured changes over a segment with predictions under the prior.
 
@@ -131,8 +123,6 @@ def prior_predictive_check(
         The same seed gives the same answer.
     criteria : PriorCriteria
         When the prior could not have made the data.
-    least_draws : int
-        Draws that the check needs.
 
     Returns
     -------
@@ -160,8 +150,8 @@ def prior_predictive_check(
         from pbrl_ppl.model import problem_in  # PyMC takes seconds to load
 
         problem = problem_in(model)
-    if draws < least_draws:
-        raise ValueError(f"draws is {draws}, expected at least {least_draws}")
+    if draws < 50:
+        raise ValueError(f"draws is {draws}, expected at least 50")
     rng = np.random.default_rng(seed)
     observations, segments = problem.observations, problem.segments
     columns = list(observations.columns)
@@ -176,23 +166,17 @@ def prior_predictive_check(
     for velocity in unused:
         if (d := STATE.index(velocity.state)) in columns:
             measured[:, history.bodies.index(velocity.body), columns.index(d)] = np.nan
-    phi = draw_prior(problem, rng, draws)
-    ends = _predicted_ends(problem, phi, last)
+    ends = _predicted_ends(problem, draw_prior(problem, rng, draws), last)
     exact = observations.wrapped(ends - first)
     predicted = ends + _noise_of_changes(problem, history) * rng.standard_normal(exact.shape)
     derived = ~recorded[:, [d if d >= len(POSE) else d + len(POSE) for d in columns]]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # of what was never measured all is NaN
-        dataset = _compare(observations.wrapped(predicted - first), measured, derived)
-        dataset = dataset.merge(_factors(exact, measured))
+        dataset = _compare(observations.wrapped(predicted - first), exact, measured, derived)
     fall = wrong_clock(history, problem.scene)
-    coords = {
-        "body": [body.name for body in problem.scene.moving],
-        "state": list(observations.names),
-        "quantile": list(QUANTILES),
-    }
+    bodies, states = [body.name for body in problem.scene.moving], list(observations.names)
     return PriorCheck(
-        dataset.assign_coords(coords),
+        dataset.assign_coords(body=bodies, state=states, quantile=list(QUANTILES)),
         problem.data.horizon * problem.scene.time_step,
         draws,
         draws - len(ends),
@@ -241,14 +225,6 @@ def _noise_of_changes(problem: Problem, history: History) -> Floats:
     )
 
 
-def _factors(exact: Floats, measured: Floats) -> xr.Dataset:
-    """Return quantiles over draws of the ratio of measured (transition, body, state) changes."""
-    seen = np.where(np.isfinite(measured), exact, 0.0)
-    factor = (seen * np.nan_to_num(measured)).sum(axis=1) / (seen**2).sum(axis=1)
-    quantiles = np.nanquantile(factor, QUANTILES, axis=0)
-    return xr.Dataset({"factor": (("quantile", "body", "state"), quantiles)})
-
-
 def _unit(factor: xr.DataArray, beyond: float = 1.5) -> tuple[str, str]:
     """Return how many times as large measured changes are, and a hint if a unit has that factor.
 
@@ -259,17 +235,17 @@ def _unit(factor: xr.DataArray, beyond: float = 1.5) -> tuple[str, str]:
     low, middle, high = (float(factor[i]) for i in (0, len(QUANTILES) // 2, -1))
     if not low > 0:  # nothing was predicted, or motion the other way
         return "", ""
-    over, size = ("", middle) if middle > 1 else ("1/", 1 / middle)
-    if middle <= 1:
-        low, high = 1 / high, 1 / low
+    over = "" if middle > 1 else "1/"
+    if over:
+        low, middle, high = 1 / high, 1 / middle, 1 / low
     if low < 1:
         return "", ""
-    words = f"{over}{size:.2g} times as much as"
+    words = f"{over}{middle:.2g} times as much as"
     low, high = low / beyond, high * beyond
-    near = [factor_of_units for factor_of_units in _UNITS if low < factor_of_units < high]
+    near = [unit for unit in _UNITS if low < unit < high]
     if low < 1 or not near:
         return words, ""
-    best = min(near, key=lambda factor_of_units: abs(np.log(factor_of_units / size)))
+    best = min(near, key=lambda unit: abs(np.log(unit / middle)))
     return words, f" (a factor near {over}{_UNITS[best]}: units?)"
 
 
@@ -325,18 +301,12 @@ def _mean_square(values: Floats, angle: Bools, steps: int, order: int) -> Floats
     return np.asarray(np.nansum(change**2, axis=1) / np.maximum(count, 1))
 
 
-def _measurement_noise(
-    history: History, stated: Mapping[str, float], *, still: float = 2.0, least_intervals: int = 4
-) -> Floats:
+def _measurement_noise(history: History, stated: Mapping[str, float]) -> Floats:
     """Return the measurement noise of each state, shape (body, state); 0 where it is unknown.
 
     It is the stated one, or an estimate; of a coordinate that never moves beyond its noise the one
-    that third differences show.
-
-    ``still``: a coordinate that never moves has mean square changes of at most this many times
-    those of its noise.
-
-    ``least_intervals``: that holds over all times and up to this many intervals or more.
+    that third differences show: over all times, up to four intervals or more, its mean square
+    changes are at most twice those of its noise.
     """
     noises = measurement_noise(history)
     observed = history.dataset["observed"].to_numpy()
@@ -348,7 +318,7 @@ def _measurement_noise(
             column = observed[:, :, body, d]
             noise = float(_mean_square(column, angle, 1, 3).mean()) / 20.0
             largest = max(float(_mean_square(column, angle, step, 1).mean()) for step in steps)
-            if half >= least_intervals and largest <= 2.0 * still * noise:
+            if half >= 4 and largest <= 2.0 * 2.0 * noise:
                 noises[body, d] = max(noises[body, d], np.sqrt(noise))
             if name in stated and np.isfinite(column).any():
                 if name in POSE and np.isnan(observed[:, :, body, d + len(POSE)]).all():
@@ -358,22 +328,19 @@ def _measurement_noise(
     return noises
 
 
-def _compare(
-    predicted: Floats, measured: Floats, derived: Bools, *, slack: float = 0.25
-) -> xr.Dataset:
+def _compare(predicted: Floats, exact: Floats, measured: Floats, derived: Bools) -> xr.Dataset:
     """Return summaries of changes (draw, transition, body, state), and (transition, body, state).
 
-    Where velocities are ``derived``, shape (body, state), draws reach measurements within ``slack``
-    of the usual change.
+    ``exact`` changes are predicted ones without noise. Where velocities are ``derived``, shape
+    (body, state), draws reach measurements within a quarter of the usual change.
     """
     seen = np.isfinite(measured)
     low, high = np.quantile(predicted, [QUANTILES[0], QUANTILES[-1]], axis=0)
-    inside = (measured >= low) & (measured <= high)
-    near = slack * derived * np.sqrt(np.nanmean(measured**2, axis=0))
+    near = 0.25 * derived * np.sqrt(np.nanmean(measured**2, axis=0))
     low_end, high_end = predicted.min(axis=0) - near, predicted.max(axis=0) + near
     farther = np.maximum(measured - high_end, low_end - measured)
-    beyond = farther > 0.0
-    count = seen.sum(axis=0)
+    count, known = seen.sum(axis=0), np.where(seen, exact, 0.0)
+    factor = (known * np.nan_to_num(measured)).sum(axis=1) / (known**2).sum(axis=1)
     # cells that were not measured count on neither side
     pooled = np.where(seen, predicted, np.nan).reshape(-1, *measured.shape[1:])
     dims = ("body", "state")
@@ -381,13 +348,10 @@ def _compare(
         {
             "predicted": (("quantile", *dims), np.nanquantile(pooled, QUANTILES, axis=0)),
             "measured": (("quantile", *dims), np.nanquantile(measured, QUANTILES, axis=0)),
-            "predicted_sd": (dims, np.nanstd(pooled, axis=0)),
-            "measured_sd": (dims, np.nanstd(measured, axis=0)),
-            "predicted_extent": (dims, np.nanquantile(np.abs(pooled), HDI_PROB, axis=0)),
-            "measured_largest": (dims, np.nanmax(np.abs(measured), axis=0)),
-            "share_inside": (dims, inside.sum(axis=0) / count),
-            "share_beyond": (dims, beyond.sum(axis=0) / count),
+            "share_inside": (dims, ((measured >= low) & (measured <= high)).sum(axis=0) / count),
+            "share_beyond": (dims, (farther > 0.0).sum(axis=0) / count),
             "largest_beyond": (dims, np.nanmax(np.where(seen, farther, 0.0), axis=0).clip(0.0)),
             "cells": (dims, count),
+            "factor": (("quantile", *dims), np.nanquantile(factor, QUANTILES, axis=0)),
         }
     ).transpose("body", "state", "quantile")

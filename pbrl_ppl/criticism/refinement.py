@@ -26,14 +26,7 @@ from pbrl_ppl.history import (
     without_bad_frames,
 )
 from pbrl_ppl.likelihood import Problem, check_moves, observed_coordinates, single_transitions
-from pbrl_ppl.modes import (
-    FilteredMode,
-    Mode,
-    find_mode,
-    mode_of_more,
-    nearby_mode,
-    trajectory_mode,
-)
+from pbrl_ppl.modes import FilteredMode, Mode, find_mode, mode_of_more, nearby_mode, trajectory_mode
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE, Floats, Ints
@@ -92,27 +85,18 @@ def checked_histories(
         np.isfinite(history.dataset["observed"].to_numpy()).any(axis=(0, 1))
         for history in (train, test)
     )
-    if (tested & ~known).any():
-        missing = ", ".join(
-            f"{STATE[d]} of {scene.moving[body].name}" for body, d in np.argwhere(tested & ~known)
-        )
+    where = np.argwhere(tested & ~known)
+    if len(where):
+        missing = (f"{STATE[d]} of {scene.moving[body].name}" for body, d in where)
         raise HistoryError(
-            f"test history measures {missing}, which the training history does"
+            f"test history measures {', '.join(missing)}, which the training history does"
             " not; leave those columns empty, or measure them in both"
         )
     held_out = [] if same else [f"held out: {frame}" for frame in more]
     return train, test, unused, (*map(str, bad), *held_out)
 
 
-def outliers(
-    mode: FilteredMode,
-    criteria: Criteria = DEFAULT,
-    *,
-    errors_off: float = 4.0,
-    neighbours: float = 2.0,
-    most: float = 0.05,
-    least_measurements: int = 12,
-) -> Floats:
+def outliers(mode: FilteredMode, criteria: Criteria) -> Floats:
     """Return errors of single measurements that a fitted model and all others contradict.
 
     They are judged by the residual given all other measurements (auxiliary residuals), without any
@@ -125,14 +109,6 @@ def outliers(
         Fitted to whole trajectories.
     criteria : Criteria
         How far off a measurement is to be left out.
-    errors_off : float
-        It is this many measurement errors from the smoothed state, which it attracts.
-    neighbours : float
-        It is this many times as far off as its neighbours, which an event that lasts moves, too.
-    most : float
-        If a larger share of a coordinate's measurements is far off, none is left out.
-    least_measurements : int
-        Measurements of a coordinate that are needed to call one far off.
 
     Returns
     -------
@@ -155,12 +131,14 @@ def outliers(
     for cell, place in enumerate(noise.coordinates.places):
         sizes = size[:, cell]
         count = np.isfinite(sizes).sum()
-        if noise.coordinates.sensor[cell] < 0 or count < least_measurements:
+        if noise.coordinates.sensor[cell] < 0 or count < 12:  # too few to call one far
             continue
         far = sizes > criteria.outlier_deviations * np.nanmedian(sizes) / norm.isf(0.25)
-        far &= np.abs(off[:, cell]) > errors_off * error[cell]
-        far &= sizes > neighbours * np.nan_to_num(_beside(sizes, trajectory, row))
-        if 0 < far.sum() <= max(most * count, 1):
+        # from the smoothed state, which it attracts
+        far &= np.abs(off[:, cell]) > 4.0 * error[cell]
+        # an event that lasts moves the neighbours, too
+        far &= sizes > 2.0 * np.nan_to_num(_beside(sizes, trajectory, row))
+        if 0 < far.sum() <= max(0.05 * count, 1):  # where many are far off, none is left out
             flat[trajectory[far], row[far], place] = off[far, cell]
     return errors
 
@@ -234,24 +212,13 @@ class Declared:
 
 
 def with_enough_substeps(
-    mode: FilteredMode,
-    say: Callable[[str], None],
-    criteria: Criteria = DEFAULT,
-    *,
-    better_mode: float = 5.0,
-    large: float = 0.1,
-    still: float = 0.1,
+    mode: FilteredMode, say: Callable[[str], None], criteria: Criteria = DEFAULT
 ) -> FilteredMode:
     """Double the substeps until neither predictions nor the acceleration test move, and refit.
 
     The engine's error hardly depends on the parameters, so it is measured at the mode found with
     fewer substeps. At the end smoothing restarts: an optimum with too large a noise confirms
     itself through the states that were smoothed with that noise.
-
-    ``better_mode``: a mode is replaced by one smoothed again whose log-posterior is higher by this
-    (nats).
-    ``large``: an unexplained acceleration above this share of the bodies' is no numerical error.
-    ``still``: nor is one that a doubling of the substeps moves by a smaller share.
     """
     limits = criteria.engine
     confirmed = 0  # substeps with which smoothing was restarted
@@ -264,15 +231,16 @@ def with_enough_substeps(
             continue
         if confirmed < substeps:
             fresh, confirmed = trajectory_mode(mode.problem, mode.phi), substeps
-            if fresh.log_posterior > mode.log_posterior + better_mode:
+            if fresh.log_posterior > mode.log_posterior + 5.0:  # nats
                 mode = fresh
                 continue
         excess = unexplained_acceleration(mode, criteria)
-        if not excess.matters.any() or excess.worst > large or substeps >= limits.most_substeps:
+        # a tenth of the bodies' acceleration is no numerical error
+        if not excess.matters.any() or excess.worst > 0.1 or substeps >= limits.most_substeps:
             return mode
         finer = _refined(mode, 2 * substeps, say)
         moved = np.abs(excess.relative - unexplained_acceleration(finer, criteria).relative)
-        if (moved < still * excess.relative)[excess.matters].all():
+        if (moved < 0.1 * excess.relative)[excess.matters].all():
             return mode
         mode = finer
 

@@ -49,7 +49,7 @@ CANDIDATE = (
 #: Keys of an added law in JSON.
 ADDED = (
     "effect", "body", "statistic", "p_value", "parameters", "not_separable_from",
-    "elpd_difference", "elpd_difference_se", "simulated_nats", "simulated_share",
+    "simulated_nats", "simulated_share",
 )  # fmt: skip
 #: Keys of a law of the search in JSON, and of one that it does not add.
 NAMED = ("effect", "body", "sentence", "estimate", "sd", "units", "nats", "share", "confounded")
@@ -106,9 +106,6 @@ class Law:
         Effects that explain these data as well.
     parameters : dict of str to Estimate
         Posterior of each parameter in the revised model.
-    elpd_difference, elpd_difference_se : float
-        Gain of expected log predictive density over the model without it, and its standard error
-        (nats).
     """
 
     effect: str
@@ -129,8 +126,6 @@ class Law:
     sd: Mapping[str, float] = field(default_factory=dict)
     not_separable_from: tuple[str, ...] = ()
     parameters: Mapping[str, Estimate] = field(default_factory=dict)
-    elpd_difference: float = math.nan
-    elpd_difference_se: float = math.nan
 
     @property
     def chance(self) -> float:
@@ -217,48 +212,6 @@ class ResidualTest:
     def untested(cls, name: KindOfTest, why: str) -> ResidualTest:
         """Return the result of a test that the data cannot fail."""
         return cls(name, float("nan"), 0.0, True, f"not tested: {why}", tested=False)
-
-
-@dataclass(frozen=True, eq=False)
-class Correlations:
-    """Correlations of innovations, for a plot.
-
-    Parameters
-    ----------
-    cells : tuple of str
-        Observed coordinates: state dimension and body.
-    own : ndarray
-        Correlation with innovations 1, 2, ... intervals before, shape (lag, cell).
-    pairs : ndarray
-        Number of pairs of each, shape (lag, cell).
-    commands : tuple of str
-        Commands that vary.
-    driven : ndarray
-        Correlation with commands 0, 1, ... intervals before, shape (lag, command, cell).
-    """
-
-    cells: tuple[str, ...]
-    own: Floats
-    pairs: Floats
-    commands: tuple[str, ...]
-    driven: Floats
-
-
-@dataclass(frozen=True, eq=False)
-class Growth:
-    """Growth of forecasts' errors with their length, for a plot.
-
-    Parameters
-    ----------
-    seconds : ndarray
-        Lengths (s), shape (length,).
-    error, floor : tuple of dict
-        Root mean square error of each state dimension, and that of noise alone, one each length.
-    """
-
-    seconds: Floats
-    error: tuple[Mapping[str, float], ...]
-    floor: tuple[Mapping[str, float], ...]
 
 
 @dataclass(frozen=True)
@@ -432,16 +385,10 @@ class Misfit:
         In the order of the report.
     dependence : Unexplained or None
         The recorded quantity that the residual depends on; None if it depends on none.
-    correlations : Correlations
-        Correlations of the innovations.
-    growth : Growth
-        Growth of the forecasts' errors.
     """
 
     tests: tuple[ResidualTest, ...]
     dependence: Unexplained | None
-    correlations: Correlations
-    growth: Growth
 
     @property
     def unexplained(self) -> Unexplained | None:
@@ -516,14 +463,11 @@ class ComparedModel:
         The model with whole trajectories filtered, which the tests are made with.
     errors : Errors
         Held-out errors.
-    residuals : dict of str to ndarray
-        Held-out residuals in units of noise per state dimension, 1-d arrays.
     """
 
     fit: Fit
     innovations: FilteredMode
     errors: Errors
-    residuals: Mapping[str, Floats]
 
 
 @dataclass(frozen=True, eq=False)
@@ -679,14 +623,8 @@ class Loop:
     @property
     def rejected(self) -> tuple[Law, ...]:
         """Return the significant candidates that were not added, best first."""
-        present = {(added.effect, added.body) for added in self.added}
-        return tuple(
-            one
-            for one in self.candidates
-            if one.why
-            and one.p_value < self.criteria.try_p
-            and (one.effect, one.body) not in present
-        )
+        tried = (one for one in self.candidates if one.why not in ("", "added"))
+        return tuple(one for one in tried if one.p_value < self.criteria.try_p)
 
     @property
     def diverges(self) -> bool:
@@ -715,6 +653,7 @@ class Loop:
     def to_dict(self) -> dict[str, Any]:
         """Return the contents of ``report.json``; numbers that are not finite become null."""
         tested = [key for key in CANDIDATE if key not in ("sentence", "units")]
+        errors = {"before": self.before, "after": self.after, "noise_floor": self.noise_floor}
         contents: dict[str, Any] = json_values(
             {
                 "verdict": self.verdict,
@@ -728,11 +667,7 @@ class Loop:
                 "tests": self.tests,
                 "unexplained_acceleration": self.acceleration,
                 "unexplained": self.unexplained,
-                "error": {
-                    "before": self.before,
-                    "after": self.after,
-                    "noise_floor": self.noise_floor,
-                },
+                "error": errors,
                 "identifiability": self.identifiability and self.identifiability.to_dict(),
                 "loo": self.loo and self.loo.to_dict(),
                 "velocities_not_used": self.data.velocities_not_used,

@@ -39,11 +39,6 @@ class GridPoint:
     columns: tuple[int, ...]
 
     @property
-    def place(self) -> GridPoint:
-        """Return the grid point without its signature."""
-        return replace(self, signature=self.signature[:0].copy())
-
-    @property
     def proposed(self) -> Floats:
         """Return the grid point as a scan proposes it, shape (q,), NaN for what is not scanned."""
         point = self.values.astype(float)
@@ -52,12 +47,7 @@ class GridPoint:
 
 
 def each_grid_point(
-    mode: Mode,
-    candidate: Attached,
-    proposed: Floats | None = None,
-    *,
-    at_once: int = 8,
-    most_values: int = 4_000_000,
+    mode: Mode, candidate: Attached, proposed: Floats | None = None, most_values: int = 4_000_000
 ) -> Iterator[GridPoint]:
     """Simulate a candidate at grid points, a few at a time, for each holds a value a measurement.
 
@@ -70,10 +60,8 @@ def each_grid_point(
     proposed : ndarray, optional
         The grid points, shape (point, q); by default all that its scan proposes, simulated with as
         few engine steps as tell them apart.
-    at_once : int
-        Grid points that are simulated in one call, at most.
     most_values : int
-        Measurements times grid points in one call, at most.
+        Measurements times grid points in one call, at most; it has at most 8 grid points.
 
     Yields
     ------
@@ -85,12 +73,16 @@ def each_grid_point(
         return
     body = problem.scene.body(candidate.body)
     enlarged = problem.with_physics(effects=(*problem.physics.effects, candidate)).medium
-    of_scan = proposed is None
-    if proposed is None:
+    null = np.array(effect.null)
+    steps = 1e-3 * np.array([parameter.prior.scale for parameter in effect.parameters])
+    lower, upper = np.array([p.prior.support for p in effect.parameters]).T
+    # one-sided where the null is the least that there can be
+    ahead, behind = np.minimum(null + steps, upper) - null, np.maximum(null - steps, lower) - null
+    if proposed is None:  # one side will do to choose from
         proposed, enlarged = effect.scan(problem.scene, problem.data.history, body), enlarged.coarse
+        behind = np.where(ahead > 0.0, 0.0, behind)
     declared = enlarged.layout.places(problem.layout.labels)
     places = enlarged.layout.places(candidate.labels)
-    null = np.array(effect.null)
 
     def whitened(points: Floats) -> Floats:
         phi = np.zeros((len(points), enlarged.layout.size))
@@ -98,18 +90,10 @@ def each_grid_point(
         phi[:, places] = points
         return -enlarged.whitened(phi, mode.sigma).reshape(len(points), -1)
 
-    free = np.isnan(proposed)
-    steps = 1e-3 * np.array([parameter.prior.scale for parameter in effect.parameters])
-    lower, upper = np.array([p.prior.support for p in effect.parameters]).T
-    # one-sided where the null is the least that there can be
-    ahead, behind = np.minimum(null + steps, upper) - null, np.maximum(null - steps, lower) - null
-    if of_scan:  # one side will do to choose from
-        behind = np.where(ahead > 0.0, 0.0, behind)
     nothing = whitened(null[None])
-    at_once = max(1, min(at_once, most_values // max(mode.whitened_residual.size, 1)))
+    at_once = max(1, min(8, most_values // max(mode.whitened_residual.size, 1)))
     for begin in range(0, len(proposed), at_once):
-        part = slice(begin, begin + at_once)
-        points, plan = _points(proposed[part], free[part], null, (ahead, behind))
+        points, plan = _points(proposed[begin : begin + at_once], null, (ahead, behind))
         states = np.vstack([nothing, whitened(points)])
         for values, columns, rows in plan:
             if columns:
@@ -124,7 +108,7 @@ def each_grid_point(
 
 
 def _points(
-    proposed: Floats, free: Floats, null: Floats, steps: tuple[Floats, Floats]
+    proposed: Floats, null: Floats, steps: tuple[Floats, Floats]
 ) -> tuple[Floats, list[tuple[Floats, tuple[int, ...], list[int]]]]:
     """Return points to simulate, and each grid point's values, free columns and rows of states.
 
@@ -132,9 +116,9 @@ def _points(
     """
     points: list[Floats] = []
     plan = []
-    for row, unknown in zip(proposed, free, strict=True):
-        values = np.where(unknown, null, row)
-        columns = tuple(int(i) for i in np.flatnonzero(unknown))
+    for row in proposed:
+        values = np.where(np.isnan(row), null, row)
+        columns = tuple(np.flatnonzero(np.isnan(row)).tolist())
         rows = []
         for column in columns:
             for step in steps:
@@ -177,7 +161,8 @@ def detection_limits(
     criteria : ResidualCriteria
         P-value and power of the limit.
     """
-    tried = candidates * len(points)
+    tail = criteria.detection_p / 2 / max(candidates * len(points), 1)  # of a two-sided test
+    needed = float(norm.isf(tail) + norm.ppf(criteria.detection_power))
     names = [parameter.name for parameter in effect.parameters]
     limits: dict[str, float] = {}
     whole = [
@@ -185,11 +170,11 @@ def detection_limits(
     ]
     if whole and len(names) == 1:
         null = effect.null[0]
-        seen = [values[0] for values, unit in whole if unit[0] >= _needed(tried, criteria)]
+        seen = [values[0] for values, unit in whole if unit[0] >= needed]
         limits[names[0]] = float(min(seen, key=lambda value: abs(value - null), default=np.inf))
     for point, unit in zip(points, units, strict=True):
         with np.errstate(divide="ignore"):
-            sizes = _needed(tried, criteria) / unit
+            sizes = needed / unit
         for column, size in zip(point.columns, sizes, strict=False):
             limits[names[column]] = min(limits.get(names[column], np.inf), float(size))
     return limits
@@ -200,11 +185,6 @@ def is_upper_limit(effect: Effect, points: Sequence[GridPoint]) -> bool:
     return bool(points) and all(
         not point.columns and point.values[0] < effect.null[0] for point in points
     )
-
-
-def _needed(tried: int, criteria: ResidualCriteria) -> float:
-    """Return the detectable change in units of noise, for a two-sided test."""
-    return float(norm.isf(criteria.detection_p / 2 / tried) + norm.ppf(criteria.detection_power))
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,43 +214,6 @@ class Signature:
     direction: Floats
     linear: tuple[Linearisation, ...]
 
-    def without_bases(self) -> Signature:
-        """Return the test with its direction, without arrays of several values a row."""
-        return replace(self, basis=self.basis[:0].copy(), linear=())
-
-
-@dataclass(frozen=True, eq=False)
-class Linearisation:
-    """Predictions of a candidate near one point, to first order.
-
-    Parameters
-    ----------
-    values : ndarray
-        The effect's parameters there, shape (q,).
-    columns : tuple of int
-        Parameters by which it is linear; none for a whole change, as by a threshold.
-    basis : ndarray
-        Orthonormal basis of the change of whitened predictions, without what declared parameters
-        absorb, shape (n, direction).
-    back : ndarray
-        From coordinates in the basis to sizes of the columns (or of the whole change, which is 1),
-        shape (column, direction).
-    absorbed : ndarray
-        By how much declared parameters change with coordinates in the basis, shape (p, direction).
-    """
-
-    values: Floats
-    columns: tuple[int, ...]
-    basis: Floats
-    back: Floats
-    absorbed: Floats
-
-    def sizes(self, coordinates: Floats) -> Floats:
-        """Return the effect's parameters, shape (q,), at coordinates in the basis."""
-        values = self.values.copy()
-        values[list(self.columns)] += (self.back @ coordinates)[: len(self.columns)]
-        return values
-
 
 def rank_candidates(
     mode: Mode, candidates: Sequence[Attached], criteria: Criteria = DEFAULT, say: Say = silent
@@ -282,9 +225,9 @@ def rank_candidates(
     library = Library(mode, criteria=criteria)
 
     def score(attached: Attached) -> Signature:
-        signature = library.scored(attached, len(candidates)).without_bases()
+        signature = library.scored(attached, len(candidates))
         library.forget(attached)
-        return signature
+        return replace(signature, basis=signature.basis[:0].copy(), linear=())
 
     # p-values of the same physics differ by rounding
     scored = in_parallel(score, candidates, f"scoring {len(candidates)} laws", say)
@@ -364,14 +307,13 @@ class Library:
         """
         test, effect = self.test(without), attached.effect
         points, tried, units = self.points(attached)
-        judged = [(test.at(point, attached), point) for point in points]
-        judged.sort(key=lambda one: one[0].log_p)
-        best, values = test.nothing(1), np.array(effect.null)
-        if judged:
-            best, point = judged[0]
-            values = point.values.copy()
-            for column, size in zip(point.columns, best.size, strict=False):
-                values[column] += size
+        judged = sorted((test.at(point, attached) for point in points), key=lambda one: one.log_p)
+        nowhere = GridPoint(np.array(effect.null, dtype=float), np.zeros((0, 1)), ())
+        best = judged[0] if judged else test.nothing(nowhere)
+        coordinates = best.basis.T @ test.residual
+        values, direction = best.sizes(coordinates), np.zeros(len(test.residual))
+        if best.statistic > 0:
+            direction = best.basis @ coordinates / np.sqrt(best.statistic)
         names = [parameter.name for parameter in effect.parameters]
         log_p = min(0.0, best.log_p + np.log(max(1, len(tried))))
         candidate = Law(
@@ -379,7 +321,7 @@ class Library:
             body=attached.body,
             sentence=effect.sentence,
             statistic=best.statistic,
-            dof=best.basis.shape[1] or best.size.size,  # directions that are seen
+            dof=best.basis.shape[1] or len(best.back),  # directions that are seen
             p_value=float(min(1.0, np.exp(log_p) * candidates)),
             estimate=dict(zip(names, values.tolist(), strict=True)),
             units={parameter.name: parameter.unit for parameter in effect.parameters},
@@ -388,21 +330,17 @@ class Library:
             detectable=detection_limits(effect, tried, units, candidates, self.criteria.residual),
             is_upper_limit=is_upper_limit(effect, tried),
         )
-        linear = tuple(
-            one.about(point) for one, point in judged if one.statistic > 0 or effect.scan is None
-        )
-        return Signature(attached, candidate, log_p, best.basis, best.direction, linear)
+        linear = tuple(one for one in judged if one.statistic > 0 or effect.scan is None)
+        return Signature(attached, candidate, log_p, best.basis, direction, linear)
 
     def forget(self, attached: Attached) -> None:
         """Let go of a candidate's derivatives, which take much memory in long recordings."""
         self._scans.pop(attached, None)
 
-    def points(
-        self, attached: Attached, again: int = 4
-    ) -> tuple[list[GridPoint], list[GridPoint], list[Floats]]:
+    def points(self, attached: Attached) -> tuple[list[GridPoint], list[GridPoint], list[Floats]]:
         """Return where a candidate is linearised, all grid points, and changes by a unit of each.
 
-        Of a scan, the ``again`` leading ones beside the laws and in their place, simulated with
+        Of a scan, the four leading ones beside the laws and in their place, simulated with
         more engine steps: with these a body may pass by.
         """
         if attached not in self._scans:
@@ -421,10 +359,11 @@ class Library:
                 tests, judged = [test, self.test(self.laws)][: 1 + bool(self.laws)], []
                 for point in each_grid_point(mode, attached):
                     scores = [one.at(point, attached) for one in tests]
-                    judged.append(([one.log_p for one in scores], point.place, scores[0].unit))
+                    place = replace(point, signature=point.signature[:0].copy())
+                    judged.append(([one.log_p for one in scores], place, scores[0].unit))
                 leading: dict[int, Floats] = {}
                 for i in range(len(tests)):
-                    for one in sorted(judged, key=lambda one: one[0][i])[:again]:
+                    for one in sorted(judged, key=lambda one: one[0][i])[:4]:
                         leading |= {id(one[1]): one[1].proposed} if one[0][i] < 0.0 else {}
                 proposed = np.array([*leading.values()])
                 finer = list(each_grid_point(mode, attached, proposed)) if leading else []
@@ -469,22 +408,46 @@ def _slopes(mode: Mode, attached: Attached | None = None) -> Floats:
 
 
 @dataclass(frozen=True, eq=False)
-class _Evidence:
-    """Result of the score test of a signature's columns."""
+class Linearisation:
+    """Predictions of a candidate near one point, to first order, and their score test.
 
+    Parameters
+    ----------
+    values : ndarray
+        The effect's parameters there, shape (q,).
+    columns : tuple of int
+        Parameters by which it is linear; none for a whole change, as by a threshold.
+    statistic, log_p : float
+        Score statistic, and the natural logarithm of its p-value.
+    share : float
+        Share of the signature that declared parameters do not absorb.
+    unit : ndarray
+        Change of whitened predictions by one unit of each column, without what is absorbed.
+    basis : ndarray
+        Orthonormal basis of the change of whitened predictions, without what declared parameters
+        absorb, shape (n, direction).
+    back : ndarray
+        From coordinates in the basis to sizes of the columns (or of the whole change, which is 1),
+        shape (column, direction).
+    absorbed : ndarray
+        By how much declared parameters change with coordinates in the basis, shape (p, direction).
+    """
+
+    values: Floats
+    columns: tuple[int, ...]
     statistic: float
     log_p: float
     share: float
-    size: Floats
-    basis: Floats
-    direction: Floats
     unit: Floats
+    basis: Floats
     back: Floats
     absorbed: Floats
 
-    def about(self, point: GridPoint) -> Linearisation:
-        """Return the linearisation of the signature of a grid point."""
-        return Linearisation(point.values, point.columns, self.basis, self.back, self.absorbed)
+    def sizes(self, coordinates: Floats) -> Floats:
+        """Return the effect's parameters, shape (q,), at coordinates in the basis."""
+        values = self.values.copy()
+        values[list(self.columns)] += (self.back @ coordinates)[: len(self.columns)]
+        return values
 
 
 @dataclass(frozen=True, eq=False)
@@ -515,72 +478,53 @@ class ScoreTest:
         """Return whitened rows, shape (n, ...), without what the declared parameters absorb."""
         return np.asarray(rows - self.q @ (self.q.T @ rows))
 
-    def at(self, point: GridPoint, attached: Attached) -> _Evidence:
-        """Return the score test of a candidate at a grid point."""
-        missing = len(self.residual) - len(point.signature)
-        rows, columns = np.pad(point.signature, ((0, missing), (0, 0))), list(point.columns)
-        sides = null_sides(attached)[columns] if columns else np.ones(1, dtype=np.intp)
-        typical = np.array([parameter.prior.sigma for parameter in attached.effect.parameters])
-        return self.evidence(rows, sides, typical[columns] if columns else np.ones(1))
+    def nothing(self, point: GridPoint, share: float = 0.0) -> Linearisation:
+        """Return no evidence at a grid point of whose signature this share is not absorbed."""
+        count = point.signature.shape[1]
+        sizes = len(self.residual), count, len(self.phi)
+        basis, back, absorbed = (np.zeros((size, 0)) for size in sizes)
+        return Linearisation(
+            point.values, point.columns, 0.0, 0.0, share, np.zeros(count), basis, back, absorbed
+        )
 
-    def nothing(self, columns: int, share: float = 0.0) -> _Evidence:
-        """Return no evidence for a signature of which this share is not absorbed."""
-        n, none = len(self.residual), np.zeros(columns)
-        basis, back, absorbed = (np.zeros((size, 0)) for size in (n, columns, len(self.phi)))
-        return _Evidence(0.0, 0.0, share, none, basis, np.zeros(n), none, back, absorbed)
+    def at(self, point: GridPoint, attached: Attached) -> Linearisation:
+        """Return the score test of a candidate at a grid point.
 
-    def evidence(
-        self,
-        signature: Floats,
-        sides: Ints,
-        scales: Floats,
-        *,
-        absorbed_below: float = 1e-3,
-        visible: float = 1e-3,
-    ) -> _Evidence:
-        """Return the score test of a signature.
-
-        Parameters
-        ----------
-        signature : ndarray
-            Shape (n, columns).
-        sides : ndarray of int
-            1 (or -1) where a column's size can only be positive (or negative), shape (columns,).
-        scales : ndarray
-            Typical sizes, shape (columns,): directions that are invisible at these are left out.
-        absorbed_below : float
-            Share of a signature that declared parameters have to leave, or they absorb it.
-        visible : float
-            Least change in units of noise: a smaller one is the engine's rounding.
+        Directions that are invisible at typical sizes of the columns are left out.
         """
-        signature = signature * scales
+        absorbed_below = 1e-3  # share that declared parameters leave, or they absorb a signature
+        columns, scales, sides = list(point.columns), np.ones(1), np.ones(1, dtype=np.intp)
+        if columns:
+            sides = null_sides(attached)[columns]
+            scales = np.array([attached.effect.parameters[i].prior.sigma for i in columns])
+        missing = len(self.residual) - len(point.signature)
+        signature = np.pad(point.signature, ((0, missing), (0, 0))) * scales
         projected = self.left(signature)
         total = (signature**2).sum()
         share = float((projected**2).sum() / total) if total > 0 else 0.0
         if not share > absorbed_below:
-            return self.nothing(signature.shape[1], share)
+            return self.nothing(point, share)
         u, s, vt = np.linalg.svd(projected, full_matrices=False)
         whole = np.linalg.norm(signature @ vt.T, axis=0)  # before the projection
-        keep = (s > 1e-6 * s.max()) & (s >= min(visible, s.max()))
+        # a change of less than 1e-3 of the noise is the engine's rounding
+        keep = (s > 1e-6 * s.max()) & (s >= min(1e-3, s.max()))
         keep &= s**2 > absorbed_below * whole**2
         basis = u[:, keep]
         unit = np.sqrt((projected**2).sum(axis=0)) / scales
         coordinates = basis.T @ self.residual
         along = vt[keep].T / s[keep]
         back, absorbed = scales[:, None] * along, self.back @ (self.q.T @ (signature @ along))
-        size = back @ coordinates
         statistic = float(coordinates @ coordinates)
         log_p = float(chi2.logsf(statistic, max(1, int(keep.sum()))))
         seen = int(np.argmax(np.abs(vt[0])))
         if sides[seen] and keep.sum() == 1 and np.abs(vt[0, seen]) > 1 - 1e-6:
             # it can only have one sign: half the p-value, and no evidence for the other sign
-            allowed = sides[seen] * size[seen] > 0
+            allowed = sides[seen] * (back @ coordinates)[seen] > 0
             statistic = statistic if allowed else 0.0
             log_p = log_p + np.log(0.5) if allowed else 0.0
-        direction = np.zeros(len(u))
-        if statistic > 0:
-            direction = basis @ coordinates / np.sqrt(statistic)
-        return _Evidence(statistic, log_p, share, size, basis, direction, unit, back, absorbed)
+        return Linearisation(
+            point.values, point.columns, statistic, log_p, share, unit, basis, back, absorbed
+        )
 
 
 def null_sides(attached: Attached) -> Ints:

@@ -216,12 +216,10 @@ class Search:
             states = mode.problem.data.smoothed_states
             short = fit_pieces(in_pieces(_apart(mode, lengths[0]), lengths[0], states), mode.phi)
         declared = short.problem.physics.effects
-        table = Table(
-            declared, max(len(self._candidates(short, single)), 1), {}, {frozenset(): short}
-        )
-        common = best = _Climb(
-            table.fitted(short, laws or {}, by_label(laws or {})), table, unusual=single
-        )
+        tried = max(len(self._candidates(short, single)), 1)
+        table = Table(declared, tried, modes={frozenset(): short})
+        begun = table.fitted(short, laws or {}, by_label(laws or {}))
+        common = best = _Climb(begun, table, unusual=single)
         self._climb(common, lengths)
         self._leave_out(common)
         hypotheses: Mapping[Attached, float] = {}
@@ -231,10 +229,9 @@ class Search:
             i, hypotheses = self._promised(common, lost)
             if i is not None:
                 self.say("common laws leave more than the noise: trying unusual ones")
-                tried = len(self._candidates(short, True))
-                begun = common.modes[i]
-                names = frozenset(table.laws(begun))
-                table = Table(declared, tried, {**common.table.points}, {names: begun})
+                tried, begun = len(self._candidates(short, True)), common.modes[i]
+                modes = {frozenset(table.laws(begun)): begun}
+                table = Table(declared, tried, {**common.table.points}, modes)
                 more = _Climb(begun, table, True, common.noise, lengths=common.lengths[:i])
                 self._climb(more, lengths[i:], common.modes[i:])
                 common.regressions.append(more.regressions[0])
@@ -284,10 +281,7 @@ class Search:
         return found, {law: alone[law] for law in leading if alone[law] >= limits.main_share}
 
     def of(
-        self,
-        train: History,
-        fit: Callable[[History, FilteredMode | None], FilteredMode],
-        seed: int,
+        self, train: History, fit: Callable[[History, FilteredMode | None], FilteredMode], seed: int
     ) -> tuple[FilteredMode, SearchResult]:
         """Return the declared model's mode, and the laws that it lacks.
 
@@ -319,10 +313,9 @@ class Search:
 
     def _is_complete(self, more: _Climb, common: _Climb) -> bool:
         """Return whether unusual laws explain all that common ones leave, or most of it."""
-        unusual = any(law.effect.unusual for law in more.laws)
-        if not unusual or more.mode.problem.data.horizon < common.mode.problem.data.horizon:
-            return False
         plain, rows = common.mode, more.mode.problem.data.horizon
+        if not any(law.effect.unusual for law in more.laws) or rows < plain.problem.data.horizon:
+            return False
         if is_simulated_mode(plain) and plain.problem.data.horizon < rows:
             plain = _carried(plain, rows)
         return self._explains(more, plain)
@@ -360,13 +353,12 @@ class Search:
                 )
                 climb.mode = longer
             climb.last = bool(i) and length == lengths[-1]
-            self._improve(climb, beside[i] if i < len(beside) else None)
+            plain = beside[i] if i < len(beside) else None
+            self._improve(climb, plain)
             if not climb.noise.size:
                 climb.noise = climb.mode.sigma
-            if i < len(beside):
-                better = share(beside[i], climb.mode, weights(climb.mode))
-                if better < limits.least_share:
-                    break
+            if plain and share(plain, climb.mode, weights(climb.mode)) < limits.least_share:
+                break
 
     def _linearised(self, climb: _Climb) -> tuple[Library, list[Attached]]:
         """Return derivatives at a climb's model, and candidates beside at most one unusual law."""
@@ -462,15 +454,13 @@ class Search:
         # friction has kinks, by which a regression underrates it
         everyday = [one for one in subsets if all(law.effect.log_odds == 0 for law in one.laws)]
         proposals += {len(one.laws): one for one in reversed(everyday)}.values()
-        moves = {
-            frozenset((*climb.laws, *one.laws)): one.begin(climb.mode.problem.layout.labels)
-            for one in proposals
-        }
+        labels = climb.mode.problem.layout.labels
+        moves = {frozenset((*climb.laws, *one.laws)): one.begin(labels) for one in proposals}
         for subset in proposals:  # a spring has the constant torque of its anchor
             kin = [law for law in climb.laws if any(_are_kin(law, new) for new in subset.laws)]
             if kin and any(law.effect.unusual for law in subset.laws):
-                begin = subset.begin(climb.mode.problem.layout.labels)
-                moves[frozenset((*climb.laws, *subset.laws)) - {*kin}] = _without(begin, *kin)
+                laws = frozenset((*climb.laws, *subset.laws)) - {*kin}
+                moves[laws] = _without(subset.begin(labels), *kin)
         for subset in instead.subsets[: limits.singles] if instead and climb.laws else ():
             moves.setdefault(frozenset(subset.laws), subset.begin(_labels(climb.mode, *climb.laws)))
         return self._best(climb, moves, least_share)
@@ -587,10 +577,7 @@ class Search:
             climb.small.pop(law, None)
 
     def _result(
-        self,
-        climb: _Climb,
-        regressions: Sequence[Regression],
-        hypotheses: Mapping[Attached, float],
+        self, climb: _Climb, regressions: Sequence[Regression], hypotheses: Mapping[Attached, float]
     ) -> SearchResult:
         """Return what a table says of its best model and of what was tried."""
         table, mode, limits = climb.table, climb.mode, self.criteria.search
@@ -627,17 +614,11 @@ class Search:
             law: _named(law, scored.get(law), climb, mode, part, rivals[law])
             for law, part in shares.items()
         }
-        too_little = "takes too little off the error of simulated trajectories"
+        little = "takes too little off the error of simulated trajectories"
+        tried = {law: replace(one, why=decided.get(law, little)) for law, one in scored.items()}
+        aside = _aside(climb.small), _aside(hypotheses)
         return SearchResult(
-            before,
-            mode,
-            laws,
-            {law: replace(one, why=decided.get(law, too_little)) for law, one in scored.items()},
-            tuple(climb.lengths),
-            rejected,
-            _aside(climb.small),
-            _aside(hypotheses),
-            doubt,
+            before, mode, laws, tried, tuple(climb.lengths), rejected, *aside, doubt
         )
 
 
@@ -650,9 +631,8 @@ def _scored(regressions: Sequence[Regression]) -> dict[Attached, Law]:
         for subset in (one for one in regression.subsets if len(one.laws) == 1):
             part = 1.0 - float(np.sqrt(1.0 - subset.share))
             for law in (*subset.laws, *regression.same[subset.laws[0]]):
-                if laws[law].simulated_nats is None:
-                    alone = replace(laws[law], simulated_nats=subset.nats, simulated_share=part)
-                    laws[law] = alone
+                if (one := laws[law]).simulated_nats is None:
+                    laws[law] = replace(one, simulated_nats=subset.nats, simulated_share=part)
     return laws
 
 
@@ -691,14 +671,10 @@ def _apart(mode: Mode, length: int, *, most: float = 0.5) -> Problem:
     return problem.with_data(breaks=breaks)
 
 
-def _with_contacts(
-    found: SearchResult, whole: Mode, shortest: int, *, far_out: float = 5.0
-) -> SearchResult:
+def _with_contacts(found: SearchResult, whole: Mode, shortest: int) -> SearchResult:
     """Return the result with its models fitted to contacts as well, which have parameters, too.
 
     These begin where the ``whole`` trajectories have them.
-
-    ``far_out``: errors of collisions above this many noise sizes are those of the engine.
     """
     contacts = found.after.problem.data.breaks
     if contacts is None:
@@ -714,8 +690,8 @@ def _with_contacts(
         known = problem.layout.from_layout(whole.problem.layout, whole.phi)
         pieces = in_pieces(problem, shortest, states)
         fitted = fit_pieces(pieces, _informed_or(known, mode))
-        # a collision that the engine does not have stays left out
-        off = np.abs(fitted.problem.residual(fitted.phi)).max(axis=(1, 2)) > far_out * mode.sigma
+        # a collision that the engine does not have, five times the noise off, stays left out
+        off = np.abs(fitted.problem.residual(fitted.phi)).max(axis=(1, 2)) > 5.0 * mode.sigma
         segments, breaks = pieces.segments, np.zeros_like(contacts)
         for i in np.flatnonzero(off.any(axis=1)):
             rows = segments.trajectory[i], slice(segments.step[i], segments.step[i] + shortest)
@@ -738,36 +714,6 @@ def _carried(mode: Mode, length: int) -> SimulatedMode:
     return fit_pieces(in_pieces(mode.problem, length, simulated_states(mode)), mode.phi)
 
 
-def elpd_gain(before: Mode, after: Mode) -> tuple[float, float]:
-    """Return the gain in expected log predictive density, and its standard error.
-
-    The gain in log-density at the modes, less one nat for each further parameter that the data
-    inform (to first order that of leave-one-out cross-validation: M. Stone, Journal of the Royal
-    Statistical Society B 39, 1977). Both count correlated residuals as ``after`` does. The error is
-    that of a sum over pieces or transitions; NaN for a single one.
-    """
-
-    def densities(mode: Mode) -> Floats:
-        problem = mode.problem
-        residual = problem.residual(mode.phi)
-        if not (is_simulated(problem) and is_simulated_mode(after)):
-            return np.asarray(problem.log_density(residual, mode.sigma, mode.phi))
-        likelihood = problem.likelihood
-        initial, tau = likelihood.initial_states, np.array(after.problem.likelihood.tau)
-        rows, begin = likelihood.unwhitened(residual, mode.sigma)
-        sensed = initial.column >= 0
-        of_start = np.eye(len(mode.sigma))[initial.column[sensed]]
-        square = (rows**2).sum((1, 2)) + begin[:, sensed] ** 2 @ of_start
-        count = initial.seen.sum((1, 2)) + np.isfinite(initial.begin)[:, sensed] @ of_start
-        density = count * np.log(mode.sigma) + 0.5 * square / mode.sigma**2
-        return np.asarray(-(density / tau).sum(axis=1))
-
-    gains = densities(after) - densities(before)
-    paid = max(int(informed(after).sum()) - int(informed(before).sum()), 0)
-    n, total = len(gains), float(gains.sum()) - paid
-    return total, float(np.sqrt(n) * gains.std(ddof=1)) if n > 1 else float("nan")
-
-
 def _named(
     law: Attached,
     scored: Law | None,
@@ -783,7 +729,6 @@ def _named(
     effect, places = law.effect, mode.problem.layout.places(law.labels)
     sd = np.sqrt(np.diag(mode.covariance)[places])
     names = [parameter.name for parameter in effect.parameters]
-    gain, error = elpd_gain(climb.table.without(climb.mode, law), mode)
     return replace(
         scored or Law(effect.name, law.body, effect.sentence),
         estimate=dict(zip(names, mode.phi[places].tolist(), strict=True)),
@@ -792,8 +737,6 @@ def _named(
         simulated_nats=climb.earlier.get(law, 0.0),
         simulated_share=part,
         not_separable_from=tuple(named_beside(rival, law) for rival in rivals),
-        elpd_difference=gain,
-        elpd_difference_se=error,
     )
 
 
@@ -807,12 +750,11 @@ def _weightless(mode: Mode, law: Attached, *, least: float = 0.9) -> str:
     known = dict(body.known).get("mass")
     mass = known or mode.phi[mode.problem.layout.index("mass", body.owner)]
     share = float(-(force @ gravity) / (mass * (gravity @ gravity)))
-    if not least < share <= 1.0:
-        return ""
-    return (
+    why = (
         f"{law.body} falls with {100 * (1 - share):.2g} % of gravity: a wrong gravity, or a wrong"
         " unit of time or length"
     )
+    return why if least < share <= 1.0 else ""
 
 
 def are_alike(law: Attached, other: Attached) -> bool:

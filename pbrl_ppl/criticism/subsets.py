@@ -127,7 +127,6 @@ def best_subsets(
     without: tuple[Attached, ...] = (),
     *,
     largest: int = 3,
-    points: int = 3,
     say: Say = silent,
 ) -> Regression:
     """Search the subsets of a few laws that explain the residual of a mode.
@@ -147,8 +146,6 @@ def best_subsets(
         Laws of the model that are left out, to first order.
     largest : int
         Laws in a subset, at most.
-    points : int
-        Grid points kept per candidate.
     say : callable
         Called with how many candidates are linearised.
     """
@@ -166,15 +163,15 @@ def best_subsets(
     for signature in _leading(distinct, residual):
         law = signature.attached
         price = np.log(len(distinct) * signature.candidate.n_grid_points) - law.effect.log_odds
-        for linear in signature.linear[:points]:
+        for linear in signature.linear[:3]:  # grid points of a scan
             columns = np.arange(width, width + linear.basis.shape[1])
             terms.append(Term(law, linear, columns, float(price)))
             width += len(columns)
     order = {law: place for place, law in enumerate(candidates)}
     equations = _NormalEquations(terms, library.test(without), n)
     tried = equations.search([order[term.law] for term in terms], largest)
-    best = sorted(tried, key=lambda subset: -subset.nats)
-    return Regression(tuple(best), same, tuple(signatures))
+    tried.sort(key=lambda subset: -subset.nats)
+    return Regression(tuple(tried), same, tuple(signatures))
 
 
 class _NormalEquations:
@@ -269,15 +266,13 @@ def _distinct(
     return distinct, same
 
 
-def _leading(
-    distinct: Sequence[Signature], residual: Floats, *, leaders: int = 14, beside: int = 8
-) -> list[Signature]:
-    """Return the candidates that take most away, alone and beside the first of them."""
+def _leading(distinct: Sequence[Signature], residual: Floats) -> list[Signature]:
+    """Return the 14 candidates that take most away alone, and 8 beside the first of them."""
 
     def taken(signature: Signature) -> float:
         return float(((signature.basis.T @ residual) ** 2).sum())
 
-    leading = sorted(distinct, key=taken, reverse=True)[:leaders]
+    leading = sorted(distinct, key=taken, reverse=True)[:14]
     first = leading[0].basis
     left = residual - first @ (first.T @ residual)
 
@@ -286,5 +281,5 @@ def _leading(
         q, r = np.linalg.qr(rest)
         return float(((q[:, np.abs(np.diag(r)) > 1e-3].T @ left) ** 2).sum())
 
-    second = sorted(distinct, key=taken_beside, reverse=True)[:beside]
+    second = sorted(distinct, key=taken_beside, reverse=True)[:8]
     return list(dict.fromkeys([*leading, *second]))

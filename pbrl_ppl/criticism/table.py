@@ -92,9 +92,7 @@ def far_out(mode: Mode, laws: Iterable[Attached]) -> float:
 
 
 def with_effects(
-    mode: Mode[LikelihoodT],
-    effects: tuple[Attached, ...],
-    begin: Mapping[str, float] | None = None,
+    mode: Mode[LikelihoodT], effects: tuple[Attached, ...], begin: Mapping[str, float] | None = None
 ) -> tuple[Problem[LikelihoodT], Floats]:
     """Return a mode's problem with other effects, and where a search for its mode begins.
 
@@ -195,10 +193,7 @@ class Table:
         return tuple(one for one in mode.problem.physics.effects if one not in self.declared)
 
     def fitted(
-        self,
-        near: Mode,
-        laws: Collection[Attached],
-        begin: Mapping[str, float] | None = None,
+        self, near: Mode, laws: Collection[Attached], begin: Mapping[str, float] | None = None
     ) -> Mode:
         """Return the model with these laws alone, fitted from another model if it is new.
 
@@ -226,15 +221,11 @@ class Table:
         near: Mode,
         moves: Mapping[frozenset[Attached], Mapping[str, float]],
         say: Say = silent,
-        *,
-        rounds: int = 2,
-        most_rounds: int = 8,
-        far: float = 30.0,
     ) -> None:
         """Fit models at once, from where their parameters begin, by their labels.
 
-        Those that are ``far`` behind the best after a few ``rounds`` (nats) are given up, others
-        take at most ``most_rounds``.
+        Those that are 30 nats behind the best after two rounds are given up, others take at most
+        eight.
         """
         told = f"refitting models on pieces of {near.problem.data.horizon} rows", say
 
@@ -247,15 +238,15 @@ class Table:
 
         new = [key for key in moves if key not in self.modes]
         if not is_simulated_mode(near) or len(new) < 2:
-            self.modes |= fits(new, most_rounds)
+            self.modes |= fits(new, 8)
             return
-        self.behind |= fits([key for key in new if key not in self.behind], rounds)
+        self.behind |= fits([key for key in new if key not in self.behind], 2)
         self.modes |= (tried := {key: self.behind[key] for key in new})
         values = {key: self.value(mode) for key, mode in tried.items()}
-        least = max(*values.values(), self.value(near)) - far
+        least = max(*values.values(), self.value(near)) - 30.0
         for key in new:
             del self.modes[key]
-        self.modes |= fits([key for key in new if values[key] >= least], most_rounds)
+        self.modes |= fits([key for key in new if values[key] >= least], 8)
 
     def without(self, mode: Mode, law: Attached) -> Mode:
         """Return a model without a law."""

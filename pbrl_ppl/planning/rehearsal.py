@@ -225,7 +225,7 @@ class _Regression:
         def linearised(law: Attached) -> list[Term]:
             points = list(each_grid_point(mode, law)) or library.points(law)[0]
             price = float(np.log(len(laws) * max(len(points), 1))) - law.effect.log_odds
-            each = (self.test.at(point, law).about(point) for point in points)
+            each = (self.test.at(point, law) for point in points)
             return [Term(law, a, np.arange(len(a.basis.T)), price) for a in each if a.basis.size]
 
         terms = in_parallel(linearised, laws, f"linearising {len(laws)} laws", say)

@@ -6,12 +6,11 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 import numpy as np
-from cycler import cycler
 from matplotlib.figure import Figure
-from scipy.stats import chi2, norm
+from scipy.stats import chi2
 
 from pbrl_ppl.criticism import Loop, diverged_after
-from pbrl_ppl.posterior import HDI_PROB, scalars
+from pbrl_ppl.posterior import scalars
 from pbrl_ppl.reporting import style
 from pbrl_ppl.reporting.residual_force import ForceLaw, bin_means
 from pbrl_ppl.reporting.words import error, plain, quantity
@@ -121,37 +120,6 @@ def _models(loop: Loop, before: T, after: T) -> list[tuple[str, T, str]]:
     return [("before", before, style.BEFORE), ("after", after, style.AFTER)]
 
 
-def plot_residuals(loop: Loop, width: float = style.WIDE) -> Figure:
-    """Plot held-out residuals of each state dimension in units of noise, before and after."""
-    names = list(loop.declared.residuals)
-    figure, (axes,) = style.blank_figure(width, 3.6)
-    edge = float(norm.ppf(0.5 + HDI_PROB / 2))
-    axes.axhspan(-edge, edge, color=style.BAND, zorder=0)
-    axes.axhline(0.0, color="black", linewidth=0.8, zorder=1)
-    models = _models(loop, loop.declared.residuals, loop.revised.residuals)
-    for i, (_, residuals, colour) in enumerate(models):
-        places = np.arange(len(names)) + 0.36 * (i - (len(models) - 1) / 2)
-        values = [np.asarray(residuals[name], dtype=float) for name in names]
-        finite = [each[np.isfinite(each)] for each in values]
-        drawn = axes.boxplot(
-            finite, positions=places, widths=0.3, whis=(50 - 50 * HDI_PROB, 50 + 50 * HDI_PROB),
-            manage_ticks=False, flierprops={"marker": ".", "markeredgecolor": colour, "alpha": 0.3},
-        )  # fmt: skip
-        for line in (*drawn["boxes"], *drawn["whiskers"], *drawn["caps"], *drawn["medians"]):
-            line.set_color(colour)
-        for place, each, seen in zip(places, values, finite, strict=True):
-            if seen.size < each.size:
-                axes.text(place, 0.0, "diverged", color=colour, fontsize=8, ha="center")
-    if np.abs(axes.dataLim.intervaly).max() > 12:
-        axes.set_yscale("symlog", linthresh=10.0)
-        axes.yaxis.set_major_formatter("{x:g}")
-    axes.set(xticks=range(len(names)), xticklabels=names, ylabel="residual / noise")
-    colours = {name: colour for name, _, colour in models}
-    colours[f"noise alone, {100 * HDI_PROB:.0f} %"] = style.BAND
-    style.legend(figure, style.patches(colours))
-    return figure
-
-
 def plot_errors(loop: Loop, width: float = style.WIDE) -> Figure:
     """Plot held-out errors one step ahead and at the end of a rollout, before and after."""
     titles = {
@@ -251,60 +219,3 @@ def _beside(line: Floats, measured: Floats) -> Floats:
         return line
     turns = np.round((measured[both[0]] - line[both[0]]) / (2 * np.pi))
     return np.asarray(line + 2 * np.pi * turns)
-
-
-def plot_correlations(loop: Loop, width: float = style.WIDE, most: int = 4) -> Figure:
-    """Plot correlations of errors with earlier errors and with commands; name the largest.
-
-    Noise alone puts any curve of a panel outside the band once in 100 times.
-    """
-    found = loop.misfit.correlations
-    pairs = found.pairs[found.pairs > 1].min(initial=found.pairs.max(initial=1))  # the fewest
-    panels_of = {"with itself": (found.own, 1, pairs, list(found.cells))}
-    if found.commands:
-        names = [f"{c}, {u.replace('_', ' ')}" for u in found.commands for c in found.cells]
-        driven = found.driven.reshape(len(found.driven), -1)
-        panels_of["with commands"] = (driven, 0, found.pairs.max(initial=1), names)
-    figure, panels = style.blank_figure(width, 3.2, len(panels_of), len(panels_of))
-    for axes, (title, (values, first, size, names)) in zip(panels, panels_of.items(), strict=True):
-        edge = norm.isf(0.01 / 2 / max(values.size, 1)) / np.sqrt(max(size, 1))
-        axes.axhspan(-edge, edge, color=style.BAND, zorder=0)
-        axes.axhline(0.0, color="black", linewidth=0.8, zorder=1)
-        largest, lags = np.abs(values).max(axis=0), np.arange(first, len(values) + first)
-        shown = [i for i in np.argsort(-largest) if largest[i] > edge][:most]
-        for i in (i for i in range(values.shape[1]) if i not in shown):
-            axes.plot(lags, values[:, i], ".-", color=style.PLAIN, linewidth=0.7, markersize=4)
-        for i in shown:
-            axes.plot(lags, values[:, i], ".-", linewidth=1.6, markersize=7, label=names[i])
-        if shown:
-            axes.legend(frameon=False, fontsize="small")
-        top = max(1.3 * edge, 1.1 * largest.max())
-        axes.set(title=title, xlabel="intervals before", ylim=(-top, top), xticks=lags)
-    panels[0].set_ylabel("correlation of errors")
-    return figure
-
-
-def plot_growth(loop: Loop, width: float = style.WIDE) -> Figure:
-    """Plot errors of forecasts over their length, as multiples of the error from noise alone."""
-    growth = loop.misfit.growth
-    figure, (axes,) = style.blank_figure(width, 3.2)
-    axes.axhline(1.0, color="black", linewidth=0.8)
-    axes.set_prop_cycle(style.LINES + cycler(marker=list("ooss^^")))
-    for name in (name for name, size in growth.floor[-1].items() if size > 0):
-        ratio = [
-            errors.get(name, np.nan) / (floor.get(name) or np.nan)
-            for errors, floor in zip(growth.error, growth.floor, strict=True)
-        ]
-        ended, why = np.flatnonzero(~np.isfinite(ratio)), ""
-        if ended.size:
-            said = "diverged" if np.isinf(ratio[ended[0]]) else "not measured"
-            why = f" ({said} at {growth.seconds[ended[0]]:.3g} s)"
-        axes.plot(growth.seconds, ratio, label=f"{name}{why}")
-    axes.set(xlabel="length of the forecast (s)", ylabel="error / noise alone")
-    top = axes.get_ylim()[1]
-    if top > 10:
-        axes.set_yscale("log")
-    else:
-        axes.set_ylim(0.0, max(2.0, top))
-    axes.legend(frameon=False, ncols=3, fontsize="small")
-    return figure

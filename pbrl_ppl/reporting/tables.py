@@ -82,7 +82,7 @@ def compare_models(
 def measured_parameters(candidate: Law, loop: Loop) -> tuple[str, ...]:
     """Return a candidate's parameters without those of state dimensions that were not measured."""
     sensors = {effect.name for effect in loop.catalogue if isinstance(effect.stage, Sensor)}
-    unseen = {*STATE} - {*loop.revised.residuals} if candidate.effect in sensors else set()
+    unseen = {*STATE} - {*loop.after.one_step_rmse} if candidate.effect in sensors else set()
     return tuple(name for name in candidate.units if name not in unseen)
 
 

@@ -8,7 +8,7 @@ import pytest
 from pbrl_ppl.criticism import close_loop
 from pbrl_ppl.criticism.criteria import DEFAULT
 from pbrl_ppl.criticism.held_out import forecast
-from pbrl_ppl.criticism.misfit import held_out_forecasts
+from pbrl_ppl.criticism.misfit import forecast_test
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.effects import candidates, catalogue
 from pbrl_ppl.history import History
@@ -82,4 +82,4 @@ def test_errors_of_diverging_forecasts_are_infinite(diverging) -> None:
 
 @pytest.mark.one_stack
 def test_diverging_forecasts_fail_their_test(diverging) -> None:
-    assert not held_out_forecasts(diverging, diverging.sigma, 3, DEFAULT).passed
+    assert not forecast_test(diverging, diverging.sigma, 3, DEFAULT).passed

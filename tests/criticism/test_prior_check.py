@@ -70,8 +70,6 @@ def test_the_measured_side_is_the_data_s(scene, history) -> None:
     segments = history.segments(2)
     change = (segments.observed[:, -1] - segments.start)[:, 0, STATE.index("vx")]
     one = check.dataset.sel(body="cart", state="vx")
-    assert float(one["measured_sd"]) == pytest.approx(change.std())
-    assert float(one["measured_largest"]) == pytest.approx(np.abs(change).max())
     np.testing.assert_allclose(one["measured"], np.quantile(change, QUANTILES))
 
 
@@ -179,7 +177,7 @@ def test_missing_cells_count_on_neither_side(scene, history) -> None:
     change = (segments.observed[:, -1] - segments.start)[:, 0, 0]
     assert np.isnan(change).any()
     one = check.dataset.sel(body="cart", state="x")
-    assert float(one["measured_sd"]) == pytest.approx(np.nanstd(change))
+    np.testing.assert_allclose(one["measured"], np.nanquantile(change, QUANTILES))
     assert float(one["share_inside"]) > 0.75
 
 

@@ -41,9 +41,8 @@ def revised() -> Loop:
     modes = tuple(trajectory_mode(one.problem, *one.best) for one in (before, after))
     size = Estimate(DRAG, 0.01, (DRAG - 0.02, DRAG + 0.02), "kg/s")
     added = Law(
-        "linear_drag", "puck", statistic=99.0, p_value=1e-9, parameters={"coefficient": size},
-        elpd_difference=9.0, elpd_difference_se=1.0,
-    )  # fmt: skip
+        "linear_drag", "puck", statistic=99.0, p_value=1e-9, parameters={"coefficient": size}
+    )
     found = made_up()
     return changed(
         found,
@@ -86,10 +85,6 @@ def diverging() -> Loop:
     rollout, far = found.forecasts.rollout, dict.fromkeys(found.after.rollout_rmse, np.inf)
     lost = rollout.after.copy()
     lost[12:] = np.nan
-    growth = replace(
-        found.misfit.growth,
-        error=(*found.misfit.growth.error[:2], dict.fromkeys(("x", "omega"), np.inf)),
-    )
     attrs = dict(found.posterior_after.attrs)
     fit = Fit(found.revised.fit.problem, from_groups(datasets | {"posterior": pushed}, attrs))
     return changed(
@@ -97,7 +92,6 @@ def diverging() -> Loop:
         revised=replace(found.revised, fit=fit, innovations=replace(after, phi=far_off)),
         after=replace(found.after, rollout_rmse=far),
         rollout=replace(rollout, after=lost),
-        growth=growth,
     )
 
 

@@ -115,7 +115,7 @@ def test_posterior_draws_collide(model) -> None:
 
 def test_the_prior_check_s_draws_collide(model) -> None:
     check = prior_predictive_check(model, draws=50, seed=1)
-    assert float(check.dataset["predicted_extent"].sel(body="b", state="x")) > 0.1
+    assert float(abs(check.dataset["predicted"].sel(body="b", state="x")).max()) > 0.1
 
 
 def test_calibration_s_data_collide(model) -> None:

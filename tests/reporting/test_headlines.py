@@ -8,7 +8,7 @@ import pytest
 from pbrl_ppl.criticism import Loop
 from pbrl_ppl.criticism.results import Estimate
 from pbrl_ppl.reporting import in_brief, render
-from pbrl_ppl.reporting.loop_plots import plot_errors, plot_growth, plot_rollout
+from pbrl_ppl.reporting.loop_plots import plot_errors, plot_rollout
 from pbrl_ppl.reporting.tables import acceleration_table, error_tables
 from pbrl_ppl.reporting.words import gains_in_words, number, remains_in_words, verdict_in_words
 from tests.helpers.html import Page
@@ -150,8 +150,5 @@ def test_lines_that_end_early_say_why() -> None:
         for axes in plot_rollout(changed(loop, rollout=seen)).axes
     ]
     assert notes[:3] == [["not measured after 1.9 s"], ["not measured"], []]
-    (axes,) = plot_growth(loop).axes
-    names = [text.get_text() for text in axes.get_legend().get_texts()]
-    assert names == ["x (diverged at 1 s)", "omega (diverged at 1 s)"]
     bars = plot_errors(loop).axes[1]
     assert [text.get_text() for text in bars.texts].count("diverged") == 6

@@ -155,8 +155,8 @@ def candidate(effect: str, is_upper_limit: bool = False, **sizes: float) -> Law:
 
 def test_limits_of_what_was_not_measured_are_left_out() -> None:
     findings = made_up()
-    seen = {name: findings.revised.residuals[name] for name in ("x", "y", "theta")}
-    blind = changed(findings, revised=replace(findings.revised, residuals=seen))
+    seen = {name: findings.after.one_step_rmse[name] for name in ("x", "y", "theta")}
+    blind = changed(findings, after=replace(findings.after, one_step_rmse=seen))
     bias = candidate("sensor_bias", x=0.01, y=0.01, theta=0.02, vx=0.3, vy=0.3, omega=0.1)
     positions = "x 0.0100 m, y 0.0100 m, theta 0.0200 rad"
     assert limits_in_words(bias, blind) == positions
@@ -166,9 +166,8 @@ def test_limits_of_what_was_not_measured_are_left_out() -> None:
     assert "x 0.250 m, y 0.250 m, theta 0.250 rad 100 %" in text  # estimates too
     # a coordinate of another effect is no measurement
     offset = candidate("com_offset", x=0.01, y=0.02)
-    kept = limits_in_words(
-        offset, changed(findings, revised=replace(findings.revised, residuals={}))
-    )
+    nothing = changed(findings, after=replace(findings.after, one_step_rmse={}))
+    kept = limits_in_words(offset, nothing)
     assert kept == "x 0.0100 m, y 0.0200 m"
 
 
