@@ -49,7 +49,7 @@ CANDIDATE = (
 #: Keys of an added law in JSON.
 ADDED = (
     "effect", "body", "statistic", "p_value", "parameters", "not_separable_from",
-    "simulated_nats", "simulated_share",
+    "elpd_difference", "elpd_difference_se", "simulated_nats", "simulated_share",
 )  # fmt: skip
 #: Keys of a law of the search in JSON, and of one that it does not add.
 NAMED = ("effect", "body", "sentence", "estimate", "sd", "units", "nats", "share", "confounded")
@@ -106,6 +106,9 @@ class Law:
         Effects that explain these data as well.
     parameters : dict of str to Estimate
         Posterior of each parameter in the revised model.
+    elpd_difference, elpd_difference_se : float
+        Gain of expected log predictive density over the model without it, and its standard error
+        (nats).
     """
 
     effect: str
@@ -126,6 +129,8 @@ class Law:
     sd: Mapping[str, float] = field(default_factory=dict)
     not_separable_from: tuple[str, ...] = ()
     parameters: Mapping[str, Estimate] = field(default_factory=dict)
+    elpd_difference: float = math.nan
+    elpd_difference_se: float = math.nan
 
     @property
     def chance(self) -> float:

@@ -714,6 +714,36 @@ def _carried(mode: Mode, length: int) -> SimulatedMode:
     return fit_pieces(in_pieces(mode.problem, length, simulated_states(mode)), mode.phi)
 
 
+def elpd_gain(before: Mode, after: Mode) -> tuple[float, float]:
+    """Return the gain in expected log predictive density, and its standard error.
+
+    The gain in log-density at the modes, less one nat for each further parameter that the data
+    inform (to first order that of leave-one-out cross-validation: M. Stone, Journal of the Royal
+    Statistical Society B 39, 1977). Both count correlated residuals as ``after`` does. The error is
+    that of a sum over pieces or transitions; NaN for a single one.
+    """
+
+    def densities(mode: Mode) -> Floats:
+        problem = mode.problem
+        residual = problem.residual(mode.phi)
+        if not (is_simulated(problem) and is_simulated_mode(after)):
+            return np.asarray(problem.log_density(residual, mode.sigma, mode.phi))
+        likelihood = problem.likelihood
+        initial, tau = likelihood.initial_states, np.array(after.problem.likelihood.tau)
+        rows, begin = likelihood.unwhitened(residual, mode.sigma)
+        sensed = initial.column >= 0
+        of_start = np.eye(len(mode.sigma))[initial.column[sensed]]
+        square = (rows**2).sum((1, 2)) + begin[:, sensed] ** 2 @ of_start
+        count = initial.seen.sum((1, 2)) + np.isfinite(initial.begin)[:, sensed] @ of_start
+        density = count * np.log(mode.sigma) + 0.5 * square / mode.sigma**2
+        return np.asarray(-(density / tau).sum(axis=1))
+
+    gains = densities(after) - densities(before)
+    paid = max(int(informed(after).sum()) - int(informed(before).sum()), 0)
+    n, total = len(gains), float(gains.sum()) - paid
+    return total, float(np.sqrt(n) * gains.std(ddof=1)) if n > 1 else float("nan")
+
+
 def _named(
     law: Attached,
     scored: Law | None,
@@ -729,6 +759,7 @@ def _named(
     effect, places = law.effect, mode.problem.layout.places(law.labels)
     sd = np.sqrt(np.diag(mode.covariance)[places])
     names = [parameter.name for parameter in effect.parameters]
+    gain, error = elpd_gain(climb.table.without(climb.mode, law), mode)
     return replace(
         scored or Law(effect.name, law.body, effect.sentence),
         estimate=dict(zip(names, mode.phi[places].tolist(), strict=True)),
@@ -737,6 +768,8 @@ def _named(
         simulated_nats=climb.earlier.get(law, 0.0),
         simulated_share=part,
         not_separable_from=tuple(named_beside(rival, law) for rival in rivals),
+        elpd_difference=gain,
+        elpd_difference_se=error,
     )
 
 

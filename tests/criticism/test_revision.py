@@ -127,6 +127,7 @@ def test_a_catalogued_effect_is_named_with_its_size(make_history) -> None:
     low, high = added.parameters["share"].hdi
     assert low <= 0.3 <= high  # of one seed: it does in 94 % of all
     assert high - low < 0.02
+    assert added.elpd_difference > 2 * added.elpd_difference_se
     (named,) = [one for one in found.candidates if one.effect == added.effect]
     assert named.why == "added"
     assert all(one.why for one in found.candidates)

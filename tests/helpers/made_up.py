@@ -169,6 +169,8 @@ def made_up(verdict: str = "effects-added", stuck: bool = False) -> Loop:
         p_value=1e-80,
         parameters={"coefficient": Estimate(3.0, 0.1, (2.81, 3.19), "kg/s")},
         not_separable_from=("quadratic_drag",),
+        elpd_difference=210.0,
+        elpd_difference_se=19.0,
     )
     remains = Unexplained(
         "cart", "omega", "omega", 0.34, 0.002, "its omega is off in a way that depends on omega"

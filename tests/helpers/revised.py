@@ -41,8 +41,9 @@ def revised() -> Loop:
     modes = tuple(trajectory_mode(one.problem, *one.best) for one in (before, after))
     size = Estimate(DRAG, 0.01, (DRAG - 0.02, DRAG + 0.02), "kg/s")
     added = Law(
-        "linear_drag", "puck", statistic=99.0, p_value=1e-9, parameters={"coefficient": size}
-    )
+        "linear_drag", "puck", statistic=99.0, p_value=1e-9, parameters={"coefficient": size},
+        elpd_difference=9.0, elpd_difference_se=1.0,
+    )  # fmt: skip
     found = made_up()
     return changed(
         found,

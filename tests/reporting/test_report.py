@@ -101,6 +101,7 @@ def test_page_shows_the_search_by_length_of_pieces() -> None:
         "30 3.00 x 0.0100 m – spring on cart",
         "Linear drag on the cart takes 80 % off the error of the longest pieces (480 nats"
         " of evidence).",
+        "it gains 210 ± 19.0 nats",
     ):
         assert said in text
     assert "Search for missing laws" not in page("effects-added").text  # none is made up
@@ -436,6 +437,8 @@ def test_save_writes_the_contract(tmp_path: Path) -> None:
         "p_value",
         "parameters",
         "not_separable_from",
+        "elpd_difference",
+        "elpd_difference_se",
         "simulated_nats",
         "simulated_share",
     ]
