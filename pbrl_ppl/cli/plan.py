@@ -165,7 +165,6 @@ def suggest(
     start: list[str] | None = None,
     effect: list[str] | None = None,
     bounds: list[str] | None = None,
-    actions: Path | None = None,
     steps: options.Count = 20,
     hold: options.Count | None = None,
     draws: options.Count = 16,
@@ -183,9 +182,8 @@ def suggest(
         Effects to tell apart, such as spring or 'spring on cart'; two or more. What the loop could
         not separate if not given.
     bounds : BODY.NAME=LOW,HIGH
-        What is allowed: cart.force_x=-20,20 (N, world frame; torque N m); repeat for others.
-    actions
-        Or actions (.toml), as of plan; if neither, such as were recorded.
+        What is allowed: cart.force_x=-20,20 (N, world frame; torque N m); repeat for others. Such
+        as were recorded if not given.
     steps
         Sampling intervals.
     hold
@@ -193,11 +191,9 @@ def suggest(
     draws
         Posterior draws of each effect's model.
     """
-    if bounds and actions is not None:
-        raise GoalError("suggest: --bounds and --actions both say what is allowed; drop one")
     catalogue = laws.catalogue()
     progress("reading the posterior")
-    from pbrl_ppl.planning import ActionSet, suggest_actions
+    from pbrl_ppl.planning import suggest_actions
     from pbrl_ppl.planning.experiments import kept_groups
     from pbrl_ppl.posterior import load_posterior, scene_of
 
@@ -211,11 +207,9 @@ def suggest(
         )
     bodies = [body.name for body in scene_of(idata).dynamic]
     starts = options.starts_of(start, bodies)
-    allowed = _bounds(bounds, bodies) if bounds else None
     result = suggest_actions(
-        idata, starts, allowed if actions is None else ActionSet.load(actions),
-        effects=effect, steps=steps, hold=hold, draws=draws, seed=seed, catalogue=catalogue,
-        progress=progress,
+        idata, starts, _bounds(bounds, bodies) if bounds else None, effects=effect, steps=steps,
+        hold=hold, draws=draws, seed=seed, catalogue=catalogue, progress=progress,
     )  # fmt: skip
     result.to_csv(to.output)
     contents = {

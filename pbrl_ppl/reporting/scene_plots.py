@@ -13,7 +13,7 @@ from matplotlib.patches import Circle, Patch, Polygon
 
 from pbrl_ppl.files import write_atomically
 from pbrl_ppl.planning import Goal, Plan
-from pbrl_ppl.reporting.style import NARROW, WIDE, blank_figure, legend
+from pbrl_ppl.reporting.style import blank_figure, legend
 from pbrl_ppl.scene import Body, Scene
 from pbrl_ppl.state import Floats
 
@@ -79,9 +79,7 @@ def draw_motion(axes: Axes, scene: Scene, states: Floats) -> None:
             axes.plot(x, y, color=_colour(i), linewidth=1.5, zorder=3)
 
 
-def plot_recording(
-    scene: Scene, poses: Floats, held_out: Floats | None = None, width: float = WIDE
-) -> Figure:
+def plot_recording(scene: Scene, poses: Floats, held_out: Floats | None) -> Figure:
     """Draw a scene from above, with the bodies' recorded paths.
 
     Parameters
@@ -93,10 +91,8 @@ def plot_recording(
         NaN where not measured.
     held_out : ndarray, optional
         The same of the held-out recording.
-    width : float
-        Of the figure (inches).
     """
-    figure, (axes,) = blank_figure(width, 0.62 * width if width > NARROW else width)
+    figure, (axes,) = blank_figure(5.0)
     for paths, style, alpha in ((poses, "-", 0.8), (held_out, ":", 1.0)):
         for states in () if paths is None else paths:
             for i in range(states.shape[1]):
