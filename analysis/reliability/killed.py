@@ -49,7 +49,6 @@ COMMANDS = {
     "simulate-parquet": (16, "simulate posterior.nc test.csv -o out.parquet"),
     "simulate-netcdf": (16, "simulate posterior.nc test.csv -o out.nc"),
     "plan": (16, "plan posterior.nc --start 0,0,0 --goal 1,0,- -o out.csv --nodes 200"),
-    "animate": (8, "plan posterior.nc --start 0,0,0 --goal 1,0,- --animate out.gif --nodes 200"),
     "rehearse": (4, "rehearse scene.toml test.csv --noise x=0.01,y=0.01,theta=0.01 -o out.csv"),
     "new": (20, "new models/out.toml --from shopping_cart"),
     "demo": (4, "demo -o out"),
@@ -136,11 +135,6 @@ def torn(path: Path) -> str:
             from pbrl_ppl import Scene
 
             Scene.load(path)
-        elif path.suffix in (".png", ".gif"):
-            from PIL import Image
-
-            with Image.open(path) as image:
-                image.load()
         else:
             return f"{path.name}: of what kind?"
     except Exception as error:

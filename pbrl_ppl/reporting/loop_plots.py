@@ -142,7 +142,7 @@ def plot_rollout(loop: Loop) -> Figure:
             spare = 0.5 * float(np.ptp(seen)) or 1.0
             axes.set_ylim(float(seen.min()) - spare, float(seen.max()) + spare)
         axes.set_ylabel(f"{name} ({unit})")
-    figure.supxlabel("time (s)")
+    figure.supxlabel("time (s)", fontsize=9)
     style.legend(figure, panels[0].lines)
     return figure
 
