@@ -104,7 +104,7 @@ def plot_errors(loop: Loop) -> Figure:
         for i, (_, values, colour) in enumerate(models):
             found = [(values.get(d, np.nan), floor.get(d) or np.nan, d) for d in before]
             texts = [error(v) if np.isinf(v) else quantity(v, style.UNITS[d]) for v, _, d in found]
-            shown = np.nan_to_num([v / least for v, least, _ in found], posinf=0.0)
+            shown = [float(np.nan_to_num(v / least, posinf=0.0)) for v, least, _ in found]
             shift = 0.38 * (i - (len(models) - 1) / 2)
             style.bars(axes, list(before), shown, colour, texts, shift=shift, height=0.36)
         axes.axvline(1.0, color="black", linewidth=1.0, linestyle=":")
