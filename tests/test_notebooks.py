@@ -136,9 +136,7 @@ def test_figures_of_the_paper(run, tmp_path) -> None:
 
 def test_many_robots(run, tmp_path, monkeypatch) -> None:
     """The robots' reports have no pictures here: drawing those takes most of the time."""
-    monkeypatch.setattr(
-        "pbrl_ppl.reporting.reports.picture", lambda draw: {"wide": "", "narrow": ""}
-    )
+    monkeypatch.setattr("pbrl_ppl.reporting.reports.picture", lambda plot, *data: "")
     names = run("07_many_robots.py", ROBOTS=2, TRAJECTORIES=4, INTERVALS=10, DRAWS=300)
     assert names["found"] == names["dragged"] == ["puck2"]
     assert list(names["table"]["verdict"]) == ["adequate", "effects-added"]

@@ -49,8 +49,7 @@ COMMANDS = {
     "simulate-parquet": (16, "simulate posterior.nc test.csv -o out.parquet"),
     "simulate-netcdf": (16, "simulate posterior.nc test.csv -o out.nc"),
     "plan": (16, "plan posterior.nc --start 0,0,0 --goal 1,0,- -o out.csv --nodes 200"),
-    "animate": (8, "plan posterior.nc --start 0,0,0 --goal 1,0,- --animate out.gif --nodes 200"),
-    "rehearse": (4, "rehearse scene.toml test.csv --noise x=0.01,y=0.01,theta=0.01 -o out.json"),
+    "rehearse": (4, "rehearse scene.toml test.csv --noise x=0.01,y=0.01,theta=0.01 -o out.csv"),
     "new": (20, "new models/out.toml --from shopping_cart"),
     "demo": (4, "demo -o out"),
 }
@@ -86,9 +85,9 @@ def prepare(base: Path) -> None:
 
 def without_pictures() -> None:
     """Draw one pixel for each figure: pictures take most of the time, and write no file."""
-    from pbrl_ppl.reporting import page
+    from pbrl_ppl.reporting import reports
 
-    page.picture = lambda draw: dict.fromkeys(("wide", "narrow"), "data:image/gif;base64,R0lGODlh")
+    reports.picture = lambda plot, *data: "data:image/gif;base64,R0lGODlh"
 
 
 def command(name: str, again: bool) -> list[str]:
@@ -136,11 +135,6 @@ def torn(path: Path) -> str:
             from pbrl_ppl import Scene
 
             Scene.load(path)
-        elif path.suffix in (".png", ".gif"):
-            from PIL import Image
-
-            with Image.open(path) as image:
-                image.load()
         else:
             return f"{path.name}: of what kind?"
     except Exception as error:

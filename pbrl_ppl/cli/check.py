@@ -46,7 +46,7 @@ def check(
     draws
         Draws from the prior.
     verbose
-        List all default priors of effects, not three.
+        List the default priors of effects.
     """
     declared, (loaded,) = reading.read(scene, [history])
     catalogue = reading.catalogue()
@@ -71,9 +71,8 @@ def check(
     console.print(_missing_table(missing, rows))
     for sentence in (*said, *_lacking(declared, loaded)):
         console.print(sentence, soft_wrap=True)
-    title, listed = _priors_table(priors, None if verbose else 3)
-    console.print(title, soft_wrap=True)
-    console.print(listed)
+    if verbose:
+        console.print(_priors_table(priors))
     checked = None
     if prior:
         progress("comparing with draws from the prior")
@@ -175,14 +174,12 @@ def _default_priors(scene: Scene, catalogue: Sequence[Effect]) -> dict[str, dict
     return priors
 
 
-def _priors_table(priors: dict[str, dict[str, str]], most: int | None) -> tuple[str, Table]:
-    """Return title and table of so many default priors, of all without a number, by body."""
-    names = list(dict.fromkeys(chain(*priors.values())))
-    shown = names[:most]
+def _priors_table(priors: dict[str, dict[str, str]]) -> Table:
+    """Return a table of default priors, of all without a number, by body."""
+    names = dict.fromkeys(chain(*priors.values()))
+    cells = ([name, *(those.get(name, "") for those in priors.values())] for name in names)
     title = "default priors of effects, from the recording"
-    title += f" ({len(shown)} of {len(names)}: --verbose lists all)" * (len(shown) < len(names))
-    cells = ([name, *(those.get(name, "") for those in priors.values())] for name in shown)
-    return title, table(None, dict.fromkeys(["parameter", *priors], "<"), cells)
+    return table(title, dict.fromkeys(["parameter", *priors], "<"), cells)
 
 
 @command("criticise", 4, "pbrl-ppl criticise scene.toml train.csv")

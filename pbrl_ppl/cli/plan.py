@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from pbrl_ppl.cli import options
 from pbrl_ppl.cli.app import command
-from pbrl_ppl.cli.terminal import FAILED, Progress, Result, check_file
+from pbrl_ppl.cli.terminal import FAILED, Progress, Result
 from pbrl_ppl.errors import EffectError, GoalError
 
 if TYPE_CHECKING:
@@ -82,37 +82,13 @@ class PlanSearch:
     seed: options.Seed = 1
 
 
-@dataclass(frozen=True)
-class PlanOutput(options.Output):
-    """Options of a plan's files.
-
-    Parameters
-    ----------
-    output
-        The plan (.csv).
-    animate : FILE
-        Show the plan as a picture that moves (.gif).
-    """
-
-    endings = (".csv",)
-
-    animate: Path | None = None
-
-    def __post_init__(self) -> None:
-        if self.output is None and self.animate is None:
-            raise GoalError("plan: say where it should be written: -o plan.csv")
-        super().__post_init__()
-        if self.animate is not None:
-            check_file(self.animate, (".gif",), self.overwrite)
-
-
 @command("plan", 10, "pbrl-ppl plan cart.nc --start -2,0,0 --goal 2,1,1.57 -o plan.csv")
 def plan(
     posterior: Path,
     wanted: Wanted,
     search: PlanSearch,
     laws: options.EffectFiles,
-    to: PlanOutput,
+    to: options.TableOutput,
     progress: Progress,
     start: list[str] | None = None,
     actions: Path | None = None,
@@ -121,6 +97,8 @@ def plan(
 
     Parameters
     ----------
+    output
+        The plan (.csv).
     actions
         Actions (.toml); such as the posterior's data were recorded with.
     """
@@ -142,18 +120,11 @@ def plan(
         idata, starts, goal, allowed, effects=catalogue, progress=progress,
         **options.given(vars(search)),
     )  # fmt: skip
-    if to.output is not None:
-        result.save(to.output)
-    if to.animate is not None:
-        progress("drawing")
-        from pbrl_ppl.reporting import animate_plan
-
-        animate_plan(result, to.animate)
-    written = [path for path in (to.output, to.animate) if path is not None]
+    result.save(to.output)
     words = result.in_words()
     contents = {"reached": result.reached, "duration": result.duration, "words": words}
-    shown = [words, *(f"plan: {path}" for path in written)]
-    return Result(contents | {"written": written}, shown, 0 if result.reached else FAILED)
+    shown = [words, f"plan: {to.output}"]
+    return Result(contents | {"written": [to.output]}, shown, 0 if result.reached else FAILED)
 
 
 @command("suggest", 7, "pbrl-ppl suggest report/after.nc --start 0,0,0 -o next.csv")
@@ -165,7 +136,6 @@ def suggest(
     start: list[str] | None = None,
     effect: list[str] | None = None,
     bounds: list[str] | None = None,
-    actions: Path | None = None,
     steps: options.Count = 20,
     hold: options.Count | None = None,
     draws: options.Count = 16,
@@ -183,9 +153,8 @@ def suggest(
         Effects to tell apart, such as spring or 'spring on cart'; two or more. What the loop could
         not separate if not given.
     bounds : BODY.NAME=LOW,HIGH
-        What is allowed: cart.force_x=-20,20 (N, world frame; torque N m); repeat for others.
-    actions
-        Or actions (.toml), as of plan; if neither, such as were recorded.
+        What is allowed: cart.force_x=-20,20 (N, world frame; torque N m); repeat for others. Such
+        as were recorded if not given.
     steps
         Sampling intervals.
     hold
@@ -193,11 +162,9 @@ def suggest(
     draws
         Posterior draws of each effect's model.
     """
-    if bounds and actions is not None:
-        raise GoalError("suggest: --bounds and --actions both say what is allowed; drop one")
     catalogue = laws.catalogue()
     progress("reading the posterior")
-    from pbrl_ppl.planning import ActionSet, suggest_actions
+    from pbrl_ppl.planning import suggest_actions
     from pbrl_ppl.planning.experiments import kept_groups
     from pbrl_ppl.posterior import load_posterior, scene_of
 
@@ -211,11 +178,9 @@ def suggest(
         )
     bodies = [body.name for body in scene_of(idata).dynamic]
     starts = options.starts_of(start, bodies)
-    allowed = _bounds(bounds, bodies) if bounds else None
     result = suggest_actions(
-        idata, starts, allowed if actions is None else ActionSet.load(actions),
-        effects=effect, steps=steps, hold=hold, draws=draws, seed=seed, catalogue=catalogue,
-        progress=progress,
+        idata, starts, _bounds(bounds, bodies) if bounds else None, effects=effect, steps=steps,
+        hold=hold, draws=draws, seed=seed, catalogue=catalogue, progress=progress,
     )  # fmt: skip
     result.to_csv(to.output)
     contents = {

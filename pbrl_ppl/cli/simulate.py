@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,7 +13,6 @@ from pbrl_ppl.cli import options
 from pbrl_ppl.cli.app import command
 from pbrl_ppl.cli.terminal import Progress, Result, sizes, table
 from pbrl_ppl.errors import HistoryError, ParameterError, PosteriorError, RecordingWarning, warn
-from pbrl_ppl.files import json_values, write_text
 from pbrl_ppl.scene import Scene, nearest
 from pbrl_ppl.state import STATE, Floats
 
@@ -167,17 +164,10 @@ def _history(
     return History(copies)
 
 
-@dataclass(frozen=True)
-class RehearsalOutput(options.Output):
-    """Options of an answer, or of a recording."""
-
-    endings = (".json", *options.Output.endings)
-
-
 @command("rehearse", 2, "pbrl-ppl rehearse scene.toml commands.csv --noise x=0.002,y=0.002")
 def rehearse(
     scene: Path,
-    to: RehearsalOutput,
+    to: options.Output,
     reading: options.SceneReading,
     progress: Progress,
     commands: Annotated[Path | None, typer.Argument()] = None,
@@ -194,12 +184,11 @@ def rehearse(
     commands : COMMANDS
         Initial states and wrenches (.csv, .parquet, .nc), as of simulate; proposed if not given.
     output
-        The answer (.json), or the simulated recording with its commands (.csv, .parquet, .nc).
+        The simulated recording with its commands (.csv, .parquet, .nc).
     given : NAME=VALUE
         A declared parameter (SI units): mass=8 for all bodies, or 'mass[cart]=8'; repeat. The
         prior's centre if not given.
     """
-    output = to.output
     values = options.pairs(given, "--set", "mass=8", float)
     progress("reading the scene and the commands")
     declared, histories = reading.read(scene, [] if commands is None else [[commands]])
@@ -214,10 +203,8 @@ def rehearse(
     )  # fmt: skip
     contents = {key: value for key, value in vars(found).items() if key != "history"}
     contents = {"versions": versions(), **contents}
-    if output is not None and output.suffix == ".json":
-        write_text(output, json.dumps(json_values(contents), indent=1, allow_nan=False) + "\n")
-    elif output is not None:
-        found.history.save(output)
+    if to.output is not None:
+        found.history.save(to.output)
     noise = ", ".join(f"{name} {sd:.2g}" for name, sd in found.noise.items())
     columns = {"law": "<", "body": "<", "named from": "<", "of typical": "", "named as": "<"}
     laws = table(
@@ -230,7 +217,7 @@ def rehearse(
         if not law.named:
             unseen.setdefault(law.note, []).append(f"{law.effect} on {law.body}")
     lines = [f"unseen, {why}: {', '.join(names)}" for why, names in unseen.items()]
-    lines += [f"written: {output}"] if output is not None else []
+    lines += [f"written: {to.output}"] if to.output is not None else []
     return Result(contents, [laws, *lines])
 
 

@@ -15,7 +15,6 @@ from pbrl_ppl.reporting.reports import render_logs as render_logs
 from pbrl_ppl.reporting.reports import render_posterior as render_posterior
 from pbrl_ppl.reporting.reports import render_without_verdict as render_without_verdict
 from pbrl_ppl.reporting.reports import report as report
-from pbrl_ppl.reporting.scene_plots import animate_plan as animate_plan
 from pbrl_ppl.reporting.scene_plots import draw_goal as draw_goal
 from pbrl_ppl.reporting.scene_plots import draw_motion as draw_motion
 from pbrl_ppl.reporting.scene_plots import draw_scene as draw_scene

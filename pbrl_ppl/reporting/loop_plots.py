@@ -1,4 +1,4 @@
-"""Plots of a closed loop: candidates, added effects, held-out errors, residuals."""
+"""Plots of a closed loop: candidates, held-out errors, residuals."""
 
 from __future__ import annotations
 
@@ -10,11 +10,9 @@ from matplotlib.figure import Figure
 from scipy.stats import chi2
 
 from pbrl_ppl.criticism import Loop, diverged_after
-from pbrl_ppl.posterior import scalars
 from pbrl_ppl.reporting import style
 from pbrl_ppl.reporting.residual_force import ForceLaw, bin_means
 from pbrl_ppl.reporting.words import error, plain, quantity
-from pbrl_ppl.scene import units_of
 from pbrl_ppl.state import Floats
 
 T = TypeVar("T")
@@ -25,12 +23,12 @@ HARDLY = 0.01
 MOST_CANDIDATES = 20
 
 
-def plot_candidates(loop: Loop, width: float = style.WIDE, level: float = 0.01) -> Figure:
+def plot_candidates(loop: Loop, level: float = 0.01) -> Figure:
     """Plot the score of the candidates, best on top, with the threshold of each at a level."""
     added = {(addition.effect, addition.body) for addition in loop.added}
     rest = (c for c in loop.candidates[MOST_CANDIDATES:] if (c.effect, c.body) in added)
     shown = [*loop.candidates[:MOST_CANDIDATES], *rest]
-    figure, (axes,) = style.blank_figure(width, 0.9 + 0.3 * max(len(shown), 3), grid="x")
+    figure, (axes,) = style.blank_figure(0.9 + 0.3 * max(len(shown), 3), grid="x")
     several = len({candidate.body for candidate in shown}) > 1
     thresholds = [
         chi2.isf(level / (len(loop.candidates) * max(candidate.n_grid_points, 1)), candidate.dof)
@@ -56,41 +54,10 @@ def plot_candidates(loop: Loop, width: float = style.WIDE, level: float = 0.01) 
     return figure
 
 
-def plot_added(loop: Loop, width: float = style.WIDE, most: int = 12) -> Figure:
-    """Plot the posterior of the added effects' parameters, and the values that mean no effect."""
-    shown = [
-        (added, name, estimate)
-        for added in loop.accepted
-        for name, estimate in added.parameters.items()
-    ][:most]
-    columns = min(max(len(shown), 1), 2)
-    width = width if columns > 1 else min(width, 5.0)
-    figure, panels = style.blank_figure(width, 2.6, max(len(shown), 1), columns, "x")
-    draws = scalars(loop.posterior_after)
-    effects = {effect.name: effect for effect in loop.catalogue}
-    for axes, (added, name, estimate) in zip(panels, shown, strict=False):
-        variable, x = f"{added.effect}_{name}[{added.body}]", f"{plain(name)} ({estimate.unit})"
-        if variable in draws:
-            values = draws[variable].to_numpy().ravel()
-            style.density(axes, values, style.AFTER, (values.min(), values.max()), estimate.hdi)
-        axes.plot(estimate.hdi, [-0.06] * 2, color=style.AFTER, linewidth=4, solid_capstyle="butt")
-        axes.plot(estimate.mean, -0.06, "o", color="white", markeredgecolor=style.AFTER)
-        if added.effect in effects:
-            sized = effects[added.effect].in_si(units_of(loop.scene, added.body))
-            null = {parameter.name: parameter.null for parameter in sized.parameters}[name]
-            x += f"; no effect at {null:g}"
-            if abs(null - estimate.mean) < 25 * estimate.sd:
-                axes.axvline(null, color="black", linestyle="--", linewidth=1.2)
-        title = f"{plain(added.effect)} on {added.body}"
-        axes.set(title=title, xlabel=x, ylim=(-0.14, 1.15), yticks=[])
-    return figure
-
-
-def plot_laws(laws: Sequence[ForceLaw], width: float = style.WIDE) -> Figure:
+def plot_laws(laws: Sequence[ForceLaw]) -> Figure:
     """Plot residual forces against the quantities that they depend on, with means and a curve."""
-    count = max(len(laws), 1)
-    figure, panels = style.blank_figure(width, 3.6, count, count)
-    for axes, law in zip(panels, laws, strict=False):
+    figure, panels = style.blank_figure(3.6, len(laws), len(laws))
+    for axes, law in zip(panels, laws, strict=True):
         axes.plot(law.x, law.residual.values, ".", color=style.PLAIN, markersize=3, alpha=0.6)
         bins = bin_means(law.x, law.residual.values)
         axes.errorbar(
@@ -108,8 +75,7 @@ def plot_laws(laws: Sequence[ForceLaw], width: float = style.WIDE) -> Figure:
         x, force = f"{law.quantity} ({law.unit})".replace(" (1)", ""), law.residual
         y = f"{force.name}, {force.dimension} ({force.unit})" * (law is laws[0])
         axes.set(title=f"R² {max(law.curve.share, 0):.2f}", xlabel=x, ylabel=y)
-    if laws:
-        panels[0].legend(frameon=False, fontsize="small")
+    panels[0].legend(frameon=False, fontsize="small")
     return figure
 
 
@@ -120,7 +86,7 @@ def _models(loop: Loop, before: T, after: T) -> list[tuple[str, T, str]]:
     return [("before", before, style.BEFORE), ("after", after, style.AFTER)]
 
 
-def plot_errors(loop: Loop, width: float = style.WIDE) -> Figure:
+def plot_errors(loop: Loop) -> Figure:
     """Plot held-out errors one step ahead and at the end of a rollout, before and after."""
     titles = {
         "one_step_rmse": "one step ahead",
@@ -128,46 +94,39 @@ def plot_errors(loop: Loop, width: float = style.WIDE) -> Figure:
     }
     kinds = [kind for kind in titles if getattr(loop.before, kind)]
     height = 1.2 + 0.42 * max((len(getattr(loop.before, kind)) for kind in kinds), default=1)
-    figure, panels = style.blank_figure(width, height, max(len(kinds), 1), max(len(kinds), 1), "x")
+    count = max(len(kinds), 1)
+    figure, panels = style.blank_figure(height, count, count, "x")
     for axes, kind in zip(panels, kinds, strict=False):
         before, after, floor = (
             getattr(e, kind) for e in (loop.before, loop.after, loop.noise_floor)
         )
-        has_floor = all(np.isfinite(floor.get(d, np.nan)) and floor[d] > 0 for d in before)
-        scale = floor if has_floor else {d: e if np.isfinite(e) else 1.0 for d, e in before.items()}
         models = _models(loop, before, after)
         for i, (_, values, colour) in enumerate(models):
-            found = {d: values.get(d, np.nan) for d in before}
-            shown = [np.nan_to_num(v / (scale[d] or np.nan), posinf=0.0) for d, v in found.items()]
-            texts = [
-                quantity(v, style.UNITS[d]) if np.isfinite(v) else error(v)
-                for d, v in found.items()
-            ]
+            found = [(values.get(d, np.nan), floor.get(d) or np.nan, d) for d in before]
+            texts = [error(v) if np.isinf(v) else quantity(v, style.UNITS[d]) for v, _, d in found]
+            shown = [float(np.nan_to_num(v / least, posinf=0.0)) for v, least, _ in found]
             shift = 0.38 * (i - (len(models) - 1) / 2)
             style.bars(axes, list(before), shown, colour, texts, shift=shift, height=0.36)
         axes.axvline(1.0, color="black", linewidth=1.0, linestyle=":")
         axes.margins(x=0.3)
-        scaled_by = "noise floor" if has_floor else "error before"
-        axes.set(title=titles[kind], xlabel=f"error / {scaled_by}", xlim=(0.0, None))
+        axes.set(title=titles[kind], xlabel="error / noise floor", xlim=(0.0, None))
     colours = {name: colour for name, _, colour in _models(loop, 0, 0)}
     style.legend(figure, style.patches(colours))
     return figure
 
 
-def plot_rollout(loop: Loop, width: float = style.WIDE) -> Figure:
+def plot_rollout(loop: Loop) -> Figure:
     """Plot one held-out trajectory: measured, and predicted before and after."""
     rollout = loop.forecasts.rollout
     count = len(rollout.names)
-    columns = min(count, 2)
-    figure, panels = style.blank_figure(width, 1.9, count, columns, spare=0.8)
+    figure, panels = style.blank_figure(1.9, count, min(count, 2), spare=0.8)
     for place, (name, unit) in enumerate(zip(rollout.names, rollout.units, strict=True)):
         axes, measured = panels[place], rollout.measured[:, place]
         if unit == "rad":
             measured = unwrap(measured)
         axes.plot(rollout.time, measured, "o", color="black", markersize=2.5, label="measured")
-        notes = [("black", _measured_until(rollout.time, measured))]
-        shown, models = [measured], _models(loop, rollout.before, rollout.after)
-        for which, values, colour in models:
+        seen = measured[np.isfinite(measured)]
+        for which, values, colour in _models(loop, rollout.before, rollout.after):
             line = values[:, place]
             if unit == "rad":
                 line = _beside(unwrap(line), measured)
@@ -175,33 +134,17 @@ def plot_rollout(loop: Loop, width: float = style.WIDE) -> Figure:
             axes.plot(rollout.time, line, dashes, color=colour, linewidth=1.6, label=which)
             end = diverged_after(rollout.time, values)
             if end is None:
-                shown.append(line)
+                seen = np.r_[seen, line]
             else:
-                notes.append((colour, f"{which}: diverged after {end:.3g} s"))
-        seen = np.concatenate(shown)
-        seen = seen[np.isfinite(seen)]
-        if len(shown) <= len(models) and seen.size:  # a line that diverges leaves the panel
+                note, y = f"{which}: diverged after {end:.3g} s", 0.88 - 0.11 * len(axes.texts)
+                axes.text(0.98, y, note, color=colour, transform=axes.transAxes, ha="right")
+        if axes.texts and seen.size:  # a line that diverges leaves the panel
             spare = 0.5 * float(np.ptp(seen)) or 1.0
             axes.set_ylim(float(seen.min()) - spare, float(seen.max()) + spare)
-        for i, (colour, text) in enumerate(note for note in notes if note[1]):
-            axes.text(
-                0.98, 0.97 - 0.11 * i, text, color=colour, transform=axes.transAxes, ha="right",
-                va="top", fontsize=8, bbox=style.BOX,
-            )  # fmt: skip
         axes.set_ylabel(f"{name} ({unit})")
-        if place >= count - columns:
-            axes.set_xlabel("time (s)")
+    figure.supxlabel("time (s)", fontsize=9)
     style.legend(figure, panels[0].lines)
     return figure
-
-
-def _measured_until(time: Floats, measured: Floats) -> str:
-    """Say where measurements end before the curve does; empty if they do not."""
-    seen = np.flatnonzero(np.isfinite(measured))
-    if not seen.size:
-        return "not measured"
-    last = seen[-1]
-    return "" if last + 1 == len(time) else f"not measured after {time[last]:.3g} s"
 
 
 def unwrap(angle: Floats) -> Floats:

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import combinations
 
 import numpy as np
 import pandas as pd
-import xarray as xr
 from matplotlib.figure import Figure
 from scipy.stats import rankdata
 
 from pbrl_ppl.criticism import PriorCheck
 from pbrl_ppl.effects import Effect
-from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.parameters import BODY_PARAMETERS, JOINT_ANCHORS
 from pbrl_ppl.posterior import (
     DATATREE,
@@ -27,11 +23,8 @@ from pbrl_ppl.posterior import (
     convergence,
     from_groups,
     group,
-    groups,
-    left_out,
     loo_pit,
     scalars,
-    separate,
     stored_fields,
 )
 from pbrl_ppl.reporting import style
@@ -212,78 +205,18 @@ def recorded_poses(posterior: Idata) -> Floats | None:
     return np.asarray(poses) if np.isfinite(poses[..., :2]).any() else None
 
 
-def prior_draws(posterior: Idata) -> xr.Dataset:
-    """Return one variable per scalar parameter of the prior; none if there are no prior draws."""
-    if "prior" not in groups(posterior):
-        return xr.Dataset()
-    return scalars(from_groups({"posterior": group(posterior, "prior")}, {}))
+def coverage(posterior: Idata) -> dict[str, float]:
+    """Return the share of measurements in the central 94 % of leave-one-out predictions.
 
-
-def moving(posterior: Idata) -> list[str]:
-    """Return the parameters whose draws differ."""
-    return [str(name) for name, v in scalars(posterior).items() if float(v.max() - v.min()) > 0]
-
-
-def most_dependent(posterior: Idata, most: int = 4) -> list[str]:
-    """Return the parameters whose draws depend most on each other, by rank correlation."""
-    draws, names = scalars(posterior), moving(posterior)
-    if len(names) < 2:
-        return []
-    strength = np.abs(np.nan_to_num(rank_correlations(draws, names)))
-    np.fill_diagonal(strength, 0.0)
-    chosen = list(divmod(int(strength.argmax()), len(names)))
-    while len(chosen) < min(most, len(names)):
-        rest = [i for i in range(len(names)) if i not in chosen]
-        chosen.append(max(rest, key=lambda i: float(strength[i, chosen].max())))
-    return [names[i] for i in chosen]
-
-
-def rank_correlations(draws: xr.Dataset, names: Sequence[str]) -> Floats:
-    """Return rank correlations, shape (parameter, parameter)."""
-    table = pd.DataFrame({name: draws[name].to_numpy().ravel() for name in names})
-    return np.asarray(table.corr("spearman"))
-
-
-def pit_values(posterior: Idata) -> dict[str, Floats]:
-    """Return where measurements lie in leave-one-out predictions (0 to 1), by state dimension."""
+    By state dimension; those that were not measured are left out.
+    """
     pit = loo_pit(posterior)
-    every = {str(name): pit.sel(state=name).to_numpy().ravel() for name in pit["state"].values}
-    seen = {name: values[np.isfinite(values)] for name, values in every.items()}
-    return {name: values for name, values in seen.items() if values.size}
+    inside = (abs(pit - 0.5) < 0.47).astype(float).where(pit.notnull())
+    shares = inside.mean([name for name in pit.dims if name != "state"]).dropna("state")
+    return {str(name): float(shares.sel(state=name)) for name in shares["state"].values}
 
 
-def coverage(posterior: Idata) -> dict[str, tuple[float, float, int]]:
-    """Return how leave-one-out predictions cover the measurements, by state dimension.
-
-    Shares of measurements in the central 50 % and 94 % of predictions, and their number.
-    """
-    off = {name: np.abs(values - 0.5) for name, values in pit_values(posterior).items()}
-    return {
-        name: (float((each < 0.25).mean()), float((each < 0.47).mean()), each.size)
-        for name, each in off.items()
-    }
-
-
-def pareto_k(posterior: Idata) -> tuple[Floats, float, str]:
-    """Return Pareto k, the threshold above which it is bad, and the unit left out at a time.
-
-    Raises
-    ------
-    PosteriorError
-        If ArviZ cannot compute it.
-    """
-    with warnings.catch_warnings(), np.errstate(all="ignore"):
-        warnings.simplefilter("ignore")  # ArviZ warns of a high k, which the result shows
-        try:
-            loo = arviz().loo(separate(posterior), pointwise=True)
-        except (TypeError, ValueError, KeyError, IndexError) as error:  # no finite likelihood
-            raise PosteriorError(f"leave-one-out cross-validation: {error}") from error
-    return np.asarray(loo.pareto_k, dtype=float).ravel(), float(loo.good_k), left_out(posterior)
-
-
-def plot_rank(
-    posterior: Idata, parameters: Sequence[str] | None = None, width: float = style.WIDE
-) -> Figure:
+def plot_rank(posterior: Idata, parameters: Sequence[str] | None = None) -> Figure:
     """Plot how evenly the ranks of each chain's draws are spread.
 
     A curve is the share of a chain's draws below each rank, less what an even spread gives. The
@@ -296,8 +229,6 @@ def plot_rank(
         With a group ``posterior``.
     parameters : sequence of str, optional
         Labels such as ``mass[cart]``; by default those with the worst R-hat.
-    width : float
-        Width of the figure (inches).
     """
     if parameters is None:
         parameters = most_interesting(summary(posterior))
@@ -307,98 +238,21 @@ def plot_rank(
         convergence(from_groups({"posterior": draws.isel(chain=[i])}, {}))[1]
         for i in range(draws.sizes["chain"])
     ]
-    count = len(draws.data_vars)
-    figure, panels = style.blank_figure(width, 1.7, count, min(count, 2), spare=0.6)
+    count, even = len(draws.data_vars), np.linspace(0.0, 1.0, 201)
+    figure, panels = style.blank_figure(1.7, count, min(count, 2), spare=0.6)
     for axes, (name, values) in zip(panels, draws.items(), strict=False):
         chains = values.to_numpy()
-        ranks = rankdata(chains).reshape(chains.shape) / chains.size
+        ranks = np.sort(rankdata(chains).reshape(chains.shape) / chains.size)
+        off = [np.searchsorted(each, even, side="right") / each.size - even for each in ranks]
         fewest = min(ess[str(name)] for ess in sizes)
-        size = fewest if np.isfinite(fewest) else 1.0
-        edge, largest = style.shares_below(
-            axes, {str(i): chain for i, chain in enumerate(ranks)}, size
-        )
+        # Kolmogorov's distance times the root of the size, at 1 %
+        edge = 1.63 / float(np.sqrt(max(fewest, 1.0) if np.isfinite(fewest) else 1.0))
+        axes.axhspan(-edge, edge, color=style.BAND, zorder=0)
+        axes.plot(even, np.transpose(off), linewidth=1.3)
+        largest = float(np.abs(off).max())
         top = max(1.4 * edge, 1.1 * largest)
         title = f"{name}{': chains differ' * (largest > edge)}"
         axes.set(title=title, xlabel="rank among all draws", ylim=(-top, top))
-    return figure
-
-
-def plot_prior(posterior: Idata, parameters: Sequence[str], width: float = style.WIDE) -> Figure:
-    """Plot posterior densities over those of the prior.
-
-    Parameters
-    ----------
-    posterior : InferenceData or DataTree
-        With a group ``prior``.
-    parameters : sequence of str
-        Labels such as ``mass[cart]``.
-    width : float
-        Width of the figure (inches).
-    """
-    after, before = scalars(posterior), prior_draws(posterior)
-    count = len(parameters)
-    columns = min(3, count) if width > style.NARROW else 2
-    figure, panels = style.blank_figure(width, 1.5, count, columns, None, spare=0.6, stack=False)
-    for axes, name in zip(panels, parameters, strict=False):
-        drawn = {
-            colour: draws[name].to_numpy().ravel()
-            for colour, draws in ((style.PLAIN, before), (style.AFTER, after))
-            if name in draws
-        }
-        low, high = np.quantile(next(iter(drawn.values())), [0.01, 0.99])
-        ends = min(low, drawn[style.AFTER].min()), max(high, drawn[style.AFTER].max())
-        for colour, values in drawn.items():
-            style.density(axes, values, colour, ends, ends)
-        axes.set(title=name, yticks=[], ylim=(0.0, None))
-    style.legend(figure, style.patches({"prior": style.PLAIN, "posterior": style.AFTER}))
-    return figure
-
-
-def plot_pairs(
-    posterior: Idata, parameters: Sequence[str], width: float = style.WIDE, points: int = 800
-) -> Figure:
-    """Plot some draws of each pair of parameters, with the rank correlation of all."""
-    draws = scalars(posterior)
-    correlation = rank_correlations(draws, parameters)
-    pairs = list(combinations(range(len(parameters)), 2))
-    columns = min(3, len(pairs)) if width > style.NARROW else 2
-    figure, panels = style.blank_figure(width, 2.0, len(pairs), columns, None, stack=False)
-    for axes, (i, k) in zip(panels, pairs, strict=False):
-        x, y = (draws[parameters[place]].to_numpy().ravel() for place in (i, k))
-        some = slice(None, None, max(1, len(x) // points))
-        axes.plot(x[some], y[some], ".", color=style.AFTER, markersize=2, alpha=0.4)
-        axes.locator_params(nbins=3)
-        axes.tick_params(labelsize=7)
-        title = f"{correlation[i, k]:+.2f}".replace("-", "−")
-        axes.set(title=title, xlabel=parameters[i], ylabel=parameters[k])
-    return figure
-
-
-def plot_predictions(posterior: Idata, width: float = style.WIDE) -> Figure:
-    """Plot the calibration of leave-one-out predictions, one curve a state dimension.
-
-    A curve is the share of measurements below each quantile, less what calibrated predictions give;
-    those of independent measurements stay in the band 99 times of 100.
-    """
-    seen = pit_values(posterior)
-    figure, (axes,) = style.blank_figure(width, 3.4)
-    axes.set_prop_cycle(style.LINES)
-    style.shares_below(axes, seen, min((len(values) for values in seen.values()), default=1))
-    x = "position in the prediction: 0 below all draws, 1 above"
-    axes.set(xlabel=x, ylabel="share below, less expected")
-    if seen:
-        style.legend(figure, axes.lines)
-    return figure
-
-
-def plot_pareto(k: Floats, good: float, unit: str, width: float = style.WIDE) -> Figure:
-    """Plot Pareto k of every unit left out, and the threshold above which LOO is unreliable."""
-    figure, (axes,) = style.blank_figure(width, 2.8)
-    high = ~(k <= good)
-    axes.axhline(good, color=style.BEFORE, linewidth=1.2, linestyle="--")
-    axes.plot(np.flatnonzero(~high), k[~high], ".", color=style.AFTER, markersize=4)
-    axes.plot(np.flatnonzero(high), np.nan_to_num(k[high], posinf=2.0), "x", color=style.BEFORE)
-    axes.set(xlabel=unit, ylabel="Pareto k")
     return figure
 
 
@@ -406,7 +260,7 @@ def plot_prior_check(check: PriorCheck) -> Figure:
     """Plot the measured changes of state over a segment beside those that the prior predicts."""
     bodies, states = check.dataset["body"].values, check.dataset["state"].values
     pairs = [(body, state) for body in bodies for state in states]
-    figure, panels = style.blank_figure(8.0, 1.3, len(pairs), 2, "x", spare=0.8)
+    figure, panels = style.blank_figure(1.3, len(pairs), 2, "x", spare=0.8)
     ends = ("whislo", "q1", "med", "q3", "whishi")
     for axes, (body, state) in zip(panels, pairs, strict=False):
         changes = check.dataset.sel(body=body, state=state)

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import base64
-import re
 from collections import ChainMap, Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 from urllib.parse import quote
@@ -33,16 +31,10 @@ from pbrl_ppl.reporting import (
     words,
 )
 from pbrl_ppl.reporting.motion import held_out_motions
-from pbrl_ppl.reporting.posteriors import (
-    Parameters,
-    coverage,
-    most_dependent,
-    pareto_k,
-    recorded_poses,
-)
-from pbrl_ppl.reporting.style import NARROW, WIDE, png
+from pbrl_ppl.reporting.posteriors import Parameters, coverage, recorded_poses
+from pbrl_ppl.reporting.style import png
 from pbrl_ppl.reporting.tables import tabulate
-from pbrl_ppl.reporting.words import added_labels, error, joined, plain
+from pbrl_ppl.reporting.words import added_labels, error, listed, plain
 
 T = TypeVar("T")
 
@@ -111,7 +103,7 @@ def templates() -> jinja2.Environment:
 
 
 def render_page(title: str, header: str, sections: Sequence[Section], **context: object) -> str:
-    """Return a page of HTML; pictures are drawn twice, for a page and for a telephone.
+    """Return a page of HTML.
 
     Parameters
     ----------
@@ -125,35 +117,27 @@ def render_page(title: str, header: str, sections: Sequence[Section], **context:
         Values that the templates show, by name.
     """
     environment = templates()
-    draws: list[Callable[..., Figure]] = []
-
-    def draw(plot: Callable[..., Figure], *data: object) -> Mapping[str, str]:
-        """Return the places of a picture in both widths, which is drawn after all text."""
-        draws.append(partial(plot, *data))
-        return {width: f"\0{len(draws) - 1} {width}\0" for width in ("wide", "narrow")}
 
     def rendered(name: str) -> Markup:
-        return Markup(environment.get_template(f"{name}.html.jinja").render(context, draw=draw))
+        template = environment.get_template(f"{name}.html.jinja")
+        return Markup(template.render(context, draw=picture))
 
     shown = [
         (section, environment.from_string(section.title).render(context), body)
         for section in sections
         if (body := rendered(section.template)).strip()
     ]
-    page = environment.get_template("page.html.jinja").render(
+    return environment.get_template("page.html.jinja").render(
         title=title, header=rendered(header), sections=shown
     )
-    pictures = [picture(draw) for draw in draws]
-    return re.sub(r"\0(\d+) (\w+)\0", lambda place: pictures[int(place[1])][place[2]], page)
 
 
-def picture(draw: Callable[..., Figure]) -> Mapping[str, str]:
-    """Return a picture in both widths, ``wide`` and ``narrow``, as data URLs."""
-    sizes = {"wide": WIDE, "narrow": NARROW}
+def picture(plot: Callable[..., Figure], *data: object) -> str:
+    """Return what a function plots of data as a data URL."""
     # a $ is part of a name
     with rc_context({"text.parse_math": False, "axes.titlesize": 9}):
-        data = {name: base64.b64encode(png(draw(width=width))) for name, width in sizes.items()}
-    return {name: f"data:image/png;base64,{code.decode('ascii')}" for name, code in data.items()}
+        code = base64.b64encode(png(plot(*data))).decode("ascii")
+    return f"data:image/png;base64,{code}"
 
 
 LOOP_SECTIONS = (
@@ -178,7 +162,6 @@ POSTERIOR_SECTIONS = (
     Section("scene", "The scene and the recording", "Scene"),
     Section("identifiability", "What the data say", "What the data say"),
     Section("sampler", "Did the sampler work?", "Sampler"),
-    Section("predictions", "Posterior predictions", "Predictions"),
     Section("loo", "Leave-one-out cross-validation", "LOO"),
     Section("words", "What the words mean", "Words"),
     Section("origin", "Where this came from", "Source"),
@@ -309,14 +292,7 @@ def render_posterior(
     record = PosteriorRecord.of(posterior)
     known, why_unknown = _or_why(lambda: identify(posterior, effects=effects))
     covered, why_uncovered = _or_why(lambda: coverage(posterior))
-    k, why_no_k = _or_why(lambda: pareto_k(posterior))
-    compared = compare(posterior, posterior) if k else None
-    if k and compared is None:
-        why_no_k = (
-            f"Not available: leaving out one {k[2]} at a time gives no finite number; in some draws"
-            " the likelihood is zero"
-        )
-        k = None
+    compared, why_not_compared = _or_why(lambda: compare(posterior, posterior))
     return render_page(
         f"posterior of {', '.join(body.name for body in record.scene.moving)}",
         "posterior",
@@ -324,7 +300,6 @@ def render_posterior(
         posterior=posterior,
         record=record,
         parameters=Parameters(posterior, effects),
-        dependent=most_dependent(posterior),
         source=source or Source(command="render_posterior(pp.load_posterior(...))"),
         scene=record.scene,
         poses=recorded_poses(posterior),
@@ -334,9 +309,8 @@ def render_posterior(
         unfolded=True,
         covered=covered,
         why_uncovered=why_uncovered,
-        pareto=k,
         compared=compared,
-        why_no_k=why_no_k,
+        why_not_compared=why_not_compared,
         sizes={**group(posterior, "observed_data").sizes, **sizes},
     )
 
@@ -388,7 +362,7 @@ def render_logs(rows: Sequence[Mapping[str, Any]], command: str) -> str:
             "Log": named,
             "Verdict": lambda row: row["verdict"].replace("-", " "),
             "Added laws, or what went wrong": lambda row: (
-                row.get("message") or joined(map(plain, row["added"]))
+                row.get("message") or listed(map(plain, row["added"]))
             ),
             "Error before": lambda row: error(row.get("error_before")),
             "Error after": lambda row: error(row.get("error_after")),

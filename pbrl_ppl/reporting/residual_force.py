@@ -100,8 +100,6 @@ def find_laws(loop: Loop, most: int = 3, least: float = 0.02) -> list[ForceLaw]:
         if np.ptp(x) > 1e-9 * abs(x).max()
     ]
     laws.sort(key=lambda law: (law.quantity != remains.depends_on, -law.curve.share))
-    if not laws or laws[0].quantity != remains.depends_on:
-        return []
     return [laws[0], *(law for law in laws[1:most] if law.curve.share > least)]
 
 
@@ -146,7 +144,7 @@ def _simplest(x: Floats, y: Floats) -> Curve:
         "{0:.3g} {1:+.3g} q {2:+.3g} q |q|": (one, x, x * np.abs(x)),
     }
     total = max(float(((y - y.mean()) ** 2).sum()), 1e-300)
-    best, result = np.inf, Curve("", np.zeros_like(x), 0.0)
+    curves = []
     for form, terms in forms.items():
         columns = np.stack(terms, axis=1)
         largest = np.maximum(abs(columns).max(axis=0), np.finfo(float).tiny)
@@ -156,7 +154,6 @@ def _simplest(x: Floats, y: Floats) -> Curve:
         sizes = sizes / largest
         rest = max(float(((y - columns @ sizes) ** 2).sum()), 1e-300)
         bic = len(y) * np.log(rest) + len(terms) * np.log(len(y))
-        if bic < best:
-            text = form.format(*sizes).replace("-", "−").replace(" +", " + ").replace(" −", " − ")
-            best, result = bic, Curve(text, (columns @ sizes)[order], 1.0 - rest / total)
-    return result
+        text = form.format(*sizes).replace("-", "−").replace(" +", " + ").replace(" −", " − ")
+        curves.append((bic, Curve(text, (columns @ sizes)[order], 1.0 - rest / total)))
+    return min(curves, key=lambda one: one[0])[1]

@@ -1,19 +1,15 @@
-"""Plots of scenes from above: bodies, motions, goals, animated plans."""
+"""Plots of scenes from above: bodies, motions, goals."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
-from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, Polygon
 
-from pbrl_ppl.files import write_atomically
-from pbrl_ppl.planning import Goal, Plan
-from pbrl_ppl.reporting.style import NARROW, WIDE, blank_figure, legend
+from pbrl_ppl.planning import Goal
+from pbrl_ppl.reporting.style import blank_figure, legend
 from pbrl_ppl.scene import Body, Scene
 from pbrl_ppl.state import Floats
 
@@ -79,9 +75,7 @@ def draw_motion(axes: Axes, scene: Scene, states: Floats) -> None:
             axes.plot(x, y, color=_colour(i), linewidth=1.5, zorder=3)
 
 
-def plot_recording(
-    scene: Scene, poses: Floats, held_out: Floats | None = None, width: float = WIDE
-) -> Figure:
+def plot_recording(scene: Scene, poses: Floats, held_out: Floats | None) -> Figure:
     """Draw a scene from above, with the bodies' recorded paths.
 
     Parameters
@@ -93,10 +87,8 @@ def plot_recording(
         NaN where not measured.
     held_out : ndarray, optional
         The same of the held-out recording.
-    width : float
-        Of the figure (inches).
     """
-    figure, (axes,) = blank_figure(width, 0.62 * width if width > NARROW else width)
+    figure, (axes,) = blank_figure(5.0)
     for paths, style, alpha in ((poses, "-", 0.8), (held_out, ":", 1.0)):
         for states in () if paths is None else paths:
             for i in range(states.shape[1]):
@@ -106,22 +98,15 @@ def plot_recording(
         trajectory, time = np.argwhere(shown)[0]
         draw_scene(axes, scene, poses[trajectory, time], names=True)
     places = poses[..., :2].reshape(-1, 2)
-    reach = max(body.shape.bounding_radius for body in scene.moving)
-    _show(axes, places, 1.5 * reach, figure.get_figheight() / figure.get_figwidth())
+    margin = 1.5 * max(body.shape.bounding_radius for body in scene.moving)
+    low, high = np.nanmin(places, axis=0) - margin, np.nanmax(places, axis=0) + margin
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    axes.set_aspect("equal", adjustable="datalim")
     handles = [Line2D([], [], color="black", label="fitted")]
     if held_out is not None:
         handles.append(Line2D([], [], color="black", linestyle=":", label="held out"))
     legend(figure, handles)
     return figure
-
-
-def _show(axes: Axes, places: Floats, margin: float, share: float = 1.0) -> None:
-    """Set the limits so that places are seen, with a margin (m); height over width is `share`."""
-    low, high = np.nanmin(places, axis=0) - margin, np.nanmax(places, axis=0) + margin
-    middle, half = (low + high) / 2, (high - low) / 2
-    half = np.maximum(half, [half[1] / share, half[0] * share])
-    (left, bottom), (right, top) = middle - half, middle + half
-    axes.set(xlim=(left, right), ylim=(bottom, top))
 
 
 def draw_goal(axes: Axes, scene: Scene, goal: Goal) -> None:
@@ -155,48 +140,3 @@ def _outline(body: Body, pose: Floats) -> Patch:
         return Circle((pose[0], pose[1]), float(body.shape.radius or 0.0))
     c, s = np.cos(pose[2]), np.sin(pose[2])
     return Polygon(np.array(corners) @ np.array([[c, s], [-s, c]]) + pose[:2])
-
-
-def animate_plan(plan: Plan, path: str | Path, *, frames: int = 20, draws: int = 12) -> None:
-    """Write a plan as a moving picture: the bodies under each draw, and where they should be.
-
-    Parameters
-    ----------
-    plan : Plan
-        Its predicted states are drawn.
-    path : str or Path
-        Ends in ``.gif``; written whole or not at all.
-    frames : int
-        Pictures a second at most; the plan is shown at its real speed, or so as to last 1 to 20 s.
-    draws : int
-        Posterior draws that are shown, at most.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be written there.
-    """
-    states = plan.predicted["predicted"].to_numpy()[:draws]
-    # at the speed of the plan, with no more pictures than the eye can tell apart
-    intervals = max(states.shape[1] - 1, 1)
-    step = float(np.clip(intervals * plan.scene.time_step, 1.0, 20.0)) / intervals  # shown (s)
-    every = max(1, round(1.0 / (frames * step)))
-    times = [*range(0, states.shape[1] - 1, every), states.shape[1] - 1]
-    figure = Figure(figsize=(6.0, 6.0), layout="constrained")
-    axes = figure.add_subplot()
-    reach = max(body.shape.bounding_radius for body in plan.scene.moving)
-    targets = [(t.x, t.y) for t in plan.goal.targets if t.x is not None and t.y is not None]
-    places = np.concatenate([states[..., :2].reshape(-1, 2), np.reshape(targets, (-1, 2))])
-
-    def draw(time: int) -> None:
-        axes.clear()
-        draw_goal(axes, plan.scene, plan.goal)
-        for others in states[1:]:
-            draw_scene(axes, plan.scene, others[time], faded=True)
-        draw_scene(axes, plan.scene, states[0, time])
-        _show(axes, places, 2 * reach)
-        axes.set_title(f"{time * plan.scene.time_step:.3g} s")
-
-    moving = FuncAnimation(figure, draw, frames=times, init_func=lambda: None)
-    writer = PillowWriter(fps=1.0 / (every * step))
-    write_atomically(Path(path), lambda to: moving.save(to, writer, dpi=80))

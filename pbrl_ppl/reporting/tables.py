@@ -7,13 +7,12 @@ from functools import cache
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-import xarray as xr
 
 from pbrl_ppl.criticism import Errors, Law, Loop, SearchLength
 from pbrl_ppl.effects import Sensor
 from pbrl_ppl.parameters import Prior
-from pbrl_ppl.posterior import Comparison, Identifiability, interval, scalars
-from pbrl_ppl.reporting.posteriors import Parameters, prior_draws
+from pbrl_ppl.posterior import Comparison, Identifiability
+from pbrl_ppl.reporting.posteriors import Parameters
 from pbrl_ppl.reporting.style import UNITS
 from pbrl_ppl.reporting.words import (
     chance,
@@ -294,35 +293,17 @@ def _span(low: float, high: float) -> str:
     return f"{number(low, digits)} to {number(high, digits)}"
 
 
-def width_table(known: Identifiability, parameters: Parameters) -> PageTable:
-    """Tabulate the intervals of each parameter before and after the data."""
-    before, after = (draws(parameters.posterior) for draws in (prior_draws, scalars))
+def width_table(known: Identifiability) -> PageTable:
+    """Tabulate how much narrower the data made each parameter."""
     data = {"informed": "inform it", "weak": "inform it weakly"}
-
-    def span(draws: xr.Dataset, name: str) -> str:
-        return _span(*interval(draws[name].to_numpy())) if name in draws else "–"
-
     return tabulate(
-        "What was believed, and what is known now (94 % intervals)",
+        "What the data say of each parameter",
         known.parameters,
         {
             "Parameter": lambda one: one.parameter,
-            "Before the data": lambda one: span(before, one.parameter),
-            "After": lambda one: span(after, one.parameter),
-            "Unit": lambda one: parameters.summary["unit"].get(one.parameter, ""),
             "Width left": lambda one: f"{100 * one.ratio:.3g} %",
             "The data": lambda one: data.get(one.verdict, "say nothing beyond the prior"),
         },
-        {"Unit", "The data"},
+        {"The data"},
         lambda one: "bad" * (one.verdict == "prior only"),
     )
-
-
-def coverage_table(covered: Mapping[str, tuple[float, float, int]]) -> PageTable:
-    """Tabulate the shares of measurements inside leave-one-out predictions."""
-    heads = ("State dimension", "In the central 50 %", "In the central 94 %", "Measurements")
-    rows = [
-        (name, f"{100 * half:.1f} %", f"{100 * wide:.1f} %", str(count))
-        for name, (half, wide, count) in covered.items()
-    ]
-    return PageTable("Measurements inside leave-one-out predictions", heads, rows)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -34,7 +34,7 @@ def verdict_in_words(loop: Loop) -> str:
     """
     if loop.verdict == NOT_CONVERGED:
         named = [_named(one) for one in loop.added]
-        so_far = f" (found so far: {_listed(named, 'and')})" if named else ""
+        so_far = f" (found so far: {listed(named)})" if named else ""
         return (
             f"No verdict: the chains have not converged{so_far}; take more draws (--draws),"
             " Gaussians at the modes (--method laplace), or give the parameters tighter priors."
@@ -50,7 +50,7 @@ def _found(loop: Loop) -> str:
         matters = " that matters" if loop.found.small or loop.acceleration.remaining else ""
         return f"Nothing{matters} was found missing"
     first, *more = loop.added
-    sentence = _listed([_named(one) for one in (first, *more)], "and")
+    sentence = listed([_named(one) for one in (first, *more)])
     if not more and has_size(first):
         (size,) = first.parameters.values()
         sentence += f", {with_interval(size)}"
@@ -62,7 +62,7 @@ def _named(added: Law) -> str:
     others = [plain(name) for name in added.not_separable_from]
     if len(others) > 2:
         others = [f"one of {len(others)} others that fit as well"]
-    return f"{_listed([plain(added.effect), *others], 'or')} on the {plain(added.body)}"
+    return f"{listed([plain(added.effect), *others], 'or')} on the {plain(added.body)}"
 
 
 def has_size(added: Law) -> bool:
@@ -161,7 +161,7 @@ def remains_in_words(loop: Loop) -> str:
     model = model_of(loop)
     passed = f"The {model} model passes all {tested} tests of its residual"
     if untested := [test.name for test in loop.tests if not test.tested]:
-        passed += f" that these data can fail (not {joined(untested, 'nor')})"
+        passed += f" that these data can fail (not {listed(untested, 'nor')})"
     if name := loop.acceleration.remaining:
         size, relative = loop.acceleration.after[name], loop.acceleration.relative_after[name]
         passed += (
@@ -272,7 +272,7 @@ def left_aside_in_words(loop: Loop) -> list[str]:
             for one in loop.found.hypotheses
         ]
         said.append(
-            f"Of what remains one of these would take a part off: {_listed(names, 'or')}; few rigs"
+            f"Of what remains one of these would take a part off: {listed(names, 'or')}; few rigs"
             " have it, so it was not added: declare it to try."
         )
     return [f"{one[:1].upper()}{one[1:]}" for one in said]
@@ -391,45 +391,7 @@ def share(relative: float) -> str:
     return percent(relative) if relative < LARGEST_SHARE else "> 100 %"
 
 
-def gains_in_words(
-    before: Mapping[str, float], after: Mapping[str, float], units: Mapping[str, str] = UNITS
-) -> str:
-    """Return how the errors of all state dimensions changed.
-
-    Examples
-    --------
-    >>> gains_in_words({"x": 0.2, "omega": 1.0}, {"x": 0.1, "omega": 0.1}, {"x": "m"})
-    'fell in 2 of 2 state dimensions, most in omega (by 90 %, from 1.00 to 0.100)'
-    """
-    ends = {d: (before[d], after[d]) for d in before if d in after and before[d] > 0}
-    lost = [d for d, (_, last) in ends.items() if np.isposinf(last)]
-    won = [d for d, (first, last) in ends.items() if np.isposinf(first) and d not in lost]
-    said = {"diverges": lost, "no longer diverges": won}
-    diverging = [f"{what} in {_listed(names, 'and')}" for what, names in said.items() if names]
-    shares = {d: last / first for d, (first, last) in ends.items() if d not in (*lost, *won)}
-    if not shares:
-        return "; it ".join(diverging)
-    best, worst = min(shares, key=shares.__getitem__), max(shares, key=shares.__getitem__)
-
-    def change_of(name: str) -> str:
-        size = f"from {number(before[name])} to {quantity(after[name], units.get(name, ''))}"
-        return f"{name} (by {100 * abs(1 - shares[name]):.0f} %, {size})"
-
-    fell = sum(share < 0.995 for share in shares.values())
-    parts = [f"fell in {fell} of {len(shares)} state dimensions, most in {change_of(best)}"] * (
-        fell > 0
-    )
-    if shares[worst] > 1.005:
-        parts.append(f"rose{' most' if fell < len(shares) - 1 else ''} in {change_of(worst)}")
-    return "; it ".join([*diverging, *parts]) or "did not change"
-
-
-def _listed(parts: Sequence[str], word: str) -> str:
-    """Write a list as a headline has it: ``a, b and c``."""
-    return f" {word} ".join([", ".join(parts[:-1]), parts[-1]]) if len(parts) > 1 else parts[0]
-
-
-def joined(parts: Iterable[str], word: str = "and") -> str:
-    """Write a list as words: ``a; b, and c``."""
+def listed(parts: Iterable[str], word: str = "and") -> str:
+    """Write a list as words: ``a, b and c``."""
     *most, last = [str(part) for part in parts] or [""]
-    return f"{'; '.join(most)}, {word} {last}" if most else last
+    return f"{', '.join(most)} {word} {last}" if most else last

@@ -12,7 +12,6 @@ from pbrl_ppl.parameters import Prior
 from pbrl_ppl.reporting import in_brief, render
 from pbrl_ppl.reporting.tables import limits_in_words
 from pbrl_ppl.reporting.words import (
-    gains_in_words,
     held_out_in_words,
     remains_in_words,
     verdict_in_words,
@@ -99,7 +98,6 @@ def test_intervals_without_a_verdict_are_left_out() -> None:
     text = text_of(stuck)
     for claim in ("How sure.", "How large.", "with 94 % probability", "Adding linear drag"):
         assert claim not in text
-    assert "Posterior densities of the parameters of" not in render(stuck)
     assert not any("94 % interval" in line for line in in_brief(stuck, "out"))
 
 
@@ -200,19 +198,6 @@ def test_limits_beyond_the_prior_are_no_limits() -> None:
     assert limits_in_words(
         candidate("dead_zone", threshold=1e4), changed(findings, catalogue=(own,))
     ) == ("threshold 10,000 N")
-
-
-def test_gains_name_what_changed() -> None:
-    units = {"x": "m", "theta": "rad"}
-    before = {"x": 0.2, "theta": 0.025}
-    assert gains_in_words(before, {"x": 0.1, "theta": 0.025}, units) == (
-        "fell in 1 of 2 state dimensions, most in x (by 50 %, from 0.200 to 0.100 m)"
-    )
-    assert gains_in_words(before, {"x": 0.1, "theta": 0.05}, units) == (
-        "fell in 1 of 2 state dimensions, most in x (by 50 %, from 0.200 to 0.100 m); it rose in"
-        " theta (by 100 %, from 0.0250 to 0.0500 rad)"
-    )
-    assert gains_in_words(before, before, units) == "did not change"
 
 
 def test_the_terminal_has_ten_lines_and_says_where_and_what_next() -> None:

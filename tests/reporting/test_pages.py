@@ -65,7 +65,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {name: folder / f"{name}.html" for name in pages}
 
 
-@pytest.mark.parametrize(("name", "pictures"), [("loop", 9), ("posterior", 6)])
+@pytest.mark.parametrize(("name", "pictures"), [("loop", 5), ("posterior", 2)])
 def test_page_as_a_file(files: dict[str, Path], name: str, pictures: int) -> None:
     html = files[name].read_text(encoding="utf-8")
     stands_alone(html, pictures)
@@ -80,7 +80,7 @@ def test_page_of_many_logs_as_a_file(files: dict[str, Path]) -> None:
     stands_alone(html, 0, ("cart%20%231/report.html", "told/report.html"))
     for words in (
         "1 adequate, 1 effects added, 1 failed",
-        "linear drag[cart]; angular drag[cart], and quadratic drag[cart] 12.3 1.01",
+        "linear drag[cart], angular drag[cart] and quadratic drag[cart] 12.3 1.01",
         "row 3: x is lost – –",
         "told adequate 1.00 1.00 rows were resampled",
         "logs/ -o out",
