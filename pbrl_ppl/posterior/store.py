@@ -21,7 +21,7 @@ import xarray as xr
 
 from pbrl_ppl.errors import OutputError, PosteriorError
 from pbrl_ppl.files import check_hdf5, is_as_sealed, seal, write_atomically
-from pbrl_ppl.state import Floats, Ints
+from pbrl_ppl.state import Floats
 
 #: ArviZ 1.x stores groups in an xarray.DataTree, 0.x in an InferenceData.
 DATATREE = not version("arviz").startswith("0.")
@@ -204,36 +204,21 @@ def check_schema(attrs: Mapping[str, object], where: str) -> None:
         )
 
 
-def draws(idata: Idata, n: int | None = None, seed: int = 0) -> dict[str, Floats]:
+def draws(idata: Idata) -> dict[str, Floats]:
     """Return posterior draws by name, chains joined.
 
     Parameters
     ----------
     idata : InferenceData or DataTree
         A posterior.
-    n : int, optional
-        How many, chosen at random without replacement; all by default.
-    seed : int
-        Of the choice.
 
     Returns
     -------
     dict of str to ndarray
         Shape (draw, ...), SI units.
-
-    Raises
-    ------
-    PosteriorError
-        If more are asked for than there are.
     """
     stacked = group(idata, "posterior").stack(sample=("chain", "draw")).transpose("sample", ...)
-    total = stacked.sizes["sample"]
-    if n is not None and n > total:
-        raise PosteriorError(f"posterior: {n} draws were asked for, it has {total}")
-    chosen: slice | Ints = slice(None)
-    if n is not None:
-        chosen = np.random.default_rng(seed).choice(total, n, replace=False)
-    return {str(name): stacked[name].values[chosen] for name in stacked.data_vars}
+    return {str(name): stacked[name].to_numpy() for name in stacked.data_vars}
 
 
 def scalars(posterior: Idata) -> xr.Dataset:
