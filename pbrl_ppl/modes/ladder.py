@@ -136,9 +136,8 @@ def with_robust_covariance(mode: SimulatedMode, *, many: int = 8) -> SimulatedMo
         of_dimension = by_phi[..., d, :]
         errors = autocovariance(residual[..., d], seen[..., d], start[..., d, :], of_dimension)
         errors[0] += white**2
-        score = score + np.einsum(
-            "arbp,rs,asbq->pq", of_dimension, errors[lags], of_dimension, optimize=True
-        )
+        operands = of_dimension, errors[lags], of_dimension
+        score = score + np.einsum("arbp,rs,asbq->pq", *operands, optimize=True)
     inverse = covariance_of((mode.jacobian.T @ mode.jacobian) + np.diag(slopes**2))
     robust = sandwich(inverse, score)
     _, cluster = np.unique(problem.segments.trajectory, return_inverse=True)

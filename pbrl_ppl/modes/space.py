@@ -198,16 +198,12 @@ class Space:
             slope = np.where(self.roots, np.log(0.5 * _POWER / size), 0.0).sum(axis=-1)
             return np.asarray(log_noise_prior(self.problem, log_sigma) + slope)
 
-    def each(self, q: Floats, residual: Floats) -> Floats:
-        """Return the log-likelihood of each transition at residuals, shape (n, transition)."""
-        phi, sigma = self.split(q)
+    def each(self, q: Floats) -> Floats:
+        """Return the log-likelihood of each transition at points (n, d), shape (n, transition)."""
+        residual, (phi, sigma) = self.problem.residual(self.possible(q)), self.split(q)
         with np.errstate(all="ignore"):
             value = self.problem.log_density(residual, sigma, phi)
         return np.where(np.isnan(value), -np.inf, value)
-
-    def residual(self, q: Floats) -> Floats:
-        """Return the engine's residuals, shape (n, transition, H, body, state)."""
-        return self.problem.residual(self.possible(q))
 
     def possible(self, q: Floats) -> Floats:
         """Return phi (n, p), with the centre where a point is outside what numbers can hold."""
@@ -224,7 +220,7 @@ class Space:
         """
         width = max(1, numbers // max(self.problem.measured.size, 1))
         parts = (q[first : first + width] for first in range(0, len(q), width))
-        each = np.concatenate([self.each(some, self.residual(some)) for some in parts])
+        each = np.concatenate([self.each(some) for some in parts])
         return self.log_prior(q) + each.sum(axis=1), each
 
     def log_density(self, q: Floats) -> Floats:
@@ -288,7 +284,6 @@ class Space:
 
         At a kink, or with few contacts, the curvature overstates how well a parameter is known.
         """
-        p = self.phi_size
         informed = np.flatnonzero(~self.uninformed)
         if not len(informed):
             return covariance
@@ -305,7 +300,7 @@ class Space:
         count = np.logical_and.accumulate(within, axis=2).sum(axis=2)
         stretch = np.array([distances[0], *distances])[count].mean(axis=1) / distances[0]
         extra = np.zeros(len(mean))
-        extra[:p][informed] = steps**2 * (stretch**2 - 1.0)
+        extra[informed] = steps**2 * (stretch**2 - 1.0)
         return np.asarray(covariance + np.diag(extra))
 
 

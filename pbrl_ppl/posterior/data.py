@@ -276,10 +276,9 @@ def with_recording(problem: Problem, constants: xr.Dataset, data_sha256: str) ->
         start, slope = pieces.segments.start, stored[_BY_START]
         return linearised_pieces(pieces, start, slope, stored[_TAU]).with_likelihood(prior=prior)
     coordinates = observed_coordinates(problem.scene, history)
-    data = replace(
-        problem.data, history=history, horizon=1, states=states, columns=coordinates.columns
+    problem = problem.with_data(
+        history=history, horizon=1, states=states, columns=coordinates.columns
     )
-    problem = problem.on(data)
     noise = linearised(problem, coordinates, stored["slope"], stored["linearised_at"])
     if _SENSITIVITY in stored:
         slopes = noise.slope, stored[_ORIGIN], stored[_SENSITIVITY]
@@ -345,10 +344,8 @@ def both_places(earlier: xr.Dataset, segments: Segments) -> dict[str, xr.Variabl
 def placed(idata: Idata, coords: xr.Coordinates | Mapping[str, xr.Variable]) -> Idata:
     """Return the posterior with the trajectory and time of these coordinates, and no others."""
     chosen = {name: coords[name] for name in PLACES}
-    data = {
-        name: dataset.drop_vars(PLACES, errors="ignore").assign_coords(chosen)
-        if "transition" in dataset.dims
-        else dataset
-        for name, dataset in groups(idata).items()
-    }
+    data = groups(idata)
+    for name, dataset in data.items():
+        if "transition" in dataset.dims:
+            data[name] = dataset.drop_vars(PLACES, errors="ignore").assign_coords(chosen)
     return from_groups(data, idata.attrs)

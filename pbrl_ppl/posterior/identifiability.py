@@ -115,10 +115,7 @@ class Identifiability:
         """Return plain values for ``report.json``."""
         return {
             "parameters": [asdict(width) for width in self.parameters],
-            "directions": [
-                {"weights": dict(direction.weights), "effect": direction.effect}
-                for direction in self.directions
-            ],
+            "directions": [vars(d) | {"weights": dict(d.weights)} for d in self.directions],
             "sentences": list(self.sentences),
         }
 
@@ -184,13 +181,10 @@ def identify(
         widths = tuple(_width(label, float(a), float(b), moved=0.0) for label, a, b in pairs)
     else:
         widths = _widths(layout, prior, posterior)
-    verdicts = {width.parameter: width.verdict for width in widths}
+    informed = {width.parameter for width in widths if width.verdict == INFORMED}
     # squared column norm in prior sds: the data's precision is below a tenth of the prior's
-    without = tuple(
-        label
-        for label, information in zip(labels, np.diag(gram), strict=True)
-        if information < 0.1 and verdicts[label] != INFORMED
-    )
+    little = [labels[i] for i in np.flatnonzero(np.diag(gram) < 0.1)]
+    without = tuple(label for label in little if label not in informed)
     return Identifiability(widths, without, _directions(gram, labels))
 
 

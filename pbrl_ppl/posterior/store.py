@@ -45,12 +45,6 @@ class Idata(Protocol):
 
     attrs: dict[str, Any]
 
-    def sel(self, **indexers: object) -> Idata:
-        """Select by labels in all groups."""
-
-    def copy(self) -> Idata:
-        """Copy all groups."""
-
     def __getitem__(self, name: str) -> Any:
         """Return a group, in 1.x a node of the tree."""
 
