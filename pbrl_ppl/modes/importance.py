@@ -227,8 +227,7 @@ class _StudentT:
         q = q[:, self.space.informed]
         covariance = (1.0 - retained) * np.atleast_2d(np.cov(q, rowvar=False))
         covariance += retained * self.factor @ self.factor.T
-        factor = covariance_factor(covariance)
-        return replace(self, centre=q.mean(axis=0), factor=factor)
+        return replace(self, centre=q.mean(axis=0), factor=covariance_factor(covariance))
 
 
 def importance(mode: Mode, rng: np.random.Generator) -> Marginal:

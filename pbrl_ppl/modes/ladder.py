@@ -160,6 +160,8 @@ def fit_pieces(
     tolerance: float = 0.1,
     *,
     initial_states_alone: bool = False,
+    n_steps: int = 2,
+    dampings: tuple[float, ...] = (0.03, 0.3, 3.0, 30.0, 300.0, 3e3, 3e4),
 ) -> SimulatedMode:
     """Return a mode of simulated pieces by Gauss-Newton steps, initial states projected out.
 
@@ -175,9 +177,11 @@ def fit_pieces(
         Gain in log-posterior (nats) below which it ends.
     initial_states_alone : bool
         Whether phi stays, and the initial states alone are fitted.
+    n_steps : int
+        Steps from one linearisation.
+    dampings : tuple of float
+        Dampings that are tried at once, as multiples of the last good one.
     """
-    # dampings that are tried at once, as multiples of the last good one
-    dampings = (0.03, 0.3, 3.0, 30.0, 300.0, 3e3, 3e4)
     # widths of derivatives that are tried where no step gains, as shares of the usual ones
     wider = (3.0, 0.1)
     priors, layout = problem.layout.priors, problem.layout
@@ -193,7 +197,7 @@ def fit_pieces(
         if not failed:
             steps = step.differences(scale, sizes)
         gained, predicted_gain = 0.0, step.predicted_gain
-        for _ in range(2):
+        for _ in range(n_steps):
             tried = [step.moved(damping * factor, initial_states_alone) for factor in dampings]
             points, initial_states = (np.array(values) for values in zip(*tried, strict=True))
             residuals = _residual(problem, points, initial_states)

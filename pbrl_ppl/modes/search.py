@@ -163,25 +163,23 @@ def climb(
         return LocalMode(phi, sigma, value)
     # least squares over multiples of each parameter's scale, whatever its unit
     origin = problem.layout.origin
-    scale = np.where(problem.layout.discrete, 1.0, problem.layout.scale(phi))
+    scale = problem.layout.scale(phi)
     ends = (lower - origin) / scale, (upper - origin) / scale
-    steps = np.where(problem.layout.discrete, 0.0, 1e-3)
+    steps = np.full(len(phi), 1e-3)
 
-    def residual(
-        moved: Floats, sigma: Floats, steps: Floats, engine: PartedSimulator | None = None
-    ) -> Floats:
+    def residual(moved: Floats, engine: PartedSimulator | None = None) -> Floats:
         points = np.clip(origin + scale * moved, lower, upper)  # rounding leaves no support
         z = _least_squares(problem, points, sigma, phi, engine)
         return np.nan_to_num(z, nan=FAR_OFF, posinf=FAR_OFF, neginf=-FAR_OFF)
 
-    def jacobian(moved: Floats, sigma: Floats, steps: Floats) -> Floats:
+    def jacobian(moved: Floats) -> Floats:
         size = np.minimum(steps, 0.1 * np.maximum(np.abs(moved), steps))
-        return differentiate(lambda x: residual(x, sigma, steps, slope), moved, size, *ends)
+        return differentiate(partial(residual, engine=slope), moved, size, *ends)
 
     for _ in range(rounds):
         result = least_squares(
             residual, (phi - origin) / scale, jac=jacobian, bounds=ends, x_scale="jac",
-            max_nfev=tries, ftol=1e-6, xtol=1e-6, gtol=1e-6, args=(sigma, steps),
+            max_nfev=tries, ftol=1e-6, xtol=1e-6, gtol=1e-6,
         )  # fmt: skip
         reached = np.clip(origin + scale * result.x, lower, upper)
         reached = best_tails(problem, reached, sigma)
@@ -192,7 +190,7 @@ def climb(
         if gain < _STALLED:
             break
         size = np.sqrt((result.jac**2).sum(axis=0))
-        steps = np.where(steps > 0, np.clip(1.0 / np.maximum(size, 1e-300), 1e-6, 0.1), 0.0)
+        steps = np.clip(1.0 / np.maximum(size, 1e-300), 1e-6, 0.1)
     return LocalMode(phi, sigma, value)
 
 
@@ -274,16 +272,14 @@ def _spectrum(matrix: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 @one_blas_thread
-def find_modes(
-    problem: Problem[LikelihoodT], *, seed: int | np.random.Generator = 0
-) -> list[Mode[LikelihoodT]]:
+def find_modes(problem: Problem[LikelihoodT], *, seed: int = 0) -> list[Mode[LikelihoodT]]:
     """Return modes found from several starts, best first.
 
     Parameters
     ----------
     problem : Problem
         What to fit.
-    seed : int or Generator
+    seed : int
         Of the draws from the prior.
 
     Returns
@@ -403,11 +399,7 @@ def _part(problem: Problem, transitions: int) -> Problem:
 
 @one_blas_thread
 def find_mode(
-    problem: Problem[LikelihoodT],
-    *,
-    seed: int | np.random.Generator = 0,
-    initial: Floats | None = None,
-    rounds: int | None = None,
+    problem: Problem[LikelihoodT], *, seed: int = 0, initial: Floats | None = None, rounds: int = 0
 ) -> Mode[LikelihoodT]:
     """Return the best mode with others that are not far below it; see :func:`find_modes`.
 

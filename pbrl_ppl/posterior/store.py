@@ -263,9 +263,8 @@ def convergence(idata: Idata) -> tuple[dict[str, float], dict[str, float]]:
         by importance sampling have an ESS of at most ``attrs["importance_ess"]``.
     """
     variables = scalars(idata)
-    fixed = [str(name) for name, v in variables.data_vars.items() if v.min() == v.max()]
-    constant = {name: float(variables[name].size) for name in fixed}
-    flat = variables.drop_vars(fixed)
+    constant = {str(n): float(v.size) for n, v in variables.items() if v.min() == v.max()}
+    flat = variables.drop_vars(list(constant))
     if not flat.data_vars:
         return dict.fromkeys(constant, 1.0), constant
     az = arviz()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
@@ -136,16 +137,11 @@ def joint_probabilities(idata: Idata) -> dict[str, dict[str, float]]:
             "posterior: the bodies of all its joints were named in the scene; leave out bodies of a"
             " [[joint]], with known = false, and fit again"
         )
-    table: dict[str, dict[str, float]] = {}
+    table: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
     for row in rows:
         for joint, pair in row["joints"].items():
-            probabilities = table.setdefault(joint, {})
-            name = NONE if pair is None else "-".join(pair)
-            probabilities[name] = probabilities.get(name, 0.0) + row["probability"]
-    return {
-        joint: dict(sorted(probabilities.items(), key=lambda item: -item[1]))
-        for joint, probabilities in table.items()
-    }
+            table[joint][NONE if pair is None else "-".join(pair)] += row["probability"]
+    return {joint: dict(sorted(p.items(), key=lambda item: -item[1])) for joint, p in table.items()}
 
 
 def moment_matched(prior: Prior, draws: Floats) -> Prior:
