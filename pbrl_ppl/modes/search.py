@@ -86,6 +86,11 @@ class Mode(Generic[LikelihoodT]):
     log_posterior: float
     others: tuple[Mode[LikelihoodT], ...] = ()
 
+    @property
+    def factor(self) -> Floats:
+        """Cholesky factor of the covariance, shape (p, p)."""
+        return covariance_factor(self.covariance)
+
     def noise_gaussian(self) -> tuple[Floats, Floats]:
         """Return the Laplace approximation of log sigma: mean and covariance.
 
@@ -99,8 +104,7 @@ class Mode(Generic[LikelihoodT]):
 
     def draws(self, rng: np.random.Generator, n: int) -> Floats:
         """Draw phi from the Laplace approximation, clipped to the supports, shape (n, p)."""
-        factor = covariance_factor(self.covariance)
-        moved = self.phi + rng.standard_normal((n, len(self.phi))) @ factor.T
+        moved = self.phi + rng.standard_normal((n, len(self.phi))) @ self.factor.T
         return inside(self.problem.layout.priors, moved)
 
     @cached_property
