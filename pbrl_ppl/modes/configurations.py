@@ -195,6 +195,12 @@ def configurations(scene: Scene) -> tuple[Configuration, ...]:
     return tuple(sorted(possible, key=lambda each: not each.empty))
 
 
+def nothing(scene: Scene) -> Configuration:
+    """Return the configuration without joints, whether or not the prior allows it."""
+    groups = alike(scene)
+    return _configuration(groups, [[None] * len(group.names) for group in groups])
+
+
 def one_more(scene: Scene, configuration: Configuration) -> tuple[Configuration, ...]:
     """Yield the configurations with one more joint."""
     groups, chosen, larger = alike(scene), dict(configuration.pairs), []
@@ -333,9 +339,8 @@ def _tried(
 
     ``breadth``: configurations to which further joints are added, at most.
     """
-    scene, groups = problem.scene, alike(problem.scene)
-    # without joints, whether or not the prior allows it
-    apart = _configuration(groups, [[None] * len(group.names) for group in groups])
+    scene = problem.scene
+    apart = nothing(scene)
     modes = {apart: _apart(apart.problem(problem), seed)}
     evidence = {apart: laplace(modes[apart])}
 
