@@ -32,8 +32,6 @@ from .search import is_simulated_mode as is_simulated_mode
 from .search import near_mode as near_mode
 from .search import posterior_slopes as posterior_slopes
 from .space import Space as Space
-from .space import constrain as constrain
-from .space import unconstrain as unconstrain
 from .trajectories import carried_mode as carried_mode
 from .trajectories import filtered_mode as filtered_mode
 from .trajectories import find_simulation_mode as find_simulation_mode

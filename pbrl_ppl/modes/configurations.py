@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, combinations_with_replacement, product
 from typing import Any
@@ -245,20 +245,16 @@ def stored(configurations: Sequence[Weighed]) -> list[dict[str, Any]]:
     ]
 
 
-def evidence_warning(
-    rows: Iterable[Mapping[str, Any]], *, material: float = 0.02, few: int = 50
-) -> str | None:
-    """Return a warning if the evidences of :func:`stored` rows are too uncertain, or None.
-
-    ``material``: two standard errors of the evidence may move a probability by so much.
-    ``few``: with fewer effective draws, the standard error itself says little.
-    """
+def evidence_warning(rows: Iterable[Mapping[str, Any]]) -> str | None:
+    """Return a warning if the evidences of :func:`stored` rows are too uncertain, or None."""
+    material = 0.02  # two standard errors of the evidence may move a probability by so much
     for row in rows:
         probability, error, ess = row["probability"], row["error"], row["ess"]
         if error is None:
             continue
         move = 2.0 * error * probability * (1.0 - probability)
-        if move > material or (ess < few and 4.0 * probability * (1.0 - probability) > material):
+        # with fewer than 50 effective draws, the standard error itself says little
+        if move > material or (ess < 50 and 4.0 * probability * (1.0 - probability) > material):
             joined = ", ".join(
                 f"{joint}: {NONE if pair is None else '-'.join(pair)}"
                 for joint, pair in row["joints"].items()
@@ -279,14 +275,7 @@ def evidence_warning(
 _CONTENDERS = 100.0
 
 
-def weigh(
-    problem: Problem,
-    *,
-    seed: int = 0,
-    progress: Say = silent,
-    margin: float = 25.0,
-    at_least: int = 2,
-) -> tuple[Weighed, ...]:
+def weigh(problem: Problem, *, seed: int = 0, progress: Say = silent) -> tuple[Weighed, ...]:
     """Return the probability of each configuration of the joints of unknown bodies.
 
     Each gets the mode of the continuous parameters that it leaves; the search for it begins where
@@ -306,11 +295,6 @@ def weigh(
         The same seed gives the same answer.
     progress : callable
         Called with how many configurations are done.
-    margin : float
-        A log-evidence this far below the best by the Laplace method is not looked at more closely:
-        the approximation's error is a few units, and the same for all configurations in great part.
-    at_least : int
-        So many of the best are searched in any case.
 
     Returns
     -------
@@ -325,8 +309,7 @@ def weigh(
     """
     problem.segments  # noqa: B018  # checks the initial states, once for all
     modes, evidence = _tried(problem, seed, progress)
-    tried, worth = tuple(modes), _worth(modes)
-    leading = _leading(evidence, _CONTENDERS, at_least=at_least)
+    worth, leading = _worth(modes), _leading(evidence, _CONTENDERS, at_least=2)
     for configuration in counted(leading, len(leading), "looking again", progress):
         mode = modes[configuration]
         if configuration.empty:
@@ -335,16 +318,17 @@ def weigh(
             better = _searched_again(mode, configuration, worth, seed)
         if better.log_posterior > mode.log_posterior:
             modes[configuration], evidence[configuration] = better, laplace(better)
-    close = _leading(evidence, margin)
+    # Laplace's error is a few nats, and the same for all configurations in great part
+    close = _leading(evidence, 25.0)
     if len(close) > 1:
         rng = np.random.default_rng(seed)
         for configuration in counted(close, len(close), "weighing joints", progress):
             evidence[configuration] = importance(modes[configuration], rng)
-    score = np.array([e.log_prior + evidence[e].log_z for e in tried])
+    score = np.array([e.log_prior + evidence[e].log_z for e in modes])
     probability = np.exp(score - logsumexp(score))
     return tuple(
-        Weighed(configuration, modes[configuration], evidence[configuration], float(p))
-        for configuration, p in zip(tried, probability, strict=True)
+        Weighed(configuration, mode, evidence[configuration], float(p))
+        for (configuration, mode), p in zip(modes.items(), probability, strict=True)
     )
 
 
@@ -367,8 +351,7 @@ def _tried(
             evidence[configuration] = laplace(modes[configuration])
 
     if number(scene) <= MOST:
-        others = {other: apart for other in configurations(scene) if not other.empty}
-        extend(others, "trying joints")
+        extend({e: apart for e in configurations(scene) if not e.empty}, "trying joints")
         return modes, evidence
     best, levels = [apart], len(apart.pairs)
     for level in range(levels):
@@ -452,39 +435,27 @@ def _best(problem: Problem, found: list[Mode], worth: float, *, rounds: int = 2)
     return first if first.log_posterior < worth else find_mode(problem, initial=first.phi)
 
 
-def _searched_again(
-    mode: Mode,
-    configuration: Configuration,
-    worth: float,
-    seed: int,
-    *,
-    starts: int = 4,
-    screened: int = 200,
-) -> Mode:
+def _searched_again(mode: Mode, configuration: Configuration, worth: float, seed: int) -> Mode:
     """Return a better mode with the same anchors and any bodies' parameters.
 
-    ``starts``: starts of each of these configurations: a wheel's axes may have been caught in a
+    It begins at the best four of 200 draws from the prior: a wheel's axes may have been caught in a
     local optimum.
-
-    ``screened``: draws from the prior that they are chosen from.
     """
     problem, priors = mode.problem, mode.problem.layout.priors
-    draws = prior_draws(priors, np.random.default_rng(seed), screened)
+    draws = prior_draws(priors, np.random.default_rng(seed), 200)
     places = _anchor_places(problem, configuration)
     draws[:, places] = mode.phi[places]
     draws = inside(priors, draws)
     z = np.nan_to_num(problem.coarse.whitened(draws, mode.sigma), nan=1e6)
-    order = np.argsort(np.log1p(z**2).sum(axis=(1, 2)))[:starts]
+    order = np.argsort(np.log1p(z**2).sum(axis=(1, 2)))[:4]
     return _best(problem, _climbed(problem, draws[order]), worth)
 
 
-def _joined(problem: Problem, configuration: Configuration) -> Iterator[tuple[str, Joint]]:
-    """Yield the names and joints of a configuration, as in its scene."""
-    chosen = {name for name, pair in configuration.pairs if pair is not None}
-    scene = problem.scene
-    for name, joint in zip(scene.joint_names, scene.joints, strict=True):
-        if name in chosen:
-            yield name, joint
+def _joined(problem: Problem, configuration: Configuration) -> list[tuple[str, Joint]]:
+    """Return the names and joints of a configuration, as in its scene."""
+    chosen, scene = dict(configuration.pairs), problem.scene
+    named = zip(scene.joint_names, scene.joints, strict=True)
+    return [(name, joint) for name, joint in named if chosen.get(name) is not None]
 
 
 def _anchor_places(problem: Problem, configuration: Configuration) -> list[int]:
@@ -505,45 +476,36 @@ def _placed(problem: Problem, configuration: Configuration) -> list[Floats]:
     return [np.concatenate(anchors) for anchors in zip(*alternatives, strict=False)]
 
 
-def _anchors(
-    problem: Problem, name: str, joint: Joint, *, n_starts: int = 12, kept: int = 2
-) -> list[Floats]:
+def _anchors(problem: Problem, name: str, joint: Joint) -> list[Floats]:
     """Return anchors that keep their distance over the recording: zero for a hinge.
 
-    A hinge's are linear least squares; a rod's are not, and are sought from several starts.
-
-    ``n_starts``: starts of the search by geometry.
-    ``kept``: anchors that are kept.
+    A hinge's are linear least squares; a rod's are not: the best two from twelve starts.
     """
     priors = [problem.layout.priors[problem.layout.index(anchor, name)] for anchor in JOINT_ANCHORS]
     a, b = (_states(problem, body) for body in joint.bodies or ())
     by_anchors = np.concatenate([_turns(a), -_turns(b)], axis=2)
 
-    def miss(anchors: Floats) -> tuple[Floats, Floats]:
-        """Return how far from their distance the anchors are, and the derivative of that."""
-        apart = (a - b)[:, :2] + by_anchors @ anchors
-        if joint.kind == "hinge":
-            return apart[:-1].ravel(), by_anchors[:-1].reshape(-1, len(anchors))
-        length = np.maximum(np.linalg.norm(apart, axis=1), np.finfo(float).tiny)
-        slope = np.einsum("ri,ria->ra", apart / length[:, None], by_anchors)
-        return length[:-1] - length[-1], slope[:-1] - slope[-1]
-
-    starts = prior_draws(priors, np.random.default_rng(0), n_starts)
-    starts[0] = [prior.centre for prior in priors]
-    starts = inside(priors, starts[:1] if joint.kind == "hinge" else starts)
     bounds = np.array([prior.support for prior in priors]).T
     size = float(np.ptp(bounds, axis=0).min())  # so that the optimiser's tolerances have no unit
+
+    def miss(u: Floats) -> tuple[Floats, Floats]:
+        """Return how far from their distance anchors are, and its derivative, in units of size."""
+        apart = (a - b)[:, :2] + by_anchors @ (size * u)
+        if joint.kind == "hinge":
+            return apart[:-1].ravel() / size, by_anchors[:-1].reshape(-1, len(u))
+        length = np.maximum(np.linalg.norm(apart, axis=1), np.finfo(float).tiny)
+        slope = np.einsum("ri,ria->ra", apart / length[:, None], by_anchors)
+        return (length[:-1] - length[-1]) / size, slope[:-1] - slope[-1]
+
+    starts = prior_draws(priors, np.random.default_rng(0), 12)
+    starts[0] = [prior.centre for prior in priors]
+    starts = inside(priors, starts[:1] if joint.kind == "hinge" else starts)
     results = [
-        least_squares(
-            lambda u: miss(size * u)[0] / size,
-            start / size,
-            lambda u: miss(size * u)[1],
-            bounds / size,
-        )
+        least_squares(lambda u: miss(u)[0], start / size, lambda u: miss(u)[1], bounds / size)
         for start in starts
     ]
     results.sort(key=lambda result: float(result.cost))
-    return [size * result.x for result in results[:kept]]
+    return [size * result.x for result in results[:2]]
 
 
 def _states(problem: Problem, body: str, *, most_rows: int = 500) -> Floats:

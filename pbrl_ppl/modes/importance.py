@@ -82,9 +82,7 @@ def adaptive_importance(
     enough: float,
     smooth: Callable[[Floats], tuple[Floats, float]] = normalised,
     most_batches: int = 40,
-    patient_batches: int = 16,
     trial_batches: int = 6,
-    hopeless_share: float = 0.3,
     max_pareto_k: float = 0.7,
     say: Say = silent,
 ) -> tuple[WeightedPoints, ProposalT]:
@@ -105,18 +103,14 @@ def adaptive_importance(
     batch : int
         Points of a batch.
     enough : float
-        Effective number of points that suffices.
+        Effective number of points that suffices; after 16 batches it falls with their number.
     smooth : callable
         Takes log-weights, returns weights that add up to one and their Pareto k.
     most_batches : int
         Batches at most.
-    patient_batches : int
-        Batches after which the number that suffices falls with their number.
     trial_batches : int
-        Batches after which it ends without success if, at this pace, less than `hopeless_share` of
-        the number that suffices would be reached.
-    hopeless_share : float
-        See `trial_batches`.
+        Batches after which it ends without success if, at this pace, less than 0.3 of the number
+        that suffices would be reached.
     max_pareto_k : float
         Largest Pareto k that suffices.
     say : callable
@@ -146,9 +140,9 @@ def adaptive_importance(
             break
         weight, k = smooth(log_weight[there])
         size = 1.0 / float((weight**2).sum())
-        good = k <= max_pareto_k and size >= enough * min(1.0, patient_batches / turn)
+        good = k <= max_pareto_k and size >= enough * min(1.0, 16 / turn)
         best = max(best, size)
-        hopeless = best * most_batches < hopeless_share * enough * turn
+        hopeless = best * most_batches < 0.3 * enough * turn
         if good or (turn >= trial_batches and hopeless):
             break
         chosen = q[there][systematic(weight, len(q), rng)]
@@ -233,13 +227,10 @@ class _StudentT:
         q = q[:, self.space.informed]
         covariance = (1.0 - retained) * np.atleast_2d(np.cov(q, rowvar=False))
         covariance += retained * self.factor @ self.factor.T
-        factor = covariance_factor(covariance)
-        return replace(self, centre=q.mean(axis=0), factor=factor)
+        return replace(self, centre=q.mean(axis=0), factor=covariance_factor(covariance))
 
 
-def importance(
-    mode: Mode, rng: np.random.Generator, *, draws: int = 1000, rounds: int = 12, enough: int = 200
-) -> Marginal:
+def importance(mode: Mode, rng: np.random.Generator) -> Marginal:
     """Return the evidence by adaptive importance sampling from a Student-t.
 
     It begins with the Laplace approximation. It sees what is about one mode: other modes, and a
@@ -251,10 +242,6 @@ def importance(
         Of a problem of continuous parameters.
     rng : Generator
         Source of randomness.
-    draws, rounds : int
-        Draws a round, and rounds at most.
-    enough : int
-        Effective draws at which it ends: 200 give the log-evidence to within 0.07.
     """
     space = Space.of(mode)
     centre, covariance = space.laplace(mode)
@@ -264,10 +251,10 @@ def importance(
     def density(q: Floats) -> tuple[Floats, Floats]:
         return space.log_density(q), np.zeros((len(q), 0))
 
+    # 200 effective draws give the log-evidence to within 0.07
     proposals, _ = adaptive_importance(
-        _StudentT(space, centre[informed], factor), density, len(informed), rng, batch=draws,
-        enough=enough,
-        most_batches=rounds, trial_batches=rounds,
+        _StudentT(space, centre[informed], factor), density, len(informed), rng, batch=1000,
+        enough=200, most_batches=12, trial_batches=12,
     )  # fmt: skip
     error = float(np.sqrt(max(1.0 / max(proposals.ess, 1.0) - 1.0 / len(proposals.q), 0.0)))
     return Marginal(proposals.log_z, error, proposals.ess)

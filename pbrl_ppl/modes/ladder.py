@@ -7,7 +7,6 @@ were simulated there.
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -81,9 +80,8 @@ def piece_lengths(mode: Mode) -> list[int]:
             f"history: its longest trajectory has {longest + 1} rows, a simulation is judged by at"
             " least 3; record longer trajectories"
         )
-    initial_states = in_pieces(
-        mode.problem, longest, mode.problem.data.smoothed_states
-    ).likelihood.initial_states
+    whole = in_pieces(mode.problem, longest, mode.problem.data.smoothed_states)
+    initial_states = whole.likelihood.initial_states
     measured, unknown = int(initial_states.measured.sum()), initial_states.unknown + len(mode.phi)
     if measured <= unknown:
         raise HistoryError(
@@ -138,9 +136,8 @@ def with_robust_covariance(mode: SimulatedMode, *, many: int = 8) -> SimulatedMo
         of_dimension = by_phi[..., d, :]
         errors = autocovariance(residual[..., d], seen[..., d], start[..., d, :], of_dimension)
         errors[0] += white**2
-        score = score + np.einsum(
-            "arbp,rs,asbq->pq", of_dimension, errors[lags], of_dimension, optimize=True
-        )
+        operands = of_dimension, errors[lags], of_dimension
+        score = score + np.einsum("arbp,rs,asbq->pq", *operands, optimize=True)
     inverse = covariance_of((mode.jacobian.T @ mode.jacobian) + np.diag(slopes**2))
     robust = sandwich(inverse, score)
     _, cluster = np.unique(problem.segments.trajectory, return_inverse=True)
@@ -164,11 +161,7 @@ def fit_pieces(
     *,
     initial_states_alone: bool = False,
     n_steps: int = 2,
-    much: float = 0.2,
     dampings: tuple[float, ...] = (0.03, 0.3, 3.0, 30.0, 300.0, 3e3, 3e4),
-    least_damping: float = 1e-8,
-    wider: tuple[float, ...] = (3.0, 0.1),
-    first_width: float = 1e-4,
 ) -> SimulatedMode:
     """Return a mode of simulated pieces by Gauss-Newton steps, initial states projected out.
 
@@ -186,26 +179,20 @@ def fit_pieces(
         Whether phi stays, and the initial states alone are fitted.
     n_steps : int
         Steps from one linearisation.
-    much : float
-        A step that gains less than this share of all of them is the last of a linearisation.
     dampings : tuple of float
         Dampings that are tried at once, as multiples of the last good one.
-    least_damping : float
-        The least damping.
-    wider : tuple of float
-        Widths of derivatives that are tried where no step gains, as shares of the usual ones.
-    first_width : float
-        First steps of derivatives, as shares of each scale.
     """
+    # widths of derivatives that are tried where no step gains, as shares of the usual ones
+    wider = (3.0, 0.1)
     priors, layout = problem.layout.priors, problem.layout
     scale = layout.scale(phi)
     sizes = problem.likelihood.initial_states.coordinates.sizes(problem.scene)
     phi, start = inside(priors, phi), problem.segments.start
-    steps = first_width * scale, first_width * sizes
+    steps = 1e-4 * scale, 1e-4 * sizes
     damping, failed, one_sided = 1e-3, 0, True
     for _ in range(rounds):
         residual, *slopes = _linearised(problem, phi, start, steps, one_sided)
-        step = _Step(problem, phi, start, residual, *slopes)
+        step = _Step(problem, phi, start, (residual, *slopes))
         problem = step.problem
         if not failed:
             steps = step.differences(scale, sizes)
@@ -214,18 +201,16 @@ def fit_pieces(
             tried = [step.moved(damping * factor, initial_states_alone) for factor in dampings]
             points, initial_states = (np.array(values) for values in zip(*tried, strict=True))
             residuals = _residual(problem, points, initial_states)
-            costs = [
-                step.cost(*trial) for trial in zip(points, initial_states, residuals, strict=True)
-            ]
+            costs = [step.cost(*point, z) for point, z in zip(tried, residuals, strict=True)]
             best = int(np.argmin(costs))
             gain = step.cost_before - costs[best]
             if gain > 0:
                 phi, start = points[best], initial_states[best]
-                step = step.at(phi, start, residuals[best])
+                step.move(phi, start, residuals[best])
             gained += max(gain, 0.0)
-            if gain <= max(tolerance, much * gained):
+            if gain <= max(tolerance, 0.2 * gained):
                 break
-            damping = min(max(damping * dampings[best], least_damping), 1.0)
+            damping = min(max(damping * dampings[best], 1e-8), 1.0)
         if gained > tolerance:
             failed = 0
             continue
@@ -240,30 +225,22 @@ def fit_pieces(
         damping, failed = 1e-3, failed + 1
     else:
         residual, *slopes = _linearised(problem, phi, start, steps)
-    return _Step(problem, phi, start, residual, *slopes).mode()
+    return _Step(problem, phi, start, (residual, *slopes)).mode()
 
 
 @one_blas_thread
-def fit_pieces_closely(
-    problem: SimulatedProblem,
-    phi: Floats,
-    rounds: int = 8,
-    tolerance: float = 0.5,
-    *,
-    repeats: int = 2,
-    worth: float = 1.0,
-) -> SimulatedMode:
+def fit_pieces_closely(problem: SimulatedProblem, phi: Floats) -> SimulatedMode:
     """Return a mode of simulated pieces that climbs from the linearised initial states confirm.
 
     Friction makes kinks, at which Gauss-Newton steps of parameters and initial states end. Climbs
-    of the parameters alone go on from there, and the initial states follow. ``repeats`` of both,
-    until they gain less than ``worth`` (nats); other arguments as of :func:`fit_pieces`.
+    of the parameters alone go on from there, and the initial states follow: twice, or until that
+    gains less than a nat.
     """
-    mode = fit_pieces(problem, phi, rounds, tolerance)
-    for _ in range(repeats):
+    mode = fit_pieces(problem, phi, rounds=8, tolerance=0.5)
+    for _ in range(2):
         climbed = near_mode(mode.problem, mode.phi)
-        better = fit_pieces(mode.problem, climbed.phi, rounds, tolerance)
-        if better.log_posterior < mode.log_posterior + worth:
+        better = fit_pieces(mode.problem, climbed.phi, rounds=8, tolerance=0.5)
+        if better.log_posterior < mode.log_posterior + 1.0:
             break
         mode = better
     return mode
@@ -328,14 +305,9 @@ class _Step:
     """Gauss-Newton steps from one linearisation, with fixed noise, weights and projection."""
 
     def __init__(
-        self,
-        problem: SimulatedProblem,
-        phi: Floats,
-        start: Floats,
-        residual: Floats,
-        by_phi: Floats,
-        by_start: Floats,
+        self, problem: SimulatedProblem, phi: Floats, start: Floats, slopes: tuple[Floats, ...]
     ) -> None:
+        residual, by_phi, by_start = slopes
         problem = linearised_about(problem, start, by_start)
         likelihood, self.by_start = problem.likelihood, by_start
         self.sigma = likelihood.profile(residual, problem.least_noise)
@@ -352,9 +324,10 @@ class _Step:
         projected = self.by_phi - self.u @ (np.swapaxes(self.u, 1, 2) @ self.by_phi)
         self.jacobian = projected.reshape(pieces * self.u.shape[1], len(phi))
         self.normal = self.jacobian.T @ self.jacobian
-        self._move(phi, start, residual)
+        self.move(phi, start, residual)
 
-    def _move(self, phi: Floats, start: Floats, residual: Floats) -> None:
+    def move(self, phi: Floats, start: Floats, residual: Floats) -> None:
+        """Go on from another point, with the same derivatives."""
         self.phi, self.start, self.residual = phi, start, residual
         self.rows = self._rows(start, residual)
         left = without(self.u, self.rows)
@@ -363,12 +336,6 @@ class _Step:
         self.gradient = self.jacobian.T @ left.ravel() - slopes * prior_residual(priors, phi)
         self.precision = self.normal + np.diag(slopes**2)
         self.cost_before = self._profiled(left, residual, phi)
-
-    def at(self, phi: Floats, start: Floats, residual: Floats) -> _Step:
-        """Return the steps from another point, with the same derivatives."""
-        other = copy(self)
-        other._move(phi, start, residual)
-        return other
 
     def _rows(self, start: Floats, residual: Floats) -> Floats:
         """Return weighted residuals with those of the initial states, shape (piece, row)."""
@@ -381,9 +348,9 @@ class _Step:
 
     def _profiled(self, left: Floats, residual: Floats, phi: Floats) -> float:
         """Return the cost of projected rows; ``residual`` has their shape before."""
-        cut = residual[0].size
+        cut, squares = residual[0].size, left**2
         square = self.initial_states.totals(
-            left[:, :cut].reshape(residual.shape) ** 2, left[:, cut:] ** 2
+            squares[:, :cut].reshape(residual.shape), squares[:, cut:]
         )
         sigma = np.sqrt(square / self.initial_states.counts) / self.weight
         return _cost(self.problem, np.maximum(sigma, self.problem.least_noise), phi)
@@ -401,29 +368,20 @@ class _Step:
         """Gain that the derivatives predict (nats)."""
         return 0.5 * float(self.gradient @ covariance_of(self.precision) @ self.gradient)
 
-    def differences(
-        self,
-        scale: Floats,
-        sizes: Floats,
-        *,
-        of_phi: float = 0.5,
-        of_start: float = 0.3,
-        least: float = 1e-6,
-        most: float = 2e-2,
-    ) -> tuple[Floats, Floats]:
+    def differences(self, scale: Floats, sizes: Floats) -> tuple[Floats, Floats]:
         """Return steps of the next derivatives, shapes (p,) and (cell,).
 
-        ``of_phi``, ``of_start``: steps as shares of the standard deviations of phi and of a start.
-        ``least``, ``most``: the least and the largest steps, as shares of each scale.
+        They are half a standard deviation of phi, and 0.3 of a start, but within 1e-6 and 2e-2 of
+        each scale.
         """
-        width = of_phi / np.sqrt(np.maximum(np.diag(self.precision), 1e-300))
-        width = np.clip(width, least * scale, most * scale)
+        width = 0.5 / np.sqrt(np.maximum(np.diag(self.precision), 1e-300))
+        width = np.clip(width, 1e-6 * scale, 2e-2 * scale)
         by_start = np.where(self.initial_states.seen[..., None], self.by_start, 0.0)
         precision = ((by_start * self.weight[:, None]) ** 2).sum((1, 2, 3))
         of_weight = self.initial_states.of_coordinates(self.weight)
         precision += np.isfinite(self.initial_states.begin) * of_weight**2
-        begin = of_start / np.sqrt(np.maximum(np.median(precision, axis=0), 1e-300))
-        return width, np.clip(begin, least * sizes, most * sizes)
+        begin = 0.3 / np.sqrt(np.maximum(np.median(precision, axis=0), 1e-300))
+        return width, np.clip(begin, 1e-6 * sizes, 2e-2 * sizes)
 
     def moved(self, damping: float, initial_states_alone: bool) -> tuple[Floats, Floats]:
         """Return phi and initial states a damped step on, shapes (p,) and (piece, body, 6)."""

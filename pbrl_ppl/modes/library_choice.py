@@ -48,28 +48,19 @@ class _Combinations:
         self.likelihood = problem.likelihood
         self.observations = Observations(measured, problem.observations.columns)
         self.indices = np.array(list(product(*possible)), dtype=np.intp).reshape(count, -1)
-        self.log_prior = np.sum(
-            [np.log(p[self.indices[:, i]]) for i, p in enumerate(priors)], axis=0
-        )
+        logs = [np.log(p[self.indices[:, i]]) for i, p in enumerate(priors)]
+        self.log_prior = np.sum(logs, axis=0)
         owners = [owner for block in part.physics.layout.blocks for owner in block.owners]
         whose = [bodies.index(owner) for owner in owners]
         phi = table[part.places, self.indices[:, whose]].reshape(count, -1)
-        segments = problem.segments
-        states = part.simulator(
-            phi, segments.start[:, part.bodies], problem.inputs[:, :, part.bodies]
-        )
-        self.residual = self.observations.residual(states)
+        start, inputs = problem.segments.start[:, part.bodies], problem.inputs[:, :, part.bodies]
+        self.residual = self.observations.residual(part.simulator(phi, start, inputs))
 
-    def log_joint(
-        self, sigma: Floats, nu: float | Floats | None, *, numbers: int = 4_000_000
-    ) -> Floats:
-        """Return the log-density of data and combination given sigma, shape (draw, combination).
-
-        ``numbers``: numbers held at once.
-        """
+    def log_joint(self, sigma: Floats, nu: float | Floats | None) -> Floats:
+        """Return the log-density of data and combination given sigma, shape (draw, combination)."""
         seen = self.observations.measured
         result = np.empty((len(sigma), len(self.indices)))
-        size = max(1, numbers // max(self.residual.size, 1))
+        size = max(1, 4_000_000 // max(self.residual.size, 1))  # numbers held at once
         for begin in range(0, len(sigma), size):
             part = sigma[begin : begin + size, None]
             densities = self.likelihood.log_density(self.residual[None], part, seen, nu)
@@ -78,14 +69,7 @@ class _Combinations:
 
 
 def choose_from_library(
-    problem: Problem,
-    draws: int,
-    chains: int,
-    seed: int,
-    *,
-    df: int = 5,
-    wider: float = 1.2,
-    proposals: int = 10,
+    problem: Problem, draws: int, chains: int, seed: int
 ) -> tuple[Floats, Floats, Ints, Ints]:
     """Draw sigma from its marginal posterior, and the parameter sets given sigma.
 
@@ -101,12 +85,6 @@ def choose_from_library(
         Draws of each chain, and chains.
     seed : int
         Of the draws.
-    df : int
-        Degrees of freedom of the proposal of log sigma.
-    wider : float
-        Its width over the posterior's.
-    proposals : int
-        Proposals a draw.
 
     Returns
     -------
@@ -141,10 +119,10 @@ def choose_from_library(
     begin = problem.likelihood.centre(_estimated_sigma(problem, parts, median))
     top = minimize(lambda x: -float(density(x[None])[0]), begin, method="L-BFGS-B").x
     # log sigma of n residuals has about this precision; wider, for combinations that mix
-    variance = wider**2 / (2.0 * counts + spread**-2.0)
-    proposal = stats.multivariate_t(top, np.diag(variance), df=df)
+    variance = 1.2**2 / (2.0 * counts + spread**-2.0)
+    proposal = stats.multivariate_t(top, np.diag(variance), df=5)
     n = draws * chains
-    x = proposal.rvs(proposals * n, random_state=rng).reshape(proposals * n, -1)
+    x = proposal.rvs(10 * n, random_state=rng).reshape(10 * n, -1)
     # in parts, for there may be many combinations
     log_densities = np.concatenate([density(some) for some in np.array_split(x, 4 * chains)])
     log_weight = log_densities - proposal.logpdf(x)

@@ -132,9 +132,7 @@ def gaussian_profile(problem: Problem, square: Floats) -> Floats:
     return np.asarray(likelihood + log_noise_prior(problem, t) - t.sum(axis=-1))
 
 
-def noise_gaussian(
-    problem: Problem, residual: Floats, sigma: Floats, phi: Floats, *, width: float = 0.05
-) -> tuple[Floats, Floats]:
+def noise_gaussian(problem: Problem, phi: Floats, sigma: Floats) -> tuple[Floats, Floats]:
     """Return the Laplace approximation of log noise parameters by second differences.
 
     It is taken at the mode of the density of the logarithm: at that of the parameters themselves,
@@ -144,21 +142,17 @@ def noise_gaussian(
     ----------
     problem : Problem
         Of whole trajectories.
-    residual : ndarray
-        Shape (transition, 1, body, state).
-    sigma : ndarray
-        Most probable noise parameters, shape (parameter,).
     phi : ndarray
         Parameters, shape (p,).
-    width : float
-        Of second differences in the logarithm of a noise parameter.
+    sigma : ndarray
+        Most probable noise parameters, shape (parameter,).
 
     Returns
     -------
     mean, covariance : ndarray
         Shapes (parameter,) and (parameter, parameter); no direction is wider than the prior.
     """
-    spread = noise_law(problem)[1]
+    residual, spread = problem.residual(phi), noise_law(problem)[1]
     begin, n = np.log(sigma), len(sigma)
     floor = np.log(0.1 * problem.noise_prior[0])
     begin = np.where(exponential(problem), np.maximum(begin, floor), begin)
@@ -168,6 +162,7 @@ def noise_gaussian(
 
     at = minimize(cost, begin, method="L-BFGS-B", bounds=[(b - _FAR, b + _FAR) for b in begin]).x
 
+    width = 0.05  # of second differences
     middle, hessian, steps = cost(at), np.empty((n, n)), width * np.eye(n)
     for i, one in enumerate(steps):
         hessian[i, i] = (cost(at + one) - 2 * middle + cost(at - one)) / width**2
@@ -203,21 +198,15 @@ def best_tails(problem: Problem, phi: Floats, sigma: Floats) -> Floats:
     return result
 
 
-def tail_precision(
-    problem: Problem, phi: Floats, sigma: Floats, *, least: float = 1.0, width: float = 0.02
-) -> Floats:
-    """Return the curvature of the negative log-posterior in each tail parameter.
-
-    ``least``: least curvature.
-    ``width``: step of a second difference in the tails.
-    """
+def tail_precision(problem: Problem, phi: Floats, sigma: Floats) -> Floats:
+    """Return the curvature of the negative log-posterior in each tail parameter, at least 1."""
     tails = list(problem.tails)
     lower, upper = (end[tails] for end in box(problem.layout.priors))
     cost = _tail_cost(problem, phi, sigma)
     curvature = np.empty(len(tails))
-    for i, step in enumerate(np.minimum(width, 0.25 * (upper - lower))):
+    for i, step in enumerate(np.minimum(0.02, 0.25 * (upper - lower))):
         middle, move = phi[tails], step * np.eye(len(tails))[i]
         middle[i] = np.clip(middle[i], lower[i] + step, upper[i] - step)
         fall = cost(middle - move) - 2 * cost(middle) + cost(middle + move)
-        curvature[i] = max(fall / step**2, least)
+        curvature[i] = max(fall / step**2, 1.0)
     return curvature

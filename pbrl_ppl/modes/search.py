@@ -97,8 +97,7 @@ class Mode(Generic[LikelihoodT]):
         Shapes (parameter,) and (parameter, parameter).
         """
         if is_filtered(self.problem):
-            residual = self.problem.residual(self.phi)
-            return noise_gaussian(self.problem, residual, self.sigma, self.phi)
+            return noise_gaussian(self.problem, self.phi, self.sigma)
         # half the inverse of the number of measurements
         counts = self.problem.likelihood.counts(self.problem.observations)
         return np.log(self.sigma), np.diag(0.5 / np.maximum(counts, 1))
@@ -168,25 +167,23 @@ def climb(
         return LocalMode(phi, sigma, value)
     # least squares over multiples of each parameter's scale, whatever its unit
     origin = problem.layout.origin
-    scale = np.where(problem.layout.discrete, 1.0, problem.layout.scale(phi))
+    scale = problem.layout.scale(phi)
     ends = (lower - origin) / scale, (upper - origin) / scale
-    steps = np.where(problem.layout.discrete, 0.0, 1e-3)
+    steps = np.full(len(phi), 1e-3)
 
-    def residual(
-        moved: Floats, sigma: Floats, steps: Floats, engine: PartedSimulator | None = None
-    ) -> Floats:
+    def residual(moved: Floats, engine: PartedSimulator | None = None) -> Floats:
         points = np.clip(origin + scale * moved, lower, upper)  # rounding leaves no support
         z = _least_squares(problem, points, sigma, phi, engine)
         return np.nan_to_num(z, nan=FAR_OFF, posinf=FAR_OFF, neginf=-FAR_OFF)
 
-    def jacobian(moved: Floats, sigma: Floats, steps: Floats) -> Floats:
+    def jacobian(moved: Floats) -> Floats:
         size = np.minimum(steps, 0.1 * np.maximum(np.abs(moved), steps))
-        return differentiate(lambda x: residual(x, sigma, steps, slope), moved, size, *ends)
+        return differentiate(partial(residual, engine=slope), moved, size, *ends)
 
     for _ in range(rounds):
         result = least_squares(
             residual, (phi - origin) / scale, jac=jacobian, bounds=ends, x_scale="jac",
-            max_nfev=tries, ftol=1e-6, xtol=1e-6, gtol=1e-6, args=(sigma, steps),
+            max_nfev=tries, ftol=1e-6, xtol=1e-6, gtol=1e-6,
         )  # fmt: skip
         reached = np.clip(origin + scale * result.x, lower, upper)
         reached = best_tails(problem, reached, sigma)
@@ -197,7 +194,7 @@ def climb(
         if gain < _STALLED:
             break
         size = np.sqrt((result.jac**2).sum(axis=0))
-        steps = np.where(steps > 0, np.clip(1.0 / np.maximum(size, 1e-300), 1e-6, 0.1), 0.0)
+        steps = np.clip(1.0 / np.maximum(size, 1e-300), 1e-6, 0.1)
     return LocalMode(phi, sigma, value)
 
 
@@ -279,34 +276,15 @@ def _spectrum(matrix: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 @one_blas_thread
-def find_modes(
-    problem: Problem[LikelihoodT],
-    *,
-    seed: int | np.random.Generator = 0,
-    initial: Floats | None = None,
-    rounds: int | None = None,
-    n_part: int = 40,
-    polished: int = 2,
-    n_few: int = 20,
-) -> list[Mode[LikelihoodT]]:
+def find_modes(problem: Problem[LikelihoodT], *, seed: int = 0) -> list[Mode[LikelihoodT]]:
     """Return modes found from several starts, best first.
 
     Parameters
     ----------
     problem : Problem
         What to fit.
-    seed : int or Generator
+    seed : int
         Of the draws from the prior.
-    initial : ndarray, optional
-        Where to begin, shape (p,); then there is one local search.
-    rounds : int, optional
-        With ``initial``, the most rounds, without polish: a first look at where it leads.
-    n_part : int
-        Transitions used to tell basins apart.
-    polished : int
-        How many of the best are searched with all data.
-    n_few : int
-        With at most so many transitions, all are used.
 
     Returns
     -------
@@ -318,28 +296,18 @@ def find_modes(
     FitError
         If a joint's bodies are unknown: modes are sought over continuous parameters.
     """
+    _refuse_discrete(problem)
     priors, coarse = problem.layout.priors, problem.coarse.physics.simulator
-    if problem.layout.discrete.any():
-        raise FitError(
-            "which bodies a joint of the scene joins is unknown, and a mode is one of continuous"
-            " parameters; name the bodies in the scene: pbrl_ppl.fit finds them, and"
-            " joint_probabilities says which they are"
-        )
-    if initial is not None:
-        begin = inside(priors, initial)
-        if rounds:
-            return [finish(problem, climb(problem, begin, coarse, rounds))]
-        return [finish(problem, _polish(problem, climb(problem, begin, coarse)))]
     if not priors:  # everything is known but the noise
         return [finish(problem, climb(problem, np.zeros(0), coarse))]
-    few = problem.segments.n <= n_few
+    few = problem.segments.n <= 20
     # more starts with few data: they cost little, and friction makes more modes
     starts, screened = (16, 1000) if few else (4, 48)
     rng = np.random.default_rng(seed)
     draws = np.vstack([[prior.centre for prior in priors], prior_draws(priors, rng, screened)])
     draws = inside(priors, draws)
     # the basins show in a part of the data already, and with few engine steps
-    part = problem if few else _part(problem, n_part)
+    part = problem if few else _part(problem, 40)
     residual = part.residual(draws)
     sigma = estimate_sigma(np.nanmedian(residual, axis=0), part.observations, part.scene)
     z = np.nan_to_num(residual / sigma, nan=FAR_OFF).reshape(len(draws), -1)
@@ -348,37 +316,35 @@ def find_modes(
     begin = draws[order[:starts]]
     if few:
         begin = np.vstack([begin, _evolve(problem, rng)])
-    peaks = _distinct(
-        part, [canonical_wheels(part, climb(part, phi, part.physics.simulator)) for phi in begin]
-    )
+    peaks = [climb(part, phi, part.physics.simulator) for phi in begin]
+    peaks = _distinct(part, [canonical_wheels(part, peak) for peak in peaks])
     if not few:  # all data may join what a part of them told apart
-        peaks = [climb(problem, phi, coarse) for phi, *_ in peaks[:polished]]
+        peaks = [climb(problem, phi, coarse) for phi, *_ in peaks[:2]]
         peaks = _distinct(problem.coarse, peaks)
     best = _polish(problem, peaks[0])
     return [finish(problem, peak) for peak in (best, *peaks[1:])]
 
 
-def _evolve(
-    problem: Problem,
-    rng: np.random.Generator,
-    *,
-    climbed: int = 8,
-    population: int = 200,
-    generations: int = 120,
-    most_parameters: int = 15,
-    afforded: float = 2e7,
-) -> Floats:
-    """Return the best points of differential evolution, best first, shape (evolved, p).
+def _refuse_discrete(problem: Problem) -> None:
+    """Raise a FitError if a joint's bodies are unknown."""
+    if problem.layout.discrete.any():
+        raise FitError(
+            "which bodies a joint of the scene joins is unknown, and a mode is one of continuous"
+            " parameters; name the bodies in the scene: pbrl_ppl.fit finds them, and"
+            " joint_probabilities says which they are"
+        )
+
+
+def _evolve(problem: Problem, rng: np.random.Generator) -> Floats:
+    """Return the best eight points of differential evolution, best first, shape (8, p).
 
     Where few transitions slide, the mode may be too narrow for draws from the prior to find. The
     exact engine is needed: with fewer steps, friction's kinks are elsewhere. There are none with
-    more than ``most_parameters``, or where it would take more than ``afforded`` engine steps.
-
-    ``climbed``: how many of the ``population`` are climbed from, after ``generations``.
+    more than 15 parameters, or where it would take more than 2e7 engine steps.
     """
-    priors = problem.layout.priors
+    priors, population, generations = problem.layout.priors, 200, 120
     steps = problem.physics.simulator.steps * problem.segments.n * problem.data.horizon
-    if len(priors) > most_parameters or steps * population * generations >= afforded:
+    if len(priors) > 15 or steps * population * generations >= 2e7:
         return np.zeros((0, len(priors)))
     draws = prior_draws(priors, rng, population)
     measured = problem.observations.measured
@@ -397,21 +363,15 @@ def _evolve(
         strategy="rand1bin", recombination=0.9, maxiter=generations, polish=False,
         vectorized=True, updating="deferred", tol=0.0, atol=_STALLED,
     )  # fmt: skip
-    best = np.argsort(result.population_energies)[:climbed]
+    best = np.argsort(result.population_energies)[:8]
     return inside(priors, result.population[best])
 
 
-def _distinct(
-    problem: Problem, peaks: list[LocalMode], *, same_below: float = 10.0, far: float = 100.0
-) -> list[LocalMode]:
+def _distinct(problem: Problem, peaks: list[LocalMode]) -> list[LocalMode]:
     """Return peaks, best first, without those that predict as a better one and are connected to it.
 
     Equivalent wheels and uninformed directions are connected; mirror images are not: they predict
     the same, but points between them do not.
-
-    ``same_below``: predictions this close (sum of squares, in noise units) are of the same mode.
-    ``far``: parameters whose predictions agree are of different modes if by the derivative they
-    should differ by this (sum of squares, in noise units): ten standard deviations.
     """
     if len(peaks) == 1:
         return peaks
@@ -420,8 +380,10 @@ def _distinct(
     z = np.nan_to_num(problem.whitened(folded, peaks[0].sigma), nan=FAR_OFF)
     kept: dict[int, Floats] = {}
     for i in range(len(peaks)):
-        same = [j for j in kept if ((z[i] - z[j]) ** 2).sum() < same_below]
-        if not any(((kept[j] @ (folded[i] - folded[j])) ** 2).sum() < far for j in same):
+        # sums of squares in noise units: predictions within 10 agree; they are of different modes
+        # if by the derivative they should differ by 100, ten standard deviations
+        same = [j for j in kept if ((z[i] - z[j]) ** 2).sum() < 10.0]
+        if not any(((kept[j] @ (folded[i] - folded[j])) ** 2).sum() < 100.0 for j in same):
             kept[i] = finish(problem, peaks[i]).jacobian
     return [peaks[i] for i in kept]
 
@@ -439,21 +401,24 @@ def _part(problem: Problem, transitions: int) -> Problem:
     return part if same else problem.coarse
 
 
+@one_blas_thread
 def find_mode(
-    problem: Problem[LikelihoodT],
-    *,
-    seed: int | np.random.Generator = 0,
-    initial: Floats | None = None,
-    rounds: int | None = None,
-    lower: float = 20.0,
+    problem: Problem[LikelihoodT], *, seed: int = 0, initial: Floats | None = None, rounds: int = 0
 ) -> Mode[LikelihoodT]:
     """Return the best mode with others that are not far below it; see :func:`find_modes`.
 
-    ``lower``: log-posterior by which a mode is too low to hold a share of the posterior, however
-    wide it is.
+    From ``initial``, shape (p,), there is one local search; with ``rounds`` it has so many at most,
+    and no polish: a first look at where it leads.
     """
-    best, *others = find_modes(problem, seed=seed, initial=initial, rounds=rounds)
-    near = (mode for mode in others if mode.log_posterior > best.log_posterior - lower)
+    if initial is not None:
+        _refuse_discrete(problem)
+        begin, coarse = inside(problem.layout.priors, initial), problem.coarse.physics.simulator
+        if rounds:
+            return finish(problem, climb(problem, begin, coarse, rounds))
+        return finish(problem, _polish(problem, climb(problem, begin, coarse)))
+    best, *others = find_modes(problem, seed=seed)
+    # a mode lower by 20 nats holds no share of the posterior, however wide it is
+    near = (mode for mode in others if mode.log_posterior > best.log_posterior - 20.0)
     return replace(best, others=tuple(near))
 
 

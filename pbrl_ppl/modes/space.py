@@ -75,9 +75,8 @@ class Space:
         centre = mode.phi.copy()
         for i, prior in enumerate(mode.problem.layout.priors):
             if prior.family == "von_mises":  # cut where it is farthest from every mode
-                angles = np.sort(
-                    np.mod([other.phi[i] for other in (mode, *mode.others)], 2 * np.pi)
-                )
+                found = [other.phi[i] for other in (mode, *mode.others)]
+                angles = np.sort(np.mod(found, 2 * np.pi))
                 gaps = np.diff([*angles, angles[0] + 2 * np.pi])
                 widest = int(np.argmax(gaps))
                 middle = angles[widest] + 0.5 * gaps[widest] - np.pi
@@ -117,9 +116,8 @@ class Space:
     @property
     def informed(self) -> Ints:
         """The coordinates that the data inform, shape (informed,)."""
-        return np.concatenate(
-            [np.flatnonzero(~self.uninformed), np.arange(self.phi_size, self.size)]
-        )
+        noise = np.arange(self.phi_size, self.size)
+        return np.concatenate([np.flatnonzero(~self.uninformed), noise])
 
     @cached_property
     def blocks(self) -> tuple[Ints, ...]:
@@ -200,16 +198,12 @@ class Space:
             slope = np.where(self.roots, np.log(0.5 * _POWER / size), 0.0).sum(axis=-1)
             return np.asarray(log_noise_prior(self.problem, log_sigma) + slope)
 
-    def each(self, q: Floats, residual: Floats) -> Floats:
-        """Return the log-likelihood of each transition at residuals, shape (n, transition)."""
-        phi, sigma = self.split(q)
+    def each(self, q: Floats) -> Floats:
+        """Return the log-likelihood of each transition at points (n, d), shape (n, transition)."""
+        residual, (phi, sigma) = self.problem.residual(self.possible(q)), self.split(q)
         with np.errstate(all="ignore"):
             value = self.problem.log_density(residual, sigma, phi)
         return np.where(np.isnan(value), -np.inf, value)
-
-    def residual(self, q: Floats) -> Floats:
-        """Return the engine's residuals, shape (n, transition, H, body, state)."""
-        return self.problem.residual(self.possible(q))
 
     def possible(self, q: Floats) -> Floats:
         """Return phi (n, p), with the centre where a point is outside what numbers can hold."""
@@ -226,7 +220,7 @@ class Space:
         """
         width = max(1, numbers // max(self.problem.measured.size, 1))
         parts = (q[first : first + width] for first in range(0, len(q), width))
-        each = np.concatenate([self.each(some, self.residual(some)) for some in parts])
+        each = np.concatenate([self.each(some) for some in parts])
         return self.log_prior(q) + each.sum(axis=1), each
 
     def log_density(self, q: Floats) -> Floats:
@@ -242,16 +236,11 @@ class Space:
             q[:, place] = unconstrain(prior, drawn)[0]
         return q
 
-    def laplace(
-        self, mode: Mode, *, least_curvature: float = 0.05, width: float = 1e-3
-    ) -> tuple[Floats, Floats]:
+    def laplace(self, mode: Mode) -> tuple[Floats, Floats]:
         """Return the Laplace approximation about a mode, shapes (d,) and (d, d).
 
         Its curvature is Gauss and Newton's. A density's mode moves with its coordinates: where the
         data say little, it is that of the prior here.
-
-        ``least_curvature``: least curvature of the prior; a truncated one's tails are flat there.
-        ``width``: step of differences of a prior's density in the unconstrained space.
         """
         p, mean = self.phi_size, self.at(mode.phi, mode.sigma)
         about = self._about(mean)
@@ -262,14 +251,14 @@ class Space:
         covariance[p:, p:] = stretch[:, None] * of_noise * stretch
         if p:
             priors = self.problem.layout.priors
-            slope = np.array(
-                [1.0 / unconstrain(*pair)[1] for pair in zip(priors, mode.phi, strict=True)]
-            )
-            jacobian = mode.jacobian * slope
+            slope = [1.0 / unconstrain(*pair)[1] for pair in zip(priors, mode.phi, strict=True)]
+            jacobian = mode.jacobian * np.array(slope)
+            width = 1e-3  # of differences of the prior's density
             ends = mean + width * np.eye(len(mean))[:p], mean - width * np.eye(len(mean))[:p]
             here = about._of_parameters(mean)
             above, below = (np.diagonal(about._of_parameters(end)) for end in ends)
-            curvature = np.maximum((2 * here - above - below) / width**2, least_curvature)
+            # at least 0.05: a truncated prior's tails are flat here
+            curvature = np.maximum((2 * here - above - below) / width**2, 0.05)
             precision = jacobian.T @ jacobian + np.diag(curvature)
             for place in self.problem.tails:
                 precision[place, place] += slope[place] ** 2 / mode.covariance[place, place]
@@ -290,60 +279,45 @@ class Space:
         middle[self._circles] = q[self._circles]
         return replace(self, centre=middle)
 
-    def widened(
-        self,
-        mean: Floats,
-        covariance: Floats,
-        *,
-        distances: tuple[float, ...] = (2.0, 4.0, 8.0, 16.0),
-        outside: float = 2.5,
-    ) -> Floats:
+    def widened(self, mean: Floats, covariance: Floats) -> Floats:
         """Return a covariance, widened where the posterior falls off slowly, shape (d, d).
 
         At a kink, or with few contacts, the curvature overstates how well a parameter is known.
-
-        ``distances``: distances at which a posterior is evaluated (standard deviations).
-        ``outside``: the fall (nats) from which a point is outside; a Gaussian falls by 2 at the
-        first distance.
         """
-        p = self.phi_size
         informed = np.flatnonzero(~self.uninformed)
         if not len(informed):
             return covariance
         steps = np.sqrt(np.diag(covariance))[informed]
+        distances = (2.0, 4.0, 8.0, 16.0)  # standard deviations
         ends = np.array([*distances, *(-far for far in distances)])
         moves = np.zeros((len(informed), len(ends), len(mean)))
         moves[np.arange(len(informed)), :, informed] = steps[:, None] * ends
         points = np.vstack([mean, mean + moves.reshape(-1, len(mean))])
         top, *log_densities = self._about(mean).log_density(points)
         fall = (top - np.array(log_densities)).reshape(len(informed), 2, -1)
-        # on either side, up to the first point that has fallen
-        within = np.nan_to_num(fall, nan=np.inf) < outside
+        # on either side, up to the first point that has fallen by 2.5 nats; a Gaussian's first by 2
+        within = np.nan_to_num(fall, nan=np.inf) < 2.5
         count = np.logical_and.accumulate(within, axis=2).sum(axis=2)
         stretch = np.array([distances[0], *distances])[count].mean(axis=1) / distances[0]
         extra = np.zeros(len(mean))
-        extra[:p][informed] = steps**2 * (stretch**2 - 1.0)
+        extra[informed] = steps**2 * (stretch**2 - 1.0)
         return np.asarray(covariance + np.diag(extra))
 
 
-def uninformed(mode: Mode, *, least: float = 1e-3) -> Bools:
+def uninformed(mode: Mode) -> Bools:
     """Return the mask of parameters of which the data say nothing: their posterior is the prior.
 
-    A wheel's parameters are never among them, for its prior is not one of independent numbers.
-
-    ``least``: a parameter whose derivative is below this in units of noise over its prior is not
-    informed.
+    Their derivative is below 1e-3 in units of noise over their prior. A wheel's parameters are
+    never among them, for its prior is not one of independent numbers.
     """
     problem = mode.problem
     # the sigma of a log-normal prior is that of the logarithm
-    scale = np.array(
-        [
-            prior.sigma * (x if prior.family == "log_normal" else 1.0)
-            for prior, x in zip(problem.layout.priors, mode.phi, strict=True)
-        ]
-    )
+    scale = [
+        prior.sigma * (x if prior.family == "log_normal" else 1.0)
+        for prior, x in zip(problem.layout.priors, mode.phi, strict=True)
+    ]
     size = np.sqrt((mode.jacobian**2).sum(axis=0)) * np.nan_to_num(scale, nan=1.0)
-    mask = (size < least) & bool(mode.jacobian.any())
+    mask = (size < 1e-3) & bool(mode.jacobian.any())
     for wheel in wheels(problem.layout):
         mask[list(wheel.places)] = False
     mask[list(problem.tails)] = False

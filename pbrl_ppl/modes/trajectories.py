@@ -40,10 +40,8 @@ _ROUNDS, _CONVERGED = 6, 0.2
 
 
 @one_blas_thread
-def find_trajectory_mode(
-    problem: Problem, seed: int, *, starts: int = 5, wider: float = 2.0
-) -> FilteredMode:
-    """Return the best mode of whole trajectories, from several starts about one of Eq. 11.
+def find_trajectory_mode(problem: Problem, seed: int) -> FilteredMode:
+    """Return the best mode of whole trajectories, from five starts about one of Eq. 11.
 
     A climb's end depends on the side of a kink that the states are smoothed on.
 
@@ -52,11 +50,7 @@ def find_trajectory_mode(
     problem : Problem
         Of whole trajectories.
     seed : int
-        Of the starts.
-    starts : int
-        Climbs of the search.
-    wider : float
-        How much farther apart than draws from single transitions they begin.
+        Of the starts, which are twice as far apart as draws from single transitions.
 
     Returns
     -------
@@ -64,21 +58,19 @@ def find_trajectory_mode(
         Result of :func:`with_state_sensitivity`.
     """
     near = find_mode(single_transitions(problem), seed=seed)
-    off = near.draws(np.random.default_rng(seed), starts - 1) - near.phi
-    far = inside(problem.layout.priors, near.phi + wider * off)
+    off = near.draws(np.random.default_rng(seed), 4) - near.phi
+    far = inside(problem.layout.priors, near.phi + 2.0 * off)
     there = np.isfinite(near.problem.residual(far)).all(axis=(1, 2, 3, 4))
-    modes = [
-        with_state_sensitivity(trajectory_mode(problem, phi)) for phi in (near.phi, *far[there])
-    ]
+    starts = (near.phi, *far[there])
+    modes = [with_state_sensitivity(trajectory_mode(problem, phi)) for phi in starts]
     return max(modes, key=lambda mode: mode.log_posterior)
 
 
-def trajectory_mode(
-    problem: Problem, phi: Floats, sigma: Floats | None = None, *, share: float = 0.1
-) -> FilteredMode:
+def trajectory_mode(problem: Problem, phi: Floats, sigma: Floats | None = None) -> FilteredMode:
     """Return the mode of whole trajectories, linearised at smoothed states.
 
-    The better of two, which start with the given noise and with near-zero process noise.
+    The better of two, which start with the given noise and with near-zero process noise: errors of
+    measuring and unexplained accelerations trade places, and have a mode each.
 
     Parameters
     ----------
@@ -88,10 +80,6 @@ def trajectory_mode(
         Where to begin, shape (p,).
     sigma : ndarray, optional
         Noise parameters to begin with where the problem is one of trajectories, smoothed nearby.
-    share : float
-        The second climb begins with unexplained accelerations of this share of their prior's
-        median: errors of measuring and unexplained accelerations trade places, and have a mode
-        each.
 
     Returns
     -------
@@ -103,7 +91,7 @@ def trajectory_mode(
     else:
         whole = _smoothed_cheaply(problem, phi)
         mode = nearby_mode(whole, phi, whole.likelihood.noise.sigma)
-    small = _with_small_process_noise(mode.problem, mode.sigma, share)
+    small = _with_small_process_noise(mode.problem, mode.sigma)
     if np.array_equal(small, mode.sigma):
         return mode
     other = nearby_mode(smoothed(mode.problem, mode.phi, small), mode.phi, small)
@@ -115,10 +103,10 @@ def mode_of_more(problem: Problem, mode: FilteredMode) -> FilteredMode:
     return nearby_mode(_smoothed_cheaply(problem, mode.phi), mode.phi, mode.sigma)
 
 
-def _with_small_process_noise(problem: FilteredProblem, sigma: Floats, share: float) -> Floats:
-    """Return sigma with unexplained accelerations of at most a share of their prior median."""
+def _with_small_process_noise(problem: FilteredProblem, sigma: Floats) -> Floats:
+    """Return sigma with unexplained accelerations of at most a tenth of their prior median."""
     steps, sigma = problem.likelihood.noise.coordinates.accelerations, sigma.copy()
-    sigma[steps] = np.minimum(sigma[steps], share * problem.noise_prior[0][steps])
+    sigma[steps] = np.minimum(sigma[steps], 0.1 * problem.noise_prior[0][steps])
     return sigma
 
 
@@ -130,13 +118,11 @@ def _smoothed_cheaply(problem: Problem, phi: Floats) -> FilteredProblem:
 
 
 @one_blas_thread
-def filtered_mode(
-    mode: FilteredMode, other: Mode, *, share: float = 0.1, rounds: int = 3
-) -> FilteredMode:
+def filtered_mode(mode: FilteredMode, other: Mode) -> FilteredMode:
     """Return the mode of whole trajectories at another mode's parameters.
 
-    Noise and smoothed states are fitted in turn, from two sizes of the unexplained acceleration as
-    in :func:`trajectory_mode`; the parameters stay.
+    Noise and smoothed states are fitted in turn three times, from two sizes of the unexplained
+    acceleration as in :func:`trajectory_mode`; the parameters stay.
 
     Parameters
     ----------
@@ -144,35 +130,26 @@ def filtered_mode(
         Of whole trajectories.
     other : Mode
         Of a model of the same recording, under any likelihood.
-    share, rounds : float, int
-        Second size of the unexplained acceleration, as a share of its prior's median; rounds.
     """
     physics, phi = other.problem.physics, other.phi
     problem = mode.problem.with_physics(effects=physics.effects, substeps=physics.substeps)
     problem = _smoothed_cheaply(problem, phi)
     sigma = problem.likelihood.noise.sigma
     ends: list[tuple[FilteredProblem, LocalMode]] = []
-    for begin in (sigma, _with_small_process_noise(problem, sigma, share)):
+    for begin in (sigma, _with_small_process_noise(problem, sigma)):
         sigma, there = begin, problem
-        for _ in range(rounds):
+        for _ in range(3):
             there = smoothed(there, phi, sigma)
             sigma, value = profiled(there, phi)
         ends.append((there, LocalMode(phi, sigma, value)))
     return finish(*max(ends, key=lambda end: end[1].log_posterior))
 
 
-def nearby_mode(
-    problem: FilteredProblem,
-    phi: Floats,
-    sigma: Floats,
-    *,
-    corrections: int = 3,
-    same: float = 0.5,
-) -> FilteredMode:
+def nearby_mode(problem: FilteredProblem, phi: Floats, sigma: Floats) -> FilteredMode:
     """Return the mode by alternating climbs with smoothing.
 
     It climbs with few engine steps, whose error at the start is corrected, and corrects it again
-    where that ends.
+    where that ends, three times at most.
 
     Parameters
     ----------
@@ -180,13 +157,9 @@ def nearby_mode(
         Of whole trajectories.
     phi, sigma : ndarray
         Where to begin, shapes (p,) and (parameter,).
-    corrections : int
-        Of the error of few engine steps, at most.
-    same : float
-        A correction with which the log-posterior (nats) is as with many steps is the last.
     """
     modes: list[FilteredMode] = []
-    for _ in range(corrections):
+    for _ in range(3):
         cheap = corrected(problem, phi)
         mode = _alternate_smoothing(cheap, phi, sigma)
         if cheap is problem:
@@ -195,7 +168,7 @@ def nearby_mode(
         moved, phi = _change(mode, phi), mode.phi
         sigma, value = profiled(problem, phi)
         modes.append(replace(mode, problem=problem, sigma=sigma, log_posterior=value, others=()))
-        if moved < _CONVERGED or abs(value - mode.log_posterior) < same:
+        if moved < _CONVERGED or abs(value - mode.log_posterior) < 0.5:  # nats, as with many steps
             break
     return max(modes, key=lambda candidate: candidate.log_posterior)
 
@@ -249,6 +222,7 @@ def _change(mode: FilteredMode, phi: Floats) -> float:
     return float((np.abs(moved) / spread).max(initial=0.0))
 
 
+@one_blas_thread
 def find_simulation_mode(problem: Problem, seed: int) -> SimulatedMode:
     """Return the best mode of simulated trajectories, from one of whole trajectories.
 
@@ -262,20 +236,21 @@ def find_simulation_mode(problem: Problem, seed: int) -> SimulatedMode:
     Returns
     -------
     Mode
-        Result of :func:`simulation_mode`.
+        Result of :func:`tempered_mode` of the longest simulated pieces.
     """
     prior = problem.likelihood.prior if is_simulated(problem) else None
-    return simulation_mode(find_trajectory_mode(problem, seed), prior)
+    return tempered_mode(ladder(find_trajectory_mode(problem, seed))[-1], prior)
 
 
-@one_blas_thread
-def simulation_mode(mode: Mode, prior: NoisePrior | None = None) -> SimulatedMode:
-    """Return the mode of simulated trajectories, from one of whole trajectories.
+def tempered_mode(mode: SimulatedMode, prior: NoisePrior | None = None) -> SimulatedMode:
+    """Return a mode of simulated pieces as the mode of their posterior.
+
+    The density of each dimension is divided by its autocorrelation time.
 
     Parameters
     ----------
     mode : Mode
-        Of whole trajectories.
+        Of simulated pieces, with any number of engine steps.
     prior : tuple, optional
         Of sigma; by default it is taken from the pieces. The last climb has it, and all engine
         steps.
@@ -285,14 +260,6 @@ def simulation_mode(mode: Mode, prior: NoisePrior | None = None) -> SimulatedMod
     Mode
         Its problem has an :class:`pbrl_ppl.likelihood.OutputErrorLikelihood`, linearised at its
         initial states, and the prior of sigma fixed.
-    """
-    return tempered_mode(ladder(mode)[-1], prior)
-
-
-def tempered_mode(mode: SimulatedMode, prior: NoisePrior | None = None) -> SimulatedMode:
-    """Return a mode of simulated pieces as the mode of their posterior; arguments as above.
-
-    The density of each dimension is divided by its autocorrelation time.
     """
     median, spread = mode.problem.noise_prior
     problem = mode.problem.with_likelihood(prior=prior or (tuple(median.tolist()), spread))

@@ -200,10 +200,6 @@ class Layout:
         """Which entries are discrete, indices of names, shape (p,)."""
         return np.array([prior.discrete for prior in self.priors], dtype=bool)
 
-    def owner_kind(self, place: int) -> str:
-        """Return whether an entry belongs to a ``body`` or a ``joint``."""
-        return self.entries[place][0].of
-
     def index(self, name: str, owner: str) -> int:
         """Return the place of a parameter of a body, or joint, in the vector.
 

@@ -106,14 +106,13 @@ class Prior:
         >>> Prior("half_normal", sigma=0.5).scaled(20.0).sigma
         10.0
         """
-        if self.family == "log_normal" and not origin:
+        positive = ("log_normal", "half_normal") if origin else ()
+        if self.family in ("von_mises", "categorical", *positive):
+            raise ParameterError(f"{self.family}: it has no scale; expected a prior of a size")
+        if self.family == "log_normal":
             return replace(self, mu=self.mu + float(np.log(factor)))
-        if self.family in ("normal", "truncated_normal") or not (
-            origin or self.family != "half_normal"
-        ):
-            ends = {key: origin + factor * getattr(self, key) for key in ("mu", "lower", "upper")}
-            return replace(self, sigma=factor * self.sigma, **ends)
-        raise ParameterError(f"{self.family}: it has no scale; expected a prior of a size")
+        ends = {key: origin + factor * getattr(self, key) for key in ("mu", "lower", "upper")}
+        return replace(self, sigma=factor * self.sigma, **ends)
 
     @property
     def scale(self) -> float:

@@ -189,10 +189,9 @@ class EngineProperties:
         """
         if not np.isfinite(phi).all():
             first = int(np.argwhere(~np.isfinite(phi))[0, 1])
-            name, owner = self._layout.labels[first][:-1].split("[")
+            block, owner, _ = self._layout.entries[first]
             raise ParameterError(
-                f"{self._layout.owner_kind(first)} {owner!r}: {name} is not finite; give a finite"
-                " number"
+                f"{block.of} {owner!r}: {block.name} is not finite; give a finite number"
             )
         bodies = np.repeat(self._known[None], len(phi), axis=0)
         place, body, column = self._moved

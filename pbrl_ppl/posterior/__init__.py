@@ -5,7 +5,6 @@ from .completion import MAX_PARETO_K as MAX_PARETO_K
 from .completion import MIN_ESS as MIN_ESS
 from .completion import PARETO_K as PARETO_K
 from .completion import SAMPLED as SAMPLED
-from .completion import checked as checked
 from .completion import complete as complete
 from .completion import evaluate as evaluate
 from .cross_validation import Comparison as Comparison
@@ -14,7 +13,6 @@ from .cross_validation import by_trajectory as by_trajectory
 from .cross_validation import compare as compare
 from .cross_validation import left_out as left_out
 from .cross_validation import loo_pit as loo_pit
-from .cross_validation import predicted_rows as predicted_rows
 from .cross_validation import separate as separate
 from .data import Fit as Fit
 from .data import both_places as both_places
@@ -24,16 +22,13 @@ from .data import parameter_draws as parameter_draws
 from .data import placed as placed
 from .data import problem_of as problem_of
 from .data import recorded as recorded
-from .data import recorded_coordinates as recorded_coordinates
 from .data import recording as recording
 from .data import versions as versions
 from .identifiability import Identifiability as Identifiability
 from .identifiability import identify as identify
 from .identifiability import uninformed as uninformed
-from .record import LinearisationCheck as LinearisationCheck
 from .record import ParameterPoint as ParameterPoint
 from .record import PosteriorRecord as PosteriorRecord
-from .record import StoredMode as StoredMode
 from .record import layout_of as layout_of
 from .record import scene_of as scene_of
 from .record import stored_fields as stored_fields

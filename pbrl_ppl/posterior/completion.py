@@ -134,9 +134,6 @@ def evaluate(
     rows: Sequence[int] | Ints,
     rng: np.random.Generator,
     known: Floats | None = None,
-    *,
-    draws: int = 64,
-    transitions: int = 20_000,
 ) -> tuple[Floats, Floats]:
     """Return log-likelihoods of the transitions at draws, and next states drawn from some of them.
 
@@ -152,8 +149,6 @@ def evaluate(
         Of the predictions.
     known : ndarray, optional
         Log-likelihoods where the sampler has them already.
-    draws, transitions : int
-        Draws that are simulated at once: this many, or as many as have so many transitions.
 
     Returns
     -------
@@ -166,7 +161,7 @@ def evaluate(
     predictive = []
     parallel = problem.with_physics(threads=max(problem.physics.threads, 2))
     rows = np.asarray(rows, dtype=int)
-    size = max(draws, transitions // problem.segments.n)
+    size = max(64, 20_000 // problem.segments.n)  # draws that are simulated at once
     for begin in range(0, len(phi), size):
         part = slice(begin, begin + size)
         if known is None:
@@ -187,15 +182,7 @@ def evaluate(
     return likelihood, np.array(predictive)
 
 
-def predictive_rows(
-    chains: int,
-    draws: int,
-    cells: int,
-    *,
-    least: int = 50,
-    most: int = 200,
-    cells_in_all: int = 2_000_000,
-) -> Ints:
+def predictive_rows(chains: int, draws: int, cells: int) -> Ints:
     """Return draws to predict with: equally many of each chain, evenly spread, the last included.
 
     Parameters
@@ -203,18 +190,14 @@ def predictive_rows(
     chains, draws : int
         Of the posterior; draws of each chain.
     cells : int
-        Numbers that one prediction has.
-    least, most : int
-        Draws with predictions, of all chains.
-    cells_in_all : int
-        Numbers that their predictions have, if that leaves the least.
+        Numbers that one prediction has: of 50 to 200 draws there are two million in all.
 
     Returns
     -------
     ndarray
         Shape (chain, draw): indices of the draws, chains joined.
     """
-    wanted = int(np.clip(cells_in_all // max(cells, 1), least, most))
+    wanted = int(np.clip(2_000_000 // max(cells, 1), 50, 200))
     a_chain = min(draws, -(-wanted // chains))
     chosen = np.linspace(draws - 1, 0, a_chain).astype(int)[::-1]
     return np.asarray(draws * np.arange(chains)[:, None] + chosen)
@@ -261,10 +244,8 @@ def prior_groups(
     density = np.where(steps, -np.log(scale) - sigma[:, : len(scale)] / scale, density)
 
     def shaped(like: xr.Dataset, of_phi: Floats, of_noise: Floats) -> xr.Dataset:
-        named = problem.named(of_phi, of_noise)
-        return xr.Dataset(
-            {x: like[x].copy(data=v.reshape(like[x].shape)) for x, v in named.items()}
-        )
+        named = problem.named(of_phi, of_noise).items()
+        return xr.Dataset({x: like[x].copy(data=v.reshape(like[x].shape)) for x, v in named})
 
     return {
         "prior": shaped(posterior, nearest(layout, drawn, phi), noise_drawn),
@@ -272,9 +253,7 @@ def prior_groups(
     }
 
 
-def linearisation_errors(
-    problem: FilteredProblem, phi: Floats, sigma: Floats, *, diverged: float = -1e100
-) -> Floats:
+def linearisation_errors(problem: FilteredProblem, phi: Floats, sigma: Floats) -> Floats:
     """Return log-likelihoods with the states smoothed at each draw, less the linearised ones.
 
     Parameters
@@ -283,8 +262,6 @@ def linearisation_errors(
         Of whole trajectories.
     phi, sigma : ndarray
         Draws, shapes (draw, p) and (draw, parameter).
-    diverged : float
-        Log-likelihood (nats) of a draw at which the engine diverges.
 
     Returns
     -------
@@ -294,8 +271,8 @@ def linearisation_errors(
     """
     errors = np.zeros((len(phi), problem.data.history.n_trajectories))
     for row, point, noise in zip(errors, phi, sigma, strict=True):
-        again, stored = (
-            np.maximum(other.log_density(other.residual(point), noise, point), diverged)
+        again, stored = (  # finite where the engine diverges
+            np.maximum(other.log_density(other.residual(point), noise, point), -1e100)
             for other in (smoothed(problem, point, noise), problem)
         )
         np.add.at(row, problem.segments.trajectory, again - stored)
@@ -352,8 +329,7 @@ def checked(
         )
         warnings.append((ConvergenceWarning, text))
     warnings += _of_approximations(record)
-    least_draws = 4  # a chain, for which R-hat is defined
-    if sizes["draw"] >= least_draws:
+    if sizes["draw"] >= 4:  # there is an R-hat
         r_hat, ess = convergence(idata)
         worst = max(r_hat, key=r_hat.__getitem__), min(ess, key=ess.__getitem__)
         record = replace(record, max_rhat=r_hat[worst[0]], min_ess=ess[worst[1]])
@@ -363,7 +339,7 @@ def checked(
     elif record.method != "map":  # a mode alone is one draw
         text = (
             f"with {sizes['draw']} draws a chain there is no R-hat (it takes at least"
-            f" {least_draws}), so whether the chains have converged is not known; {more}"
+            f" 4), so whether the chains have converged is not known; {more}"
         )
         warnings.append((ConvergenceWarning, text))
     replace(record, warnings=tuple(text for _, text in warnings)).write(idata)
@@ -472,7 +448,6 @@ def _with_units(problem: Problem, posterior: xr.Dataset) -> xr.Dataset:
     units = {block.name: block.unit for block in problem.layout.blocks}
     units["sigma"] = "the unit of each state dimension"
     units |= dict.fromkeys((ACCELERATION, CONTACT), "m/s^2, of omega rad/s^2")
-    for name, variable in posterior.data_vars.items():
-        if name in units:
-            variable.attrs["units"] = units[str(name)]
+    for name in units.keys() & posterior.data_vars.keys():
+        posterior[name].attrs["units"] = units[name]
     return posterior

@@ -242,9 +242,8 @@ def by_number(idata: Idata) -> Idata:
         for name, values in data.items()
     }
     posterior = group(idata, "posterior").sel(some).drop_vars(["chain", "draw"])
-    return from_groups(
-        {"posterior": posterior.transpose("chain", "draw", ...), **numbers}, idata.attrs
-    )
+    posterior = posterior.transpose("chain", "draw", ...)
+    return from_groups({"posterior": posterior, **numbers}, idata.attrs)
 
 
 def loo_pit(idata: Idata) -> xr.DataArray:

@@ -16,7 +16,6 @@ from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.history import History, Segments, from_segments
 from pbrl_ppl.likelihood import (
     NEXT_STATE_DIMS,
-    Coordinates,
     Problem,
     Sensitivity,
     TransitionLikelihood,
@@ -123,27 +122,20 @@ def problem_of(
     elif actions.shape[-1] == len(INPUT):  # recorded since
         # of the first interval: there is no number after a trajectory's end
         history = history.numbered(float(actions[:, 0, :, INPUT.index("trajectory")].max()) + 1.0)
+    law = TransitionLikelihood(scalar=record.scalar_sigma, nu=record.nu, prior=record.sigma_prior)
     problem = Problem.of(
-        record.physics(effects),
-        history,
-        horizon=record.horizon,
-        columns=columns,
-        likelihood=TransitionLikelihood(
-            scalar=record.scalar_sigma, nu=record.nu, prior=record.sigma_prior
-        ),
+        record.physics(effects), history, horizon=record.horizon, columns=columns, likelihood=law,
         library=record.library,
-    )
+    )  # fmt: skip
     stored = with_recording(problem, constants, record.data_sha256)
     if not other:
         return stored
     if not is_filtered(stored):
         return problem
     # linearised at the posterior's best draw
-    phi, sigma = parameter_draws(stored, idata)
-    best = best_draw(idata)
-    coordinates = stored.likelihood.noise.coordinates
-    whole = along_trajectories(problem, phi[best], sigma[best], coordinates)
-    return with_sensitivity(whole, phi[best], sigma[best])
+    phi, sigma = Fit(stored, idata).best
+    whole = along_trajectories(problem, phi, sigma, stored.likelihood.noise.coordinates)
+    return with_sensitivity(whole, phi, sigma)
 
 
 def parameter_draws(problem: Problem, trace: Idata) -> tuple[Floats, Floats]:
@@ -251,9 +243,8 @@ def recording(problem: Problem) -> xr.Dataset:
     if is_independent(problem):
         return xr.Dataset()
     dataset = problem.data.history.dataset
-    kept = dataset.rename(
-        {name: f"{_PREFIX}{name}" for name in (*dataset.dims, *dataset.data_vars)}
-    )
+    names = (*dataset.dims, *dataset.data_vars)
+    kept = dataset.rename({name: f"{_PREFIX}{name}" for name in names})
     kept = kept.drop_vars([name for name in kept.coords if name not in kept.dims])
     dims = tuple(f"{_PREFIX}{name}" for name in ("trajectory", "time", "body", "state"))
     kept[SMOOTHED] = (dims, problem.data.smoothed_states)
@@ -285,10 +276,9 @@ def with_recording(problem: Problem, constants: xr.Dataset, data_sha256: str) ->
         start, slope = pieces.segments.start, stored[_BY_START]
         return linearised_pieces(pieces, start, slope, stored[_TAU]).with_likelihood(prior=prior)
     coordinates = observed_coordinates(problem.scene, history)
-    data = replace(
-        problem.data, history=history, horizon=1, states=states, columns=coordinates.columns
+    problem = problem.with_data(
+        history=history, horizon=1, states=states, columns=coordinates.columns
     )
-    problem = problem.on(data)
     noise = linearised(problem, coordinates, stored["slope"], stored["linearised_at"])
     if _SENSITIVITY in stored:
         slopes = noise.slope, stored[_ORIGIN], stored[_SENSITIVITY]
@@ -302,15 +292,9 @@ def recorded(scene: Scene, constants: xr.Dataset, data_sha256: str = "") -> Hist
     dataset = constants[[name for name in constants.data_vars if str(name).startswith(_PREFIX)]]
     names = (*dataset.data_vars, *dataset.dims)
     dataset = dataset.rename({name: str(name).removeprefix(_PREFIX) for name in names})
-    dataset = dataset.assign_coords(
-        kinematic=("body", [body.kinematic for body in scene.moving])
-    ).assign_attrs(time_step=scene.time_step, data_sha256=data_sha256)
-    return History(dataset)
-
-
-def recorded_coordinates(scene: Scene, constants: xr.Dataset) -> Coordinates:
-    """Return the coordinates of the history that a posterior's constant data hold."""
-    return observed_coordinates(scene, recorded(scene, constants))
+    kinematic = ("body", [body.kinematic for body in scene.moving])
+    dataset = dataset.assign_coords(kinematic=kinematic)
+    return History(dataset.assign_attrs(time_step=scene.time_step, data_sha256=data_sha256))
 
 
 def both_recordings(earlier: xr.Dataset, new: xr.Dataset) -> xr.Dataset:
@@ -360,10 +344,8 @@ def both_places(earlier: xr.Dataset, segments: Segments) -> dict[str, xr.Variabl
 def placed(idata: Idata, coords: xr.Coordinates | Mapping[str, xr.Variable]) -> Idata:
     """Return the posterior with the trajectory and time of these coordinates, and no others."""
     chosen = {name: coords[name] for name in PLACES}
-    data = {
-        name: dataset.drop_vars(PLACES, errors="ignore").assign_coords(chosen)
-        if "transition" in dataset.dims
-        else dataset
-        for name, dataset in groups(idata).items()
-    }
+    data = groups(idata)
+    for name, dataset in data.items():
+        if "transition" in dataset.dims:
+            data[name] = dataset.drop_vars(PLACES, errors="ignore").assign_coords(chosen)
     return from_groups(data, idata.attrs)

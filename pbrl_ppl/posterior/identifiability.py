@@ -115,20 +115,13 @@ class Identifiability:
         """Return plain values for ``report.json``."""
         return {
             "parameters": [asdict(width) for width in self.parameters],
-            "directions": [
-                {"weights": dict(direction.weights), "effect": direction.effect}
-                for direction in self.directions
-            ],
+            "directions": [vars(d) | {"weights": dict(d.weights)} for d in self.directions],
             "sentences": list(self.sentences),
         }
 
 
 def identify(
-    fitted: Idata | Mode,
-    *,
-    mode: Mode | None = None,
-    effects: Iterable[Effect] = catalogue,
-    no_effect: float = 0.1,
+    fitted: Idata | Mode, *, mode: Mode | None = None, effects: Iterable[Effect] = catalogue
 ) -> Identifiability:
     """Return which parameters the data inform, and which combinations they cannot tell apart.
 
@@ -146,8 +139,6 @@ def identify(
         highest likelihood, with measured initial states taken as exact.
     effects : iterable of Effect
         Where the names of a posterior's effects are looked up; add your own to the package's.
-    no_effect : float
-        Squared column norm in prior sds below which the data's precision is a tenth of the prior's.
 
     Returns
     -------
@@ -190,12 +181,10 @@ def identify(
         widths = tuple(_width(label, float(a), float(b), moved=0.0) for label, a, b in pairs)
     else:
         widths = _widths(layout, prior, posterior)
-    verdicts = {width.parameter: width.verdict for width in widths}
-    without = tuple(
-        label
-        for label, information in zip(labels, np.diag(gram), strict=True)
-        if information < no_effect and verdicts[label] != INFORMED
-    )
+    informed = {width.parameter for width in widths if width.verdict == INFORMED}
+    # squared column norm in prior sds: the data's precision is below a tenth of the prior's
+    little = [labels[i] for i in np.flatnonzero(np.diag(gram) < 0.1)]
+    without = tuple(label for label in little if label not in informed)
     return Identifiability(widths, without, _directions(gram, labels))
 
 
@@ -219,16 +208,13 @@ def uninformed(idata: Idata, *, effects: Iterable[Effect] = catalogue) -> tuple[
     return tuple(width.parameter for width in widths if width.verdict == PRIOR_ONLY)
 
 
-def _prior_draws(layout: Layout, *, n_draws: int = 20_000) -> dict[str, Floats]:
-    """Return prior draws by label, wheels folded as the posterior's are.
-
-    ``n_draws``: draws from the prior.
-    """
+def _prior_draws(layout: Layout) -> dict[str, Floats]:
+    """Return 20,000 prior draws by label, wheels folded as the posterior's are."""
     rng = np.random.default_rng(0)
     # anchors in different bodies cannot be compared
     free = {owner for b in layout.blocks if b.name in JOINT_INDICES for owner in b.owners}
     draws = {
-        f"{block.name}[{owner}]": prior.sample(rng, n_draws)
+        f"{block.name}[{owner}]": prior.sample(rng, 20_000)
         for block, owner, prior in layout.entries
         if owner not in free or block.of != "joint"
     }
@@ -328,8 +314,7 @@ def _linearised(idata: Idata, effects: Iterable[Effect]) -> tuple[Layout, Floats
     data, measured = group(idata, "constant_data"), group(idata, "observed_data")["next_state"]
     columns = tuple(STATE.index(name) for name in record.measured)
     observations = Observations(measured.to_numpy(), columns)
-    best = best_draw(idata)
-    draws = labelled_draws(idata)
+    best, draws = best_draw(idata), labelled_draws(idata)
     phi = inside(layout.priors, np.array([draws[label][best] for label in layout.labels]))
     stated = dict.fromkeys(observations.names, np.inf) | dict(record.scene.noise)
     inferred = {n: draws.get("sigma", draws.get(f"sigma[{n}]")) for n in observations.names}

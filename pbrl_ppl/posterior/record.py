@@ -243,13 +243,10 @@ class PosteriorRecord:
         EffectError
             If one is not among them.
         """
+        laws = attach(self.scene, (), effects)
+        tolerance = Physics.tolerance if self.tolerance is None else self.tolerance
         return Physics(
-            self.scene,
-            attach(self.scene, (), effects),
-            self.substeps,
-            threads,
-            tolerance=Physics.tolerance if self.tolerance is None else self.tolerance,
-            together=self.together,
+            self.scene, laws, self.substeps, threads, tolerance=tolerance, together=self.together
         )
 
     @property

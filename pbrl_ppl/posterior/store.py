@@ -21,7 +21,7 @@ import xarray as xr
 
 from pbrl_ppl.errors import OutputError, PosteriorError
 from pbrl_ppl.files import check_hdf5, is_as_sealed, seal, write_atomically
-from pbrl_ppl.state import Floats, Ints
+from pbrl_ppl.state import Floats
 
 #: ArviZ 1.x stores groups in an xarray.DataTree, 0.x in an InferenceData.
 DATATREE = not version("arviz").startswith("0.")
@@ -44,12 +44,6 @@ class Idata(Protocol):
     """A posterior or a trace: an InferenceData of ArviZ 0.x, or a DataTree of ArviZ 1.x."""
 
     attrs: dict[str, Any]
-
-    def sel(self, **indexers: object) -> Idata:
-        """Select by labels in all groups."""
-
-    def copy(self) -> Idata:
-        """Copy all groups."""
 
     def __getitem__(self, name: str) -> Any:
         """Return a group, in 1.x a node of the tree."""
@@ -204,36 +198,21 @@ def check_schema(attrs: Mapping[str, object], where: str) -> None:
         )
 
 
-def draws(idata: Idata, n: int | None = None, seed: int = 0) -> dict[str, Floats]:
+def draws(idata: Idata) -> dict[str, Floats]:
     """Return posterior draws by name, chains joined.
 
     Parameters
     ----------
     idata : InferenceData or DataTree
         A posterior.
-    n : int, optional
-        How many, chosen at random without replacement; all by default.
-    seed : int
-        Of the choice.
 
     Returns
     -------
     dict of str to ndarray
         Shape (draw, ...), SI units.
-
-    Raises
-    ------
-    PosteriorError
-        If more are asked for than there are.
     """
     stacked = group(idata, "posterior").stack(sample=("chain", "draw")).transpose("sample", ...)
-    total = stacked.sizes["sample"]
-    if n is not None and n > total:
-        raise PosteriorError(f"posterior: {n} draws were asked for, it has {total}")
-    chosen: slice | Ints = slice(None)
-    if n is not None:
-        chosen = np.random.default_rng(seed).choice(total, n, replace=False)
-    return {str(name): stacked[name].values[chosen] for name in stacked.data_vars}
+    return {str(name): stacked[name].to_numpy() for name in stacked.data_vars}
 
 
 def scalars(posterior: Idata) -> xr.Dataset:
@@ -284,9 +263,8 @@ def convergence(idata: Idata) -> tuple[dict[str, float], dict[str, float]]:
         by importance sampling have an ESS of at most ``attrs["importance_ess"]``.
     """
     variables = scalars(idata)
-    fixed = [str(name) for name, v in variables.data_vars.items() if v.min() == v.max()]
-    constant = {name: float(variables[name].size) for name in fixed}
-    flat = variables.drop_vars(fixed)
+    constant = {str(n): float(v.size) for n, v in variables.items() if v.min() == v.max()}
+    flat = variables.drop_vars(list(constant))
     if not flat.data_vars:
         return dict.fromkeys(constant, 1.0), constant
     az = arviz()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
@@ -17,7 +18,7 @@ from pbrl_ppl.parameters import JOINT_INDICES, ParameterLibrary, Prior, folded
 from pbrl_ppl.physics import index_priors
 from pbrl_ppl.posterior.record import layout_of, scene_of, stored_fields
 from pbrl_ppl.posterior.store import Idata, group, labelled_draws, scalars
-from pbrl_ppl.scene import Body, Joint, Scene
+from pbrl_ppl.scene import Joint, Scene
 from pbrl_ppl.state import Floats
 
 #: Variables of a posterior that are not parameters.
@@ -59,8 +60,8 @@ def updated_scene(idata: Idata, *, effects: Iterable[Effect] = catalogue) -> Sce
     """
     scene, layout = scene_of(idata), layout_of(idata, effects)
     draws = folded(layout, labelled_draws(idata))
-    priors: dict[str, dict[str, float]] = {}
-    for label, (block, _, prior) in zip(layout.labels, layout.entries, strict=True):
+    new: dict[tuple[str, str], tuple[tuple[str, float], ...]] = {}
+    for label, (block, owner, prior) in zip(layout.labels, layout.entries, strict=True):
         if block.of != "body":
             continue
         if label not in draws:
@@ -71,27 +72,12 @@ def updated_scene(idata: Idata, *, effects: Iterable[Effect] = catalogue) -> Sce
                 " width to a prior; fit again, with more draws"
             )
         matched = moment_matched(prior, draws[label])
-        priors[label] = {k: getattr(matched, k) for k in matched.hyper_names}
-    bodies = tuple(with_priors(body, priors) for body in scene.bodies)
-    return scene.replace(bodies=bodies, joints=_joints(idata, scene))
-
-
-def with_priors(body: Body, priors: Mapping[str, Mapping[str, float]]) -> Body:
-    """Return a body with new hyper-parameters, its class's and its effects' among them.
-
-    Parameters
-    ----------
-    body : Body
-        Keeps its other priors.
-    priors : mapping of str to mapping
-        Hyper-parameters by label, such as ``mass[cart]``, of all bodies.
-    """
-    known = dict(body.prior)
-    for label, hyper in priors.items():
-        name, _, owner = label.rstrip("]").partition("[")
-        if owner in (body.owner, body.name):
-            known[name] = tuple(hyper.items())
-    return replace(body, prior=tuple(known.items()))
+        new[block.name, owner] = tuple((k, getattr(matched, k)) for k in matched.hyper_names)
+    bodies = []
+    for body in scene.bodies:  # with its class's and its effects' among them
+        own = {name: new[name, owner] for name, owner in new if owner in (body.owner, body.name)}
+        bodies.append(replace(body, prior=tuple((dict(body.prior) | own).items())))
+    return scene.replace(bodies=tuple(bodies), joints=_joints(idata, scene))
 
 
 def _joints(idata: Idata, scene: Scene) -> tuple[Joint, ...]:
@@ -151,16 +137,11 @@ def joint_probabilities(idata: Idata) -> dict[str, dict[str, float]]:
             "posterior: the bodies of all its joints were named in the scene; leave out bodies of a"
             " [[joint]], with known = false, and fit again"
         )
-    table: dict[str, dict[str, float]] = {}
+    table: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
     for row in rows:
         for joint, pair in row["joints"].items():
-            probabilities = table.setdefault(joint, {})
-            name = NONE if pair is None else "-".join(pair)
-            probabilities[name] = probabilities.get(name, 0.0) + row["probability"]
-    return {
-        joint: dict(sorted(probabilities.items(), key=lambda item: -item[1]))
-        for joint, probabilities in table.items()
-    }
+            table[joint][NONE if pair is None else "-".join(pair)] += row["probability"]
+    return {joint: dict(sorted(p.items(), key=lambda item: -item[1])) for joint, p in table.items()}
 
 
 def moment_matched(prior: Prior, draws: Floats) -> Prior:
@@ -196,14 +177,11 @@ def moment_matched(prior: Prior, draws: Floats) -> Prior:
     return replace(prior, mu=mean, sigma=sd)
 
 
-def _parent(
-    mean: float, sd: float, lower: float, upper: float, *, outside: float = 5.0, level: float = 5.0
-) -> tuple[float, float]:
-    """Return mu and sigma of the normal that has this mean and sd once it is truncated.
-
-    ``outside``: sigmas that mu is outside the support at most; there it is exponential.
-    ``level``: sigma at most, as a multiple of the width of what it covers; there it is uniform.
-    """
+def _parent(mean: float, sd: float, lower: float, upper: float) -> tuple[float, float]:
+    """Return mu and sigma of the normal that has this mean and sd once it is truncated."""
+    # sigmas that mu is outside the support at most, where it is exponential; sigma at most, as a
+    # multiple of the width of what it covers, where it is uniform
+    outside, level = 5.0, 5.0
     reach = min(upper - lower, mean - lower + sd, upper - mean + sd)
     reach = reach if np.isfinite(upper - lower) else 10 * reach
 

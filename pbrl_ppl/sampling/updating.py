@@ -21,6 +21,7 @@ from pbrl_ppl.likelihood import (
     along_trajectories,
     declared_problem,
     is_filtered,
+    observed_coordinates,
     single_transitions,
 )
 from pbrl_ppl.modes import systematic
@@ -340,8 +341,8 @@ def _weighted(
     data = _with_data(idata, problem)
     changed = replace(record, together=tuple(problem.physics.together))
     if is_filtered(problem):
-        coordinates = files.recorded_coordinates(problem.scene, data["constant_data"])
-        changed = replace(changed, cells=coordinates)
+        history = files.recorded(problem.scene, data["constant_data"])
+        changed = replace(changed, cells=observed_coordinates(problem.scene, history))
     more_noise = [label for label in changed.noise_labels if label not in problem.noise_labels]
     both = from_groups(groups(idata) | data, dict(idata.attrs) | changed.attributes())
     earlier = group(idata, "log_likelihood")["next_state"].transpose("chain", "draw", "transition")

@@ -118,7 +118,7 @@ def test_a_search_takes_one_thread_of_linear_algebra(problem, modes, monkeypatch
 
     monkeypatch.setattr(search, "climb", watched)
     with threadpool_limits(2, "blas"):
-        find_modes(problem, initial=modes[0].phi)
+        find_mode(problem, initial=modes[0].phi)
         assert blas_threads() == {2}  # as it was
     assert seen
     assert all(threads == {1} for threads in seen)

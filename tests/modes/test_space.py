@@ -9,8 +9,8 @@ from scipy import stats
 
 from pbrl_ppl.likelihood import Problem, along_trajectories, single_transitions
 from pbrl_ppl.model import build_model, physics_model, problem_in
-from pbrl_ppl.modes import Space, constrain, find_mode, trajectory_mode, unconstrain
-from pbrl_ppl.modes.space import uninformed
+from pbrl_ppl.modes import Space, find_mode, trajectory_mode
+from pbrl_ppl.modes.space import constrain, unconstrain, uninformed
 from pbrl_ppl.parameters import Prior, prior_draws, symmetrised
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Body, Scene, Shape

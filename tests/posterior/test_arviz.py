@@ -12,8 +12,9 @@ from pymc.stats import compute_log_prior
 
 from pbrl_ppl.model import physics_model, problem_in
 from pbrl_ppl.parameters import wheels
-from pbrl_ppl.posterior import by_number, from_groups, group, groups, loo_pit, predicted_rows
+from pbrl_ppl.posterior import by_number, from_groups, group, groups, loo_pit
 from pbrl_ppl.posterior.completion import predictive_rows, prior_groups
+from pbrl_ppl.posterior.cross_validation import predicted_rows
 from pbrl_ppl.posterior.store import DATATREE, load_posterior, save_posterior
 from pbrl_ppl.sampling import fit, sample, update
 from tests.helpers.carts import CART, cart_scene

@@ -15,8 +15,9 @@ from pbrl_ppl.errors import OutputError, PosteriorError
 from pbrl_ppl.likelihood import Coordinates
 from pbrl_ppl.parameters import ParameterLibrary
 from pbrl_ppl.physics import Physics
-from pbrl_ppl.posterior import LinearisationCheck, PosteriorRecord, StoredMode, scene_of
+from pbrl_ppl.posterior import PosteriorRecord, scene_of
 from pbrl_ppl.posterior import store as posterior
+from pbrl_ppl.posterior.record import LinearisationCheck, StoredMode
 from pbrl_ppl.posterior.store import (
     DATATREE,
     convergence,
@@ -244,27 +245,6 @@ def test_all_draws_with_chains_joined() -> None:
     assert set(found) == {"mass", "sigma"}
     np.testing.assert_array_equal(found["mass"], values["mass"].values.reshape(100, 1))
     np.testing.assert_array_equal(found["sigma"], values["sigma"].values.reshape(100, 2))
-
-
-def test_some_draws() -> None:
-    idata = made()
-    everything = draws(idata)
-    some = draws(idata, 20, seed=3)
-    again, other = draws(idata, 20, seed=3), draws(idata, 20, seed=4)
-    assert some["mass"].shape == (20, 1)
-    for name in some:
-        np.testing.assert_array_equal(some[name], again[name])
-        assert not np.array_equal(some[name], other[name])
-    # without replacement, and the parameters of one draw stay together
-    place = [int(np.flatnonzero(everything["mass"][:, 0] == m)[0]) for m in some["mass"][:, 0]]
-    assert len(set(place)) == 20
-    np.testing.assert_array_equal(some["sigma"], everything["sigma"][place])
-    np.testing.assert_array_equal(np.sort(draws(idata, 100)["mass"], axis=0).shape, (100, 1))
-
-
-def test_more_draws_than_there_are() -> None:
-    with pytest.raises(PosteriorError, match="101 draws were asked for, it has 100"):
-        draws(made(), 101)
 
 
 def test_scene_with_its_effects(tmp_path) -> None:

@@ -12,14 +12,8 @@ from scipy.stats import ks_2samp, kstest, kstwobign, norm
 from pbrl_ppl.effects import Effect, EffectParameter
 from pbrl_ppl.errors import ConvergenceWarning, FitError, RefitWarning
 from pbrl_ppl.model import physics_model, problem_in
-from pbrl_ppl.modes import (
-    Space,
-    adaptive_importance,
-    constrain,
-    find_mode,
-    trajectory_mode,
-    unconstrain,
-)
+from pbrl_ppl.modes import Space, adaptive_importance, find_mode, trajectory_mode
+from pbrl_ppl.modes.space import constrain, unconstrain
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.posterior import (
     MAX_PARETO_K,
