@@ -131,7 +131,7 @@ def _values(
     """Return the whole model's variables, shape (chain, draw, ...), from the traces."""
     layout = problem.layout
     phi = np.full((*label.shape, layout.size), np.nan)
-    sigma = np.empty((*label.shape, len(problem.noise_labels)))
+    sigma = np.empty((*label.shape, sum(map(len, problem.noise_variables.values()))))
     for i, trace in traces.items():
         own, here = weighed[i].mode.problem, label == i
         if own.noise_labels != problem.noise_labels:
