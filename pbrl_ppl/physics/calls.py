@@ -205,7 +205,7 @@ MISSING = (
 FUNCTIONS = Functions(*map(_FOUND.get, Functions._fields)) if AVAILABLE else None
 
 
-def _calling(result, *kinds):  # type: ignore[no-untyped-def]
+def _calling(result: Any, *kinds: Any) -> tuple[Any, Callable[..., object]]:
     """Return an intrinsic's signature and code: a call by address of a C function of such kinds."""
 
     def codegen(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
