@@ -193,7 +193,7 @@ def naive(
 @numba.njit(nogil=True)
 def _prepare(fn, world, bodies, joints):  # type: ignore[no-untyped-def]
     compiled.set_properties(fn, world, bodies, joints)
-    compiled.set_strengths(fn, world, bodies, True)
+    compiled.set_solver(fn, world, bodies, True)
 
 
 @numba.njit(nogil=True)

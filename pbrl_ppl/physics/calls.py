@@ -33,7 +33,7 @@ from pymunk import _chipmunk_cffi
 from pbrl_ppl.effects import Law
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.parameters import BODY_PARAMETERS, JOINT_ANCHORS
-from pbrl_ppl.physics.world import BODY_CONSTRAINTS, JOINT_KINDS, RING, Placed, World
+from pbrl_ppl.physics.world import BODY_CONSTRAINTS, JOINT_KINDS, RING, OnBody, Placed, World
 
 
 def sources_digest(folder: Path) -> str:
@@ -173,17 +173,12 @@ Functions = namedtuple(
     cpConstraintSetMaxForce cpPinJointSetAnchorB
     """,
 )
-#: C functions that set properties of constraints.
-SETTERS = sorted(
-    {s.function for kind in JOINT_KINDS.values() for s in kind.settings}
-    | {
-        s.function
-        for kinds in BODY_CONSTRAINTS.values()
-        for kind in kinds
-        for s in (*kind.settings, *kind.joint_settings)
-    }
+_SETTINGS = chain(
+    *(kind.settings for kind in JOINT_KINDS.values()),
+    *(kind.settings + kind.joint_settings for kind in chain(*BODY_CONSTRAINTS.values())),
 )
-_PLACE, _DOUBLE = ir.IntType(64), ir.DoubleType()
+#: C functions that set properties of constraints.
+SETTERS = sorted({setting.function for setting in _SETTINGS})
 _DOUBLES = types.CPointer(types.float64)
 
 
@@ -210,63 +205,60 @@ MISSING = (
 FUNCTIONS = Functions(*map(_FOUND.get, Functions._fields)) if AVAILABLE else None
 
 
-def _calling(result: object, *kinds: object) -> Callable[..., object]:
-    """Return numba's code generator for a call by address of a C function of such arguments."""
+def _calling(result: Any, *kinds: Any) -> tuple[Any, Callable[..., object]]:
+    """Return an intrinsic's signature and code: a call by address of a C function of such kinds."""
 
     def codegen(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         function, *values = arguments
-        kind = ir.FunctionType(result, kinds).as_pointer()
+        nothing = result is types.void
+        returns = ir.VoidType() if nothing else context.get_value_type(result)
+        kind = ir.FunctionType(returns, [value.type for value in values]).as_pointer()
         returned = builder.call(builder.inttoptr(function, kind), values)
-        return context.get_dummy_value() if isinstance(result, ir.VoidType) else returned
+        return context.get_dummy_value() if nothing else returned
 
-    return codegen
+    return result(types.int64, *kinds), codegen
 
 
 @intrinsic
 def call1(typing, function, pointer, a):  # type: ignore[no-untyped-def]
     """Call a C function of a pointer and a double that returns nothing."""
-    signature = types.void(types.int64, types.int64, types.float64)
-    return signature, _calling(ir.VoidType(), _PLACE, _DOUBLE)
+    return _calling(types.void, types.int64, types.float64)
 
 
 @intrinsic
 def call2(typing, function, pointer, a, b):  # type: ignore[no-untyped-def]
     """Call a C function of a pointer and a vector that returns nothing."""
-    signature = types.void(types.int64, types.int64, types.float64, types.float64)
-    return signature, _calling(ir.VoidType(), _PLACE, _DOUBLE, _DOUBLE)
+    return _calling(types.void, types.int64, types.float64, types.float64)
 
 
 @intrinsic
 def call_int(typing, function, pointer, value):  # type: ignore[no-untyped-def]
     """Call a C function of a pointer and an int that returns nothing."""
-    signature = types.void(types.int64, types.int64, types.int32)
-    return signature, _calling(ir.VoidType(), _PLACE, ir.IntType(32))
+    return _calling(types.void, types.int64, types.int32)
 
 
 @intrinsic
 def call_pointer(typing, function, pointer, other):  # type: ignore[no-untyped-def]
     """Call a C function of two pointers, whatever it returns."""
-    signature = types.void(types.int64, types.int64, types.int64)
-    return signature, _calling(ir.VoidType(), _PLACE, _PLACE)
+    return _calling(types.void, types.int64, types.int64)
 
 
 @intrinsic
 def get1(typing, function, pointer):  # type: ignore[no-untyped-def]
     """Call a C function of a pointer that returns a double."""
-    return types.float64(types.int64, types.int64), _calling(_DOUBLE, _PLACE)
+    return _calling(types.float64, types.int64)
 
 
 @intrinsic
 def get2(typing, function, pointer):  # type: ignore[no-untyped-def]
     """Call a C function of a pointer that returns a vector."""
-    call = _calling(ir.LiteralStructType([_DOUBLE, _DOUBLE]), _PLACE)
+    return _calling(types.UniTuple(types.float64, 2), types.int64)
 
-    def codegen(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
-        value = call(context, builder, signature, arguments)
-        parts = [builder.extract_value(value, i) for i in range(2)]
-        return context.make_tuple(builder, signature.return_type, parts)
 
-    return types.UniTuple(types.float64, 2)(types.int64, types.int64), codegen
+@intrinsic
+def call_law(typing, function, a, b, c, d):  # type: ignore[no-untyped-def]
+    """Call an effect's law: four pointers to doubles."""
+    return _calling(types.void, *[_DOUBLES] * 4)
 
 
 @intrinsic
@@ -277,7 +269,7 @@ def numbers_at(typing, address):  # type: ignore[no-untyped-def]
     """
 
     def codegen(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
-        return builder.inttoptr(arguments[0], _DOUBLE.as_pointer())
+        return builder.inttoptr(arguments[0], context.get_value_type(_DOUBLES))
 
     return _DOUBLES(types.int64), codegen
 
@@ -287,8 +279,7 @@ def from_place(typing, pointer, place):  # type: ignore[no-untyped-def]
     """Return a pointer to the numbers from a place on."""
 
     def codegen(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
-        start, at = arguments
-        return builder.gep(start, [at])
+        return builder.gep(arguments[0], [arguments[1]])
 
     return _DOUBLES(_DOUBLES, types.int64), codegen
 
@@ -311,20 +302,13 @@ def record_reader(kind: np.dtype[np.void]) -> Any:
 
         def codegen(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
             start, at = arguments
-            size = ir.Constant(_PLACE, kind.itemsize)
+            size = ir.Constant(start.type, kind.itemsize)
             place = builder.add(start, builder.mul(at, size))
             return builder.inttoptr(place, context.get_value_type(record))
 
         return record(types.int64, types.int64), codegen
 
     return record_at
-
-
-@intrinsic
-def call_law(typing, function, a, b, c, d):  # type: ignore[no-untyped-def]
-    """Call an effect's law: four pointers to doubles."""
-    signature = types.void(types.int64, *[_DOUBLES] * 4)
-    return signature, _calling(ir.VoidType(), *[_DOUBLE.as_pointer()] * 4)
 
 
 #: Address of each compiled law, and the C function itself, which must be kept.
@@ -378,30 +362,18 @@ def still(world: World, near: float = 1.0) -> Still:
     )  # fmt: skip
 
 
-class Pointers(NamedTuple):
-    """Addresses of the C objects of a world, and what else its engine's rollout needs of it."""
-
-    still: Still
-    space: int
-    iterations: int
-    chained: NDArray[np.bool_]
-    padding: int
-    far: float  # m
-    bodies: NDArray[np.int64]
-    kinematic: NDArray[np.bool_]
-    shapes: NDArray[np.int64]
-    shape_body: NDArray[np.int64]
-    wheels: NDArray[np.int64]  # (2, wheel): the rod along x, the rod along y
-    wheel_body: NDArray[np.int64]
-    unlimited: NDArray[np.int64]
-    limited: NDArray[np.int64]
-    body_settings: NDArray[np.void]  # of dtype SETTING, as the others
-    strengths: NDArray[np.void]
-    pivots: NDArray[np.int64]  # (hinge, 3): body, joint, column of its anchor on the body
-    joint_settings: NDArray[np.void]
-    discs: NDArray[np.int64]
-    patches: NDArray[np.int64]  # (2, patch, point of the ring): what holds it, the rod
-    patch_body: NDArray[np.int64]
+#: Addresses of the C objects of a world, and what else its engine's rollout needs of it. Settings
+#: are of dtype `SETTING`; wheels are (2, wheel): the rod along x, the rod along y; pivots (hinge,
+#: 3): body, joint, column of its anchor on the body; patches (2, patch, point of the ring): what
+#: holds it, the rod.
+Pointers = namedtuple(
+    "Pointers",
+    """
+    still space iterations chained padding far bodies kinematic shapes shape_body
+    wheels wheel_body unlimited limited body_settings strengths joint_settings pivots
+    discs patches patch_body
+    """,
+)
 
 
 def pointers(world: World) -> Pointers:
@@ -428,7 +400,9 @@ def pointers(world: World) -> Pointers:
     def constraints(*those: Iterable[pymunk.Constraint]) -> NDArray[np.int64]:
         return at(*(constraint._constraint for constraint in chain(*those)))
 
-    wheels, patches = world.wheels, world.patches
+    def both(placed: Iterable[OnBody]) -> NDArray[np.int64]:
+        return constraints(*(p.first for p in placed), *(p.second for p in placed))
+
     return Pointers(
         still=still(world),
         space=int(ffi.cast("intptr_t", world.space._space)),
@@ -440,8 +414,8 @@ def pointers(world: World) -> Pointers:
         kinematic=world.kinematic,
         shapes=at(*(shape._shape for _, shape in world.shapes)),
         shape_body=whole(*(i for i, _ in world.shapes)),
-        wheels=constraints(*(w.first for w in wheels), *(w.second for w in wheels)).reshape(2, -1),
-        wheel_body=whole(*(wheel.body for wheel in wheels)),
+        wheels=both(world.wheels).reshape(2, -1),
+        wheel_body=whole(*(wheel.body for wheel in world.wheels)),
         unlimited=constraints(world.unlimited),
         limited=constraints(world.limited),
         body_settings=table(p for p in world.body_settings if p.setting.attribute != "max_force"),
@@ -449,8 +423,6 @@ def pointers(world: World) -> Pointers:
         joint_settings=table(world.joint_settings),
         pivots=whole(*chain(*world.pivots)).reshape(-1, 3),
         discs=at(*(disc._shape for disc in world.discs)),
-        patches=constraints(*(p.first for p in patches), *(p.second for p in patches)).reshape(
-            2, -1, len(RING)
-        ),
-        patch_body=whole(*(patch.body for patch in patches)),
+        patches=both(world.patches).reshape(2, -1, len(RING)),
+        patch_body=whole(*(patch.body for patch in world.patches)),
     )

@@ -33,7 +33,7 @@ from pbrl_ppl.physics.laws import (
     set_memory,
     states_before,
 )
-from pbrl_ppl.physics.solids import near_contact
+from pbrl_ppl.physics.solids import near_contact, place_discs
 from pbrl_ppl.physics.world import COLUMN, FINER, TINY
 
 _FREE, _TOUCHED, _LOST = 0, 1, 2
@@ -87,8 +87,13 @@ def set_properties(fn, world, bodies, joints):  # type: ignore[no-untyped-def]
 
 
 @inner
-def set_strengths(fn, world, bodies, on):  # type: ignore[no-untyped-def]
-    """Set the constraints' greatest forces, or set them to zero; patches get theirs as placed."""
+def set_solver(fn, world, bodies, on):  # type: ignore[no-untyped-def]
+    """Set the solver's iterations and the constraints' greatest forces, or one and none.
+
+    Patches get their forces as placed.
+    """
+    enough = iterations(world.iterations, world.chained, bodies)
+    call_int(fn.cpSpaceSetIterations, world.space, enough if on else 1)
     for constraint in world.unlimited:
         call1(fn.cpConstraintSetMaxForce, constraint, np.inf if on else 0.0)
     for constraint in world.limited:
@@ -140,9 +145,8 @@ def patch_point(row, after, omega, point, step, most):  # type: ignore[no-untype
     x, y = rotated(c, s, x, y)
     along_x, along_y = v_x - omega * y, v_y + omega * x
     speed = math.sqrt(along_x * along_x + along_y * along_y)
-    slow = (
-        most * step
-    )  # with a tenth of it, slow points would stick across their direction now and then
+    # with a tenth of it, slow points would stick across their direction now and then
+    slow = most * step
     share = 1.0 if speed >= slow else speed / slow
     if speed == 0.0:  # at rest any direction will do
         along_x, speed = 1.0, 1.0
@@ -196,8 +200,6 @@ def set_discs(fn, world, discs):  # type: ignore[no-untyped-def]
 
     They are removed and added again, since the order of contacts depends on their earlier places.
     """
-    obstacles = world.still.obstacles
-    first = len(obstacles) - len(world.discs)
     for j in range(len(world.discs)):
         call_pointer(fn.cpSpaceRemoveShape, world.space, world.discs[j])
     if len(world.discs):
@@ -212,10 +214,7 @@ def set_discs(fn, world, discs):  # type: ignore[no-untyped-def]
         call2(fn.cpCircleShapeSetOffset, world.discs[j], x, y)
         call1(fn.cpCircleShapeSetRadius, world.discs[j], radius)
         call_pointer(fn.cpSpaceAddShape, world.space, world.discs[j])
-        obstacle = obstacles[first + j]
-        obstacle[0] = obstacle[2] = x
-        obstacle[1] = obstacle[3] = y
-        obstacle[4] = radius
+    place_discs(world.still, discs)
 
 
 @inner
@@ -294,12 +293,9 @@ def _forget(fn, world, bodies, batch, touched):  # type: ignore[no-untyped-def]
             call_pointer(fn.cpSpaceRemoveShape, world.space, world.shapes[0])
         for shape in world.shapes:
             call_pointer(fn.cpSpaceAddShape, world.space, shape)
-    set_strengths(fn, world, bodies, False)
-    call_int(fn.cpSpaceSetIterations, world.space, 1)
+    set_solver(fn, world, bodies, False)
     call1(fn.cpSpaceStep, world.space, TINY * batch.time_step)
-    enough = iterations(world.iterations, world.chained, bodies)
-    call_int(fn.cpSpaceSetIterations, world.space, enough)
-    set_strengths(fn, world, bodies, True)
+    set_solver(fn, world, bodies, True)
 
 
 @inner
@@ -355,16 +351,6 @@ def _scratch_of(world, laws):  # type: ignore[no-untyped-def]
     )  # fmt: skip
 
 
-@inner
-def _renew(fn, world, bodies, joints, state):  # type: ignore[no-untyped-def]
-    """Set properties that change with time where an interval begins."""
-    set_properties(fn, world, bodies, joints)
-    place_bodies(fn, world, bodies, state)
-    set_strengths(fn, world, bodies, True)
-    enough = iterations(world.iterations, world.chained, bodies)
-    call_int(fn.cpSpaceSetIterations, world.space, enough)
-
-
 @inlined
 def _transition(  # type: ignore[no-untyped-def]
     fn, world, batch, laws, p, t, substeps, scratch, first, begin, whole, out
@@ -389,7 +375,6 @@ def _transition(  # type: ignore[no-untyped-def]
     remembered = from_place(start_of(memory), laws.n_slots)
     state_at, acted_at, held_at = start_of(state), start_of(acted), start_of(held)
     still = world.still
-    watch = len(still.obstacles) > 0 or k > 1
     place_bodies(fn, world, bodies, state)
     set_memory(batch, laws, p, t, begin, state, acted, memory, at)
     begin_held(state, laws, acted, held)
@@ -397,7 +382,9 @@ def _transition(  # type: ignore[no-untyped-def]
         h = end
         if h > begin and rows.shape[1] > 1:
             bodies = properties_in(rows, p, t, h, len(inputs))
-            _renew(fn, world, bodies, joints, state)
+            set_properties(fn, world, bodies, joints)
+            place_bodies(fn, world, bodies, state)
+            set_solver(fn, world, bodies, True)
         inputs_at = start_of(inputs[h])
         if driven:
             drive(fn, world, state, inputs[h])
@@ -422,7 +409,7 @@ def _transition(  # type: ignore[no-untyped-def]
             call1(fn.cpSpaceStep, world.space, step)
             if _read(fn, world, bodies, state):
                 return _LOST, end
-            if watch and (touched == _FREE or not whole):
+            if still.watched and (touched == _FREE or not whole):
                 near = near_contact(state, still.radii, still.obstacles, still.can_touch)
                 touched = _TOUCHED if near else touched
         copy(state, out[h])

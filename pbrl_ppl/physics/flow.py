@@ -3,7 +3,7 @@
 Between switches of dry friction the equations are smooth: steps of order five whose error is
 estimated (J. R. Dormand and P. J. Prince, Journal of Computational and Applied Mathematics 6,
 1980), and halved where it is too large. A switch, where a row stops or what sticks gives way, is
-located within its step (E. Hairer, S. P. Norsett and ROW.g. Wanner, Solving Ordinary Differential
+located within its step (E. Hairer, S. P. Norsett and G. Wanner, Solving Ordinary Differential
 Equations I, section II.6): the motion is a continuous function of parameters and start.
 """
 
@@ -14,7 +14,7 @@ import math
 import numpy as np
 from scipy.integrate import RK45
 
-from pbrl_ppl.physics.calls import compiled, copy, inner, numbers_at
+from pbrl_ppl.physics.calls import compiled, copy, inlined, inner, numbers_at
 from pbrl_ppl.physics.laws import begin_held, law_at, remember, set_memory, states_before
 from pbrl_ppl.physics.motion import (
     END_Q,
@@ -39,7 +39,7 @@ from pbrl_ppl.physics.motion import (
     solve,
     strain,
 )
-from pbrl_ppl.physics.solids import near_contact
+from pbrl_ppl.physics.solids import near_contact, place_discs
 from pbrl_ppl.physics.tree import FRICTION, LINK
 from pbrl_ppl.state import Floats
 
@@ -160,8 +160,7 @@ def _begin_modes(work):  # type: ignore[no-untyped-def]
             continue
         if r < count:
             speed = row_speed(work, r, U)
-            size = _size(work, r)
-            if abs(speed) * work.time_step > still * size:
+            if abs(speed) * work.time_step > still * _size(work, r):
                 kinds[r, 2] = 1 if speed > 0.0 else -1
             moved = speed != 0.0
         else:
@@ -219,8 +218,7 @@ def _margin(work, u):  # type: ignore[no-untyped-def]
             bound = max(work.rows[r, ROW.bound], 1e-300)
             least = min(least, 1.0 - abs(work.rows[r, ROW.force]) / bound)
         elif mode != MODE.smooth:
-            size = _size(work, r)
-            least = min(least, mode * row_speed(work, r, u) * work.time_step / size)
+            least = min(least, mode * row_speed(work, r, u) * work.time_step / _size(work, r))
     return least
 
 
@@ -252,7 +250,7 @@ def _step(work, laws, share, width):  # type: ignore[no-untyped-def]
     """
     motion, kinds, rings = work.motion, work.kinds, work.rings
     n, count, seconds, end, way = work.n, work.n_rows, width * work.time_step, 1.0, 1.0
-    ends = n + 1 + work.n_held  # after the numbers of laws, which have speeds alone
+    ends = n + 1 + work.n_held if work.n_held > 0 else n  # laws' numbers have speeds alone
     for j in range(ends):
         motion[SLOPES, j] = motion[U, j]
     for stage in range(1, 7):
@@ -367,7 +365,7 @@ def _attempt(work, laws, share, width, left, budget):  # type: ignore[no-untyped
 def _accept(work):  # type: ignore[no-untyped-def]
     """Begin the next step where one ends; return whether a ring that slides is to stop."""
     motion, n, stops = work.motion, work.n, False
-    for j in range(n + 1 + work.n_held):
+    for j in range(n + 1 + work.n_held if work.n_held > 0 else n):
         motion[Q, j], motion[U, j] = motion[END_Q, j], motion[END_U, j]
         motion[SLOPES + 1, j] = motion[SLOPES + 13, j]
     for r in range(work.n_rows, work.n_kinds):
@@ -392,21 +390,11 @@ def _way(work, still):  # type: ignore[no-untyped-def]
     """Return the share of an interval in which no body moves by more than half the smallest."""
     fastest = 1e-300
     for k in range(work.n_bodies):
-        square = work.states[k, 3] ** 2 + work.states[k, 4] ** 2
-        fastest = max(fastest, math.sqrt(square))
+        fastest = max(fastest, math.sqrt(work.states[k, 3] ** 2 + work.states[k, 4] ** 2))
     return max(SHORTEST, 0.5 * still.length / (fastest * work.time_step))
 
 
-@inner
-def _place_discs(still, discs):  # type: ignore[no-untyped-def]
-    """Put the hidden discs (disc, 3) of a proposal among the obstacles."""
-    for j in range(len(discs)):
-        one, there = still.obstacles[len(still.obstacles) - len(discs) + j], discs[j, 2] > 0.0
-        one[0] = one[2] = discs[j, 0] if there else 1e9 * still.length
-        one[1], one[3], one[4] = discs[j, 1], discs[j, 1], discs[j, 2]
-
-
-@inner
+@inlined
 def _begin(work, laws, batch, out, item, h, memory, at):  # type: ignore[no-untyped-def]
     """Begin an item before an interval; nothing is known of the friction."""
     n, states = len(batch.inputs), states_before(batch, out, item, h)
@@ -420,7 +408,7 @@ def _begin(work, laws, batch, out, item, h, memory, at):  # type: ignore[no-unty
         work.motion[Q, work.n + 1 + s] = work.held[0, s]
 
 
-@inner
+@inlined
 def _write(work, still, out):  # type: ignore[no-untyped-def]
     """Write the states (body, 6); return whether one has diverged."""
     lost = False
@@ -431,15 +419,6 @@ def _write(work, still, out):  # type: ignore[no-untyped-def]
         for d in range(6):
             out[k, d] = work.states[k, d]
     return lost
-
-
-@inner
-def _lose(states, first):  # type: ignore[no-untyped-def]
-    """Set the states (H, body, 6) from an interval on to NaN."""
-    for h in range(first, len(states)):
-        for k in range(states.shape[1]):
-            for d in range(6):
-                states[h, k, d] = np.nan
 
 
 @compiled
@@ -466,15 +445,13 @@ def rollout_tree(  # type: ignore[no-untyped-def]
         laws = batch.laws[p]
         if p != proposal:
             proposal = p
-            _place_discs(still, discs[p])
+            place_discs(still, discs[p])
         first, wanted = begins[place], 1.0
         begins[place] = horizon
         for h in range(first, horizon):
             if h == first or timed:
-                set_numbers(
-                    work, still.gravity, still.normal_gravity, still.ring,
-                    rows[p, t * horizon + h if timed else 0], joints[p],
-                )  # fmt: skip
+                row = rows[p, t * horizon + h if timed else 0]
+                set_numbers(work, still, row, joints[p])
             if h == first:
                 _begin(work, laws, batch, out, item, h, memory, at)
             set_inputs(work, batch.inputs[t, h])
@@ -490,5 +467,5 @@ def rollout_tree(  # type: ignore[no-untyped-def]
                 begins[place] = h
                 break
             if _write(work, still, out[item, h]) or budget == 0:
-                _lose(out[item], h)
+                out[item, h:] = np.nan
                 break

@@ -93,11 +93,9 @@ def _(stage: Friction, law: np.void, last: int, other: int) -> None:
 #: dtype `LAW`, and of their parameters. Then how many numbers command laws remember, and force laws
 #: have of their own; the number of bodies, the columns of a body's inputs and the interval (s).
 LAWS = np.dtype(
-    [
-        (name, np.int64)
-        for kind in ("commands", "forces", "frictions")
-        for name in (f"n_{kind}", kind, f"{kind}_values")
-    ]
+    [(name, np.int64) for name in ("n_commands", "commands", "commands_values")]
+    + [(name, np.int64) for name in ("n_forces", "forces", "forces_values")]
+    + [(name, np.int64) for name in ("n_frictions", "frictions", "frictions_values")]
     + [(name, np.int64) for name in ("n_slots", "n_held", "n_bodies", "width")]
     + [("time_step", np.float64)],
     align=True,

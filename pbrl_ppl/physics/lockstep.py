@@ -13,12 +13,11 @@ Bodies with joints, or with friction under them, are a :mod:`tree <pbrl_ppl.phys
 from __future__ import annotations
 
 import math
-from collections import namedtuple
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from pbrl_ppl.physics.calls import compiled, from_place, inlined, inner, rotated, start_of
+from pbrl_ppl.physics.calls import compiled, copy, from_place, inlined, inner, rotated, start_of
 from pbrl_ppl.physics.laws import (
     ACTED,
     MORE,
@@ -30,33 +29,26 @@ from pbrl_ppl.physics.laws import (
     states_before,
 )
 from pbrl_ppl.physics.solids import reaches, segment
-from pbrl_ppl.physics.world import COLUMN, World
+from pbrl_ppl.physics.world import COLUMN, World, columns
 from pbrl_ppl.state import Bools, Floats, Ints
 
 #: Number of transitions in a block, which are computed side by side.
 BLOCK = 32
 
-
-def row_of(fields: str) -> Any:
-    """Return where the values of each field begin in a row: those of a block follow each other.
-
-    All fields are in one array: the compiler then knows that they do not overlap.
-    """
-    names = fields.split()
-    return namedtuple("Row", names)(*range(0, BLOCK * len(names), BLOCK))
-
-
-#: Fields of a body: the state of its centre of mass, which is at ``com`` in its frame, and by how
-#: much it turned in a substep; the place of its origin; the wrench on it and the weight beside the
-#: scene's gravity. Then those of its wheel: place and axis in its frame, greatest and stored
-#: impulses of both rods; the axis in the world, levers and effective masses in a substep.
-BODY = row_of(
+#: Where the values of each field of a body begin in a row: those of a block follow each other. All
+#: are in one array: the compiler then knows that they do not overlap. The state of the centre of
+#: mass, which is at ``com`` in the body's frame, and by how much it turned in a substep; the place
+#: of its origin; the wrench on it and the weight beside the scene's gravity. Then those of its
+#: wheel: place and axis in its frame, greatest and stored impulses of both rods; the axis in the
+#: world, levers and effective masses in a substep.
+BODY = columns(
     """
     x y angle turned vx vy omega cos sin com_x com_y inverse_mass inverse_moment
     origin_x origin_y force_x force_y torque weight_x weight_y
     wheel_x wheel_y wheel_cos wheel_sin most_along most_across impulse_along impulse_across
     axis_x axis_y lever_along lever_across mass_along mass_across
-    """
+    """,
+    BLOCK,
 )
 #: Coefficients of the series of cosine and sine.
 _C1, _C2, _C3, _C4, _C5, _C6, _C7 = ((-1) ** k / math.factorial(2 * k) for k in range(1, 8))
@@ -301,9 +293,7 @@ def _choose(lanes, batch, items, begins, begin):  # type: ignore[no-untyped-def]
         lanes.proposal[i], lanes.transition[i] = items[place] // n, items[place] % n
         lanes.first[i], lanes.until[i] = begins[place], horizon
         longest = max(longest, horizon - lanes.first[i])
-        for j in range(lanes.discs.shape[1]):
-            for d in range(3):
-                lanes.discs[i, j, d] = batch.given[2][lanes.proposal[i], j, d]
+        copy(batch.given[2][lanes.proposal[i]], lanes.discs[i])
     return longest
 
 

@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.physics.calls import from_place, inner, numbers_at, rotated, start_of
+from pbrl_ppl.physics.calls import from_place, inlined, inner, numbers_at, rotated, start_of
 from pbrl_ppl.physics.laws import ACTED, COMMAND, MORE, WINDOW, WRENCHES, act, bound
 from pbrl_ppl.physics.tree import FRICTION, KIND, LINK, MOST, POSE, Tree
 from pbrl_ppl.physics.world import COLUMN, JOINT, RING, columns
@@ -65,7 +65,7 @@ WORK = np.dtype(
         ("slope", np.float64, (MOST, MOST, 2)),  # derivative of a link's place by each coordinate
         ("rows", np.float64, (MOST, ROW.g + MOST)),
         ("rings", np.float64, (MOST, RIM.points + len(RING), 4)),
-        ("motion", np.float64, (M + MOST, MOST + 1)),
+        ("motion", np.float64, (M + MOST, MOST)),
         ("system", np.float64, (4 * MOST, 4 * MOST + 1)),
         ("states", np.float64, (MOST, 6)),
         ("acted", np.float64, (MOST + MORE, ACTED)),  # see `laws.act`
@@ -93,8 +93,8 @@ def work_of(tree: Tree, length: float) -> NDArray[np.void]:
     return work
 
 
-@inner
-def set_numbers(work, gravity, normal_gravity, ring, bodies, joints):  # type: ignore[no-untyped-def]
+@inlined
+def set_numbers(work, still, bodies, joints):  # type: ignore[no-untyped-def]
     """Set what depends on parameters alone: of ``bodies`` (body, column), ``joints`` (joint, 9)."""
     for i in range(work.n_links):
         fields, link, joint = work.tree[i], work.links[i], work.tree[i, LINK.joint]
@@ -117,15 +117,13 @@ def set_numbers(work, gravity, normal_gravity, ring, bodies, joints):  # type: i
             continue
         row = bodies[fields[LINK.body]]
         link[HAS.mass], link[HAS.moment] = row[COLUMN.mass], row[COLUMN.moment]
-        link[HAS.com_x], link[HAS.com_y] = (
-            row[COLUMN.com_x] - link[HAS.own_x],
-            row[COLUMN.com_y] - link[HAS.own_y],
-        )
-        link[HAS.weight_x] = gravity[0] + row[COLUMN.extra_gravity_x]
-        link[HAS.weight_y] = gravity[1] + row[COLUMN.extra_gravity_y]
+        link[HAS.com_x] = row[COLUMN.com_x] - link[HAS.own_x]
+        link[HAS.com_y] = row[COLUMN.com_y] - link[HAS.own_y]
+        link[HAS.weight_x] = still.gravity[0] + row[COLUMN.extra_gravity_x]
+        link[HAS.weight_y] = still.gravity[1] + row[COLUMN.extra_gravity_y]
         if fields[LINK.owner] >= 0:
             link[HAS.damping] = bodies[fields[LINK.owner], COLUMN.pivot_damping]
-    _set_friction(work, normal_gravity, ring, bodies)
+    _set_friction(work, still.normal_gravity, still.ring, bodies)
 
 
 @inner
@@ -143,10 +141,8 @@ def _set_friction(work, normal_gravity, ring, bodies):  # type: ignore[no-untype
                 point = work.rings[r - work.n_rows, RIM.points + j]
                 point[0], point[1] = x, y
         if kind < 0:
-            grip = row[COLUMN.patch_mu] * load / len(ring)
-            work.rings[r - work.n_rows, RIM.grip, 0] = work.rings[r - work.n_rows, RIM.twist, 3] = (
-                grip
-            )
+            rim = work.rings[r - work.n_rows]
+            rim[RIM.grip, 0] = rim[RIM.twist, 3] = row[COLUMN.patch_mu] * load / len(ring)
             continue
         numbers = work.rows[r]
         if kind == FRICTION.pivot:
@@ -158,9 +154,8 @@ def _set_friction(work, normal_gravity, ring, bodies):  # type: ignore[no-untype
             numbers[ROW.bound] = row[COLUMN.turn_torque]
         else:
             angle = row[COLUMN.w_theta] + (0.5 * math.pi if kind == FRICTION.across else 0.0)
-            numbers[ROW.bound] = load * (
-                row[COLUMN.mu_x] if kind == FRICTION.along else row[COLUMN.mu_y]
-            )
+            mu = row[COLUMN.mu_x] if kind == FRICTION.along else row[COLUMN.mu_y]
+            numbers[ROW.bound] = load * mu
             numbers[ROW.w_x] = row[COLUMN.w_x] - link[HAS.own_x]
             numbers[ROW.w_y] = row[COLUMN.w_y] - link[HAS.own_y]
             numbers[ROW.w_cos], numbers[ROW.w_sin] = math.cos(angle), math.sin(angle)
@@ -236,10 +231,8 @@ def set_places(work, q, u):  # type: ignore[no-untyped-def]
         if tree[i, LINK.kind] == KIND.rail:
             j = tree[i, LINK.first]
             along, rate = motion[q, j], motion[u, j]
-            c, s = (
-                math.cos(angle + work.poses[i, POSE.axis]),
-                math.sin(angle + work.poses[i, POSE.axis]),
-            )
+            direction = angle + work.poses[i, POSE.axis]
+            c, s = math.cos(direction), math.sin(direction)
             x, y = x + c * along, y + s * along
             v_x, v_y = v_x + c * rate - s * along * omega, v_y + s * rate + c * along * omega
             b_x -= omega * (2.0 * s * rate + c * along * omega)
@@ -250,12 +243,8 @@ def set_places(work, q, u):  # type: ignore[no-untyped-def]
             angle += work.poses[i, POSE.heading]
         c, s = math.cos(angle), math.sin(angle)
         links[i, HAS.cos], links[i, HAS.sin], links[i, HAS.x], links[i, HAS.y] = c, s, x, y
-        links[i, HAS.v_x], links[i, HAS.v_y], links[i, HAS.b_x], links[i, HAS.b_y] = (
-            v_x,
-            v_y,
-            b_x,
-            b_y,
-        )
+        links[i, HAS.v_x], links[i, HAS.v_y] = v_x, v_y
+        links[i, HAS.b_x], links[i, HAS.b_y] = b_x, b_y
         k = tree[i, LINK.body]
         if k >= 0:
             o_x, o_y = rotated(c, s, links[i, HAS.own_x], links[i, HAS.own_y])
@@ -319,11 +308,8 @@ def set_rows(work, u):  # type: ignore[no-untyped-def]
             rows[r, ROW.g + j] = 0.0
         if kind in (FRICTION.pivot, FRICTION.under, FRICTION.turning):
             rows[r, ROW.g + tree[i, LINK.first if kind != FRICTION.turning else LINK.turn]] = 1.0
-            if (
-                kind == FRICTION.pivot
-                and tree[i, LINK.kind] == KIND.hinge
-                and tree[i, LINK.parent] >= 0
-            ):
+            hinged = tree[i, LINK.kind] == KIND.hinge and tree[i, LINK.parent] >= 0
+            if kind == FRICTION.pivot and hinged:
                 rows[r, ROW.g + tree[tree[i, LINK.parent], LINK.turn]] = -1.0
             continue
         c, s, omega = links[i, HAS.cos], links[i, HAS.sin], motion[u, turn]
@@ -374,11 +360,12 @@ def set_bounds(work, laws, u):  # type: ignore[no-untyped-def]
 @inner
 def load(work, laws, u, share):  # type: ignore[no-untyped-def]
     """Set what acts at places that are set and a time: wrenches, forces, and rows of friction."""
-    motion, held, held_at = work.motion, work.n + 1, start_of(work.held)
+    motion, held = work.motion, work.n + 1
     for s in range(work.n_held):
         work.held[0, s] = motion[u - 1, held + s]
     if laws.n_commands + laws.n_forces > 0:
         begin = min(max(work.low + SHORTEST, share), work.high - WINDOW)  # past a jump
+        held_at = start_of(work.held)
         act(
             start_of(work.states), numbers_at(work.inputs), laws, begin, begin + WINDOW,
             start_of(work.acted), numbers_at(work.memory), held_at, from_place(held_at, MOST),
@@ -390,7 +377,7 @@ def load(work, laws, u, share):  # type: ignore[no-untyped-def]
     set_bounds(work, laws, u)
 
 
-@inner
+@inlined
 def set_inputs(work, inputs):  # type: ignore[no-untyped-def]
     """Set the wrenches of an interval, and the velocities of bodies that follow a path."""
     work.inputs = inputs.ctypes.data
@@ -515,10 +502,9 @@ def _resist(work, r, u, column):  # type: ignore[no-untyped-def]
     """Add the friction of a row that slips, or of a ring that slides, to a column of the system."""
     system, slope = work.system, work.slope
     if r < work.n_rows:
+        force = work.kinds[r, 2] * work.rows[r, ROW.bound]
         for j in range(work.n):
-            system[j, column] -= (
-                work.kinds[r, 2] * work.rows[r, ROW.bound] * work.rows[r, ROW.g + j]
-            )
+            system[j, column] -= force * work.rows[r, ROW.g + j]
         return
     i = work.kinds[r, 1]
     turn = work.tree[i, LINK.turn]
@@ -566,9 +552,8 @@ def set_first_slide(work, u, a, tries=30):  # type: ignore[no-untyped-def]
             for j in range(n):
                 way = abs(work.slope[i, j, 0]) + abs(work.slope[i, j, 1])
                 if j == turn:
-                    way += math.sqrt(
-                        rings[ring, RIM.points, 0] ** 2 + rings[ring, RIM.points, 1] ** 2
-                    )
+                    x, y = rings[ring, RIM.points, 0], rings[ring, RIM.points, 1]
+                    way += math.sqrt(x**2 + y**2)
                 slow += (_SLOW * way * motion[a, j]) ** 2
             for point in range(RIM.points, rings.shape[1]):
                 x, y = rotated(c, s, rings[ring, point, 0], rings[ring, point, 1])

@@ -300,7 +300,9 @@ class OneWorld:
             return states, met
         whole, apart = self._whole(phi, start, actions), self._apart(phi, start, actions)
         # in a contact within a part too, for the solver's iterations depend on the others
-        differ: Bools = np.asarray((~_same(whole, apart, self._rounding)).any(axis=(-3, -1)))
+        lost = np.isnan(whole) & np.isnan(apart)
+        same = (abs(whole - apart) <= self._rounding) | lost
+        differ: Bools = np.asarray((~same).any(axis=(-3, -1)))
         if not differ.any():
             return states, met
         for bodies_a, bodies_b in combinations((part.bodies for part in self.parted.parts), 2):
@@ -324,8 +326,3 @@ class OneWorld:
             least = (1.0 + _SHARE) * (self._reach[i] + self._reach[j])
             near |= come_near(way[..., :-1, :], way[..., 1:, :], least).any(axis=-1)
         return near
-
-
-def _same(a: Floats, b: Floats, rounding: Floats) -> Bools:
-    """Whether numbers are the same to rounding, or both are lost."""
-    return np.asarray((abs(a - b) <= rounding) | (np.isnan(a) & np.isnan(b)))

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from pbrl_ppl.effects import Attached, Effect
 from pbrl_ppl.errors import HistoryError, ParameterError, SimulationError
 from pbrl_ppl.history import History
-from pbrl_ppl.physics import compiled, flow, lockstep
+from pbrl_ppl.physics import flow
 from pbrl_ppl.physics.calls import compile_beside
 from pbrl_ppl.physics.parts import OneWorld, PartedSimulator, independent_parts, joined_parts
 from pbrl_ppl.physics.settings import PhysicsSettings
@@ -285,9 +285,8 @@ def simulated_recording(physics: Physics, phi: Floats, recorded: History) -> lis
     for drawn in predicted:
         states = np.full(recorded.dataset["observed"].shape, np.nan)
         states[:, :, follows] = recorded.dataset["start"].to_numpy()[:, :, follows]
-        for i, (trajectory, step) in enumerate(
-            zip(segments.trajectory, segments.step, strict=True)
-        ):
+        starts = zip(segments.trajectory, segments.step, strict=True)
+        for i, (trajectory, step) in enumerate(starts):
             rows = np.arange(step + 1, n_rows[trajectory])
             after = drawn[i, : len(rows)][:, ~follows]
             if not np.isfinite(after).all():
@@ -301,16 +300,11 @@ def simulated_recording(physics: Physics, phi: Floats, recorded: History) -> lis
     return result
 
 
-#: The loops by what moves in them: single bodies, joined ones or bodies on friction, and contacts.
-LOOPS = {
-    "single": lockstep.rollout_free,
-    "joined": flow.rollout_tree,
-    "touching": compiled.rollout_engine,
-}
+def compile_loops(names: Iterable[str] = ("single", "joined", "touching")) -> None:
+    """Compile these loops: predict one interval by each, of a puck.
 
-
-def compile_loops(names: Iterable[str] = tuple(LOOPS)) -> None:
-    """Compile these of `LOOPS`: predict one interval by each, of a puck."""
+    They are for single bodies, for joined ones or bodies on friction, and for contacts.
+    """
     scene = Scene(time_step=0.1, bodies=(Body("puck", Shape.circle(0.1)),))
     hinge = Joint("hinge", ("world", "puck"), (0, 0), (0, 0))
     scenes = {

@@ -5,7 +5,7 @@ And initial states on the rods that effects add.
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -47,7 +47,6 @@ SEEN = {
 }
 #: The time of what acts after the recording.
 _AFTER = Clock(*np.full((3, 1, 1), np.inf))
-S = TypeVar("S")
 
 
 class EngineInput(NamedTuple):
@@ -78,18 +77,9 @@ class EngineInput(NamedTuple):
     indices: Ints
 
 
-def staged(effects: tuple[Attached, ...], kind: type[S]) -> list[tuple[Attached, S]]:
+def staged(effects: tuple[Attached, ...], kind: type) -> list[tuple[Attached, Any]]:
     """Return the effects that act at a stage, each with it."""
-    stages = ((attached, attached.effect.stage) for attached in at_stage(effects, kind))
-    return [(attached, stage) for attached, stage in stages if isinstance(stage, kind)]
-
-
-def _changed_columns(attached: Attached, stage: Properties) -> frozenset[str]:
-    """Return the names of the body's numbers that an effect changes, by a trial evaluation."""
-    row = {name: np.zeros((1, 1)) for name in (*COLUMNS, *SEEN)}
-    centre = {p.name: np.full((1, 1), p.prior.centre) for p in attached.effect.parameters}
-    stage.modify(row, centre, _AFTER)
-    return frozenset(name for name, value in row.items() if value.any())
+    return [(attached, attached.effect.stage) for attached in at_stage(effects, kind)]
 
 
 class EngineProperties:
@@ -113,8 +103,7 @@ class EngineProperties:
         moved = []  # (place in phi, body, column)
         for i, body in enumerate(scene.moving):
             known = dict(body.known) | ({"mass": 1.0} if body.kinematic else {})  # not used
-            for name in BODY_PARAMETERS:
-                index = COLUMNS.index(name)
+            for index, name in enumerate(BODY_PARAMETERS):
                 self._known[i, index] = known.get(name, 0.0)
                 place = places.get(f"{name}[{body.owner}]")
                 if place is not None:
@@ -136,19 +125,18 @@ class EngineProperties:
         #: Bodies under which effects put a ring of friction, a wheel, and friction against turning.
         self.under = tuple(map(self._changed, (_PATCH, _WHEEL, _TURN)))
         #: Body and row among all joints of each rod that an effect adds.
-        self.tied = tuple(
-            (bodies.index(attached.body), len(scene.joints) + j)
-            for j, (attached, _) in enumerate(self._tying)
-        )
+        tied = enumerate(self._tying, len(scene.joints))
+        self.tied = tuple((bodies.index(one.body), row) for row, (one, _) in tied)
         self.joints = SceneJoints(scene, places)
 
     def _changed(self, names: tuple[str, ...]) -> tuple[int, ...]:
-        """Return the bodies for which effects change one of these columns."""
-        changed = {
-            one.body
-            for one, stage in self._modifying
-            if _changed_columns(one, stage).intersection(names)
-        }
+        """Return the bodies for which effects change one of these columns, by trial evaluations."""
+        changed: set[str] = set()
+        for one, stage in self._modifying:
+            row = {name: np.zeros((1, 1)) for name in (*COLUMNS, *SEEN)}
+            centre = {p.name: np.full((1, 1), p.prior.centre) for p in one.effect.parameters}
+            stage.modify(row, centre, _AFTER)
+            changed |= {one.body for name in names if row[name].any()}
         return tuple(i for i, name in enumerate(self._bodies) if name in changed)
 
     def values(self, attached: Attached, phi: Floats, axes: int = 0) -> dict[str, Floats]:
@@ -166,10 +154,8 @@ class EngineProperties:
 
     def sensors(self, phi: Floats) -> list[tuple[int, Sensor, Values]]:
         """Return body, sensor and its parameters, shape (proposal, 1, 1), in the sensors' order."""
-        return [
-            (self._bodies.index(attached.body), stage, self.values(attached, phi, 2))
-            for attached, stage in self._sensors
-        ]
+        index = self._bodies.index
+        return [(index(one.body), stage, self.values(one, phi, 2)) for one, stage in self._sensors]
 
     def __call__(self, phi: Floats, clock: Clock | None = None) -> EngineInput:
         """Return the engine's numbers for proposals.
@@ -202,11 +188,8 @@ class EngineProperties:
         joints, indices = self.joints(phi)
         if self._tying:
             joints = np.concatenate([joints, self._rods(phi)], axis=1)
-        commands, forces, frictions = (
-            self._law_parameters(phi, stage) for stage in (Command, Force, Friction)
-        )
-        discs = self._discs(phi)
-        return EngineInput(bodies, joints, discs, commands, forces, frictions, indices)
+        laws = (self._law_parameters(phi, stage) for stage in (Command, Force, Friction))
+        return EngineInput._make((bodies, joints, self._discs(phi), *laws, indices))
 
     def _modified(self, bodies: Floats, phi: Floats, clock: Clock | None) -> Floats:
         """Return properties after the properties stage, with the moments of inertia."""
@@ -218,13 +201,9 @@ class EngineProperties:
         result = np.repeat(bodies[:, None], m, axis=1)
         for name in dict.fromkeys(attached.body for attached, _ in self._modifying):
             i = self._bodies.index(name)
-            row = {
-                key: result[:, :, i, column].copy()
-                for column, key in enumerate(COLUMNS)
-                if key not in SEEN.values()
-            }
-            row["moment_per_mass"] = np.full((len(phi), m), self._unit_moment[i])
-            for key, value in zip(("gravity_x", "gravity_y"), gravity, strict=True):
+            own = [key for key in COLUMNS if key not in SEEN.values()]
+            row = {key: result[:, :, i, COLUMNS.index(key)].copy() for key in own}
+            for key, value in zip(SEEN, (self._unit_moment[i], *gravity), strict=True):
                 row[key] = np.full((len(phi), m), value)
             for attached, stage in self._modifying:
                 if attached.body == name:
@@ -238,14 +217,10 @@ class EngineProperties:
 
     def _law_parameters(self, phi: Floats, stage: type) -> Floats:
         """Return parameters and constants of a stage's laws, one after another, (proposal, q)."""
-        columns = [
-            column
-            for law in at_stage(self._effects, stage)
-            for column in (
-                *self.values(law, phi).values(),
-                *(np.full(len(phi), constant) for constant in law.effect.constants),
-            )
-        ]
+        columns: list[Floats] = []
+        for law in at_stage(self._effects, stage):
+            constants = (np.full(len(phi), constant) for constant in law.effect.constants)
+            columns += [*self.values(law, phi).values(), *constants]
         return np.stack(columns, axis=1) if columns else np.empty((len(phi), 0))
 
     def _discs(self, phi: Floats) -> Floats:
@@ -315,6 +290,9 @@ class SceneJoints:
         holders = [*scene.joinable, *fixed]
         poses = {body.name: body.pose for body in scene.bodies} | {WORLD: None}
         self._poses = np.array([poses[name] or (0.0, 0.0, 0.0) for name in holders])
+        #: Ends of the sliders' lines from the first body's anchor, zero of other joints; no body
+        #: reaches one.
+        self._ends = np.zeros((len(scene.joints), 4))
         moved, free = [], []
         for j, (owner, joint) in enumerate(zip(scene.joint_names, scene.joints, strict=True)):
             self._anchors[j] = (*(joint.anchor_a or (0, 0)), *(joint.anchor_b or (0, 0)))
@@ -326,17 +304,12 @@ class SceneJoints:
                 self._held[j] = [holders.index(name) for name in joint.bodies]
             else:
                 free.append((j, *(places[f"{name}[{owner}]"] for name in JOINT_INDICES)))
-        self._moved_anchors = np.array(moved, dtype=int).reshape(-1, 3).T
-        self._free = np.array(free, dtype=int).reshape(-1, 3)
-        #: Ends of the sliders' lines from the first body's anchor, zero of other joints; no body
-        #: reaches one.
-        half = 1e6 * smallest_radius(scene)
-        self._ends = np.zeros((len(scene.joints), 4))
-        for j, joint in enumerate(scene.joints):
             if joint.traits.slides and joint.bodies:
                 turn = scene.direction(joint) - scene.reference_angle(joint.bodies[0])
-                along = half * np.array([np.cos(turn), np.sin(turn)])
+                along = 1e6 * smallest_radius(scene) * np.array([np.cos(turn), np.sin(turn)])
                 self._ends[j] = *-along, *along
+        self._moved_anchors = np.array(moved, dtype=int).reshape(-1, 3).T
+        self._free = np.array(free, dtype=int).reshape(-1, 3)
         lengths = self._lengths(self._anchors, self._held)
         #: Kind of each joint in the engine.
         self.kinds = tuple(

@@ -9,6 +9,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from itertools import chain
 from typing import Any, Self
 
 import numpy as np
@@ -271,27 +272,20 @@ def index_priors(scene: Scene, joint: Joint) -> tuple[Prior, Prior]:
     """
     declared = {index: dict(table) for index, table in joint.prior}
     upper = float(len(scene.joinable) - 1)
-    prior_a, prior_b = (
-        Prior(
-            "categorical",
-            lower=0.0,
-            upper=upper,
-            weights=tuple(declared[index].get(name, 0.0) for name in scene.joinable)
-            if index in declared
-            else (),
-        )
-        for index in JOINT_INDICES
-    )
-    return prior_a, prior_b
+
+    def prior(index: str) -> Prior:
+        names = scene.joinable if index in declared else ()
+        weights = tuple(declared[index].get(name, 0.0) for name in names)
+        return Prior("categorical", lower=0.0, upper=upper, weights=weights)
+
+    index_a, index_b = JOINT_INDICES
+    return prior(index_a), prior(index_b)
 
 
 def _joint_blocks(scene: Scene) -> list[Block]:
     """Table 1's parameters of the joints that are to be inferred."""
-    joints = [
-        (name, joint)
-        for name, joint in zip(scene.joint_names, scene.joints, strict=True)
-        if not joint.known
-    ]
+    named = zip(scene.joint_names, scene.joints, strict=True)
+    joints = [(name, joint) for name, joint in named if not joint.known]
     if not joints:
         return []
     free = tuple(name for name, joint in joints if joint.bodies is None)
@@ -309,9 +303,8 @@ def _joint_blocks(scene: Scene) -> list[Block]:
                 holders = (joint.bodies[side],) * len(holders)
             anchor = (joint.anchor_a, joint.anchor_b)[side]
             centre = None if anchor is None else anchor[axis]
-            conditional.append(
-                tuple(anchor_prior(scene, holder, axis, centre) for holder in holders)
-            )
+            priors = tuple(anchor_prior(scene, holder, axis, centre) for holder in holders)
+            conditional.append(priors)
         priors = tuple(_union(alternatives) for alternatives in conditional)
         owners = tuple(owner for owner, _ in joints)
         blocks.append(Block(name, owners, unit, priors, of="joint", conditional=tuple(conditional)))
@@ -351,10 +344,8 @@ def build_layout(scene: Scene, effects: tuple[Attached, ...] = ()) -> Layout:
         distribution.
     """
     for body in scene.moving:
-        names = [
-            *BODY_PARAMETERS,
-            *(v for attached in effects if attached.body == body.name for v in attached.variables),
-        ]
+        own = (attached.variables for attached in effects if attached.body == body.name)
+        names = [*BODY_PARAMETERS, *chain(*own)]
         for name, _ in body.prior:
             if name not in names:
                 raise ParameterError(

@@ -327,19 +327,9 @@ class Simulator:
         return World(self.physics.scene, kinds, joined, discs, patches, wheels, turners, rods)
 
     def _run(
-        self,
-        choice: Choice,
-        numbers: EngineInput,
-        starts: Floats,
-        inputs: Floats,
-        out: Floats,
-        a_thread: int = 5000,
-        kept: int = 64,
+        self, choice: Choice, numbers: EngineInput, starts: Floats, inputs: Floats, out: Floats
     ) -> None:
-        """Run items in worlds of a choice, of which so many are kept.
-
-        So many engine steps are worth a thread of their own.
-        """
+        """Run items in worlds of a choice; those of the last few choices are kept."""
         time_step = self.physics.scene.time_step
         batch = Batch(
             numbers[:3], laws_of(self._laws, numbers[3:6], inputs, time_step),
@@ -348,10 +338,10 @@ class Simulator:
         )  # fmt: skip
         steps = len(out) * inputs.shape[1] * int(self.levels[0].sum())
         threads = 1 if in_worker() else self.physics.threads
-        workers = max(1, min(threads, len(out), steps // a_thread))
+        workers = max(1, min(threads, len(out), steps // 5000))  # fewer steps are worth no thread
         with self._lock:
             self._worlds[choice] = engines = self._worlds.pop(choice, [])
-            while len(self._worlds) > kept:
+            while len(self._worlds) > 64:
                 self._worlds.popitem(last=False)
             while len(engines) < workers:
                 engines.append(Engine(partial(self._new_world, choice), self.physics.engine))

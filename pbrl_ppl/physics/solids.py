@@ -138,9 +138,8 @@ def depth_of(
 def _behind(a: Floats, b: Floats) -> Floats:
     """Return the least depth of corners b behind an edge of a (separating axes), (n,)."""
     least = np.full(len(a), np.inf)
-    for corner, after in zip(
-        np.moveaxis(a, 1, 0), np.moveaxis(np.roll(a, -1, 1), 1, 0), strict=True
-    ):
+    for k in range(a.shape[1]):
+        corner, after = a[:, k - 1], a[:, k]
         x, y = (after - corner).T
         outward = np.stack([y, -x], axis=-1) / np.hypot(x, y)[:, None]
         reach = ((b - corner[:, None]) * outward[:, None]).sum(axis=-1).min(axis=1)
@@ -192,9 +191,8 @@ def touching(scene: Scene, begin: Floats, end: Floats) -> Bools:
     for p in np.flatnonzero(near.any(axis=0)):
         (i, j), rows = pairs[p], np.flatnonzero(near[:, p])
         first, last = begin[rows][:, (i, j)], end[rows][:, (i, j)]
-        touched[rows] |= _touch_on_path(
-            world.solids[i], world.solids[j], first, last, scene.time_step
-        )
+        a, b = world.solids[i], world.solids[j]
+        touched[rows] |= _touch_on_path(a, b, first, last, scene.time_step)
     return touched
 
 
@@ -322,12 +320,10 @@ def overlap(scene: Scene, poses: Floats) -> Floats:
     """
     world, pairs = scenery(scene), _colliding(scene)
     poses = world.with_fixed(poses)
-    if not pairs:
-        return np.full(len(poses), -np.inf)
     bound = circles(world.solids, pairs, poses)
     for pair, rows, depths in _depths(world.solids, pairs, poses, bound > 0):
         bound[rows, pair] = depths
-    return np.asarray(bound.max(axis=1))
+    return np.asarray(bound.max(axis=1, initial=-np.inf))
 
 
 def _depths(
@@ -348,10 +344,8 @@ def _apart(scene: Scene, poses: Floats) -> Iterator[tuple[int, str]]:
         if not joint.known or joint.bodies is None:
             continue
         fixed = [np.array([reference[name]]) for name in joint.bodies]
-        now = [
-            poses[:, moving[name]] if name in moving else pose
-            for name, pose in zip(joint.bodies, fixed, strict=True)
-        ]
+        placed = zip(joint.bodies, fixed, strict=True)
+        now = [poses[:, moving[name]] if name in moving else pose for name, pose in placed]
         length = JOINT_KINDS[joint.kind].gap(_anchor_distance(scene, joint, fixed)[0])
         distance = _anchor_distance(scene, joint, now)
         smaller = min(scene.body(n).shape.bounding_radius for n in joint.bodies if n in moving)
@@ -400,8 +394,6 @@ def _colliding(scene: Scene) -> Pairs:
 def _overlaps(scene: Scene, poses: Floats) -> Iterator[tuple[int, str]]:
     """Yield the first transition and a message for each two shapes that overlap deeply."""
     world, pairs = scenery(scene), _colliding(scene)
-    if not pairs:
-        return
     poses, solids = world.with_fixed(poses), world.solids
     smaller = [ALLOWED * min(solids[i].width, solids[j].width) for i, j in pairs]
     # shapes overlap by no more than their bounding circles
@@ -420,6 +412,15 @@ def _overlaps(scene: Scene, poses: Floats) -> Iterator[tuple[int, str]]:
                 f"{which} overlap by {depths[deep[0]]:.3g} m, allowed is {allowed:.3g} m (a quarter"
                 f" of {whose} width); correct the poses, the shapes or the walls",
             )
+
+
+@inner
+def place_discs(still, discs):  # type: ignore[no-untyped-def]
+    """Put the hidden discs (disc, 3) of a proposal among the obstacles."""
+    for j in range(len(discs)):
+        one, there = still.obstacles[len(still.obstacles) - len(discs) + j], discs[j, 2] > 0.0
+        one[0] = one[2] = discs[j, 0] if there else 1e9 * still.length
+        one[1], one[3], one[4] = discs[j, 1], discs[j, 1], discs[j, 2]
 
 
 @inner

@@ -100,10 +100,8 @@ def _try(effect: Effect, scene: Scene, history: History, draws: int = 4) -> None
         for state, row in product(_some_states(history, body), values):
             result = _applied(effect, state, row, body, units)
             if not np.isfinite(result).all():
-                shown = ", ".join(
-                    f"{parameter.name} = {value:.3g}"
-                    for parameter, value in zip(effect.parameters, row, strict=True)
-                )
+                named = _named(effect, row).items()
+                shown = ", ".join(f"{name} = {value.item():.3g}" for name, value in named)
                 raise EffectError(
                     f"effect {effect.name} gives what is not a finite number on {body.name} at"
                     f" {shown}; fix its law or narrow its prior"
@@ -119,10 +117,8 @@ def _check_null(
     Six intervals are simulated. A smaller difference than ``rounding``, as a share of the
     coordinate's size, is none.
     """
-    at_null = ", ".join(
-        f"{parameter.name} = {parameter.null:.4g} {parameter.unit}".removesuffix(" 1")
-        for parameter in effect.parameters
-    )
+    null = (f"{p.name} = {p.null:.4g} {p.unit}".removesuffix(" 1") for p in effect.parameters)
+    at_null = ", ".join(null)
     cure = "change its law, or give EffectParameter the null= at which it vanishes"
     if isinstance(effect.stage, Noise):
         tail = float(effect.stage.tail(_named(effect, effect.null))[0, 0])
@@ -137,20 +133,15 @@ def _check_null(
     chosen = np.unique(np.linspace(0, segments.n - 1, 6).astype(int))
     without = Physics(scene, substeps=2, extrapolate=False, engine="chipmunk")
     there = without.changed(effects=(effect.on(body.name),))
-    values = {
-        label: prior.centre
-        for label, prior in zip(without.layout.labels, without.layout.priors, strict=True)
-    }
-    values |= dict(zip(effect.on(body.name).labels, effect.null, strict=True))
-    before, after = (
-        physics.predict(
-            np.array([values[label] for label in physics.layout.labels]),
-            segments.start[chosen],
-            physics.inputs(segments)[chosen],
-        )
-        for physics in (without, there)
-    )
-    change = np.nan_to_num(np.abs(after - before))
+    known = dict(zip(effect.on(body.name).labels, effect.null, strict=True))
+
+    def predicted(physics: Physics) -> Floats:
+        pairs = zip(physics.layout.labels, physics.layout.priors, strict=True)
+        phi = np.array([known.get(label, prior.centre) for label, prior in pairs])
+        return physics.predict(phi, segments.start[chosen], physics.inputs(segments)[chosen])
+
+    before = predicted(without)
+    change = np.nan_to_num(np.abs(predicted(there) - before))
     size = np.abs(np.nan_to_num(before)) + body_sizes(scene)
     relative = (change / size).max(axis=(0, 1))
     if relative.max() > rounding:
@@ -174,10 +165,8 @@ def _some_states(history: History, body: Body, n: int = 6) -> Floats:
 
 def _named(effect: Effect, parameters: Iterable[float]) -> dict[str, Floats]:
     """Return parameters by name, shape (1, 1) each."""
-    return {
-        parameter.name: np.array([[value]])
-        for parameter, value in zip(effect.parameters, parameters, strict=True)
-    }
+    names = (parameter.name for parameter in effect.parameters)
+    return {name: np.array([[one]]) for name, one in zip(names, parameters, strict=True)}
 
 
 def _applied(effect: Effect, state: Floats, parameters: Floats, body: Body, units: Units) -> Floats:
@@ -212,6 +201,4 @@ def _applied(effect: Effect, state: Floats, parameters: Floats, body: Body, unit
         discs = [(disc.x, disc.y, disc.radius) for disc in stage.discs(named)]
         rods = [] if stage.rod is None else [tuple(stage.rod(named))]
         return np.concatenate([np.ravel(numbers) for numbers in (*discs, *rods)])
-    if isinstance(stage, Noise):
-        return np.ravel(np.asarray(stage.tail(named), dtype=float))
-    raise EffectError(f"effect {effect.name}: {stage!r} is no stage")
+    return np.ravel(np.asarray(stage.tail(named), dtype=float))

@@ -20,10 +20,10 @@ from pbrl_ppl.scene import WORLD, Body, Joint, Scene, smallest_radius
 from pbrl_ppl.state import Bools, Floats
 
 
-def columns(names: str | Iterable[str]) -> Any:
-    """Return the numbers of columns by their names; a string has spaces between them."""
+def columns(names: str | Iterable[str], width: int = 1) -> Any:
+    """Return where columns of a width begin, by their names; a string has spaces between them."""
     found = namedtuple("Columns", names)  # type: ignore[misc]
-    return found(*range(len(found._fields)))
+    return found(*range(0, width * len(found._fields), width))
 
 
 #: Columns of a body's properties. ``moment`` is about the centre of mass (kg m^2), which is at
@@ -80,32 +80,35 @@ class EngineJoint:
         Makes the pymunk constraint of two bodies, with both anchors at their origins.
     settings : tuple of Setting
         Properties of the constraint, in the order in which they are set.
-    gap : callable
-        Distance of the anchors from that in the reference poses (m).
     friction : str
         The body's constraints by which friction and damping act in it: see `world`. None without.
+    gap : callable
+        Distance of the anchors from that in the reference poses (m); they meet by default.
     """
 
     constraint: Callable[[pymunk.Body, pymunk.Body], pymunk.Constraint]
     settings: tuple[Setting, ...]
-    gap: Callable[[float], float]
     friction: str = ""
+    gap: Callable[[float], float] = lambda distance: 0.0
+
+
+def _anchors(name: str, x: int, y: int) -> tuple[Setting, ...]:
+    """Return the settings of both anchors; ``x`` and ``y`` are columns of the first body's."""
+    return (
+        Setting("anchor_a", f"{name}SetAnchorA", (x, y)),
+        Setting("anchor_b", f"{name}SetAnchorB", (JOINT.b_x, JOINT.b_y)),
+    )
 
 
 HINGE = EngineJoint(
     constraint=lambda a, b: pymunk.PivotJoint(a, b, (0, 0), (0, 0)),
-    settings=(
-        Setting("anchor_a", "cpPivotJointSetAnchorA", (JOINT.a_x, JOINT.a_y)),
-        Setting("anchor_b", "cpPivotJointSetAnchorB", (JOINT.b_x, JOINT.b_y)),
-    ),
-    gap=lambda distance: 0.0,
+    settings=_anchors("cpPivotJoint", JOINT.a_x, JOINT.a_y),
     friction="pivot",
 )
 ROD = EngineJoint(
     constraint=lambda a, b: pymunk.PinJoint(a, b, (0, 0), (0, 0)),
     settings=(
-        Setting("anchor_a", "cpPinJointSetAnchorA", (JOINT.a_x, JOINT.a_y)),
-        Setting("anchor_b", "cpPinJointSetAnchorB", (JOINT.b_x, JOINT.b_y)),
+        *_anchors("cpPinJoint", JOINT.a_x, JOINT.a_y),
         Setting("distance", "cpPinJointSetDist", (JOINT.length,)),
     ),
     gap=lambda distance: distance,
@@ -118,7 +121,6 @@ SLIDER = EngineJoint(
         Setting("groove_b", "cpGrooveJointSetGrooveB", (JOINT.high_x, JOINT.high_y)),
         Setting("anchor_b", "cpGrooveJointSetAnchorB", (JOINT.b_x, JOINT.b_y)),
     ),
-    gap=lambda distance: 0.0,
     friction="rail",
 )
 #: Every kind that a scene can declare.
@@ -160,14 +162,8 @@ def _motor(column: int) -> ConstraintKind:
     return ConstraintKind(lambda a, b: pymunk.SimpleMotor(a, b, 0.0), _strength(column))
 
 
-def _on_line(name: str) -> tuple[Setting, ...]:
-    """Return the settings of a constraint along a slider's line, to an end that is far away."""
-    return (
-        Setting("anchor_a", f"{name}SetAnchorA", (JOINT.high_x, JOINT.high_y)),
-        Setting("anchor_b", f"{name}SetAnchorB", (JOINT.b_x, JOINT.b_y)),
-    )
-
-
+#: The place of a wheel on its body.
+_HUB = Setting("anchor_a", "cpPinJointSetAnchorA", (COLUMN.w_x, COLUMN.w_y))
 #: Beside joints, two kinds of constraints on a body for each use, with their settings.
 #:
 #: ``wheel`` is the constraint J_w: two rods to the ground, each with limited force. Every substep,
@@ -178,7 +174,8 @@ def _on_line(name: str) -> tuple[Setting, ...]:
 #: ``pivot`` is friction and damping in a hinge, with the parameters of the hanging body, and
 #: ``turning`` friction against the turning of a free one.
 #:
-#: ``rail`` is the same in a slider: a rod with limited force, and a damper, along its line.
+#: ``rail`` is the same in a slider: a rod with limited force, and a damper, along its line to an
+#: end that is far away.
 #:
 #: ``patch`` is Coulomb friction under a body, at points of a ring that share its weight. A pivot
 #: joint to the ground, whose force is limited as a vector, holds a point if it rests; a rod along
@@ -187,13 +184,7 @@ def _on_line(name: str) -> tuple[Setting, ...]:
 #: inertia.) Both get their strength every substep.
 BODY_CONSTRAINTS = {
     "wheel": tuple(
-        ConstraintKind(
-            ROD.constraint,
-            (
-                Setting("anchor_a", "cpPinJointSetAnchorA", (COLUMN.w_x, COLUMN.w_y)),
-                *_strength(friction, weighted=True),
-            ),
-        )
+        ConstraintKind(ROD.constraint, (_HUB, *_strength(friction, weighted=True)))
         for friction in (COLUMN.mu_x, COLUMN.mu_y)
     ),
     "pivot": (
@@ -207,13 +198,15 @@ BODY_CONSTRAINTS = {
     "turning": (_motor(COLUMN.turn_torque),),
     "rail": (
         ConstraintKind(
-            ROD.constraint, _strength(COLUMN.pivot_torque), joint_settings=_on_line("cpPinJoint")
+            ROD.constraint,
+            _strength(COLUMN.pivot_torque),
+            joint_settings=_anchors("cpPinJoint", JOINT.high_x, JOINT.high_y),
         ),
         ConstraintKind(
             lambda a, b: pymunk.DampedSpring(a, b, (0, 0), (0, 0), 0.0, 0.0, 0.0),
             (Setting("damping", "cpDampedSpringSetDamping", (COLUMN.pivot_damping,)),),
             limited=False,
-            joint_settings=_on_line("cpDampedSpring"),
+            joint_settings=_anchors("cpDampedSpring", JOINT.high_x, JOINT.high_y),
         ),
     ),
     "patch": tuple(
@@ -522,7 +515,7 @@ def engine_shapes(body: Body, rigid: pymunk.Body) -> list[pymunk.Shape]:
     outline = body.shape.outline
     if outline is None:
         return [pymunk.Circle(rigid, float(body.shape.radius or 0.0))]
-    if body.shape.kind == "box" or _is_convex(outline):
+    if _is_convex(outline):
         return [pymunk.Poly(rigid, outline)]
     closed = [*outline, outline[0]]
     return [pymunk.Poly(rigid, part) for part in autogeometry.convex_decomposition(closed, 0.0)]
