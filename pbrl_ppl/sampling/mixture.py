@@ -127,9 +127,8 @@ def _values(
                 "fit: choices of the bodies that a joint joins have different coordinates;"
                 " take --likelihood transitions, or name the bodies in the scene"
             )
-        sizes = group(trace, "posterior").sizes
-        rows = np.arange(sizes["chain"] * sizes["draw"]).reshape(sizes["chain"], sizes["draw"])
-        rows = rows[:, : label.shape[1]][here]
+        chain, draw = np.nonzero(here)
+        rows = chain * group(trace, "posterior").sizes["draw"] + draw
         of_phi, of_sigma = parameter_draws(own, trace)
         sigma[here] = of_sigma[rows]
         for name, values in zip(own.layout.labels, of_phi[rows].T, strict=True):

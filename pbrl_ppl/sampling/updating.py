@@ -102,12 +102,11 @@ def update(
     history = _as_recorded(idata, history)
     _check_history(idata, record, history)
     entry: dict[str, object] = {"seed": seed, "did": "refitted"}
-    chains, method, places = group(idata, "posterior").sizes["chain"], DEFAULT, None
+    chains, method, places, advice = group(idata, "posterior").sizes["chain"], DEFAULT, None, ""
     if record.likelihood == OutputErrorLikelihood.name:
         _check_engine(idata, effects)
         entry |= {"transitions": history.n_transitions, "share": None, "pareto_k": None}
         why = "initial states of simulations are fitted with the parameters, so that all data"
-        advice = ""
         whole = _simulated(idata, record, history, effects)
         method = record.method
     else:
