@@ -88,7 +88,7 @@ class InitialStates:
         begin = np.nan_to_num(self.begin) * self.of_coordinates(weight)
         return np.concatenate([z, np.broadcast_to(begin, (*z.shape[:-1], begin.shape[-1]))], -1)
 
-    def series(self, rows: Floats) -> Floats:
+    def series(self, rows: Floats | Bools) -> Floats:
         """Return rows as series that begin with the start, shape (piece, 1 + H, body, state, ...).
 
         ``rows`` has shape (piece, row, ...); a start that is not observed is 0.
