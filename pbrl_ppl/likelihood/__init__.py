@@ -3,13 +3,10 @@
 from .coordinates import ACCELERATION as ACCELERATION
 from .coordinates import CONTACT as CONTACT
 from .coordinates import Coordinates as Coordinates
-from .coordinates import check_moves as check_moves
 from .coordinates import first_states as first_states
 from .coordinates import observed_coordinates as observed_coordinates
 from .data import Observations as Observations
 from .data import estimate_sigma as estimate_sigma
-from .data import sigma_prior as sigma_prior
-from .declared import KINDS as KINDS
 from .declared import at_centre as at_centre
 from .declared import declared_problem as declared_problem
 from .declared import draw_prior as draw_prior

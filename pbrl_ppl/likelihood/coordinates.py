@@ -174,34 +174,22 @@ class Coordinates:
         return body, np.searchsorted(self.columns, dimension)
 
 
-def check_moves(coordinates: Coordinates, scene: Scene) -> None:
-    """Refuse a recording in which nothing moves.
-
-    Raises
-    ------
-    HistoryError
-        If no number that was measured ever changes.
-    """
-    if not coordinates.sensors and not coordinates.rates:
-        names = ", ".join(body.name for body in scene.dynamic)
-        raise HistoryError(
-            f"history: nothing moves: every number that was measured of {names} stays exactly the"
-            " same, which tells nothing; record a motion, or check the columns"
-        )
-
-
 def observed_coordinates(scene: Scene, history: History, *, exactness: float = 1e-6) -> Coordinates:
     """Return the unknown coordinates of a scene's bodies with the noise of a recording.
 
     ``exactness``: error of measuring what does not move at all, as a share of the coordinate's
     typical size.
+
+    Raises
+    ------
+    HistoryError
+        If nothing moves: no number that was measured ever changes.
     """
     observed = history.dataset["observed"].to_numpy()
     # what was measured of first states alone is given with them
     measured = np.isfinite(observed[:, 1:]).any(axis=(0, 1))
     with np.errstate(invalid="ignore"):
-        low = np.where(measured, np.fmin.reduce(observed, axis=(0, 1)), 0.0)
-        high = np.where(measured, np.fmax.reduce(observed, axis=(0, 1)), 0.0)
+        low, high = (of.reduce(observed, axis=(0, 1)) for of in (np.fmin, np.fmax))
     still = measured & (high == low)
     still[:, VELOCITY:] |= still[:, :VELOCITY]
     free = np.array([[not body.kinematic] * len(STATE) for body in scene.moving])
@@ -212,30 +200,31 @@ def observed_coordinates(scene: Scene, history: History, *, exactness: float = 1
             column = 1 - column  # a slider's other position
         if column is not None and measured[i, column]:
             free[i] = [d % VELOCITY == column for d in range(len(STATE))]
-    if _uncoupled(scene):  # what was not measured moves nothing that was
+    if not (scene.walls or scene.joints or len(scene.bodies) > 1 or scene.bodies[0].wheel):
+        # nothing couples coordinates of a body: what was not measured moves nothing that was
         seen = measured[:, :VELOCITY] | measured[:, VELOCITY:]
         free &= np.hstack([seen, seen])
     places = np.flatnonzero(free)
     body, dimension = np.divmod(places, len(STATE))
     stated = dict(scene.noise)
     exact = exactness * state_sizes(scene)
-    known = np.array([name in stated for name in STATE])
-    sensed = free & measured & ~still & ~known
+    sensed = free & measured & ~still & np.array([name not in stated for name in STATE])
     sensors = np.flatnonzero(sensed.any(axis=0))
     if not (free & ~still)[:, VELOCITY:].any():  # all logged as constant, while places change
         still = np.hstack([still[:, :VELOCITY]] * 2)
     rates = np.flatnonzero((free & ~still).any(axis=0)[VELOCITY:]) + VELOCITY
-    sensor = np.full(len(places), -1)
-    for i, (b, d) in enumerate(zip(body, dimension, strict=True)):
-        if sensed[b, d]:
-            sensor[i] = np.searchsorted(sensors, d)
-    push, pushed = [], []
-    dt = scene.time_step
+    if not (sensors.size or rates.size):
+        names = ", ".join(body.name for body in scene.dynamic)
+        raise HistoryError(
+            f"history: nothing moves: every number that was measured of {names} stays exactly the"
+            " same, which tells nothing; record a motion, or check the columns"
+        )
+    sensor = np.where(sensed[body, dimension], np.searchsorted(sensors, dimension), -1)
+    push, pushed, dt = [], [], scene.time_step
     ways = first_states(history)
     begin, end = (s.reshape(-1, *s.shape[2:]) for s in (ways[:, :-1], ways[:, 1:]))
     touched = bool(touching(scene, begin, end).any())
-    kinds = product(range(1 + touched), range(len(scene.moving)))
-    for kind, b in kinds:
+    for kind, b in product(range(1 + touched), range(len(scene.moving))):
         for j, d in enumerate(rates):
             if free[b, d] and not still[b, d]:
                 row = np.where((body == b) & (dimension == d), dt, 0.0)
@@ -246,20 +235,15 @@ def observed_coordinates(scene: Scene, history: History, *, exactness: float = 1
                 pushed += [len(sensors) + kind * len(rates) + j] * (1 + kind)
     return Coordinates(
         places,
-        tuple(int(d) for d in np.unique(dimension)),
+        tuple(np.unique(dimension).tolist()),
         sensor,
         np.array([stated.get(STATE[d], exact[d]) for d in dimension]),
         np.array(push).reshape(-1, len(places)),
         np.array(pushed, dtype=np.intp),
-        tuple(int(d) for d in sensors),
-        tuple(int(d) for d in rates),
-        tuple(int(d) for d in rates) if touched else (),
+        tuple(sensors.tolist()),
+        tuple(rates.tolist()),
+        tuple(rates.tolist()) if touched else (),
     )
-
-
-def _uncoupled(scene: Scene) -> bool:
-    """Return whether the scene couples no coordinate of a body with another."""
-    return not (scene.walls or scene.joints or len(scene.bodies) > 1 or scene.bodies[0].wheel)
 
 
 def first_states(history: History) -> Floats:
@@ -271,18 +255,13 @@ def first_states(history: History) -> Floats:
     states: Floats = dataset["start"].to_numpy().copy()
     seen = np.isfinite(dataset["observed"].to_numpy()).any(axis=(0, 1))
     free = ~dataset["kinematic"].to_numpy()[:, None]
-    rates = np.hstack(
-        [np.zeros_like(seen[:, :VELOCITY]), free & seen[:, :VELOCITY] & ~seen[:, VELOCITY:]]
-    )
-    states[:, :, rates] = np.nan
+    states[..., VELOCITY:][:, :, free & seen[:, :VELOCITY] & ~seen[:, VELOCITY:]] = np.nan
     estimate_rates(states, float(dataset.attrs["time_step"]))
     rows = dataset["n_rows"].to_numpy()
-    for trajectory, n in enumerate(rows):
-        for body in range(states.shape[2]):
-            for d in range(len(STATE)):
-                values = states[trajectory, :n, body, d]
-                known = np.flatnonzero(np.isfinite(values))
-                if len(known):
-                    level = np.unwrap(values[known]) if d == THETA else values[known]
-                    values[:] = np.interp(np.arange(n), known, level)
+    for trajectory, body, d in np.ndindex(len(states), *states.shape[2:]):
+        values = states[trajectory, : rows[trajectory], body, d]
+        known = np.flatnonzero(np.isfinite(values))
+        if len(known):
+            level = np.unwrap(values[known]) if d == THETA else values[known]
+            values[:] = np.interp(np.arange(len(values)), known, level)
     return np.asarray(np.nan_to_num(states))

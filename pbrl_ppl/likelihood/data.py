@@ -103,22 +103,6 @@ def least_noise(scene: Scene, columns: Sequence[int], *, share: float = 1e-9) ->
     return np.asarray(share * state_sizes(scene)[list(columns)])
 
 
-def sigma_prior(
-    observations: Observations, segments: Segments, scene: Scene
-) -> tuple[Floats, float]:
-    """Return median and log-scale of a weak prior of sigma: a tenth of the states' change.
-
-    Returns
-    -------
-    median : ndarray
-        Shape (state,), in the units of the states.
-    spread : float
-        Standard deviation of the logarithm.
-    """
-    typical = observations.root_mean_square(observations.residual(segments.start[:, None]))
-    return np.maximum(0.1 * typical, least_noise(scene, observations.columns)), SPREAD
-
-
 def estimate_sigma(residual: Floats, observations: Observations, scene: Scene) -> Floats:
     """Return the maximum-likelihood sigma of each dimension under Eq. 11, shape (state,).
 

@@ -11,12 +11,9 @@ from numpy.typing import NDArray
 from pbrl_ppl.effects import attach, catalogue
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History, check_start, measured_alone
+from pbrl_ppl.likelihood.coordinates import ACCELERATION
 from pbrl_ppl.likelihood.likelihood import TrajectoryLikelihood, TransitionLikelihood
-from pbrl_ppl.likelihood.output_error import (
-    OutputErrorLikelihood,
-    in_pieces,
-    is_simulated,
-)
+from pbrl_ppl.likelihood.output_error import OutputErrorLikelihood, in_pieces, is_simulated
 from pbrl_ppl.likelihood.problem import Problem, is_independent
 from pbrl_ppl.likelihood.smoothing import along_trajectories, as_measured
 from pbrl_ppl.parameters import ParameterLibrary
@@ -143,7 +140,8 @@ def noise_law(problem: Problem) -> tuple[Floats, float]:
 
 def exponential(problem: Problem) -> NDArray[np.bool_]:
     """Return the mask of noise parameters with an exponential prior, shape (parameter,)."""
-    return problem.likelihood.exponential(len(problem.noise_prior[0]))
+    variables = problem.noise_variables
+    return np.array([name == ACCELERATION for name, dims in variables.items() for _ in dims], bool)
 
 
 def log_noise_prior(problem: Problem, log_sigma: Floats) -> Floats:

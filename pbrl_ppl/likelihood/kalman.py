@@ -15,11 +15,8 @@ from __future__ import annotations
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.state import Bools, Floats
-
-Ints = NDArray[np.int64]
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
@@ -77,8 +74,9 @@ def _take(p: Floats, i: int, sensor: float, gain: Floats) -> float:
 
 @numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def gains(
-    slope: Floats, first: Ints, seen: Bools, begin: Floats, sensor: Floats, step: Floats, kind: Ints
-) -> tuple[Floats, Floats, Floats]:
+    slope: Floats, first: Bools, seen: Bools, begin: Floats, sensor: Floats, step: Floats,
+    met: Bools,
+) -> tuple[Floats, Floats, Floats]:  # fmt: skip
     """Return the gain and standard deviation of every innovation.
 
     Parameters
@@ -94,9 +92,9 @@ def gains(
     sensor : ndarray
         Variance of a measurement, shape (cell,).
     step : ndarray
-        Covariance of what a step of each kind adds, shape (kind, cell, cell).
-    kind : ndarray
-        Which of them each transition is of, shape (transition,).
+        Covariance of what a step without and with contact adds, shape (2, cell, cell).
+    met : ndarray of bool
+        Whether bodies touch in a transition, shape (transition,).
 
     Returns
     -------
@@ -114,7 +112,7 @@ def gains(
     for k in range(n):
         if first[k]:
             _restart(p, begin[k])
-        _forward(p, slope[k], step[kind[k]], moved)
+        _forward(p, slope[k], step[int(met[k])], moved)
         for i in range(d):
             if seen[k, i]:
                 scale[k, i] = np.sqrt(_take(p, i, sensor[i], gain[k, i]))
@@ -136,15 +134,9 @@ def _deviate(slope: Floats, state: Floats, residual: Floats, ahead: Floats) -> N
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def innovations(
-    slope: Floats,
-    first: Ints,
-    seen: Bools,
-    gain: Floats,
-    scale: Floats,
-    residual: Floats,
-    begin: Floats,
-    measured: Floats,
-) -> tuple[Floats, Floats]:
+    slope: Floats, first: Bools, seen: Bools, gain: Floats, scale: Floats,
+    residual: Floats, begin: Floats, measured: Floats,
+) -> tuple[Floats, Floats]:  # fmt: skip
     """Return the whitened innovations and filtered deviations.
 
     Parameters
@@ -185,29 +177,21 @@ def innovations(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def whitened(
-    slope: Floats,
-    first: Ints,
-    seen: Bools,
-    variance: Floats,
-    sensor: Floats,
-    step: Floats,
-    kind: Ints,
-    residual: Floats,
-    begin: Floats,
-    measured: Floats,
-) -> tuple[Floats, Floats]:
+    slope: Floats, first: Bools, seen: Bools, variance: Floats, sensor: Floats, step: Floats,
+    met: Bools, residual: Floats, begin: Floats, measured: Floats,
+) -> tuple[Floats, Floats]:  # fmt: skip
     """Return whitened innovations of sets that each have a noise of their own.
 
     It is :func:`gains` and :func:`innovations` in one, which keeps nothing but the result.
 
     Parameters
     ----------
-    slope, first, seen, kind : ndarray
+    slope, first, seen, met : ndarray
         As of :func:`gains`.
     variance : ndarray
         Variance of the state before each first transition, shape (set, transition, cell).
     sensor, step : ndarray
-        As of :func:`gains`, shapes (set, cell) and (set, kind, cell, cell).
+        As of :func:`gains`, shapes (set, cell) and (set, 2, cell, cell).
     residual, begin, measured : ndarray
         As of :func:`innovations`.
 
@@ -228,7 +212,7 @@ def whitened(
                 for a in range(d):
                     state[a] = begin[k, a]
                 _restart(p, variance[j, k])
-            _forward(p, slope[k], step[j, kind[k]], moved)
+            _forward(p, slope[k], step[j, int(met[k])], moved)
             _deviate(slope[k], state, residual[j, k], ahead)
             for i in range(d):
                 if seen[k, i]:
@@ -246,7 +230,7 @@ def whitened(
 
 @numba.njit(cache=True, error_model="numpy")
 def adjoint(
-    slope: Floats, last: Ints, seen: Bools, gain: Floats, scale: Floats, weighted: Floats
+    slope: Floats, first: Bools, seen: Bools, gain: Floats, scale: Floats, weighted: Floats
 ) -> tuple[Floats, Floats, Floats]:
     """Return the adjoint of the filter: derivatives of a sum of innovations.
 
@@ -255,10 +239,8 @@ def adjoint(
 
     Parameters
     ----------
-    slope, seen, gain, scale : ndarray
+    slope, first, seen, gain, scale : ndarray
         As of :func:`gains`.
-    last : ndarray
-        Whether a transition is its trajectory's last, shape (transition,).
     weighted : ndarray
         Derivative of the sum by each white innovation, shape (transition, cell).
 
@@ -270,48 +252,45 @@ def adjoint(
     """
     n, d = seen.shape
     before, residual, after = np.zeros((n, d)), np.zeros((n, d)), np.zeros((n, d))
-    state = np.zeros(d)
     for k in range(n - 1, -1, -1):
-        if last[k]:
-            state[:] = 0.0
         for a in range(d):
-            after[k, a] = state[a]
+            if k + 1 < n and not first[k + 1]:
+                after[k, a] = before[k + 1, a]
+            residual[k, a] = after[k, a]
         for i in range(d - 1, -1, -1):
             if seen[k, i]:
                 total = weighted[k, i] / scale[k, i]
                 for a in range(d):
-                    total += gain[k, i, a] * state[a]
-                state[i] -= total
+                    total += gain[k, i, a] * residual[k, a]
+                residual[k, i] -= total
         for a in range(d):
-            residual[k, a] = state[a]
             for b in range(d):
-                before[k, a] += slope[k, b, a] * state[b]
-        for a in range(d):
-            state[a] = before[k, a]
+                before[k, a] += slope[k, b, a] * residual[k, b]
     return before, residual, after
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def score(
-    slope: Floats, last: Ints, seen: Bools, gain: Floats, scale: Floats, white: Floats, kind: Ints
+    slope: Floats, first: Bools, seen: Bools, gain: Floats, scale: Floats, white: Floats, met: Bools
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Return the derivative of the log-likelihood by the variances.
 
     Parameters
     ----------
-    slope, last, seen, gain, scale : ndarray
-        As of :func:`adjoint`.
+    slope, first, seen, gain, scale : ndarray
+        As of :func:`gains`.
     white : ndarray
         White innovations, shape (transition, cell).
-    kind : ndarray
-        As of :func:`gains`: 0 or 1.
+    met : ndarray
+        As of :func:`gains`.
 
     Returns
     -------
     sensor : ndarray
         Twice the derivative by each cell's variance of measuring, shape (cell,).
     step : ndarray
-        Twice that by the covariance of what a step of each kind adds, shape (2, cell, cell).
+        Twice that by the covariance of what a step without and with contact adds, shape (2, cell,
+        cell).
     begin : ndarray
         Twice that by the variance of the state before each transition, shape (transition, cell).
     auxiliary : ndarray
@@ -326,7 +305,7 @@ def score(
     state, moved = np.zeros(d), np.zeros(d)
     known, pulled = np.zeros((d, d)), np.zeros((d, d))
     for k in range(n - 1, -1, -1):
-        if last[k]:
+        if k == n - 1 or first[k + 1]:
             state[:], known[:] = 0.0, 0.0
         for i in range(d - 1, -1, -1):
             if not seen[k, i]:
@@ -349,7 +328,7 @@ def score(
             known[i, i] += spread
         for a in range(d):
             for b in range(d):
-                step[kind[k], a, b] += state[a] * state[b] - known[a, b]
+                step[int(met[k]), a, b] += state[a] * state[b] - known[a, b]
         transition = slope[k]
         for a in range(d):
             moved[a] = 0.0

@@ -36,8 +36,8 @@ class Likelihood(ABC):
     nu : float, optional
         Degrees of freedom of Student-t noise; Gaussian without it.
     prior : tuple, optional
-        Medians of the noise parameters' prior, and its log-scale; by default :func:`sigma_prior`
-        takes them from the data.
+        Medians of the noise parameters' prior, and its log-scale; by default they are taken from
+        the data.
 
     Attributes
     ----------
@@ -86,10 +86,6 @@ class Likelihood(ABC):
         """Return the logarithm of the prior's medians, their mean for a scalar, shape (free,)."""
         logs = np.log(medians)
         return np.asarray(logs.mean(keepdims=True) if self.scalar else logs)
-
-    def exponential(self, n: int) -> Bools:
-        """Return which of n noise parameters have an exponential prior, shape (n,)."""
-        return np.zeros(n, dtype=bool)
 
     def of_data(self) -> TransitionLikelihood:
         """Return the likelihood for other data, without what was linearised along these.
@@ -161,9 +157,7 @@ class Likelihood(ABC):
         return self.unwhitened_slope(pull * weights[:, None], sigma, residual.shape)
 
     @abstractmethod
-    def log_density(
-        self, residual: Floats, sigma: Floats, measured: Bools, nu: Nu = None
-    ) -> Floats:
+    def log_density(self, residual: Floats, sigma: Floats, measured: Bools, nu: Nu) -> Floats:
         """Return the log-likelihood of each transition, shape (..., transition).
 
         Minus infinity where the engine diverged. ``measured`` has shape (transition, H, body,
@@ -239,9 +233,7 @@ class TransitionLikelihood(Likelihood):
         """Return one value a residual, shape (..., transition, H * body * state)."""
         return values.reshape(*values.shape[:-3], math.prod(values.shape[-3:]))
 
-    def log_density(
-        self, residual: Floats, sigma: Floats, measured: Bools, nu: Nu = None
-    ) -> Floats:
+    def log_density(self, residual: Floats, sigma: Floats, measured: Bools, nu: Nu) -> Floats:
         """Return the log-likelihood of each transition (Eq. 11)."""
         axes = (-1, -2, -3)
         log_sigma = np.where(measured, np.log(sigma)[..., None, None, None, :], 0.0).sum(axes)
@@ -282,12 +274,6 @@ class TrajectoryLikelihood(Likelihood):
         """Return errors of measurement and unexplained accelerations."""
         return self.noise.coordinates.variables
 
-    def exponential(self, n: int) -> Bools:
-        """Return a mask of the unexplained accelerations."""
-        mask = super().exponential(n)
-        mask[list(self.noise.coordinates.accelerations)] = True
-        return mask
-
     def of_parameters(self) -> TrajectoryLikelihood:
         """Return the same with smoothed states that do not follow the parameters."""
         return replace(self, noise=replace(self.noise, sensitivity=None))
@@ -314,9 +300,7 @@ class TrajectoryLikelihood(Likelihood):
         """Return one value an innovation, shape (..., transition, coordinate)."""
         return self.noise.coordinates.of_residual(values)
 
-    def log_density(
-        self, residual: Floats, sigma: Floats, measured: Bools, nu: Nu = None
-    ) -> Floats:
+    def log_density(self, residual: Floats, sigma: Floats, measured: Bools, nu: Nu) -> Floats:
         """Return the log-density of each transition's measurements given those before."""
         z, log_scale = self.noise.whitened(residual, sigma)
         nu = self.whitened_nu(nu, residual.shape)

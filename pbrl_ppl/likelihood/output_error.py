@@ -67,11 +67,6 @@ class InitialStates:
         np.add.at(total, self.column[sensed], begin.sum(axis=0)[sensed])
         return np.asarray(total)
 
-    @property
-    def unknown(self) -> int:
-        """Number of initial coordinates that are inferred."""
-        return int((~self.given).sum())
-
     @cached_property
     def counts(self) -> Floats:
         """Degrees of freedom of each observed dimension, shape (state,).
@@ -81,8 +76,7 @@ class InitialStates:
         """
         total = max(self.measured.sum(), 1.0)
         u, _ = self.basis(np.ones(self.measured.shape))
-        seen = np.concatenate([self.seen.reshape(len(u), -1), np.isfinite(self.begin)], axis=1)
-        taken = float((u**2)[seen].sum())
+        taken = float((u**2)[self.seen_rows].sum())
         return np.asarray(self.measured * max(total - taken, 1.0) / total)
 
     def rows(self, residual: Floats, weight: Floats) -> Floats:
@@ -94,7 +88,7 @@ class InitialStates:
         begin = np.nan_to_num(self.begin) * self.of_coordinates(weight)
         return np.concatenate([z, np.broadcast_to(begin, (*z.shape[:-1], begin.shape[-1]))], -1)
 
-    def series(self, rows: Floats) -> Floats:
+    def series(self, rows: Floats | Bools) -> Floats:
         """Return rows as series that begin with the start, shape (piece, 1 + H, body, state, ...).
 
         ``rows`` has shape (piece, row, ...); a start that is not observed is 0.
@@ -108,10 +102,10 @@ class InitialStates:
         return out
 
     @property
-    def seen_series(self) -> Bools:
-        """What was measured of :meth:`series`, shape (piece, 1 + H, body, state)."""
+    def seen_rows(self) -> Bools:
+        """What was measured of :meth:`rows`, shape (piece, row)."""
         seen = self.seen.reshape(len(self.seen), -1)
-        return self.series(np.concatenate([seen, np.isfinite(self.begin)], axis=1)) > 0
+        return np.concatenate([seen, np.isfinite(self.begin)], axis=1)
 
     def basis(self, weight: Floats) -> tuple[Floats, Floats]:
         """Return what initial states can take up, and how: orthonormal rows and the way back.
@@ -122,25 +116,21 @@ class InitialStates:
         u, back = self.memory.recall((weight / unit,), self._basis)
         return u, back / unit
 
-    def _basis(
-        self, weight: Floats, firm: float = 1e6, seen: float = 1e-5
-    ) -> tuple[Floats, Floats]:
-        """Return the basis for weights of which the largest is 1.
-
-        A given initial coordinate has ``firm`` times the weight of all measurements that depend on
-        it. Directions with a singular value below ``seen`` move nothing that was measured.
-        """
+    def _basis(self, weight: Floats) -> tuple[Floats, Floats]:
+        """Return the basis for weights of which the largest is 1."""
         pieces, coordinates = self.begin.shape
         moved = np.where(self.seen[..., None], self.slope, 0.0) * weight[:, None]
         moved = moved.reshape(pieces, -1, coordinates)
         diagonal = np.isfinite(self.begin) * self.of_coordinates(weight)
-        diagonal += self.given * firm * np.linalg.norm(moved, axis=1)
+        # what is given has far more weight than all measurements that depend on it
+        diagonal += self.given * 1e6 * np.linalg.norm(moved, axis=1)
         rows = np.concatenate([moved, diagonal[:, :, None] * np.eye(coordinates)], axis=1)
         scale = np.linalg.norm(rows, axis=1)
         scale = np.where(scale > 0, scale, 1.0)
         rows = rows / scale[:, None]
         square, v = np.linalg.eigh(np.swapaxes(rows, 1, 2) @ rows)
-        kept = square > seen**2 * square.max(axis=1, keepdims=True, initial=1e-300)
+        # directions of small singular values move nothing that was measured
+        kept = square > 1e-5**2 * square.max(axis=1, keepdims=True, initial=1e-300)
         inverse = np.where(kept, 1.0 / np.sqrt(np.where(kept, square, 1.0)), 0.0)
         return rows @ v * inverse[:, None], v * inverse[:, None] / scale[:, :, None]
 
@@ -201,9 +191,7 @@ class OutputErrorLikelihood(Likelihood):
         begin = np.full((*rows.shape[:-1], len(self.initial_states.column)), np.inf)
         return np.concatenate([rows, begin], axis=-1)
 
-    def log_density(
-        self, residual: Floats, sigma: Floats, measured: Bools, nu: Nu = None
-    ) -> Floats:
+    def log_density(self, residual: Floats, sigma: Floats, measured: Bools, nu: Nu) -> Floats:
         """Return the tempered log-likelihood of each piece, shape (..., piece)."""
         z = robust(self.whiten(residual, sigma), self.whitened_nu(nu, residual.shape))
         share = self.initial_states.counts / np.array(self.tau) / len(self.initial_states.begin)
@@ -241,34 +229,26 @@ class OutputErrorLikelihood(Likelihood):
         rows = z[..., :cut].reshape(residual.shape) * sigma
         return rows, z[..., cut:] * self.initial_states.of_coordinates(sigma)
 
-    def profile(self, residual: Floats, least: Floats, *, rounds: int = 6) -> Floats:
+    def profile(self, residual: Floats, least: Floats) -> Floats:
         """Return the restricted-likelihood sigma of each dimension, shape (state,).
 
         ``least`` are the least that they may be, shape (state,), SI units.
-        ``rounds``: rounds of sigma and projection, which depend on each other.
         """
-        sigma = np.maximum(
-            np.sqrt((residual**2).sum((0, 1, 2)) / self.initial_states.counts), least
-        )
-        for _ in range(rounds):
+        square = (residual**2).sum((0, 1, 2))
+        sigma = np.maximum(np.sqrt(square / self.initial_states.counts), least)
+        for _ in range(6):  # sigma and the projection depend on each other
             rows, begin = self.unwhitened(residual, sigma)
             square = self.initial_states.totals(rows**2, begin**2)
-            better = np.maximum(np.sqrt(square / self.initial_states.counts), least)
-            done = np.all(abs(better - sigma) < 1e-3 * sigma)
-            sigma = better
-            if done:
+            last, sigma = sigma, np.maximum(np.sqrt(square / self.initial_states.counts), least)
+            if np.all(abs(sigma - last) < 1e-3 * last):
                 break
         return np.asarray(sigma)
 
-    def correlation_times(
-        self, residual: Floats, sigma: Floats, *, uncorrelated: float = 0.05, least_pairs: int = 10
-    ) -> Floats:
+    def correlation_times(self, residual: Floats, sigma: Floats) -> Floats:
         """Return the integrated autocorrelation time of each dimension in rows, shape (state,).
 
         Of the projected residuals, without pairs from different pieces (Geyer's initial sequence).
-
-        ``uncorrelated``: correlations below this end the sum.
-        ``least_pairs``: pairs of residuals that an autocorrelation is taken over, at least.
+        A correlation below 0.05, or of fewer than ten pairs, ends the sum.
         """
         rows, _ = self.unwhitened(residual, sigma)
         seen, tau = self.initial_states.seen, np.ones(rows.shape[-1])
@@ -277,10 +257,10 @@ class OutputErrorLikelihood(Likelihood):
             variance = (x**2).sum() / max(there.sum(), 1)
             for lag in range(1, x.shape[1]):
                 pair = there[:, lag:] & there[:, :-lag]
-                if pair.sum() < least_pairs or not variance > 0:
+                if pair.sum() < 10 or not variance > 0:
                     break
                 correlation = (x[:, lag:] * x[:, :-lag])[pair].mean() / variance
-                if correlation < uncorrelated:
+                if correlation < 0.05:
                     break
                 tau[d] += 2 * correlation
         return tau
@@ -373,18 +353,7 @@ def _observed_initial_states(problem: Problem) -> Floats:
     return np.asarray(observed[segments.trajectory, segments.step])
 
 
-def autocovariance(
-    residual: Floats,
-    seen: Bools,
-    by_start: Floats,
-    by_phi: Floats,
-    *,
-    shortest: float = 0.5,
-    n_times: int = 12,
-    shares: tuple[float, ...] = (0.0, 0.02, 0.1, 0.3, 0.6, 0.9, 1.0),
-    least_freedom: int = 5,
-    chunk: float = 4e6,
-) -> Floats:
+def autocovariance(residual: Floats, seen: Bools, by_start: Floats, by_phi: Floats) -> Floats:
     """Return the expected autocovariance of the errors of a dimension by lag, shape (row,).
 
     The fit takes low frequencies out of the residual, so that the residual's own autocovariance is
@@ -402,16 +371,6 @@ def autocovariance(
         What was measured, shape (piece, row, body).
     by_start, by_phi : ndarray
         Derivatives by the initial states and by the parameters, shape (piece, row, body, column).
-    shortest : float
-        Least time constant of correlated errors (rows).
-    n_times : int
-        Time constants up to a piece's length.
-    shares : tuple of float
-        Shares of correlated errors in the variance.
-    least_freedom : int
-        Degrees of freedom that show a correlation, at least.
-    chunk : float
-        Numbers that an array over grid points may hold.
     """
     pieces, rows, bodies = residual.shape
     start, phi, last = (
@@ -425,12 +384,13 @@ def autocovariance(
     phi = _orthonormal(phi.reshape(1, pieces * rows * bodies, -1), least)
     phi = phi.reshape(*last.shape[:2], -1)
     freedom = seen.sum() - (start**2).sum() - (phi**2).sum()
-    if freedom < least_freedom:
+    if freedom < 5:  # too few degrees of freedom to show a correlation
         return np.append((residual[seen] ** 2).mean(), np.zeros(rows - 1))
     columns = np.concatenate([start, phi, last], axis=2).reshape(*residual.shape, -1)
-    times = np.geomspace(shortest, max(rows, 1.0), n_times)
+    times = np.geomspace(0.5, max(rows, 1.0), 12)  # time constants (rows) up to a piece's length
+    shares = (0.0, 0.02, 0.1, 0.3, 0.6, 0.9, 1.0)  # of correlated errors in the variance
     grid = np.array([(np.exp(-1 / t), share) for t in times for share in shares])
-    chunks = np.ceil(len(grid) * pieces * columns.shape[-1] ** 2 / chunk)
+    chunks = np.ceil(len(grid) * pieces * columns.shape[-1] ** 2 / 4e6)  # numbers an array holds
     restricted = [
         _restricted(columns, seen, start.shape[2], *part.T)
         for part in np.array_split(grid, min(int(chunks), len(grid)))
@@ -476,15 +436,11 @@ def _restricted(
     return left[:, -1, -1] - taken, log_det + np.linalg.slogdet(within)[1]
 
 
-def _whitened(
-    columns: Floats, seen: Bools, memory: Floats, share: Floats, *, nugget: float = 1e-9
-) -> tuple[Floats, Floats]:
+def _whitened(columns: Floats, seen: Bools, memory: Floats, share: Floats) -> tuple[Floats, Floats]:
     """Return inner products of whitened columns and log-determinants of the errors' correlation.
 
     Shapes (grid, piece, column, column) and (grid,). A Kalman filter of the AR(1) process, of all
-    pieces, columns and grid points at once.
-
-    ``nugget``: share of the variance that is white in any case.
+    pieces, columns and grid points at once. A billionth of the variance is white in any case.
     """
     pieces, rows, bodies, n = columns.shape
     mean = np.zeros((len(share), pieces, bodies, n))
@@ -492,7 +448,7 @@ def _whitened(
     gram, log_det = np.zeros((len(share), pieces, n, n)), np.zeros(len(share))
     for row in range(rows):
         there = seen[:, row]
-        total = np.where(there, variance + 1.0 - share + nugget, 1.0)
+        total = np.where(there, variance + 1.0 - share + 1e-9, 1.0)
         off = np.where(there[..., None], columns[:, row] - mean, 0.0)
         gram += np.swapaxes(off, 2, 3) @ (off / total[..., None])
         log_det += np.log(total).sum((1, 2))

@@ -12,7 +12,7 @@ from pbrl_ppl.effects import Noise, at_stage
 from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.history import History, Segments
 from pbrl_ppl.likelihood.coordinates import ACCELERATION, CONTACT
-from pbrl_ppl.likelihood.data import Data, Observations, least_noise, sigma_prior
+from pbrl_ppl.likelihood.data import SPREAD, Data, Observations, least_noise
 from pbrl_ppl.likelihood.likelihood import (
     LikelihoodT,
     TrajectoryLikelihood,
@@ -69,9 +69,7 @@ def degrees_of_freedom(physics: Physics, phi: Floats, nu: float | None) -> Float
 
 
 #: Dimensions of the noise variables along trajectories.
-_NOISE_DIMS = {
-    "sigma": "sensor", ACCELERATION: "velocity", CONTACT: "velocity",
-}  # fmt: skip
+_NOISE_DIMS = {"sigma": "sensor", ACCELERATION: "velocity", CONTACT: "velocity"}
 #: Dimensions of measured next states, and of the data that they are predicted from.
 NEXT_STATE_DIMS = ("transition", "step", "body", "state")
 START_DIMS = ("transition", "body", "full_state")
@@ -124,15 +122,12 @@ class Problem(Generic[LikelihoodT]):
         return Problem(data, physics, likelihood, library)
 
     def with_data(self, **changes: Any) -> Problem[TransitionLikelihood]:
-        """Return the same problem of other data; arguments are fields of :class:`Data`."""
-        return self.on(replace(self.data, **changes))
-
-    def on(self, data: Data) -> Problem[TransitionLikelihood]:
         """Return the same problem of other data, with the likelihood of single transitions.
 
-        Independent parts are found again for another history; equal ones keep their engines.
+        Arguments are fields of :class:`Data`. Independent parts are found again for another
+        history; equal ones keep their engines.
         """
-        physics = self.physics
+        data, physics = replace(self.data, **changes), self.physics
         if data.history is not self.data.history:
             physics = physics.in_parts(data.history)
         return Problem(data, physics, self.likelihood.of_data(), self.library)
@@ -209,9 +204,14 @@ class Problem(Generic[LikelihoodT]):
 
     @cached_property
     def noise_prior(self) -> tuple[Floats, float]:
-        """Medians of sigma's prior, shape (parameter,), and its log-scale."""
+        """Medians of sigma's prior, shape (parameter,), and its log-scale.
+
+        Unless the likelihood has one it is weak, about a tenth of the states' change.
+        """
         if self.likelihood.prior is None:
-            return sigma_prior(self.observations, self.segments, self.scene)
+            change = self.observations.residual(self.segments.start[:, None])
+            typical = self.observations.root_mean_square(change)
+            return np.maximum(0.1 * typical, self.least_noise), SPREAD
         median, spread = self.likelihood.prior
         return np.array(median), spread
 
@@ -335,15 +335,10 @@ def with_defect(problem: Problem[LikelihoodT], exact: Problem, phi: Floats) -> P
     return replace(problem, defect=np.nan_to_num(exact.predict(phi) - problem.predict(phi)))
 
 
-def corrected(
-    problem: Problem[LikelihoodT], phi: Floats, *, worth: int = 3
-) -> Problem[LikelihoodT]:
-    """Return the problem with fewer engine steps, corrected at phi, where that saves time.
-
-    ``worth``: ratio of engine steps from which it does.
-    """
+def corrected(problem: Problem[LikelihoodT], phi: Floats) -> Problem[LikelihoodT]:
+    """Return the problem with fewer engine steps, corrected at phi, where that saves time."""
     medium = problem.medium
-    if medium.physics.substeps * worth > problem.physics.substeps:
+    if medium.physics.substeps * 3 > problem.physics.substeps:
         return problem
     return with_defect(medium, problem, phi)
 
@@ -355,11 +350,9 @@ def variable_dims(problem: Problem) -> dict[str, tuple[str, ...]]:
     }
     if problem.library is not None:
         dims["library_index"] = (_owner_dim(problem, tuple(problem.scene.owners), "library"),)
+    of_noise = _NOISE_DIMS if is_filtered(problem) else {"sigma": "state"}
     for name in problem.noise_variables:
-        if problem.likelihood.scalar:
-            dims[name] = ()
-        else:
-            dims[name] = (_NOISE_DIMS[name] if is_filtered(problem) else "state",)
+        dims[name] = () if problem.likelihood.scalar else (of_noise[name],)
     return dims
 
 

@@ -9,19 +9,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from pbrl_ppl.history import History, longest_gap, unseen
-from pbrl_ppl.likelihood.coordinates import (
-    Coordinates,
-    check_moves,
-    first_states,
-    observed_coordinates,
-)
+from pbrl_ppl.history import longest_gap, unseen
+from pbrl_ppl.likelihood.coordinates import Coordinates, first_states, observed_coordinates
 from pbrl_ppl.likelihood.data import SPREAD, least_noise
 from pbrl_ppl.likelihood.likelihood import LikelihoodT, TransitionLikelihood
 from pbrl_ppl.likelihood.problem import FilteredProblem, Problem
 from pbrl_ppl.likelihood.trajectory_noise import Sensitivity, TrajectoryNoise
 from pbrl_ppl.physics import touching
-from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE, THETA, VELOCITY, Bools, Floats
 
 
@@ -30,8 +24,6 @@ def along_trajectories(
     phi: Floats,
     sigma: Floats | None = None,
     coordinates: Coordinates | None = None,
-    *,
-    shares: tuple[float, ...] = (0.5, 1.0),
 ) -> FilteredProblem:
     """Return the problem with the likelihood of whole trajectories, linearised at smoothed states.
 
@@ -46,8 +38,6 @@ def along_trajectories(
         dimension, then unexplained accelerations. Without it, a guess from what one step leaves.
     coordinates : Coordinates, optional
         Coordinates and noise parameters of the training data, where these are others.
-    shares : tuple of float
-        Steps (of the logarithm) by which unexplained accelerations fall to the given ones.
 
     Returns
     -------
@@ -59,97 +49,70 @@ def along_trajectories(
     HistoryError
         If nothing moves.
     """
-    history = problem.data.history
-    data = replace(problem.data, horizon=1, states=first_states(history))
-    eq_11 = with_predicted_gaps(problem.on(data), phi)
-    continued = coordinates is not None
-    if coordinates is None:
-        eq_11, coordinates = _with_noise(eq_11)
-    eq_11 = eq_11.with_data(columns=coordinates.columns)
-    begin = _guess(eq_11, coordinates, phi)
-    sigma = begin if sigma is None else sigma
-    n, d = eq_11.segments.n, len(coordinates.places)
-    whole = eq_11.along(linearised(eq_11, coordinates, np.zeros((n, d, d)), begin))
-    whole = _sloped(whole, phi, begin, _steps(whole, coordinates, begin), np.full(n, True))
-    whole = smoothed(whole, phi, begin)
-    if sigma is not begin:  # the physics alone may diverge from rough states
-        for share in shares:
-            whole = smoothed(whole, phi, _between(begin, sigma, share, coordinates))
+    continued, whole = coordinates is not None, as_measured(problem, phi, coordinates)
+    coordinates = whole.likelihood.noise.coordinates
+    steps = list(coordinates.accelerations)
+    begin = _guess(whole, coordinates, phi)
+    widths, everywhere = _steps(whole, coordinates, begin), np.full(whole.segments.n, True)
+    whole = smoothed(_sloped(whole, phi, begin, widths, everywhere), phi, begin)
+    if sigma is not None:
+        halfway = sigma.copy()  # in the logarithm: the physics alone may diverge from rough states
+        halfway[steps] = np.maximum(begin, sigma)[steps] ** 0.5 * sigma[steps] ** 0.5
+        whole = smoothed(smoothed(whole, phi, halfway), phi, sigma)
     if not continued:  # the noise of measurements adds to the changes of states as measured
-        moved = noise_medians(coordinates, whole.scene, history, whole.data.smoothed_states)
-        steps = list(coordinates.accelerations)
+        moved = noise_medians(whole, coordinates)
         least = whole.noise_prior[0].copy()
         least[steps] = np.minimum(least[steps], moved[steps])
         whole = whole.with_likelihood(prior=(tuple(least.tolist()), SPREAD))
     return whole
 
 
-def as_measured(problem: Problem) -> FilteredProblem:
+def as_measured(
+    problem: Problem, phi: Floats | None = None, coordinates: Coordinates | None = None
+) -> FilteredProblem:
     """Return the problem with the likelihood of whole trajectories, not linearised yet.
 
-    States are as measured, gaps interpolated, and the medians of the noise's prior follow from
-    them.
+    States are as measured, gaps interpolated, or predicted where phi is given. The medians of the
+    noise's prior follow from them, unless there are coordinates of other data.
 
     Raises
     ------
     HistoryError
         If nothing moves.
     """
-    data = replace(problem.data, horizon=1, states=first_states(problem.data.history))
-    eq_11, coordinates = _with_noise(problem.on(data))
+    history = problem.data.history
+    eq_11 = problem.with_data(horizon=1, states=first_states(history))
+    if phi is not None:
+        eq_11 = with_predicted_gaps(eq_11, phi)
+    if coordinates is None:
+        coordinates = observed_coordinates(eq_11.scene, history)
+        medians = noise_medians(eq_11, coordinates)
+        eq_11 = eq_11.with_likelihood(scalar=False, prior=(tuple(medians.tolist()), SPREAD))
     eq_11 = eq_11.with_data(columns=coordinates.columns)
     d = len(coordinates.places)
     nothing = np.zeros((eq_11.segments.n, d, d))
     return eq_11.along(linearised(eq_11, coordinates, nothing, eq_11.noise_prior[0]))
 
 
-def _with_noise(
-    problem: Problem[TransitionLikelihood],
-) -> tuple[Problem[TransitionLikelihood], Coordinates]:
-    """Return the problem with the prior of trajectories' noise, and their coordinates."""
-    history, scene = problem.data.history, problem.scene
-    coordinates = observed_coordinates(scene, history)
-    check_moves(coordinates, scene)
-    medians = noise_medians(coordinates, scene, history, problem.data.smoothed_states)
-    prior = tuple(medians.tolist()), SPREAD
-    return problem.with_likelihood(scalar=False, prior=prior), coordinates
-
-
 def single_transitions(problem: Problem) -> Problem[TransitionLikelihood]:
     """Return the problem with the likelihood of single transitions (Eq. 11)."""
     horizon = longest_gap(problem.data.history)
-    data = replace(problem.data, horizon=horizon, states=None, columns=None)
-    return problem.on(data).with_likelihood(prior=None)
+    single = problem.with_data(horizon=horizon, states=None, columns=None)
+    return single.with_likelihood(prior=None)
 
 
-def smoothed(
-    problem: FilteredProblem,
-    phi: Floats,
-    sigma: Floats,
-    *,
-    converged: float = 0.05,
-    rounds: int = 4,
-    stale: float = 0.3,
-    little: float = 0.1,
-) -> FilteredProblem:
+def smoothed(problem: FilteredProblem, phi: Floats, sigma: Floats) -> FilteredProblem:
     """Return the problem linearised about states smoothed at phi and sigma.
 
     Near-zero unexplained accelerations are raised to a small value: with stick and slip, smoothing
     by the physics alone does not converge.
-
-    ``converged``: largest change of states in the last round (standard deviations).
-    ``rounds``: rounds, at most.
-    ``stale``: a slope is computed again where the state has moved by more than this (standard
-    deviations).
-
-    ``little``: least unexplained acceleration to smooth with, as a share of its prior median.
     """
     steps = list(problem.likelihood.noise.coordinates.accelerations)
     sigma = sigma.copy()
-    sigma[steps] = np.maximum(sigma[steps], little * problem.noise_prior[0][steps])
+    sigma[steps] = np.maximum(sigma[steps], 0.1 * problem.noise_prior[0][steps])
     begun: Floats = np.array(np.inf)  # states at which each transition's slope was taken
     residual = problem.likelihood.noise.coordinates.of_residual(problem.residual(phi))
-    for _ in range(rounds):
+    for _ in range(4):  # rounds at most
         noise = problem.likelihood.noise
         coordinates = noise.coordinates
         before, after = noise.smoothed(residual, sigma)
@@ -159,7 +122,8 @@ def smoothed(
             break  # diverged: keep the last linearisation
         moved = with_predicted_gaps(problem.with_states(states), phi)
         begin = coordinates.of(moved.segments.start)
-        far = np.asarray((np.abs(begin - begun) > stale * spread).any(axis=1))
+        # slopes are stale from 0.3 standard deviations on
+        far = np.asarray((np.abs(begin - begun) > 0.3 * spread).any(axis=1))
         moved = _sloped(moved, phi, sigma, spread, far)
         begun = np.where(far[:, None], begin, begun)
         residual = coordinates.of_residual(moved.residual(phi))
@@ -167,8 +131,8 @@ def smoothed(
             break  # diverged: nothing follows from the new one
         problem = moved
         shown = after[noise.seen.any(axis=1)]
-        if (np.sqrt(np.mean(shown**2, axis=0)) < converged * spread).all():
-            break
+        if (np.sqrt(np.mean(shown**2, axis=0)) < 0.05 * spread).all():
+            break  # converged
     return problem
 
 
@@ -230,20 +194,10 @@ def with_predicted_gaps(problem: Problem[LikelihoodT], phi: Floats) -> Problem[L
 def _steps(problem: Problem, coordinates: Coordinates, sigma: Floats) -> Floats:
     """Return the steps of finite differences by the coordinates, shape (coordinate,)."""
     error = coordinates.errors(sigma)
-    known = {
-        place: error[i] / problem.scene.time_step for i, place in enumerate(coordinates.places)
-    }
+    known = dict(zip(coordinates.places, error / problem.scene.time_step, strict=True))
     below = np.array([known.get(place - VELOCITY, 0.0) for place in coordinates.places])
     rate = (coordinates.places % len(STATE) >= VELOCITY) & (coordinates.sensor < 0)
     return np.where(rate, np.maximum(error, below), error)
-
-
-def _between(begin: Floats, end: Floats, share: float, coordinates: Coordinates) -> Floats:
-    """Return noise parameters with accelerations between two sets, in the logarithm."""
-    sigma, steps = end.copy(), list(coordinates.accelerations)
-    larger = np.maximum(begin, end)[steps]
-    sigma[steps] = larger ** (1.0 - share) * end[steps] ** share
-    return sigma
 
 
 def _guess(problem: Problem, coordinates: Coordinates, phi: Floats) -> Floats:
@@ -251,15 +205,10 @@ def _guess(problem: Problem, coordinates: Coordinates, phi: Floats) -> Floats:
     residual = coordinates.of_residual(problem.residual(phi))
     size, known = np.full(residual.shape[1], np.nan), np.isfinite(residual).any(axis=0)
     size[known] = np.sqrt(np.nanmedian(residual[:, known] ** 2, axis=0)) / 0.67
-    by_dimension = {
-        d: float(np.sqrt(np.mean(size[coordinates.places % len(STATE) == d] ** 2)))
-        for d in coordinates.columns
-    }
-    dt = problem.scene.time_step
-    guess = [by_dimension[d] / np.sqrt(2) for d in coordinates.sensors]
-    guess += [
-        by_dimension[d] / np.sqrt(2) / dt for d in (*coordinates.rates, *coordinates.contacts)
-    ]
+    typical = _by_dimension(coordinates, size**2) / np.sqrt(2)
+    rates = [*coordinates.rates, *coordinates.contacts]
+    changes = typical[rates] / problem.scene.time_step
+    guess = np.concatenate([typical[list(coordinates.sensors)], changes])
     medians = problem.noise_prior[0]
     return np.where(np.isnan(guess), medians, np.maximum(guess, 0.01 * medians))
 
@@ -291,9 +240,8 @@ def _sloped(
         """Return the states after an interval; a coarse engine's slope agrees with a fine one's."""
         begin = states.reshape(-1, *states.shape[2:])
         repeated = np.tile(inputs, (len(states), 1, 1, 1))
-        return np.asarray(problem.medium.physics.simulator(phi, begin, repeated)[:, 0]).reshape(
-            states.shape
-        )
+        ends = problem.medium.physics.simulator(phi, begin, repeated)[:, 0]
+        return np.asarray(ends.reshape(states.shape))
 
     if rows.any():
         slope, start = slope.copy(), problem.segments.start[rows]
@@ -302,12 +250,7 @@ def _sloped(
 
 
 def linearised(
-    problem: Problem,
-    coordinates: Coordinates,
-    slope: Floats,
-    sigma: Floats,
-    *,
-    ranges: float = 10.0,
+    problem: Problem, coordinates: Coordinates, slope: Floats, sigma: Floats
 ) -> TrajectoryNoise:
     """Return the noise along a problem's trajectories from given slopes.
 
@@ -321,15 +264,19 @@ def linearised(
         Derivative of the next state by the state, shape (transition, coordinate, coordinate).
     sigma : ndarray
         Noise parameters at which the states were smoothed, shape (parameter,).
-    ranges : float
-        Prior scale of an unmeasured state, as a multiple of its range, beside its typical size.
     """
     segments, states = problem.segments, problem.data.smoothed_states
     trajectory, step = segments.trajectory, segments.step
     observed = problem.data.history.dataset["observed"].to_numpy()
     deviation = coordinates.wrapped(coordinates.of(observed) - coordinates.of(states))
     end, begin = deviation[trajectory, step + 1], deviation[trajectory, step]
-    far = ranges * np.ptp(coordinates.of(states), axis=(0, 1)) + coordinates.sizes(problem.scene)
+    touch = np.zeros(segments.n, dtype=bool)
+    if coordinates.contacts:
+        # smoothing may take one away and blame a measurement: what was measured counts as well
+        for one in (states, np.where(np.isfinite(observed), observed, states)):
+            touch |= touching(problem.scene, one[trajectory, step], one[trajectory, step + 1])
+    # prior scale of an unmeasured state: many times its range, beside its typical size
+    far = 10.0 * np.ptp(coordinates.of(states), axis=(0, 1)) + coordinates.sizes(problem.scene)
     return TrajectoryNoise(
         coordinates=coordinates,
         slope=np.ascontiguousarray(slope),
@@ -339,74 +286,47 @@ def linearised(
         begin=np.nan_to_num(begin),
         initial_variance=np.where(np.isfinite(begin), 0.0, far**2),
         sigma=np.asarray(sigma, dtype=float),
-        touching=_touching(problem, coordinates),
+        touching=touch,
     )
 
 
-def _touching(problem: Problem, coordinates: Coordinates) -> Bools:
-    """Return the mask of transitions with contact, shape (transition,)."""
-    segments, states = problem.segments, problem.data.smoothed_states
-    if not coordinates.contacts:
-        return np.zeros(segments.n, dtype=bool)
-    trajectory, step = segments.trajectory, segments.step
-    observed = problem.data.history.dataset["observed"].to_numpy()
-    # smoothing may take a contact away and blame a measurement: what was measured counts as well
-    measured = np.where(np.isfinite(observed), observed, states)
-    smooth, met = (
-        touching(problem.scene, one[trajectory, step], one[trajectory, step + 1])
-        for one in (states, measured)
-    )
-    return smooth | met
-
-
-def noise_medians(
-    coordinates: Coordinates,
-    scene: Scene,
-    history: History,
-    states: Floats,
-    *,
-    sensor_share: float = 0.1,
-    contact_share: float = 0.1,
-    acceleration_share: float = 0.1,
-) -> Floats:
+def noise_medians(problem: Problem, coordinates: Coordinates, *, share: float = 0.1) -> Floats:
     """Return the medians of the noise priors, shape (parameter,), from changes of the states.
 
-    ``sensor_share``: median of the prior of errors of measuring, as a share of what states do in a
-    step.
-
-    ``contact_share``: the same share for contact accelerations.
-    ``acceleration_share``: an unexplained acceleration is larger than this share of the bodies'
-    with a probability of 1 %: physics is nearly deterministic, and a random force follows whatever
-    is smooth.
+    ``share``: medians of errors of measuring and of contact accelerations, as a share of what
+    states do in a step. An unexplained acceleration is larger than this share of the bodies' with a
+    probability of 1 %: physics is nearly deterministic, and a random force follows whatever is
+    smooth.
     """
+    history, states = problem.data.history, problem.data.smoothed_states
+    dt = float(history.dataset.attrs["time_step"])
     real = np.isfinite(history.dataset["clock"].to_numpy())
     shown = real & ~unseen(history).any(axis=-1)
-    typical, seen = (
-        _typical(
-            coordinates,
-            [np.diff(path[row], axis=0) for path, row in zip(states, rows, strict=True)],
-        )
+    changes = [
+        [np.diff(path[row], axis=0) for path, row in zip(states, rows, strict=True)]
         for rows in (real, shown)
-    )
-    dt = float(history.dataset.attrs["time_step"])
+    ]
+    typical, seen = (_typical(coordinates, np.concatenate(each)) for each in changes)
     sensors, contacts = list(coordinates.sensors), list(coordinates.contacts)
     # of an exponential law, as a share of what it exceeds with a probability of 1 %
     median = np.log(2.0) / -np.log(0.01)
-    steps = acceleration_share * median * _vectors(typical, coordinates.rates) / dt
-    medians = sensor_share * seen[sensors], steps, contact_share * typical[contacts] / dt
-    rates = least_noise(scene, (*coordinates.rates, *contacts)) / dt
-    floors = least_noise(scene, sensors), rates
+    steps = share * median * _vectors(typical, coordinates.rates) / dt
+    medians = share * seen[sensors], steps, share * typical[contacts] / dt
+    rates = least_noise(problem.scene, (*coordinates.rates, *contacts)) / dt
+    floors = least_noise(problem.scene, sensors), rates
     return np.asarray(np.maximum(np.concatenate(medians), np.concatenate(floors)))
 
 
-def _typical(coordinates: Coordinates, changes: list[Floats]) -> Floats:
-    """Return the root mean square change of each state dimension, shape (6,)."""
-    square = np.concatenate([change.reshape(len(change), -1) for change in changes]) ** 2
-    mean_square = square.mean(axis=0)[coordinates.places]
+def _typical(coordinates: Coordinates, changes: Floats) -> Floats:
+    """Return the root mean square of changes (..., body, 6) by state dimension, shape (6,)."""
+    square = changes.reshape(len(changes), -1) ** 2
+    return _by_dimension(coordinates, square.mean(axis=0)[coordinates.places])
+
+
+def _by_dimension(coordinates: Coordinates, square: Floats) -> Floats:
+    """Return the root mean of squares (coordinate,) of each state dimension, shape (6,)."""
     of = coordinates.places % len(STATE)
-    return np.array(
-        [np.sqrt(mean_square[of == d].mean()) if (of == d).any() else 0.0 for d in range(6)]
-    )
+    return np.array([np.sqrt(square[of == d].mean()) if (of == d).any() else 0.0 for d in range(6)])
 
 
 def _vectors(typical: Floats, rates: tuple[int, ...]) -> Floats:
@@ -423,4 +343,4 @@ def bodies_acceleration(problem: FilteredProblem) -> Floats:
     """
     coordinates, segments = problem.likelihood.noise.coordinates, problem.segments
     change = segments.observed[:, 0] - segments.start
-    return _vectors(_typical(coordinates, [change]), coordinates.rates) / problem.scene.time_step
+    return _vectors(_typical(coordinates, change), coordinates.rates) / problem.scene.time_step

@@ -11,18 +11,17 @@ Kalman filtering and moving-horizon estimation (2005), on the point of linearisa
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.likelihood.coordinates import Coordinates
 from pbrl_ppl.likelihood.kalman import adjoint, gains, innovations, score, whitened
 from pbrl_ppl.parameters import Layout, change_from, covariance_factor
 from pbrl_ppl.physics import Memory
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import Bools, Floats, Ints
+from pbrl_ppl.state import Bools, Floats
 from pbrl_ppl.threads import in_parallel, processors
 
 #: Predicts next states from phi, initial states and inputs, as a simulator does.
@@ -67,10 +66,6 @@ class Sensitivity:
         parts = [self.before[row].reshape(-1, self.phi.shape[1]) for row in rows]
         return list(zip(sets, rows, parts, strict=True))
 
-    def at(self, rows: NDArray[np.intp]) -> Sensitivity:
-        """Return the sensitivity of these transitions alone."""
-        return replace(self, slope=self.slope[rows], phi=self.phi[rows], before=self.before[rows])
-
     def moved(self, phi: Floats) -> Floats:
         """Return the change of the states with phi, shape (..., transition, coordinate)."""
         result = np.empty((*phi.shape[:-1], *self.before.shape[:2]))
@@ -84,9 +79,7 @@ class Sensitivity:
         states = np.broadcast_to(start, (*moved.shape[:-2], *start.shape))
         return self.coordinates.completed(self.scene, self._added(states, moved))
 
-    def predicted(
-        self, engine: Engine, phi: Floats, start: Floats, inputs: Floats, *, far: float = 1e6
-    ) -> Floats:
+    def predicted(self, engine: Engine, phi: Floats, start: Floats, inputs: Floats) -> Floats:
         """Return next states from smoothed initial states, shape (..., transition, 1, body, 6).
 
         Parameters
@@ -99,10 +92,9 @@ class Sensitivity:
             Smoothed states before the transitions, shape (transition, body, 6), SI units.
         inputs : ndarray
             What acts, shape (transition, 1, body, 3 or 9).
-        far : float
-            Least change of a coordinate that counts as divergence, in its typical size.
         """
-        moved, limit = self.moved(phi), far * self.coordinates.sizes(self.scene)
+        # a million times its typical size is divergence
+        moved, limit = self.moved(phi), 1e6 * self.coordinates.sizes(self.scene)
         moved = np.where(np.abs(moved) < limit, moved, np.nan)  # nothing is predicted from there
         states = engine(phi, self.begun(np.nan_to_num(moved), start), inputs)
         back = np.matmul(self.slope, moved[..., None])[..., 0]
@@ -177,7 +169,7 @@ class TrajectoryNoise:
     def _filter_gains(self, sigma: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         gain, scale, after = gains(
             self.slope, self.first, self.seen, self._begin(sigma),
-            self.coordinates.errors(sigma) ** 2, self.coordinates.steps(sigma), self.kind,
+            self.coordinates.errors(sigma) ** 2, self.coordinates.steps(sigma), self.touching,
         )  # fmt: skip
         return gain, scale, after, np.log(scale).sum(axis=1)
 
@@ -189,19 +181,7 @@ class TrajectoryNoise:
         """Covariance of filtered states, shape (transition, coordinate, coordinate)."""
         return self._gains(sigma)[2]
 
-    @property
-    def last(self) -> Bools:
-        """Whether a transition is its trajectory's last, shape (transition,)."""
-        return np.append(self.first[1:], True)
-
-    @property
-    def kind(self) -> Ints:
-        """1 where bodies touch in a transition and 0 elsewhere, shape (transition,)."""
-        return self.touching.astype(np.int64)
-
-    def whitened(
-        self, residual: Floats, sigma: Floats, *, beyond: float = 1e100
-    ) -> tuple[Floats, Floats]:
+    def whitened(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
         """Return whitened innovations with the log of their standard deviations.
 
         Parameters
@@ -210,9 +190,6 @@ class TrajectoryNoise:
             Linearised minus predicted states, shape (..., transition, 1, body, state).
         sigma : ndarray
             Noise parameters, shape (parameter,) or (..., parameter) with the same leading axes.
-        beyond : float
-            Least innovation that counts as divergence (standard deviations): its square would
-            overflow.
 
         Returns
         -------
@@ -231,16 +208,11 @@ class TrajectoryNoise:
             sigmas = np.broadcast_to(sigma, (*lead, sigma.shape[-1])).reshape(-1, sigma.shape[-1])
             white, log_scale = self._whitened(rows, sigmas)
             log_scale = log_scale.reshape(coordinates.shape[:-1])
-        white = np.where(np.abs(white) < beyond, white, np.nan)
+        white = np.where(np.abs(white) < 1e100, white, np.nan)  # squares would overflow
         return white.reshape(coordinates.shape), log_scale
 
-    def _whitened(
-        self, rows: Floats, sigmas: Floats, *, threads_from: int = 20_000
-    ) -> tuple[Floats, Floats]:
-        """Return the same of residuals (set, transition, coordinate) with a noise for each set.
-
-        ``threads_from``: numbers to filter from which threads pay.
-        """
+    def _whitened(self, rows: Floats, sigmas: Floats) -> tuple[Floats, Floats]:
+        """Return the same of residuals (set, transition, coordinate) with a noise for each set."""
         sensor = self.coordinates.errors(sigmas) ** 2
         variance, step = self._begin(sigmas), self.coordinates.steps(sigmas)
 
@@ -248,14 +220,14 @@ class TrajectoryNoise:
             residual = np.ascontiguousarray(rows[chosen])
             result: tuple[Floats, Floats] = whitened(
                 self.slope, self.first, self.seen, variance[chosen], sensor[chosen],
-                step[chosen], self.kind, residual, self.begin, self.measured,
+                step[chosen], self.touching, residual, self.begin, self.measured,
             )  # fmt: skip
             return result
 
         a_thread = -(-len(rows) // processors())
         slices = [slice(i, i + a_thread) for i in range(0, len(rows), a_thread)]
-        many = rows.size > threads_from
-        parts = in_parallel(some, slices) if many else list(map(some, slices))
+        # threads pay for many numbers alone
+        parts = in_parallel(some, slices) if rows.size > 20_000 else list(map(some, slices))
         white, log_scale = (np.concatenate(column) for column in zip(*parts, strict=True))
         return white, log_scale
 
@@ -283,7 +255,7 @@ class TrajectoryNoise:
         """Return :func:`kalman.adjoint` of weighted innovations."""
         gain, scale, *_ = self._gains(sigma)
         pulled: tuple[Floats, Floats, Floats] = adjoint(
-            self.slope, self.last, self.seen, gain, scale, weighted
+            self.slope, self.first, self.seen, gain, scale, weighted
         )
         return pulled
 
@@ -339,7 +311,7 @@ class TrajectoryNoise:
     def _score(self, residual: Floats, sigma: Floats) -> tuple[Floats, ...]:
         """Return white innovations of residuals (transition, coordinate), and `kalman.score`."""
         white, (gain, scale, *_) = self.filtered(residual[None], sigma)[0][0], self._gains(sigma)
-        return white, *score(self.slope, self.last, self.seen, gain, scale, white, self.kind)
+        return white, *score(self.slope, self.first, self.seen, gain, scale, white, self.touching)
 
     def predictive(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
         """Return the one-step predictive mean and covariance of each measurement, as deviations.
@@ -362,7 +334,7 @@ class TrajectoryNoise:
         begin = self._begin(sigma)[:, :, None] * np.eye(len(coordinates.places))
         known = np.where(first[..., None], begin, np.roll(after, 1, axis=0))
         covariance = self.slope @ known @ self.slope.transpose(0, 2, 1)
-        covariance += coordinates.steps(sigma)[self.kind]
+        covariance += coordinates.steps(sigma)[self.touching.astype(int)]
         return (
             np.einsum("kab,kb->ka", self.slope, state) - residual,
             covariance + np.diag(coordinates.errors(sigma) ** 2),

@@ -40,7 +40,6 @@ from pbrl_ppl.state import Floats
 with warnings.catch_warnings():  # PyMC 5 imports ArviZ 0.23, which announces 1.0 once a day
     warnings.filterwarnings("ignore", r"\s*ArviZ is undergoing", FutureWarning)
     import pymc as pm
-    from pymc.distributions.distribution import _support_point
     from pymc.logprob.abstract import _logprob
 
 
@@ -308,17 +307,9 @@ class _NextStateRV(RandomVariable):
         super().__init__(**settings)
         self.lazy = lazy
 
-    def rng_fn(
-        self,
-        rng: np.random.Generator,
-        predicted: Floats,
-        whole: Floats,
-        sigma: Floats,
-        phi: Floats,
-        size: object = None,
-    ) -> Floats:
-        """Draw measurements."""
-        problem = self.lazy.problem
+    def rng_fn(self, rng: np.random.Generator, *inputs: Any) -> Floats:
+        """Draw measurements, for the inputs of the variable and a size."""
+        (_, whole, sigma, phi, _), problem = inputs, self.lazy.problem
         linearised = np.nan_to_num(problem.observations.values)
         return problem.likelihood.random(whole, linearised, sigma, rng, problem.nu(phi))
 
@@ -347,11 +338,6 @@ def _log_likelihood(  # type: ignore[no-untyped-def]
     op, values, rng, size, predicted, whole, *noise, **options
 ):
     return LogLikelihoodOp(op.lazy)(values[0], predicted, *noise)
-
-
-@_support_point.register(_NextStateRV)
-def _expected(op, variable, rng, size, predicted, *parameters):  # type: ignore[no-untyped-def]
-    return predicted
 
 
 def random_variable(
@@ -403,15 +389,10 @@ def random_variable(
     return pm.Categorical(name, p=p, dims=dims)
 
 
-def _von_mises(
-    name: str, mu: Floats, kappa: Floats, dims: str | tuple[str, ...], *, sharp: float = 500.0
-) -> TensorVariable:
-    """Declare PyMC's von Mises, or an equal density that does not overflow if it is sharp.
-
-    ``sharp``: concentration above which PyMC 5's density overflows.
-    """
+def _von_mises(name: str, mu: Floats, kappa: Floats, dims: str | tuple[str, ...]) -> TensorVariable:
+    """Declare PyMC's von Mises, or an equal density that does not overflow if it is sharp."""
     kappa = np.maximum(kappa, 1e-12)  # has to be above 0: uniform to the last digit
-    if kappa.max() <= sharp:
+    if kappa.max() <= 500.0:  # PyMC 5's density overflows above
         return pm.VonMises(name, mu=mu, kappa=kappa, dims=dims)
     log_norm = np.log(2 * np.pi * i0e(kappa))
     return pm.CustomDist(

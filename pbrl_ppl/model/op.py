@@ -358,28 +358,21 @@ class LogLikelihoodOp(_BlackBoxOp):
         return self._density(*self._residual(value, predicted), sigma, phi)
 
     def pulled(
-        self, value: Floats, predicted: Floats, sigma: Floats, phi: Floats, cotangent: Floats,
-        *, step: float = 1e-5,
-    ) -> list[Floats]:  # fmt: skip
-        """Return derivatives by predictions, noise and phi; ``step`` is relative in the noise."""
+        self, value: Floats, predicted: Floats, sigma: Floats, phi: Floats, cotangent: Floats
+    ) -> list[Floats]:
+        """Return derivatives by predictions, noise and phi."""
         residual, measured = self._residual(value, predicted)
         slope = self._likelihood.slope(residual, sigma, self.lazy.problem.nu(phi), cotangent)
 
-        def by_difference(i: int, point: Floats, step: float, *, of_noise: bool) -> float:
-            ends = [point.copy(), point.copy()]
-            ends[0][i] += step
-            ends[1][i] = max(point[i] - step, 0.0)
-            high, low = (
-                self._density(residual, measured, *((end, phi) if of_noise else (sigma, end)))
-                for end in ends
-            )
-            return float((high - low) @ cotangent / (ends[0][i] - ends[1][i]))
-
-        by_sigma = [by_difference(i, sigma, step * x, of_noise=True) for i, x in enumerate(sigma)]
-        by_phi = np.zeros_like(phi)
-        for i in self.lazy.problem.tails:
-            by_phi[i] = by_difference(i, phi, step, of_noise=False)
-        return [np.where(measured, -slope, 0.0), np.array(by_sigma), by_phi]
+        point, n = np.concatenate([sigma, phi]), len(sigma)
+        by_point = np.zeros_like(point)
+        for i in (*range(n), *(n + place for place in self.lazy.problem.tails)):
+            step = 1e-5 * (point[i] if i < n else 1.0)  # relative in the noise
+            ends = np.tile(point, (2, 1))
+            ends[:, i] = point[i] + step, max(point[i] - step, 0.0)
+            high, low = (self._density(residual, measured, end[:n], end[n:]) for end in ends)
+            by_point[i] = (high - low) @ cotangent / (ends[0, i] - ends[1, i])
+        return [np.where(measured, -slope, 0.0), by_point[:n], by_point[n:]]
 
 
 class NoiseMediansOp(Op):

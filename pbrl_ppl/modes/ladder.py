@@ -82,7 +82,8 @@ def piece_lengths(mode: Mode) -> list[int]:
         )
     whole = in_pieces(mode.problem, longest, mode.problem.data.smoothed_states)
     initial_states = whole.likelihood.initial_states
-    measured, unknown = int(initial_states.measured.sum()), initial_states.unknown + len(mode.phi)
+    measured = int(initial_states.measured.sum())
+    unknown = int((~initial_states.given).sum()) + len(mode.phi)
     if measured <= unknown:
         raise HistoryError(
             f"history: it has {measured} measurements, and simulations of its trajectories have"
@@ -130,7 +131,7 @@ def with_robust_covariance(mode: SimulatedMode, *, many: int = 8) -> SimulatedMo
     jacobian = mode.jacobian.reshape(*mode.whitened_residual.shape, p)
     u = initial_states.basis(weight)[0]
     residual, start, by_phi = map(initial_states.series, (mode.whitened_residual, u, jacobian))
-    seen, score = initial_states.seen_series, np.diag(slopes**2)
+    seen, score = initial_states.series(initial_states.seen_rows) > 0, np.diag(slopes**2)
     lags = np.abs(np.subtract.outer(np.arange(seen.shape[1]), np.arange(seen.shape[1])))
     for d, white in enumerate(problem.least_noise * weight):
         of_dimension = by_phi[..., d, :]

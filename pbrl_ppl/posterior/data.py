@@ -276,9 +276,8 @@ def with_recording(problem: Problem, constants: xr.Dataset, data_sha256: str) ->
         start, slope = pieces.segments.start, stored[_BY_START]
         return linearised_pieces(pieces, start, slope, stored[_TAU]).with_likelihood(prior=prior)
     coordinates = observed_coordinates(problem.scene, history)
-    problem = problem.with_data(
-        history=history, horizon=1, states=states, columns=coordinates.columns
-    )
+    columns = coordinates.columns
+    problem = problem.with_data(history=history, horizon=1, states=states, columns=columns)
     noise = linearised(problem, coordinates, stored["slope"], stored["linearised_at"])
     if _SENSITIVITY in stored:
         slopes = noise.slope, stored[_ORIGIN], stored[_SENSITIVITY]

@@ -1,6 +1,5 @@
 """Draws from the posterior: `fit` and its samplers, and `update`."""
 
-from .fitting import DEFAULT as DEFAULT
 from .fitting import fit as fit
 from .fitting import sample as sample
 from .methods import WeightsError as WeightsError

@@ -264,11 +264,7 @@ def _drawn(
         def of_configuration(mode: Mode) -> Idata:
             return _run(replace(job, problem=mode.problem, mode=mode))
 
-        trace = mix(
-            problem, weighed, of_configuration, draws=method.draws, chains=method.chains,
-            seed=job.seed,
-        )  # fmt: skip
-        return job, trace, most_probable(problem, weighed)
+        return job, mix(job, weighed, of_configuration), most_probable(problem, weighed)
     if job.resume is not None:
         return job, _run(job), stored_mode(problem, job.resume)
     job = _at_mode(job, start)
@@ -324,8 +320,6 @@ def _run(job: SamplerRun) -> Idata:
 
 def _check(problem: Problem, method: str, start: object, resume: Idata | None) -> None:
     """Refuse arguments of `fit` that do not go with a problem."""
-    if method == "paper":
-        raise FitError("fit: the method 'paper' is now called 'metropolis'")
     if method not in METHODS:
         raise FitError(f"fit: method is {method!r}, expected one of {', '.join(METHODS)}")
     given = [name for name, one in (("start", start), ("resume", resume)) if one is not None]
@@ -354,9 +348,7 @@ def _check(problem: Problem, method: str, start: object, resume: Idata | None) -
         )
 
 
-def joined_at(
-    problem: Problem, phi: Floats, sigma: Floats, *, most: int = 50, same: float = 0.01
-) -> Problem:
+def joined_at(problem: Problem, phi: Floats, sigma: Floats) -> Problem:
     """Return the problem with bodies that meet at these draws in one part; itself if none do.
 
     Parameters
@@ -365,15 +357,11 @@ def joined_at(
         Bodies that were apart in its data are simulated apart.
     phi, sigma : ndarray
         Draws, shapes (n, p) and (n, parameter).
-    most : int
-        Of more draws so many are simulated, evenly spread.
-    same : float
-        How far predictions may differ and be the same to the likelihood, in units of the noise.
     """
     physics = problem.physics
     if len(physics.simulator.parts) == 1:
         return problem
-    rows = np.linspace(0, len(phi) - 1, min(most, len(phi))).astype(int)
+    rows = np.linspace(0, len(phi) - 1, min(50, len(phi))).astype(int)  # enough, evenly spread
     phi, sigma = phi[rows], sigma[rows]
     start, columns = problem.segments.start, list(problem.observations.columns)
     states, met = physics.one_world.meetings(phi, start, problem.inputs)
@@ -387,7 +375,8 @@ def joined_at(
         known = np.tile([stated.get(name, np.inf) for name in STATE], (len(phi), 1))
         known[:, list(sensors)] = sigma[:, : len(sensors)]
         sigma = known[:, columns]
-    matters = np.any(~(off <= same * sigma[:, None, None, None]), axis=(2, 3, 4))
+    # a hundredth of the noise is the same to the likelihood
+    matters = np.any(~(off <= 0.01 * sigma[:, None, None, None]), axis=(2, 3, 4))
     meet = (met & matters[..., None]).any(axis=(0, 1))
     meeting = [body.name for body, one in zip(problem.scene.moving, meet, strict=True) if one]
     if not meeting:

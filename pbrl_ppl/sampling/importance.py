@@ -107,14 +107,13 @@ class Reference:
         return cls(space, gaussians[0][0], tuple(mixtures))
 
     @classmethod
-    def about(cls, space: Space, mode: Mode, cheap: Space | None = None) -> Reference:
+    def about(cls, space: Space, mode: Mode, cheap: Space) -> Reference:
         """Return the Laplace approximations about a mode and its others.
 
         ``cheap`` is the space of fewer engine steps, which tells how far off densities fall.
         """
         gaussians = [space.laplace(one) for one in (mode, *mode.others)]
-        near = cheap or space
-        return cls.of(space, [(mean, near.widened(mean, spread)) for mean, spread in gaussians])
+        return cls.of(space, [(mean, cheap.widened(mean, spread)) for mean, spread in gaussians])
 
     @classmethod
     def of_draws(cls, space: Space, q: Floats) -> Reference:
@@ -162,15 +161,7 @@ class Reference:
 
 
 def draw_proposals(
-    reference: Reference,
-    n: int,
-    seed: int | Sequence[int],
-    *,
-    batches: int = 4,
-    effective_share: float = 0.5,
-    most_batches: int = 40,
-    numbers: int = 100_000_000,
-    say: Callable[[str], None] = lambda said: None,
+    reference: Reference, n: int, seed: Sequence[int], say: Callable[[str], None]
 ) -> tuple[WeightedPoints, Reference]:
     """Draw weighted proposals for a posterior; return them, and what the last were drawn from.
 
@@ -180,25 +171,18 @@ def draw_proposals(
         Where particles begin, in the space of the problem.
     n : int
         Proposals that are asked for: about the number of the draws, of which half are independent.
-    seed : int or sequence of int
+    seed : sequence of int
         Source of the draws.
-    batches : int
-        Batches of the proposals asked for.
-    effective_share : float
-        Effective share of the proposals asked for that suffices.
-    most_batches : int
-        Batches at most.
-    numbers : int
-        Log-likelihoods of transitions that proposals may hold.
     say : callable
         Called with how many proposals are effective.
     """
-    rng, batch = np.random.default_rng(seed), -(-n // batches)
+    rng, batch = np.random.default_rng(seed), -(-n // 4)
     space = reference.space
-    most = int(np.clip(numbers // (batch * space.problem.segments.n), batches, most_batches))
+    # batches: the proposals asked for at least, and what log-likelihoods fit in memory at most
+    most = int(np.clip(100_000_000 // (batch * space.problem.segments.n), 4, 40))
     return adaptive_importance(
         reference, space.log_densities, len(space.informed), rng, batch=batch, say=say,
-        enough=effective_share * n, smooth=smoothed, most_batches=most, max_pareto_k=MAX_PARETO_K,
+        enough=0.5 * n, smooth=smoothed, most_batches=most, max_pareto_k=MAX_PARETO_K,
     )  # fmt: skip
 
 

@@ -164,7 +164,7 @@ def _importance(job: SamplerRun, *, proposals: float = 1.4) -> Idata:
     """
     seed, n = job.stream(), job.chains * job.method.draws
     reference = job.reference()
-    points, learned = draw_proposals(reference, int(proposals * n), seed, say=job.progress)
+    points, learned = draw_proposals(reference, int(proposals * n), seed, job.progress)
     chosen, k, size = resample(points.log_weight, n, np.random.default_rng([*seed, 1]))
     if not np.isfinite(points.log_weight).any():
         raise FitError(
@@ -281,17 +281,12 @@ def _laplace(job: SamplerRun) -> Idata:
     return job.trace(phi, np.exp(centre + noise), accept=np.ones(len(phi)))
 
 
-def dispersed(
-    mode: Mode, rng: np.random.Generator, chains: int, *, away: float = 2.0
-) -> list[dict[str, Floats]]:
-    """Draw starts about two posterior standard deviations from the mode, one a chain.
-
-    ``away``: distance from the mode in posterior standard deviations.
-    """
+def dispersed(mode: Mode, rng: np.random.Generator, chains: int) -> list[dict[str, Floats]]:
+    """Draw starts about two posterior standard deviations from the mode, one a chain."""
     space = Space.of(mode)
     mean, covariance = space.laplace(mode)
     factor = covariance_factor(covariance)
-    q = mean + away * rng.standard_normal((chains, len(mean))) @ factor.T
+    q = mean + 2.0 * rng.standard_normal((chains, len(mean))) @ factor.T
     return [mode.problem.named(space.possible(one), space.split(one)[1]) for one in q]
 
 
@@ -336,11 +331,10 @@ def as_trace(
 
 def data_of(problem: Problem) -> xr.Dataset:
     """Return initial states, actions and measured states, with their coordinates."""
-    data: dict[str, tuple[tuple[str, ...], Floats]] = {
-        "start": (START_DIMS, problem.segments.start),
-        "actions": (ACTION_DIMS, problem.inputs),
+    data = {
+        "start": (START_DIMS, problem.segments.start), "actions": (ACTION_DIMS, problem.inputs),
         "next_state": (NEXT_STATE_DIMS, problem.measured),
-    }
+    }  # fmt: skip
     return labelled(problem, data)
 
 

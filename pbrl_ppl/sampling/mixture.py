@@ -21,19 +21,11 @@ from pbrl_ppl.modes import (
 )
 from pbrl_ppl.parameters import JOINT_ANCHORS, JOINT_INDICES
 from pbrl_ppl.posterior import Idata, ParameterPoint, from_groups, group, groups, parameter_draws
-from pbrl_ppl.sampling.methods import as_trace, posterior_dataset
+from pbrl_ppl.sampling.methods import SamplerRun, as_trace, posterior_dataset
 from pbrl_ppl.state import Bools, Floats, Ints
 
 
-def mix(
-    problem: Problem,
-    weighed: Sequence[Weighed],
-    sample: Callable[[Mode], Idata],
-    *,
-    draws: int,
-    chains: int,
-    seed: int,
-) -> Idata:
+def mix(job: SamplerRun, weighed: Sequence[Weighed], sample: Callable[[Mode], Idata]) -> Idata:
     """Sample each configuration that matters, and mix the draws by their probabilities.
 
     The number of draws of each is fixed, their order in the chains is random. A pair's
@@ -43,16 +35,12 @@ def mix(
 
     Parameters
     ----------
-    problem : Problem
+    job : SamplerRun
         Of a scene with joints of unknown bodies.
     weighed : sequence of Weighed
         Configurations with their probabilities.
     sample : callable
         ``sample(mode) -> trace`` of a configuration.
-    draws, chains : int
-        Draws a chain, and chains.
-    seed : int
-        Seed of the mixture.
 
     Returns
     -------
@@ -60,7 +48,7 @@ def mix(
         With ``posterior``, ``sample_stats``, ``observed_data`` and ``constant_data``, and the
         configurations as an attribute.
     """
-    rng = np.random.default_rng(seed)
+    draws, chains, rng = job.method.draws, job.method.chains, np.random.default_rng(job.seed)
     probability = np.array([configuration.probability for configuration in weighed])
     wanted = np.flatnonzero(allocate(probability, chains * draws))
     traces = {}
@@ -73,9 +61,9 @@ def mix(
     fitted = np.isin(np.arange(len(weighed)), list(traces))
     counts = allocate(np.where(fitted, probability, 0.0), chains * draws)
     label = rng.permutation(np.repeat(np.arange(len(weighed)), counts)).reshape(chains, draws)
-    values = _values(problem, weighed, traces, label, rng)
+    values = _values(job.problem, weighed, traces, label, rng)
     data = groups(next(iter(traces.values()))) | {
-        "posterior": posterior_dataset(problem, values), "sample_stats": _stats(traces, label)
+        "posterior": posterior_dataset(job.problem, values), "sample_stats": _stats(traces, label)
     }  # fmt: skip
     return from_groups(data, {"configurations": stored(weighed)})
 
@@ -139,9 +127,8 @@ def _values(
                 "fit: choices of the bodies that a joint joins have different coordinates;"
                 " take --likelihood transitions, or name the bodies in the scene"
             )
-        sizes = group(trace, "posterior").sizes
-        rows = np.arange(sizes["chain"] * sizes["draw"]).reshape(sizes["chain"], sizes["draw"])
-        rows = rows[:, : label.shape[1]][here]
+        chain, draw = np.nonzero(here)
+        rows = chain * group(trace, "posterior").sizes["draw"] + draw
         of_phi, of_sigma = parameter_draws(own, trace)
         sigma[here] = of_sigma[rows]
         for name, values in zip(own.layout.labels, of_phi[rows].T, strict=True):

@@ -103,12 +103,11 @@ def update(
     history = _as_recorded(idata, history)
     _check_history(idata, record, history)
     entry: dict[str, object] = {"seed": seed, "did": "refitted"}
-    chains, method, places = group(idata, "posterior").sizes["chain"], DEFAULT, None
+    chains, method, places, advice = group(idata, "posterior").sizes["chain"], DEFAULT, None, ""
     if record.likelihood == OutputErrorLikelihood.name:
-        _check_engine(idata, files.problem_of(idata, effects))
+        _check_engine(idata, effects)
         entry |= {"transitions": history.n_transitions, "share": None, "pareto_k": None}
         why = "initial states of simulations are fitted with the parameters, so that all data"
-        advice = ""
         whole = _simulated(idata, record, history, effects)
         method = record.method
     else:
@@ -119,7 +118,7 @@ def update(
         if result is not None:
             return _entered(result, record, history, entry | {"did": "reweighted"})
         why, whole = new.why_not, new.problem
-        advice = f"; {_judgement(new.earlier, new.likelihood)}"
+        advice = "; look whether they are of the same bodies, under the same conditions"
         places = new.data["observed_data"].coords
     warn(f"update: {why} are refitted, which takes as long as a fit{advice}", RefitWarning)
     fitted = sample(whole, seed=seed, progress=progress, method=method, chains=chains)
@@ -218,60 +217,19 @@ def _check_history(idata: Idata, record: PosteriorRecord, history: History) -> N
         )
 
 
-def _check_engine(
-    idata: Idata, problem: Problem, *, transitions: int = 50, tolerance: float = 0.01
-) -> None:
-    """Refuse a posterior whose stored likelihoods are not what this problem's engine gives.
-
-    Parameters
-    ----------
-    idata : InferenceData or DataTree
-        The posterior.
-    problem : Problem
-        Of the same parameters; its data do not matter.
-    transitions : int
-        How many likelihoods are computed again, at the first draw.
-    tolerance : float
-        Largest median difference from the stored ones (nats).
-    """
-    whole = "smoothed" in group(idata, "constant_data")  # neighbours depend on each other
-    some = {"transition": slice(None if whole else transitions)}
-    few = {name: group(idata, name).isel(some) for name in ("observed_data", "constant_data")}
-    earlier = from_groups(few | {"posterior": group(idata, "posterior")}, idata.attrs)
-    first = files.problem_of(earlier, {attached.effect for attached in problem.physics.effects})
+def _check_engine(idata: Idata, effects: tuple[Effect, ...]) -> None:
+    """Refuse a posterior whose stored likelihoods of the first draw this engine does not give."""
+    problem = files.problem_of(idata, effects)
     phi, sigma = parameter_draws(problem, idata)
-    now = first.log_density(first.residual(phi[0]), sigma[0], phi[0])
+    now = problem.log_density(problem.residual(phi[0]), sigma[0], phi[0])
     then = group(idata, "log_likelihood")["next_state"].isel(chain=0, draw=0).to_numpy()
-    off = float(np.median(np.abs(now - then[: len(now)])))
-    if not off < tolerance:
+    off = float(np.median(np.abs(now - then)))
+    if not off < 0.01:  # nats
         raise PosteriorError(
             f"update: the posterior's likelihoods are not what this engine gives (half of them are"
             f" off by {off:.2g} or more): it was made with other effects or another"
             " version; refit all data"
         )
-
-
-def _judgement(earlier: Floats, new: Floats, worse: float = 3.0) -> str:
-    """Return a text on whether new transitions may be of the same bodies as the posterior's.
-
-    Parameters
-    ----------
-    earlier, new : ndarray
-        Log-likelihoods of transitions, shape (..., transition), the draws first.
-    worse : float
-        Fall of the mean log-likelihood, in standard errors, from which new data are predicted
-        worse.
-    """
-    old, others = (
-        densities.reshape(-1, densities.shape[-1]).mean(axis=0) for densities in (earlier, new)
-    )
-    error = float(np.sqrt(old.var() / len(old) + others.var() / len(others)))
-    if not float(old.mean() - others.mean()) < worse * error:
-        return "look whether they are of the same bodies, under the same conditions"
-    return (
-        "the posterior predicts them as well as its own data, so they may well be of the same"
-        " bodies: it is narrower than all of the data allow"
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -329,8 +287,8 @@ def _weighted(
     idata: Idata, record: PosteriorRecord, history: History, effects: tuple[Effect, ...]
 ) -> _Weighted:
     """Weight the draws by the new transitions of a history."""
+    _check_engine(idata, effects)
     problem = files.problem_of(idata, effects, history)
-    _check_engine(idata, problem)
     phi, sigma = parameter_draws(problem, idata)
     problem = joined_at(problem, phi, sigma)
     likelihood, _ = files.evaluate(problem, phi, sigma, (), np.random.default_rng(0))

@@ -41,7 +41,7 @@ def case(seed: int = 0, missing: bool = True):
 def test_plain_equals_scipy() -> None:
     observations, predicted = case()
     residual = observations.residual(predicted)
-    ours = EQ_11.log_density(residual, SIGMA, observations.measured)
+    ours = EQ_11.log_density(residual, SIGMA, observations.measured, None)
     # the difference of angles is at most a few sigma here: wrapping it into (-pi, pi] is a no-op
     cells = stats.norm(predicted[..., COLUMNS], SIGMA).logpdf(observations.values)
     np.testing.assert_allclose(ours, np.nansum(cells, axis=(1, 2, 3)))
@@ -53,10 +53,10 @@ def test_leading_axes_of_draws() -> None:
     moved = predicted + np.linspace(-0.1, 0.1, 4)[:, None, None, None, None]
     sigmas = SIGMA * np.array([0.5, 1.0, 1.5, 2.0])[:, None]
     seen = observations.measured
-    together = EQ_11.log_density(observations.residual(moved), sigmas, seen)
+    together = EQ_11.log_density(observations.residual(moved), sigmas, seen, None)
     assert together.shape == (4, N)
     for i in range(4):
-        alone = EQ_11.log_density(observations.residual(moved[i]), sigmas[i], seen)
+        alone = EQ_11.log_density(observations.residual(moved[i]), sigmas[i], seen, None)
         np.testing.assert_allclose(together[i], alone)
 
 
@@ -66,8 +66,8 @@ def test_full_turns_of_measured_angles_change_nothing(turns) -> None:
     shifted = observations.values.copy()
     shifted[..., COLUMNS.index(2)] += 2 * math.pi * turns
     turned = Observations(shifted, COLUMNS)
-    before = EQ_11.log_density(observations.residual(predicted), SIGMA, observations.measured)
-    after = EQ_11.log_density(turned.residual(predicted), SIGMA, turned.measured)
+    before = EQ_11.log_density(observations.residual(predicted), SIGMA, observations.measured, None)
+    after = EQ_11.log_density(turned.residual(predicted), SIGMA, turned.measured, None)
     np.testing.assert_allclose(after, before, rtol=1e-9)
 
 
@@ -109,14 +109,14 @@ def test_a_transition_with_nothing_measured_says_nothing() -> None:
     values = observations.values.copy()
     values[3] = np.nan
     observations = Observations(values, COLUMNS)
-    logp = EQ_11.log_density(observations.residual(predicted), SIGMA, observations.measured)
+    logp = EQ_11.log_density(observations.residual(predicted), SIGMA, observations.measured, None)
     assert logp[3] == pytest.approx(0.0, abs=1e-12)
 
 
 def test_a_diverged_transition_is_impossible() -> None:
     observations, predicted = case()
     predicted[2] = np.nan
-    ours = EQ_11.log_density(observations.residual(predicted), SIGMA, observations.measured)
+    ours = EQ_11.log_density(observations.residual(predicted), SIGMA, observations.measured, None)
     assert ours[2] == -np.inf
     assert np.isfinite(np.delete(ours, 2)).all()
 

@@ -298,7 +298,7 @@ def test_a_sensor_far_better_than_what_was_known(problem) -> None:
     sensor = np.full(6, 1e-20)
     slope = np.eye(6) + np.diag(np.full(3, 0.004), 3)
     arguments = slope[None], np.array([1]), np.ones((1, 6), dtype=bool), np.full((1, 6), 0.01)
-    covariance = gains(*arguments, sensor, np.zeros((1, 6, 6)), np.array([0]))[2][0]
+    covariance = gains(*arguments, sensor, np.zeros((1, 6, 6)), np.array([False]))[2][0]
     np.testing.assert_allclose(np.diag(covariance), sensor, rtol=1e-3)
     correlation = covariance / np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
     assert np.linalg.eigvalsh(correlation).min() > 0.99

@@ -448,8 +448,6 @@ def test_draws_are_counted(puck, method, sentence, total) -> None:
 def test_unknown_method(model) -> None:
     with pytest.raises(FitError, match="method is 'gibbs', expected one of importance, smc"):
         fit(model, method="gibbs")
-    with pytest.raises(FitError, match="'paper' is now called 'metropolis'"):
-        fit(model, method="paper")
 
 
 def test_the_mode_alone(model, mode) -> None:

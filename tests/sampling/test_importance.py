@@ -139,9 +139,9 @@ def test_draws_have_the_moments_of_the_posterior(simple) -> None:
     """
     mode, mean, sd, log_evidence = simple
     problem, errors, widths, evidences = mode.problem, [], [], []
-    reference = Reference.about(Space.of(mode), mode)
+    reference = Reference.about(Space.of(mode), mode, Space.of(mode))
     for seed in range(10):
-        pool, _ = draw_proposals(reference, 750, [seed])
+        pool, _ = draw_proposals(reference, 750, [seed], print)
         chosen, k, size = resample(pool.log_weight, 500, np.random.default_rng(seed))
         assert k < MAX_PARETO_K
         phi, sigma = reference.space.split(pool.q[chosen])

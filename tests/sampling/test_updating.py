@@ -248,10 +248,8 @@ def test_other_data_are_refitted(parts, first, monkeypatch) -> None:
     agree(idata, quiet(fit, build_model(problem), seed=10, **QUICK | {"draws": 500}))
 
 
-@pytest.mark.parametrize(
-    ("mass", "says"), [(2.0, "predicts them as well as its own data"), (20.0, "look whether")]
-)
-def test_a_refit_says_whether_the_bodies_may_be_the_same(mass, says, monkeypatch) -> None:
+@pytest.mark.parametrize("mass", [2.0, 20.0])
+def test_a_refit_asks_whether_the_bodies_are_the_same(mass, monkeypatch) -> None:
     """Twenty times the data leave few draws of the same body too."""
     scene = pucks("a")
     truth = {"mass": 2.0, "linear_drag_coefficient": 0.5}
@@ -266,9 +264,8 @@ def test_a_refit_says_whether_the_bodies_may_be_the_same(mass, says, monkeypatch
         raise KeyboardInterrupt
 
     monkeypatch.setattr("pbrl_ppl.sampling.updating.sample", long_work)
-    with pytest.warns(RefitWarning, match=says) as caught, pytest.raises(KeyboardInterrupt):
+    with pytest.warns(RefitWarning, match="look whether"), pytest.raises(KeyboardInterrupt):
         update(start, more, seed=3, progress=False)
-    assert ("look whether" in str(caught[0].message)) == (mass != 2.0)
 
 
 @pytest.mark.parametrize(
