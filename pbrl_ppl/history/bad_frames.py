@@ -242,17 +242,12 @@ def _deviations(history: History, widths: tuple[int, ...] = (3, 4, 5), longest: 
     return result
 
 
-def _off(
-    column: Floats,
-    width: int,
-    gap: int,
-    *,
-    angle: bool,
-    limit: float = 8.0,
-    limit_of_side: float = 5.0,
-    agreement: float = 0.5,
-) -> tuple[Floats, Bools]:
+def _off(column: Floats, width: int, gap: int, *, angle: bool) -> tuple[Floats, Bools]:
     """Return how far neighbouring rows are off, and where the rows around them are not smooth.
+
+    A bad row is 8 robust standard deviations off the curve through both sides, and 5 off those
+    through either side, which agree on how far it is off, to half of it. Under Gaussian noise a row
+    is beyond the first with a probability of 1e-15.
 
     Parameters
     ----------
@@ -264,12 +259,6 @@ def _off(
         Neighbouring rows that are left out together.
     angle : bool
         Whether the column wraps (rad).
-    limit, limit_of_side : float
-        Robust standard deviations that a bad row is off the curve through both sides, and off those
-        through either side. Under Gaussian noise a row is beyond the first with a probability of
-        1e-15.
-    agreement : float
-        The curves must agree on how far the row is off, to this share of it.
 
     Returns
     -------
@@ -291,12 +280,12 @@ def _off(
         rows[:, sides] = np.unwrap(rows[:, sides], axis=1)
     least, each = finest_step(column), np.eye(span)[:, middle]
     off, far, sure, misfit = outliers(rows, each, 3, least, angle=angle)
-    good = ((far > limit) & (sure > limit)).all(axis=1)
+    good = ((far > 8.0) & (sure > 8.0)).all(axis=1)
     for side in (slice(end), slice(width, None)):
         off_side, far, _, _ = outliers(rows[:, side], each[side], 2, least, angle=angle)
         apart = wrapped(off_side - off) if angle else off_side - off
-        good &= ((far > limit_of_side) & (np.abs(apart) <= agreement * np.abs(off))).all(axis=1)
-    uneven = misfit > limit * max(float(np.median(misfit)), least)
+        good &= ((far > 5.0) & (np.abs(apart) <= 0.5 * np.abs(off))).all(axis=1)
+    uneven = misfit > 8.0 * max(float(np.median(misfit)), least)
     result[trajectory[good], first[good] + width] = off[good]
     ragged[trajectory[uneven], first[uneven] + width] = True
     return result, ragged

@@ -172,10 +172,8 @@ def _each(data: xr.Dataset, step: int, dt: float) -> History:
     seen = xr.DataArray(~beyond, dims=("trajectory", "time"))
     changed = {name: kept[name].where(seen) for name in ("observed", "start", "clock")}
     changed |= {"action": kept["action"].copy(data=action), "n_rows": rows}
-    kept = kept.assign(changed)
-    kept = kept.assign_coords(time=np.arange(len(kept["time"])))
-    kept.attrs = {**data.attrs, "time_step": dt}
-    return History(hashed(kept))
+    kept = kept.assign(changed).assign_coords(time=np.arange(len(kept["time"])))
+    return History(hashed(kept.assign_attrs(time_step=dt)))
 
 
 def _slowest_motion(history: History) -> float:
