@@ -225,7 +225,7 @@ class History:
         scene: Scene,
         *,
         logs: Sequence[Path] = (Path(),),
-        estimate_velocities: bool | None,
+        estimate_velocities: bool,
     ) -> History:
         """Return the history of each log's rows at the scene's time step, after checks of all."""
         counts, *checked = zip(*(padded(rows, scene) for rows in parts), strict=True)
