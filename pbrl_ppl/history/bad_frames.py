@@ -357,8 +357,8 @@ def unmodelled_ends(history: History, scene: Scene) -> list[End]:
 
     A body is held if it is at rest for three rows or more and then moves off while no command acts
     on any body. It was stopped if its velocity changes abruptly near the end, where the commands
-    do not change and nothing in the scene is near enough to be met. Either must be far outside of
-    what all trajectories show elsewhere. Only positions and angles are looked at.
+    do not change, in a scene that has nothing to meet. Either must be far outside of what all
+    trajectories show elsewhere. Only positions and angles are looked at.
 
     Parameters
     ----------
@@ -393,14 +393,12 @@ def unmodelled_ends(history: History, scene: Scene) -> list[End]:
         noise = column_noise(series.values(), 4, robust=True)
         noise = max(noise, finest_step(np.concatenate([*series.values()])) / np.sqrt(12))
         search = _Ends(series, push, noise)
-        stops = search.stopped()
+        stops = {} if _may_meet(scene, history.bodies[body]) else search.stopped()
         for t, values in series.items():
-            states, n = observed[t, : len(values)], len(values)
-            held, stopped = search.held(t), stops.get(t, 0)
-            others = np.delete(states, body, axis=1)[: 2 * held + search.beside, :, :3]
+            n, held, stopped = len(values), search.held(t), stops.get(t, 0)
+            others = np.delete(observed[t, :n], body, axis=1)[: 2 * held + search.beside, :, :3]
             # what others may set moving is not held
             held *= not (np.fmax.reduce(others, axis=0) > np.fmin.reduce(others, axis=0)).any()
-            stopped *= not (stopped and _near(scene, int(body), states, n - stopped))
             for last, rows, what in ((False, held, "held"), (True, stopped, "stopped")):
                 if rows > (found[t, last].rows if (t, last) in found else 0):
                     times = clock[t, n - rows : n] if last else clock[t, :rows]
@@ -551,30 +549,7 @@ def _filled(values: Floats, angle: bool) -> Floats | None:
     return np.interp(np.arange(len(values)), known, level)
 
 
-def _near(scene: Scene, body: int, states: Floats, row: int, slack: float = 0.25) -> bool:
-    """Return whether a wall, another body or a joint may have stopped a body at a row.
-
-    A contact reaches beyond the shapes' radii by the share ``slack`` of them.
-    """
-    moving = scene.moving
-    places = states[max(row - 2, 0) : row + 2, :, :2]
-    values = places[:, body]
-    if not np.isfinite(values).all():
-        return False  # a hinged body with a measured angle alone
-    reach = (1 + slack) * moving[body].shape.bounding_radius
-    reach += 2 * float(np.abs(np.diff(values, axis=0)).max(initial=0.0))
-    # a body is a wall without length, with a radius
-    others = [(places[:, i], other) for i, other in enumerate(moving) if i != body]
-    others += [(np.array(other.pose)[:2], other) for other in scene.bodies if other.static]
-    obstacles = [(place, place, other.shape.bounding_radius) for place, other in others]
-    obstacles += [(np.array(wall.start), np.array(wall.end), 0.0) for wall in scene.walls]
-    for start, end, radius in obstacles:
-        way = (end - start).reshape(-1, 2)[0]
-        along = np.clip((values - start) @ way / max(way @ way, np.finfo(float).tiny), 0.0, 1.0)
-        far = np.linalg.norm(values - start - along[:, None] * way, axis=1) - (1 + slack) * radius
-        if not (far > reach).all():
-            return True
-    return any(
-        joint.traits.stops_bodies and moving[body].name in (joint.bodies or ())
-        for joint in scene.joints
-    )
+def _may_meet(scene: Scene, body: str) -> bool:
+    """Return whether a wall, another body or a joint may stop a body."""
+    stops = (joint.bodies or () for joint in scene.joints if joint.traits.stops_bodies)
+    return bool(scene.walls) or len(scene.bodies) > 1 or any(body in both for both in stops)

@@ -162,10 +162,8 @@ def with_guesses(
     """
     if frame.attrs.get("headerless") or any("." in key for key, _ in layout.columns):
         return layout
-    tables = [with_derived(frame, lambda _: None)]
-    if commands is not None:
-        tables.append(commands)
-    plain = {str(name): _plain(str(name)) for table in tables for name in table.columns}
+    names = [*with_derived(frame, lambda _: None), *(() if commands is None else commands)]
+    plain = {str(name): _plain(str(name)) for name in names}
     known = dict(layout.columns)
     found: dict[str, str] = {}
     there = {*known, *plain} | ({"time"} if "duration" in known else set())
