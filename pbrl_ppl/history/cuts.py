@@ -36,8 +36,6 @@ def without_lost_rows(frame: pd.DataFrame, scene: Scene, say: Say) -> pd.DataFra
         Takes a sentence on each kind of lost rows.
     """
     places = [name for name in STATE[:3] if name in frame]
-    if not places or not {"trajectory", "body"} <= {*frame}:
-        return frame
     poses = frame[places].apply(pd.to_numeric, errors="coerce").to_numpy(float, copy=True)
     zero, frozen = np.zeros((2, len(frame)), dtype=bool)
     follows = {body.name for body in scene.moving if body.kinematic}

@@ -123,11 +123,8 @@ def thinned(
         f"one row in {step} is used, each {dt:.4g} s, and commands are averaged between them: the"
         " motion needs no more"
     )
-    return (
-        replace(scene, time_step=dt),
-        tuple(_each(one.dataset, step, dt) for one in histories),
-        (said,),
-    )
+    coarse = tuple(_each(one.dataset, step, dt) for one in histories)
+    return replace(scene, time_step=dt), coarse, (said,)
 
 
 def _limits(observed: Floats, *, noisy: float = 2.0, smooth: float = 1e-3) -> Floats:
@@ -205,9 +202,6 @@ def _piece(data: xr.Dataset, trajectory: int, first: int, last: int) -> xr.Datas
     if first:
         held = data["action"].isel(trajectory=[trajectory], time=first - 1)
         before = before.copy(data=np.nan_to_num(held.to_numpy()))
-    return one.assign(
-        action=action, before=before, n_rows=one["n_rows"].copy(data=[last + 1 - first])
-    ).assign_coords(
-        time=np.arange(last + 1 - first),
-        trajectory=[f"{one['trajectory'].item()} from {first}"],
-    )
+    n, label = last + 1 - first, f"{one['trajectory'].item()} from {first}"
+    one = one.assign(action=action, before=before, n_rows=one["n_rows"].copy(data=[n]))
+    return one.assign_coords(time=np.arange(n), trajectory=[label])

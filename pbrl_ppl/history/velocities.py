@@ -351,11 +351,8 @@ def computed_lag(runs: Runs, dt: float, *, widest: int = 20) -> float | None:
     if not reach or not any(rate.any() for _, rate in runs):
         return None
     place = np.arange(-reach, reach + 1)
-    windows = [
-        sliding_window_view(np.stack(run), len(place), axis=1)
-        for run in runs
-        if len(run[0]) >= len(place)
-    ]
+    long = [np.stack(run) for run in runs if len(run[0]) >= len(place)]
+    windows = [sliding_window_view(run, len(place), axis=1) for run in long]
     x, rates = np.concatenate(windows, axis=1)
     y = rates[:, reach]
     inverse = np.linalg.pinv(np.delete(x - x[:, [reach]], reach, axis=1), rcond=1e-9)

@@ -213,7 +213,7 @@ def test_a_recording_without_bodies_or_with_nothing_between_cuts(tmp_path: Path)
         ({"separator": "pipe"}, "separator is 'pipe', expected one of blank, tab"),
         ({"header": "no"}, "header is 'no', expected true or false"),
         ({"velocities": "guess"}, "velocities is 'guess', expected one of measured"),
-        ({"cut": {"gap": 1.0}}, 'cut has no "gap", only every, gaps, jumps; did you mean'),
+        ({"cut": {"gap": 1.0}}, 'unknown key "gap" in .recording.: cut; did you mean "gaps"'),
         ({"cut": {"every": 0.0}}, "expected more than 0"),
         ({"not_seen": {"x": "none"}}, "expected a number"),
     ],
