@@ -57,11 +57,10 @@ def check(
     missing, rows = _missing(loaded), int(loaded.dataset["n_rows"].sum())
     used, drawn = histories.drawn_pieces(loaded, options.MOST_TRANSITIONS, seed)
     unused = histories.unused_velocities(used)
-    masses = histories.mass_contradictions(declared, used)
     fall = histories.wrong_clock(used, declared)
     clock = [fall.sentence(declared)] if fall else []
     moved = histories.command_shifts(used, declared)
-    said = [*drawn, *(velocity.sentence for velocity in unused), *masses, *clock]
+    said = [*drawn, *(velocity.sentence for velocity in unused), *clock]
     said += [histories.shift_sentence(declared, body, late) for body, late in moved.items()]
     sized = histories.with_units(declared, used)
     priors = _default_priors(sized, catalogue)
@@ -85,7 +84,6 @@ def check(
         "missing": missing,
         "velocities_not_used": [vars(column) for column in unused],
         "unit_mismatches": histories.unit_mismatches(used),
-        "mass_contradictions": masses,
         "clock": clock,
         "command_shifts": moved,
         "typical": {body.name: dict(body.typical) for body in sized.dynamic},

@@ -43,7 +43,6 @@ from .logs import read_tables as read_tables
 from .parts import MOST_TRANSITIONS as MOST_TRANSITIONS
 from .parts import drawn_pieces as drawn_pieces
 from .parts import thinned as thinned
-from .units import mass_contradictions as mass_contradictions
 from .units import unit_mismatches as unit_mismatches
 from .units import with_units as with_units
 from .velocities import UnusedVelocity as UnusedVelocity

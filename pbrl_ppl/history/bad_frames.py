@@ -242,17 +242,12 @@ def _deviations(history: History, widths: tuple[int, ...] = (3, 4, 5), longest: 
     return result
 
 
-def _off(
-    column: Floats,
-    width: int,
-    gap: int,
-    *,
-    angle: bool,
-    limit: float = 8.0,
-    limit_of_side: float = 5.0,
-    agreement: float = 0.5,
-) -> tuple[Floats, Bools]:
+def _off(column: Floats, width: int, gap: int, *, angle: bool) -> tuple[Floats, Bools]:
     """Return how far neighbouring rows are off, and where the rows around them are not smooth.
+
+    A bad row is 8 robust standard deviations off the curve through both sides, and 5 off those
+    through either side, which agree on how far it is off, to half of it. Under Gaussian noise a row
+    is beyond the first with a probability of 1e-15.
 
     Parameters
     ----------
@@ -264,12 +259,6 @@ def _off(
         Neighbouring rows that are left out together.
     angle : bool
         Whether the column wraps (rad).
-    limit, limit_of_side : float
-        Robust standard deviations that a bad row is off the curve through both sides, and off those
-        through either side. Under Gaussian noise a row is beyond the first with a probability of
-        1e-15.
-    agreement : float
-        The curves must agree on how far the row is off, to this share of it.
 
     Returns
     -------
@@ -291,12 +280,12 @@ def _off(
         rows[:, sides] = np.unwrap(rows[:, sides], axis=1)
     least, each = finest_step(column), np.eye(span)[:, middle]
     off, far, sure, misfit = outliers(rows, each, 3, least, angle=angle)
-    good = ((far > limit) & (sure > limit)).all(axis=1)
+    good = ((far > 8.0) & (sure > 8.0)).all(axis=1)
     for side in (slice(end), slice(width, None)):
         off_side, far, _, _ = outliers(rows[:, side], each[side], 2, least, angle=angle)
         apart = wrapped(off_side - off) if angle else off_side - off
-        good &= ((far > limit_of_side) & (np.abs(apart) <= agreement * np.abs(off))).all(axis=1)
-    uneven = misfit > limit * max(float(np.median(misfit)), least)
+        good &= ((far > 5.0) & (np.abs(apart) <= 0.5 * np.abs(off))).all(axis=1)
+    uneven = misfit > 8.0 * max(float(np.median(misfit)), least)
     result[trajectory[good], first[good] + width] = off[good]
     ragged[trajectory[uneven], first[uneven] + width] = True
     return result, ragged
@@ -368,8 +357,8 @@ def unmodelled_ends(history: History, scene: Scene) -> list[End]:
 
     A body is held if it is at rest for three rows or more and then moves off while no command acts
     on any body. It was stopped if its velocity changes abruptly near the end, where the commands
-    do not change and nothing in the scene is near enough to be met. Either must be far outside of
-    what all trajectories show elsewhere. Only positions and angles are looked at.
+    do not change, in a scene that has nothing to meet. Either must be far outside of what all
+    trajectories show elsewhere. Only positions and angles are looked at.
 
     Parameters
     ----------
@@ -404,14 +393,12 @@ def unmodelled_ends(history: History, scene: Scene) -> list[End]:
         noise = column_noise(series.values(), 4, robust=True)
         noise = max(noise, finest_step(np.concatenate([*series.values()])) / np.sqrt(12))
         search = _Ends(series, push, noise)
-        stops = search.stopped()
+        stops = {} if _may_meet(scene, history.bodies[body]) else search.stopped()
         for t, values in series.items():
-            states, n = observed[t, : len(values)], len(values)
-            held, stopped = search.held(t), stops.get(t, 0)
-            others = np.delete(states, body, axis=1)[: 2 * held + search.beside, :, :3]
+            n, held, stopped = len(values), search.held(t), stops.get(t, 0)
+            others = np.delete(observed[t, :n], body, axis=1)[: 2 * held + search.beside, :, :3]
             # what others may set moving is not held
             held *= not (np.fmax.reduce(others, axis=0) > np.fmin.reduce(others, axis=0)).any()
-            stopped *= not (stopped and _near(scene, int(body), states, n - stopped))
             for last, rows, what in ((False, held, "held"), (True, stopped, "stopped")):
                 if rows > (found[t, last].rows if (t, last) in found else 0):
                     times = clock[t, n - rows : n] if last else clock[t, :rows]
@@ -562,30 +549,7 @@ def _filled(values: Floats, angle: bool) -> Floats | None:
     return np.interp(np.arange(len(values)), known, level)
 
 
-def _near(scene: Scene, body: int, states: Floats, row: int, slack: float = 0.25) -> bool:
-    """Return whether a wall, another body or a joint may have stopped a body at a row.
-
-    A contact reaches beyond the shapes' radii by the share ``slack`` of them.
-    """
-    moving = scene.moving
-    places = states[max(row - 2, 0) : row + 2, :, :2]
-    values = places[:, body]
-    if not np.isfinite(values).all():
-        return False  # a hinged body with a measured angle alone
-    reach = (1 + slack) * moving[body].shape.bounding_radius
-    reach += 2 * float(np.abs(np.diff(values, axis=0)).max(initial=0.0))
-    # a body is a wall without length, with a radius
-    others = [(places[:, i], other) for i, other in enumerate(moving) if i != body]
-    others += [(np.array(other.pose)[:2], other) for other in scene.bodies if other.static]
-    obstacles = [(place, place, other.shape.bounding_radius) for place, other in others]
-    obstacles += [(np.array(wall.start), np.array(wall.end), 0.0) for wall in scene.walls]
-    for start, end, radius in obstacles:
-        way = (end - start).reshape(-1, 2)[0]
-        along = np.clip((values - start) @ way / max(way @ way, np.finfo(float).tiny), 0.0, 1.0)
-        far = np.linalg.norm(values - start - along[:, None] * way, axis=1) - (1 + slack) * radius
-        if not (far > reach).all():
-            return True
-    return any(
-        joint.traits.stops_bodies and moving[body].name in (joint.bodies or ())
-        for joint in scene.joints
-    )
+def _may_meet(scene: Scene, body: str) -> bool:
+    """Return whether a wall, another body or a joint may stop a body."""
+    stops = (joint.bodies or () for joint in scene.joints if joint.traits.stops_bodies)
+    return bool(scene.walls) or len(scene.bodies) > 1 or any(body in both for both in stops)

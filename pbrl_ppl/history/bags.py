@@ -5,7 +5,6 @@ The library ``rosbags`` reads them, so that no ROS is needed: ``pip install 'pbr
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
@@ -18,7 +17,9 @@ import pandas as pd
 
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.files import reason
+from pbrl_ppl.history.clocks import Say
 from pbrl_ppl.history.files import FOLDER, reads
+from pbrl_ppl.history.guesses import with_derived
 from pbrl_ppl.scene import Recording, nearest
 
 if TYPE_CHECKING:
@@ -52,17 +53,12 @@ def bag_topics(path: str | Path) -> dict[str, str]:
         return _types(reader)
 
 
-def read_bag(
-    path: str | Path,
-    topics: Mapping[str, str | Sequence[str]],
-    *,
-    longest_array: int = 8,
-    longest_gap: float = 3.0,
-) -> pd.DataFrame:
+def read_bag(path: str | Path, topics: Mapping[str, str | Sequence[str]]) -> pd.DataFrame:
     """Return the messages of a bag's topics as a table, with one row for each time and body.
 
     The rows are at the stamps of the first body's messages. Other bodies are interpolated to these
-    stamps (angles unwrapped), within the time in which every body has messages. If a body has
+    stamps (angles unwrapped), within the time in which every body has messages; their cells are
+    empty in gaps of more than three of their usual (median) intervals. If a body has
     several topics, the first has its stamps, and of the others the last message before a row
     counts: a command is held.
 
@@ -73,21 +69,17 @@ def read_bag(
     topics : mapping of str to str or sequence of str
         The topic, or topics, of each body by the body's name. The name ``""`` is for a scene with
         one body: the table then has no column ``body``.
-    longest_array : int
-        Arrays of more numbers are left out, as a covariance is.
-    longest_gap : float
-        Cells of a body that is interpolated are empty in gaps between its messages that are longer
-        than this many of its usual (median) intervals.
 
     Returns
     -------
     DataFrame
         ``time`` (s, from the first row on), from the headers' stamps if all messages of a topic
         have one, else the times at which the bag received them; ``body``; each number of the
-        message under its path (``pose.pose.position.x``); and ``yaw`` (rad, unwrapped), the
-        rotation about z of the message's first quaternion. A number of a short array is
+        message under its path (``pose.pose.position.x``); and ``yaw`` (rad, unwrapped) of the
+        message's first quaternion, as of :func:`with_derived`. A number of a short array is
         ``position[shoulder]`` where the message names its elements, as a JointState does, else
-        ``data[0]``. Text, flags, headers and lists of messages are left out. A column that an
+        ``data[0]``. Text, flags, headers, lists of messages and
+        arrays of more than eight numbers, such as a covariance, are left out. A column that an
         earlier topic of the body has too is followed by its topic: ``data (/right/command)``. Of
         messages with equal stamps the last is kept.
 
@@ -109,7 +101,7 @@ def read_bag(
     """
     path = Path(path)
     listed = _listed(topics, path)
-    tables: dict[str, pd.DataFrame] = {}
+    tables, said = dict[str, pd.DataFrame](), list[str]()
     with _opened(path) as reader:
         there = _types(reader)
         for topic in dict.fromkeys(name for names in listed.values() for name in names):
@@ -119,7 +111,7 @@ def read_bag(
                     f'bag {path}: there is no topic "{topic}"{nearest(topic, there)} Its topics:'
                     f" {have}"
                 )
-            tables[topic] = _messages(reader, topic, there[topic], path, longest_array)
+            tables[topic] = _messages(reader, topic, there[topic], path, said.append)
     bodies = {body: _held({name: tables[name] for name in names}, path)
               for body, names in listed.items()}  # fmt: skip
     first, *others = bodies.values()
@@ -135,7 +127,7 @@ def read_bag(
             f"bag {path}: the bodies' messages have no time in common: {spans}; record them"
             " together, with the stamps of one clock"
         )
-    whole = [first.loc[stamps], *(_interpolated(other, stamps, longest_gap) for other in others)]
+    whole = [first.loc[stamps], *(_interpolated(other, stamps) for other in others)]
     time = 1e-9 * (stamps - stamps[0]).to_numpy()
     for body, table in zip(bodies, whole, strict=True):
         table.insert(0, "time", time)
@@ -144,6 +136,7 @@ def read_bag(
     joined: pd.DataFrame = pd.concat(whole, ignore_index=True)
     order = np.arange(len(joined)).reshape(len(whole), -1).T.ravel()  # by time, then body
     rows: pd.DataFrame = joined.iloc[order].reset_index(drop=True)
+    rows.attrs["said"] = said
     return rows
 
 
@@ -214,14 +207,12 @@ def _opened(path: Path) -> Iterator[AnyReader]:
 
 
 def _types(reader: AnyReader) -> dict[str, str]:
-    """Return the message type of each topic; several of one topic with "or" between them."""
-    kinds_of: dict[str, dict[str, None]] = {}
-    for connection in sorted(reader.connections, key=lambda connected: connected.topic):
-        kinds_of.setdefault(connection.topic, {})[connection.msgtype] = None
-    return {topic: " or ".join(kinds) for topic, kinds in kinds_of.items()}
+    """Return the message type of each topic, in the order of topics."""
+    connections = sorted(reader.connections, key=lambda connection: connection.topic)
+    return {connection.topic: connection.msgtype for connection in connections}
 
 
-def _messages(reader: AnyReader, topic: str, kind: str, path: Path, longest: int) -> pd.DataFrame:
+def _messages(reader: AnyReader, topic: str, kind: str, path: Path, say: Say) -> pd.DataFrame:
     """Return the numbers of a topic's messages by their stamps (ns)."""
     rows: list[dict[str, float]] = []
     received, stamped = [], []
@@ -231,9 +222,7 @@ def _messages(reader: AnyReader, topic: str, kind: str, path: Path, longest: int
         stamp = getattr(getattr(message, "header", None), "stamp", None)
         stamped.append(0 if stamp is None else stamp.sec * 1_000_000_000 + stamp.nanosec)
         received.append(time)
-        row: dict[str, float] = {}
-        _flatten(message, "", row, longest)
-        rows.append(row)
+        rows.append(_numbers_of(message))
     if not rows:
         raise HistoryError(f'bag {path}: topic "{topic}" ({kind}) has no messages; record it')
     table = pd.DataFrame(rows, index=stamped if all(stamped) else received, dtype=float)
@@ -244,37 +233,27 @@ def _messages(reader: AnyReader, topic: str, kind: str, path: Path, longest: int
         )
     table = table.sort_index(kind="stable")
     table = table[~table.index.duplicated(keep="last")]
-    if "yaw" in table:
-        seen = table["yaw"].notna()
-        table.loc[seen, "yaw"] = np.unwrap(table.loc[seen, "yaw"])
-    return table
+    return with_derived(table, say)
 
 
-def _flatten(message: object, path: str, row: dict[str, float], longest: int) -> None:
-    """Add the numbers of a message under their paths, and ``yaw``."""
+def _numbers_of(message: object, path: str = "", longest: int = 8) -> dict[str, float]:
+    """Return the numbers of a message, and of arrays of no more than so many, by their paths."""
     names = [field.name for field in fields(message)]  # type: ignore[arg-type]
     values = {name: getattr(message, name) for name in names}
     lists = (values.get(name) for name in ("name", "names", "joint_names"))
     labels = next((keys for keys in lists if isinstance(keys, list) and keys), None)
+    row: dict[str, float] = {}
     for name, value in values.items():
         if is_dataclass(value):
-            if name != "header":
-                _flatten(value, f"{path}{name}.", row, longest)
+            row |= _numbers_of(value, f"{path}{name}.") if name != "header" else {}
         elif isinstance(value, Real) and not isinstance(value, bool):
             row[path + name] = float(value)
         elif isinstance(value, np.ndarray) and value.dtype.kind in "iuf":
             keys = range(len(value)) if labels is None else labels
             if len(value) <= longest and len(value) == len(keys):
-                row |= {
-                    f"{path}{name}[{label}]": float(number)
-                    for label, number in zip(keys, value, strict=True)
-                }
-    if {*values} - {"__msgtype__"} == {*"xyzw"} and "yaw" not in row:
-        x, y, z, w = (values[name] for name in "xyzw")
-        # an orientation that was left out is all zeros
-        known = any((x, y, z, w))
-        yaw = math.atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
-        row["yaw"] = yaw if known else math.nan
+                columns = [f"{path}{name}[{label}]" for label in keys]
+                row |= zip(columns, map(float, value), strict=True)
+    return row
 
 
 def _held(tables: dict[str, pd.DataFrame], path: Path) -> pd.DataFrame:
@@ -293,7 +272,7 @@ def _held(tables: dict[str, pd.DataFrame], path: Path) -> pd.DataFrame:
     return whole
 
 
-def _interpolated(table: pd.DataFrame, stamps: pd.Index, longest_gap: float) -> pd.DataFrame:
+def _interpolated(table: pd.DataFrame, stamps: pd.Index, longest_gap: float = 3.0) -> pd.DataFrame:
     """Return a table's columns at other stamps (ns), within its own."""
     zero = table.index[0]  # doubles hold nanoseconds since 1970 to 0.2 microseconds alone
     have, want = ((index - zero).to_numpy().astype(float) for index in (table.index, stamps))

@@ -37,21 +37,15 @@ def read_scene(
 
 
 def read_recording(
-    path: Paths,
-    scene: Scene,
-    *,
-    trim: bool = False,
-    estimate_velocities: bool = False,
-    most_ends: int = 4,
-    **reading: Unpack[TableReading],
+    path: Paths, scene: Scene, *, trim: bool = False, **reading: Unpack[TableReading]
 ) -> History:
     """Return the history of files as `History.load` does, and warn of what looks wrong.
 
     Warns where velocities and changes of positions differ by the factor of a unit, and of rows at
     trajectory ends that belong to no model. With ``trim``, here or in the scene's ``[recording]``,
-    these are left out. A warning names ``most_ends`` of them.
+    these are left out. A warning names four of them.
     """
-    history = History.load(path, scene, estimate_velocities=estimate_velocities, **reading)
+    history = History.load(path, scene, **reading)
     path = in_words(path)
     for sentence in (*unit_mismatches(history), *angle_warnings(history, scene)):
         warn(f"history {path}: {sentence}", UserWarning)
@@ -59,8 +53,8 @@ def read_recording(
     if not ends:
         return history
     trim = trim or (scene.recording is not None and scene.recording.trim)
-    named = "; ".join(map(str, ends[:most_ends]))
-    more = f"; and {len(ends) - most_ends} more" if len(ends) > most_ends else ""
+    named = "; ".join(map(str, ends[:4]))
+    more = f"; and {len(ends) - 4} more" if len(ends) > 4 else ""
     cure = "left out" if trim else "no command or contact explains it: --trim leaves the rows out"
     warn(f"history {path}: {named}{more}: {cure}", UserWarning)
     return trimmed(history, ends) if trim else history
@@ -256,13 +250,12 @@ class WrongClock:
         )
 
 
-def wrong_clock(
-    history: History, scene: Scene, *, near: float = 0.15, certain: float = 0.1
-) -> WrongClock | None:
+def wrong_clock(history: History, scene: Scene) -> WrongClock | None:
     """Return how a body's free fall contradicts the clock; None where it does not, or none falls.
 
     A body falls freely that is on no joint, is sent no command and has no actuator. Its
-    acceleration along gravity is regressed on the drag of its motion; impacts are left out.
+    acceleration along gravity is regressed on the drag of its motion; impacts are left out. It must
+    be within 15 % of gravity over the square of a ratio, with a standard error of less than 10 %.
 
     Parameters
     ----------
@@ -270,10 +263,6 @@ def wrong_clock(
         What was measured.
     scene : Scene
         Has gravity, and says which bodies are free.
-    near : float
-        How far the acceleration may be, as a share, from gravity over the square of a ratio.
-    certain : float
-        Largest standard error of the acceleration, as a share.
     """
     gravity = float(np.hypot(*scene.gravity))
     held = {name for joint in scene.joints for name in joint.bodies or ()}
@@ -289,7 +278,7 @@ def wrong_clock(
         # ratios of the frame rates of a camera and of its film
         ratios = [ratio**sign for ratio in (2.0, 4.0, 8.0, 10.0) for sign in (1, -1)]
         factor = min(ratios, key=lambda one: abs(np.log(max(fall, 1e-300) * one**2 / gravity)))
-        if abs(fall * factor**2 / gravity - 1) < near and error < certain * fall:
+        if abs(fall * factor**2 / gravity - 1) < 0.15 and error < 0.1 * fall:
             return WrongClock(body.name, fall, factor)
     return None
 
@@ -334,23 +323,17 @@ def _fall(places: Floats, down: Floats, dt: float, *, clear: float = 0.05) -> tu
     return float(best[0]), error
 
 
-def command_shifts(
-    history: History, scene: Scene, *, clear: float = 30.0, whole: float = 0.15
-) -> dict[str, int]:
+def command_shifts(history: History, scene: Scene) -> dict[str, int]:
     """Return by how many rows bodies answer commands later than they were logged.
 
     Accelerations are regressed on the commands of each shift, on positions, speeds and a constant.
-    A shift counts if it explains far more than none, and if the commands of the rows beside it
-    explain hardly more: a delay by a part of a row, or a lag, is a law of an actuator.
+    A shift counts if it explains far more than any other (30 nats), and if the commands of the rows
+    beside it explain hardly more: a delay by a part of a row, or a lag, is a law of an actuator.
 
     Parameters
     ----------
     history, scene : History, Scene
         What was measured, and where commands act.
-    clear : float
-        Log-likelihood ratio (nats) that a shift has over any other.
-    whole : float
-        Rows by which the mean delay may differ from whole rows.
 
     Returns
     -------
@@ -361,13 +344,12 @@ def command_shifts(
     for body in scene.dynamic:
         data = history.dataset.sel(body=body.name)
         pose = data["observed"].to_numpy()[..., :3].astype(float)
-        pose[..., THETA] = np.where(
-            np.isfinite(pose[..., THETA]), np.unwrap(np.nan_to_num(pose[..., THETA])), np.nan
-        )
+        angle = pose[..., THETA]
+        pose[..., THETA] = np.where(np.isfinite(angle), np.unwrap(np.nan_to_num(angle)), np.nan)
         sent = data["action"].to_numpy().astype(float)
         for d in (THETA,) if body.name in hung else range(3):
             pushes = _pushes(scene, body.name, pose, sent, d)
-            if shift := _shift(pose[..., d], pushes, clear, whole, turns=d == THETA):
+            if shift := _shift(pose[..., d], pushes, turns=d == THETA):
                 found[body.name] = shift
                 break
     return found
@@ -402,16 +384,7 @@ def _pushes(scene: Scene, name: str, pose: Floats, sent: Floats, d: int) -> Floa
     return np.array([part * column for part in parts for column in along])
 
 
-def _shift(
-    place: Floats,
-    pushes: Floats,
-    clear: float,
-    whole_rows: float,
-    *,
-    turns: bool,
-    most: int = 3,
-    few: int = 40,
-) -> int:
+def _shift(place: Floats, pushes: Floats, *, turns: bool, most: int = 3) -> int:
     """Return the shift by at most so many rows that is clear and of whole rows; 0 without one."""
     n = place.shape[1]
     if not len(pushes) or n < 4 * most + 2:
@@ -428,7 +401,7 @@ def _shift(
     }
     whole = np.column_stack([y, *rest, *moved.values()])
     kept = np.isfinite(whole).all(axis=1)
-    if kept.sum() < few or not any(np.ptp(one[kept], axis=0).any() for one in moved.values()):
+    if kept.sum() < 40 or not any(np.ptp(one[kept], axis=0).any() for one in moved.values()):
         return 0
     base = np.stack([column[kept] for column in rest], axis=1)
     base = base / np.maximum(np.abs(base).max(axis=0), 1e-300)
@@ -446,6 +419,6 @@ def _shift(
     weights = found.reshape(3, -1)
     size = weights[:, int(np.abs(weights[1]).argmax())]
     off = float((size[2] - size[0]) / size.sum()) if size.sum() else np.inf
-    is_clear = each[best] - max(size for s, size in each.items() if s != best) >= clear
-    is_whole = abs(off) <= whole_rows and joint - each[best] <= 0.1 * (each[best] - each[0])
+    is_clear = each[best] - max(size for s, size in each.items() if s != best) >= 30.0
+    is_whole = abs(off) <= 0.15 and joint - each[best] <= 0.1 * (each[best] - each[0])
     return best if is_clear and is_whole else 0

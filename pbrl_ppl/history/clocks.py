@@ -88,9 +88,8 @@ def on_one_clock(
         if own:  # of a longer column with a clock of its own the rows below are no rows
             frame = frame[frame[name].notna()]
         time = _seconds(frame, name, layout, source)
-        if not own and (alone := _command_rows(frame, columns)).any():
-            frame = _of_two_streams(frame, columns, time, alone, layout, say)
-            time = time[~alone]
+        if not own:
+            frame, time = _of_two_streams(frame, columns, time, layout, say)
     elif "rate" in clocks:
         time = np.zeros(len(frame))
     else:
@@ -363,10 +362,13 @@ def _falls_back(time: Floats, far: float) -> Bools:
     return np.asarray(steps < -far * usual)
 
 
-def _command_rows(frame: pd.DataFrame, columns: Mapping[str, object]) -> Bools:
-    """Return the rows of a table that hold commands alone, as of topics that were merged.
+def _of_two_streams(
+    frame: pd.DataFrame, columns: Mapping[str, object], time: Floats, layout: Recording, say: Say
+) -> tuple[pd.DataFrame, Floats]:
+    """Return the rows that have a state, with the commands of the others, and their times (s).
 
-    They have no state, but something that next to no row with a state has.
+    The others are rows of commands alone, as of topics that were merged: they have no state, but
+    something that next to no row with a state has.
     """
     states = _present(frame, columns, STATE)
     posed = frame[states].notna().any(axis=1).to_numpy(dtype=bool)
@@ -374,21 +376,10 @@ def _command_rows(frame: pd.DataFrame, columns: Mapping[str, object]) -> Bools:
     sent = [name for name in map(column_of, named.values()) if name in frame]
     sent = sent or [str(name) for name in frame if name not in states]
     others = frame[sent].notna().to_numpy(dtype=bool)
-    if not posed.any():
-        return posed
     rare = others[posed].sum(axis=0) < 0.1 * others.sum(axis=0)
-    return ~posed & others[:, rare].any(axis=1)
-
-
-def _of_two_streams(
-    frame: pd.DataFrame,
-    columns: Mapping[str, object],
-    time: Floats,
-    alone: Bools,
-    layout: Recording,
-    say: Say,
-) -> pd.DataFrame:
-    """Return the rows that have a state, with the commands of the other rows at their times."""
+    alone = ~posed & others[:, rare].any(axis=1)
+    if not posed.any() or not alone.any():
+        return frame, time
     run = np.append(0, np.cumsum(_falls_back(time, 50.0)))
     brought = {}
     for name in _present(frame, columns, WRENCH):
@@ -400,7 +391,7 @@ def _of_two_streams(
             at_rows[rows] = _at_times(time[rows], time[here], values[here], hold=hold)
         brought[name] = at_rows[~alone]
     say(f"{int(alone.sum())} rows hold commands and no state: read as a stream of their own")
-    return frame[~alone].assign(**brought)
+    return frame[~alone].assign(**brought), time[~alone]
 
 
 def with_later_commands(frame: pd.DataFrame, offset: float) -> pd.DataFrame:

@@ -28,13 +28,12 @@ from pbrl_ppl.history.measures import (
     with_whole_counts,
     with_zeros,
 )
-from pbrl_ppl.history.rows import with_clean_names
 from pbrl_ppl.scene import Recording, Scene, column_of, nearest
 from pbrl_ppl.state import STATE, WRENCH
 
 
 class TableReading(TypedDict, total=False):
-    """Options of :meth:`History.load` for tables of other programs.
+    """Options of :meth:`History.load`, most of them for tables of other programs.
 
     Attributes
     ----------
@@ -47,11 +46,15 @@ class TableReading(TypedDict, total=False):
     resample : bool
         Whether uneven samples are interpolated every ``time_step`` of the scene, with a
         `ResamplingWarning` that says what this does to the noise.
+    estimate_velocities : bool
+        Whether single transitions (Eq. 11) may start from velocities that were never measured,
+        as estimated from positions by a local polynomial. Whole trajectories need no estimate.
     """
 
     columns: Mapping[str, str | float] | None
     units: Mapping[str, str] | None
     resample: bool
+    estimate_velocities: bool
 
 
 def as_history(
@@ -92,14 +95,15 @@ def as_history(
         What was repaired or left out.
     """
     columns, units = reading.get("columns") or {}, reading.get("units") or {}
-    frame = with_clean_names(frame, source)
     frame, sent = with_commands(frame, scene)
     if layout is None and not (columns or sent):
-        frame = in_si(frame, units) if units else frame
-        return _held_commands(frame, scene, source) if scene.actuators else frame
+        frame, said = in_si(frame, units), list[str]()
+        if scene.actuators and {"trajectory", "body"} <= {*frame}:
+            frame = _held(frame, scene, said.append)
+        return _warned(frame, source, said)
     columns = {**sent, **columns}
     layout = (layout or Recording()).with_entries(columns=columns, units=units)
-    said: list[str] = list(frame.attrs.get("said", ()))
+    said = list(frame.attrs.get("said", ()))
     say = said.append
     clocks = tuple(entry for entry in layout.time if commands is None or entry[0] != "offset")
     if is_history(frame):
@@ -166,7 +170,6 @@ def renamed(
     HistoryError
         If a column or a body is unknown, or one body of several has no columns.
     """
-    frame = with_clean_names(frame, source)
     bare = {unit_in_name(str(name))[0]: name for name in frame.columns}
     names = [body.name for body in scene.moving]
     shared: dict[str, object] = {name: frame[name] for name in COLUMNS if name in frame}
@@ -327,16 +330,11 @@ def _repaired(
         left = frame.loc[single, "trajectory"].nunique()
         said.append(f"{left} trajectories of one step are left out")
         frame = frame[~single]
-    if said:
-        warn(f"{source}: {'; '.join(said)}", RecordingWarning)
-    return frame
+    return _warned(frame, source, said)
 
 
-def _held_commands(frame: pd.DataFrame, scene: Scene, source: str) -> pd.DataFrame:
-    """Return a history's table whose actuators' commands hold where their cells are empty."""
-    said: list[str] = []
-    if {"trajectory", "body"} <= {*frame}:
-        frame = _held(frame.copy(), scene, said.append)
+def _warned(frame: pd.DataFrame, source: str, said: list[str]) -> pd.DataFrame:
+    """Return a table, after a warning of what was repaired, if anything was."""
     if said:
         warn(f"{source}: {'; '.join(said)}", RecordingWarning)
     return frame

@@ -36,8 +36,6 @@ def without_lost_rows(frame: pd.DataFrame, scene: Scene, say: Say) -> pd.DataFra
         Takes a sentence on each kind of lost rows.
     """
     places = [name for name in STATE[:3] if name in frame]
-    if not places or not {"trajectory", "body"} <= {*frame}:
-        return frame
     poses = frame[places].apply(pd.to_numeric, errors="coerce").to_numpy(float, copy=True)
     zero, frozen = np.zeros((2, len(frame)), dtype=bool)
     follows = {body.name for body in scene.moving if body.kinematic}
@@ -150,8 +148,6 @@ def _pieces(rows: pd.DataFrame, cuts: Mapping[str, float], least: int = 3) -> In
             if times[last] - times[first] > cuts["gaps"]:
                 kept[first + 1 : last] = False
                 begins[last] = True
-    if "rests" in cuts:
-        kept &= ~_at_rest(times, states, cuts["rests"])
     if "jumps" in cuts:
         bodies = states.shape[1] // len(names)
         planar = [i for i, name in enumerate(names) if name in ("x", "y")]
@@ -178,24 +174,6 @@ def _every(times: Floats, piece: Ints, length: float) -> Ints:
         out[members] = begin + np.minimum((spent / width + 1e-9).astype(int), parts - 1)
         begin += parts
     return out
-
-
-def _at_rest(times: Floats, states: Floats, seconds: float, still: float = 8.0) -> Bools:
-    """Return the rows that belong to a rest of all bodies of at least this long, shape (time,).
-
-    At rest a column stays within ``still`` measurement noises.
-    """
-    if len(times) < 3:
-        return np.zeros(len(times), dtype=bool)
-    n = max(2, int(np.ceil(seconds / np.median(np.diff(times)))) + 1)
-    rests = np.ones(len(times), dtype=bool)
-    for column in states.T:
-        tolerance = max(still * column_noise([column], 2, robust=True), finest_step(column))
-        windows = pd.Series(column).rolling(n)
-        constant = (windows.max() - windows.min() <= tolerance).astype(float)[::-1]
-        # of each row, whether one of the windows that it is in is constant
-        rests &= constant.rolling(n, min_periods=1).max().to_numpy()[::-1] > 0
-    return rests
 
 
 def _jumps(times: Floats, places: Floats, least: float) -> Bools:
@@ -233,16 +211,12 @@ def _velocity_changes(times: Floats, places: Floats, side: int = 5) -> tuple[Int
 
 
 def propose(
-    frame: pd.DataFrame,
-    layout: Recording,
-    time_step: float,
-    *,
-    jumps: bool = True,
-    trajectories: int = 4,
-    shortest: int = 30,
-    most: int = 12,
+    frame: pd.DataFrame, layout: Recording, time_step: float, *, jumps: bool = True
 ) -> tuple[Recording, list[str]]:
     """Return a layout with what a recording's rows show, and a sentence on each.
+
+    Fewer than four long trajectories, which criticism needs, are cut to pieces of 30 rows or more,
+    at most 12 each, and as long as the motion needs, see `telling`, where that leaves four.
 
     Parameters
     ----------
@@ -254,13 +228,6 @@ def propose(
         Time between rows of the scene (s).
     jumps : bool
         Whether velocities may jump where nothing is declared.
-    trajectories : int
-        Fewer long ones are cut: criticism needs so many.
-    shortest : int
-        Rows of a piece, at least; it is also as long as the motion needs, see `telling`, where so
-        many such pieces are there.
-    most : int
-        Pieces that one trajectory is cut to.
     """
     said = []
     times = numbers(frame["time"])
@@ -290,10 +257,10 @@ def propose(
                 f" (by more than {least:g} m/s)"
             )
     length = float(np.median([np.ptp(times[rows]) for rows in groups]))
-    few = frame["trajectory"].nunique() < trajectories
-    if few and not cuts and length >= 2 * shortest * time_step:
+    few = frame["trajectory"].nunique() < 4
+    if few and not cuts and length >= 60 * time_step:
         slow = max(telling(times[rows], poses[rows]) for rows in groups)
-        parts = np.clip(length / max(slow, shortest * time_step), min(trajectories, most), most)
+        parts = np.clip(length / max(slow, 30 * time_step), 4, 12)
         cuts["every"] = float(f"{length / int(parts):.2g}")
         said.append(
             f"{frame['trajectory'].nunique()} long trajectory: cut every {cuts['every']:g} s, so"

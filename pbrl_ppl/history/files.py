@@ -32,6 +32,7 @@ from pbrl_ppl.files import (
     seal,
     write_atomically,
 )
+from pbrl_ppl.history.measures import SAME
 from pbrl_ppl.scene import SEPARATORS, Recording
 from pbrl_ppl.state import STATE, WRENCH, Floats
 
@@ -125,8 +126,8 @@ def read_text(path: Path, layout: Recording) -> pd.DataFrame:
     path : Path
         The file: UTF-8, UTF-16 or Latin-1.
     layout : Recording
-        Separator and header, if they are declared. Missing cells of the columns that it names, and
-        of numbers of a history, may be words such as ``nan``.
+        Separator and header, if they are declared. Missing cells may be words such as ``nan``, but
+        of the columns ``trajectory`` and ``body``.
 
     Raises
     ------
@@ -177,10 +178,8 @@ def _table_of(text: str, path: Path, layout: Recording) -> pd.DataFrame:
                     f" line; repair or drop the row (file {path})"
                 )
     columns = [str(i) for i in range(width)] if names is None else names
-    named = [column for _, column in layout.columns if isinstance(column, str)]
-    numbers = ["step", "time", *STATE, *WRENCH, *named]
     decimal = "," if separator != "," and _has_commas(lines[first:]) else "."
-    missing = dict.fromkeys((*numbers, *(columns if names is None else ())), _MISSING)
+    missing = {name: _MISSING for name in columns if name not in ("trajectory", "body")}
     try:
         frame: pd.DataFrame = pd.read_csv(
             io.StringIO("\n".join(lines[first:])), sep=separator, names=columns, header=None,
@@ -193,24 +192,7 @@ def _table_of(text: str, path: Path, layout: Recording) -> pd.DataFrame:
     if not isinstance(frame.index, pd.RangeIndex):
         raise HistoryError(f"history {path}: rows have more cells than the header; repair them")
     frame.index = pd.RangeIndex(first + 1, first + 1 + len(frame))
-    frame = _with_numbers(frame, decimal)
     frame.attrs.update(lines=True, headerless=names is None, units=units, said=said)
-    return frame
-
-
-def _with_numbers(frame: pd.DataFrame, decimal: str) -> pd.DataFrame:
-    """Return a table whose columns of numbers and missing cells are numbers, whatever their names.
-
-    Such are commands of actuators, which are empty where they hold.
-    """
-    for name in frame.columns.difference(["trajectory", "body"], sort=False):
-        if pd.api.types.is_numeric_dtype(frame[name]):
-            continue
-        text = frame[name].astype(str).str.strip().str.replace(decimal, ".", regex=False)
-        given = text[~text.isin([*_MISSING, "", "nan"])]
-        numbers = pd.to_numeric(given, errors="coerce")
-        if len(given) and numbers.notna().all():
-            frame[name] = numbers.reindex(frame.index)
     return frame
 
 
@@ -337,8 +319,6 @@ _SYSID = {
     9: ("time", "left voltage", "right voltage", "left position", "right position",
         "left velocity", "right velocity", "angle", "angular rate"),
 }  # fmt: skip
-_SYSID_UNITS = {"meters": "m", "feet": "ft", "inches": "in", "radians": "rad", "degrees": "deg",
-                "rotations": "rev"}  # fmt: skip
 
 
 @reads(".json")
@@ -367,7 +347,7 @@ def read_sysid(path: Path, layout: Recording) -> pd.DataFrame:
         ) from None
     parts = [pd.DataFrame(rows, columns=names).assign(trajectory=k) for k, rows in tests.items()]
     frame: pd.DataFrame = pd.concat(parts, ignore_index=True)
-    unit = _SYSID_UNITS.get(str(log.get("units", "")).lower(), "")
+    unit = SAME.get(str(log.get("units", "")).lower(), "")
     of_rates = {"voltage": "V", "rate": "rad/s", "angle": "rad"}
     units = {name: of_rates.get(name.split()[-1], unit) for name in names[1:]}
     units |= {name: f"{unit}/s" for name in names if name.endswith("velocity") and unit}
@@ -476,18 +456,15 @@ def write_dataset(dataset: xr.Dataset, path: Path) -> None:
         raise OutputError(
             f"history {path}: the suffix is {path.suffix!r}, expected one of {', '.join(SUFFIXES)}"
         )
-    if suffix == ".nc":
-        measured = dataset[["observed", "action", "clock", "n_rows"]]
-        write_atomically(path, lambda to: _write_netcdf(measured, to))
-        return
-    table = to_table(dataset)
-    if suffix == ".csv":
-        write_atomically(path, lambda to: table.to_csv(to, index=False, lineterminator="\n"))
-    else:
-        write_atomically(path, lambda to: table.to_parquet(to, index=False))
 
+    def write(to: Path) -> None:
+        if suffix == ".nc":
+            measured = dataset[["observed", "action", "clock", "n_rows"]]
+            measured.to_netcdf(to, engine="h5netcdf")
+            seal(to)
+        elif suffix == ".csv":
+            to_table(dataset).to_csv(to, index=False, lineterminator="\n")
+        else:
+            to_table(dataset).to_parquet(to, index=False)
 
-def _write_netcdf(dataset: xr.Dataset, path: Path) -> None:
-    """Write a NetCDF file with a seal."""
-    dataset.to_netcdf(path, engine="h5netcdf")
-    seal(path)
+    write_atomically(path, write)

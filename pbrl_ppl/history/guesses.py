@@ -74,11 +74,8 @@ def with_derived(frame: pd.DataFrame, say: Say) -> pd.DataFrame:
 
 def derived_columns(frame: pd.DataFrame) -> dict[str, list[str]]:
     """Return the columns that each stamp and yaw follows from; names of the table are left out."""
-    found = {
-        prefix.rstrip("._ ") or "stamp": parts
-        for names in _STAMPS
-        for prefix, parts in _groups(frame, names)
-    }
+    stamps = (group for names in _STAMPS for group in _groups(frame, names))
+    found = {prefix.rstrip("._ ") or "stamp": parts for prefix, parts in stamps}
     for names in map(str.split, _QUATERNIONS):
         for prefix, parts in _groups(frame, names):
             found["yaw" if "yaw" not in found else f"{prefix}yaw"] = parts
@@ -162,10 +159,8 @@ def with_guesses(
     """
     if frame.attrs.get("headerless") or any("." in key for key, _ in layout.columns):
         return layout
-    tables = [with_derived(frame, lambda _: None)]
-    if commands is not None:
-        tables.append(commands)
-    plain = {str(name): _plain(str(name)) for table in tables for name in table.columns}
+    names = [*with_derived(frame, lambda _: None), *(() if commands is None else commands)]
+    plain = {str(name): _plain(str(name)) for name in names}
     known = dict(layout.columns)
     found: dict[str, str] = {}
     there = {*known, *plain} | ({"time"} if "duration" in known else set())

@@ -106,14 +106,7 @@ class History:
         self.dataset = dataset
 
     @classmethod
-    def load(
-        cls,
-        path: Paths,
-        scene: Scene,
-        *,
-        estimate_velocities: bool = False,
-        **reading: Unpack[TableReading],
-    ) -> History:
+    def load(cls, path: Paths, scene: Scene, **reading: Unpack[TableReading]) -> History:
         """Read a history from a file, by suffix, or from several.
 
         Parameters
@@ -125,12 +118,10 @@ class History:
         scene : Scene
             The bodies, hinges and time step that are expected; its ``recording`` says how a file of
             another program is laid out.
-        estimate_velocities : bool
-            Whether single transitions (Eq. 11) may start from velocities that were never measured,
-            as estimated from positions by a local polynomial. Whole trajectories need no estimate.
         **reading
-            For tables of others, as of `TableReading`: ``columns={"x": "pos_x", "force_x": 0.0}``
-            (their names, or numbers), ``units={"x": "mm"}``, ``resample=True`` for uneven samples.
+            As of `TableReading`: ``estimate_velocities``, and for tables of others
+            ``columns={"x": "pos_x", "force_x": 0.0}`` (their names, or numbers),
+            ``units={"x": "mm"}``, ``resample=True`` for uneven samples.
 
         Raises
         ------
@@ -145,7 +136,7 @@ class History:
             table, commands = read_table(log, layout), read_commands(log, scene.recording)
             source = f"history {log}"
             parts += [_rows(table, scene, scene.recording, commands, source, **reading)]
-        estimated = estimate_velocities or given.velocities == "estimate"
+        estimated = reading.get("estimate_velocities") or given.velocities == "estimate"
         return cls._of_rows(parts, scene, logs=logs, estimate_velocities=estimated)
 
     @classmethod
@@ -154,7 +145,6 @@ class History:
         frame: pd.DataFrame,
         scene: Scene,
         *,
-        estimate_velocities: bool = False,
         layout: Recording | None = None,
         commands: pd.DataFrame | None = None,
         **reading: Unpack[TableReading],
@@ -167,8 +157,9 @@ class History:
         if not isinstance(frame, pd.DataFrame):
             raise HistoryError(f"history: got {type(frame).__name__}, expected a pandas.DataFrame")
         rows = _rows(frame, scene, layout, commands, "history", **reading)
-        estimated = layout is not None and layout.velocities == "estimate"
-        return cls._of_rows([rows], scene, estimate_velocities=estimate_velocities or estimated)
+        declared = layout is not None and layout.velocities == "estimate"
+        estimated = reading.get("estimate_velocities") or declared
+        return cls._of_rows([rows], scene, estimate_velocities=estimated)
 
     @classmethod
     def of_arrays(
@@ -359,12 +350,8 @@ class History:
         states : ndarray
             Shape (trajectory, time, body, 6), SI units, without gaps.
         """
-        intervals = self.dataset["n_rows"].to_numpy() - 1
-        within = np.arange(states.shape[1]) < intervals[:, None]
         observed = self.dataset["observed"].copy(data=states)
-        between = History(self.dataset.assign(observed=observed))
-        trajectory, step = np.nonzero(within)
-        return between._segments(states, trajectory, step, 1)
+        return History(self.dataset.assign(observed=observed)).pieces(states, 1)
 
     def _inputs(self) -> Floats:
         """Return all that acts in each interval, shape (trajectory, interval, body, input)."""

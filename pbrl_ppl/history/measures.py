@@ -22,7 +22,7 @@ _ANGLE = {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180, "rev": 2 * np.pi, "turn"
 _FORCE = {"N": 1.0, "mN": 1e-3, "kN": 1e3, "lbf": 4.4482216152605, "kgf": 9.80665, "kg": 9.80665,
           "gf": 9.80665e-3, "g": 9.80665e-3, "ozf": 0.27801385, "oz": 0.27801385}  # fmt: skip
 #: How files write units that are listed above.
-_SAME = {"\u00b0": "deg", "degree": "deg", "degrees": "deg", "radian": "rad", "radians": "rad",
+SAME = {"\u00b0": "deg", "degree": "deg", "degrees": "deg", "radian": "rad", "radians": "rad",
          "meter": "m", "meters": "m", "metre": "m", "metres": "m", "sec": "s", "seconds": "s",
          "second": "s", "\u00b5s": "us", "millimeters": "mm", "feet": "ft", "inches": "in",
          "rotations": "rev", "newton": "N", "\u00b0/s": "deg/s", "dps": "deg/s", "kmh": "km/h",
@@ -102,7 +102,7 @@ def stated_units(frame: pd.DataFrame, columns: Mapping[str, object]) -> dict[str
         column = column_of(column)
         whole = next((c for c in frame.columns if column in (c, unit_in_name(str(c))[0])), column)
         text = stated_unit(frame, str(whole))
-        unit = _SAME.get(text, text)
+        unit = SAME.get(text, text)
         if unit in _UNITS[name]:
             units[key] = unit
         elif row.get(whole) and unit not in ("-", "1"):
@@ -145,14 +145,14 @@ def unit_size(name: str, text: str) -> float | None:
     ([0.001, 0.0005, None], 0.0005)
     """
     units = _UNITS[name]
-    if (unit := _SAME.get(text, text)) in units:
+    if (unit := SAME.get(text, text)) in units:
         return units[unit]
     number, _, rest = (part.strip() for part in unit.partition("/"))
     try:
         count = float(number)
     except ValueError:
         return None
-    rest = _SAME.get(rest, rest)
+    rest = SAME.get(rest, rest)
     of_rate = name in STATE[VELOCITY:] and f"{rest}/s" in units
     size = units.get(f"{rest}/s" if of_rate else rest)
     return size / count if size is not None and np.isfinite(count) and count > 0 else None

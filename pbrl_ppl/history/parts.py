@@ -123,11 +123,8 @@ def thinned(
         f"one row in {step} is used, each {dt:.4g} s, and commands are averaged between them: the"
         " motion needs no more"
     )
-    return (
-        replace(scene, time_step=dt),
-        tuple(_each(one.dataset, step, dt) for one in histories),
-        (said,),
-    )
+    coarse = tuple(_each(one.dataset, step, dt) for one in histories)
+    return replace(scene, time_step=dt), coarse, (said,)
 
 
 def _limits(observed: Floats, *, noisy: float = 2.0, smooth: float = 1e-3) -> Floats:
@@ -172,10 +169,8 @@ def _each(data: xr.Dataset, step: int, dt: float) -> History:
     seen = xr.DataArray(~beyond, dims=("trajectory", "time"))
     changed = {name: kept[name].where(seen) for name in ("observed", "start", "clock")}
     changed |= {"action": kept["action"].copy(data=action), "n_rows": rows}
-    kept = kept.assign(changed)
-    kept = kept.assign_coords(time=np.arange(len(kept["time"])))
-    kept.attrs = {**data.attrs, "time_step": dt}
-    return History(hashed(kept))
+    kept = kept.assign(changed).assign_coords(time=np.arange(len(kept["time"])))
+    return History(hashed(kept.assign_attrs(time_step=dt)))
 
 
 def _slowest_motion(history: History) -> float:
@@ -207,9 +202,6 @@ def _piece(data: xr.Dataset, trajectory: int, first: int, last: int) -> xr.Datas
     if first:
         held = data["action"].isel(trajectory=[trajectory], time=first - 1)
         before = before.copy(data=np.nan_to_num(held.to_numpy()))
-    return one.assign(
-        action=action, before=before, n_rows=one["n_rows"].copy(data=[last + 1 - first])
-    ).assign_coords(
-        time=np.arange(last + 1 - first),
-        trajectory=[f"{one['trajectory'].item()} from {first}"],
-    )
+    n, label = last + 1 - first, f"{one['trajectory'].item()} from {first}"
+    one = one.assign(action=action, before=before, n_rows=one["n_rows"].copy(data=[n]))
+    return one.assign_coords(time=np.arange(n), trajectory=[label])

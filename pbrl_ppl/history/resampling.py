@@ -80,7 +80,7 @@ def resampled(rows: Rows, scene: Scene, source: str, *, reach: float = 1.9) -> R
     shape = (len(grids), max(map(len, grids)), len(scene.moving))
     state, action = (np.full((*shape, len(names)), np.nan) for names in (STATE, WRENCH))
     clock = np.full(shape[:2], np.nan)
-    weights, empty = [], 0
+    between, empty = 0, 0
     for i, (_, grid, bodies) in enumerate(kept):
         clock[i, : len(grid)] = grid
         for body, track in enumerate(bodies):
@@ -89,7 +89,8 @@ def resampled(rows: Rows, scene: Scene, source: str, *, reach: float = 1.9) -> R
             # the last wrench acts in an interval that was not measured
             for d, column in enumerate(track.action[:-1].T):
                 action[i, : len(grid) - 1, body, d] = held_means(grid, track.time[:-1], column)
-            weights.append(_weights(track.time, grid, dt))
+            sample = track.time[np.searchsorted(track.time, grid + _SAME * dt) - 1]
+            between += int((grid - sample > _SAME * dt).sum())
             measured = ~np.isnan(track.state).all(axis=0)
             empty += int((np.isnan(states) & measured).any(axis=1).sum())
     state[:, :, quotients] = np.nan
@@ -97,8 +98,13 @@ def resampled(rows: Rows, scene: Scene, source: str, *, reach: float = 1.9) -> R
     message = (
         f"{source}: samples are {spacing.min():.4g} to {spacing.max():.4g} s apart (median"
         f" {np.median(spacing):.4g} s), not {dt:g} s: {len(rows.time)} rows were resampled to"
-        f" {len(result.time)}{_noise_in_words(weights)}"
+        f" {len(result.time)}"
     )
+    if between:
+        message += (
+            f"; {between / len(result.time):.0%} are interpolated (positions by cubics, velocities"
+            " linearly; wrenches are means), with errors that are less independent than they look"
+        )
     if short := len(tracks) - len(kept):
         message += f"; {short} trajectories shorter than a time step are left out"
     if empty:
@@ -148,18 +154,16 @@ def _tracks(rows: Rows, label: int, scene: Scene, near: float = 0.05) -> list[_T
     return tracks
 
 
-def _check_spacing(
-    rows: Rows, tracks: list[list[_Track]], dt: float, coarsest: float = 1.1
-) -> None:
+def _check_spacing(rows: Rows, tracks: list[list[_Track]], dt: float) -> None:
     """Refuse samples that are too far apart, and gaps that are too long.
 
-    With a median of more than ``coarsest`` time steps between samples rows would be made up.
+    With a median of more than 1.1 time steps between samples rows would be made up.
     """
     for track in (track for bodies in tracks for track in bodies if len(track.time) > 1):
         spacing = np.diff(track.time)
         worst, median = int(spacing.argmax()), np.median(spacing)
         row = int(track.row[worst + 1])
-        if median > coarsest * dt:
+        if median > 1.1 * dt:
             raise rows.error(
                 row,
                 f"samples of {rows.trajectory_of(row)} are {median:.4g} s apart, more than the time"
@@ -253,35 +257,3 @@ def held_means(times: Floats, stamps: Floats, values: Floats) -> Floats:
     impulse = np.append(0.0, np.cumsum(values[:-1] * np.diff(stamps)))
     impulse = impulse[which] + values[which] * (times - stamps[which])
     return np.asarray(np.diff(impulse) / np.diff(times))
-
-
-def _weights(time: Floats, grid: Floats, dt: float) -> tuple[Floats, Ints]:
-    """Return the later sample's share in each interpolated step, and the earlier sample's index."""
-    before = np.clip(np.searchsorted(time, grid, side="right") - 1, 0, max(len(time) - 2, 0))
-    after = np.minimum(before + 1, len(time) - 1)
-    width = np.where(after > before, time[after] - time[before], 1.0)
-    share = np.clip((grid - time[before]) / width, 0.0, 1.0)
-    share[np.abs(grid - time[before]) < _SAME * dt] = 0.0
-    share[np.abs(grid - time[after]) < _SAME * dt] = 1.0
-    return share, before.astype(np.int64)
-
-
-def _noise_in_words(weights: list[tuple[Floats, Ints]]) -> str:
-    """Return what interpolation does to the noise, in words."""
-    share = np.concatenate([later for later, _ in weights])
-    between = (share > 0) & (share < 1)
-    remaining = np.sqrt(((1 - share) ** 2 + share**2).mean())
-    pairs = [(i + (later > 0))[:-1] >= (i + (later == 1))[1:] for later, i in weights]
-    shared = np.concatenate(pairs)
-    text = ""
-    if between.any():
-        text += (
-            f"; {between.mean():.0%} are interpolated (positions by cubics, velocities linearly;"
-            f" wrenches are means), which leaves {remaining:.0%} of the velocities' noise"
-        )
-    if shared.any():
-        text += (
-            f"; {shared.mean():.0%} of neighbouring rows share a sample: their errors are less"
-            " independent than they look, and intervals come out too narrow"
-        )
-    return text

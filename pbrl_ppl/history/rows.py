@@ -196,10 +196,9 @@ def rows_of_table(frame: pd.DataFrame, scene: Scene, source: str, *, cut: bool =
     labels, trajectory = _trajectories(frame["trajectory"], at)
     body = _bodies(frame["body"], at, scene)
     where = ["" if cut else f"in trajectory {labels[i]}" for i in trajectory]
-    number = {name: np.full(len(frame), np.nan) for name in ("time", *STATE, *WRENCH)} | {
-        name: _numbers(frame[name], at, where)
-        for name in frame.columns.difference(["trajectory", "body"], sort=False)
-    }
+    number = {name: np.full(len(frame), np.nan) for name in ("time", *STATE, *WRENCH)}
+    given = frame.columns.difference(["trajectory", "body"], sort=False)
+    number |= {name: _numbers(frame[name], at, where) for name in given}
     for name in ("time", "step"):
         for row in np.flatnonzero(~np.isfinite(number.get(name, np.zeros(0)))):
             value = number[name][row]

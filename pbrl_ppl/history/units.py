@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import linregress
 
 from pbrl_ppl.history.history import History
-from pbrl_ppl.history.kinematics import hung_bodies
-from pbrl_ppl.scene import MASS_PRIOR, Scene, units_of
+from pbrl_ppl.scene import Scene, units_of
 from pbrl_ppl.state import STATE, THETA, VELOCITY, Floats, wrapped
 
 
@@ -109,57 +107,6 @@ def _rates(values: Floats, dt: float, stands_out: float = 5.0) -> tuple[float, f
             lag *= 2
         rates.append(size)
     return rates[0], rates[1]
-
-
-def shown_mass(
-    scene: Scene, history: History, name: str, *, few: int = 8, certainty: float = 5.0
-) -> float | None:
-    """Return the mass (kg) that the commands and the accelerations of a body show.
-
-    It is the regression of accelerations on commanded forces, or about a hinge of angular
-    accelerations on torques: other forces make it wrong by a factor, not by orders of magnitude.
-
-    Returns
-    -------
-    float or None
-        None where no command moves the body measurably.
-    """
-    data, body = history.dataset, scene.body(name)
-    pose = data["start"].sel(body=name).to_numpy()[..., :3].copy()
-    pose[..., THETA] = np.unwrap(np.nan_to_num(pose[..., THETA]), axis=1)
-    wrench = data["action"].sel(body=name).to_numpy()
-    columns, moment = [0, 1], 1.0
-    if name in hung_bodies(scene):
-        columns, moment = [THETA], body.shape.unit_moment + units_of(scene, name).length ** 2
-    response = np.diff(pose[..., columns], 2, axis=1).ravel() / scene.time_step**2
-    # between the middles of two intervals each command acts for half of the time
-    push = (0.5 * (wrench[:, :-2, columns] + wrench[:, 1:-1, columns])).ravel() / moment
-    seen = np.isfinite(response) & np.isfinite(push)
-    if seen.sum() < few or not np.ptp(push[seen]) > 0:
-        return None
-    fitted = linregress(push[seen], response[seen])
-    shows = fitted.slope > certainty * fitted.stderr
-    return 1.0 / float(fitted.slope) if shows else None
-
-
-def mass_contradictions(scene: Scene, history: History, *, far: float = 5.0) -> list[str]:
-    """Return a sentence for each prior of a mass that the recording contradicts."""
-    sentences = []
-    for body in scene.dynamic:
-        shown = shown_mass(scene, history, body.name)
-        hyper = dict(zip(("mu", "sigma"), MASS_PRIOR, strict=True))
-        hyper |= dict(dict(body.prior).get("mass", ()))
-        if "mass" in dict(body.known) or shown is None:
-            continue
-        if abs(np.log(shown) - hyper["mu"]) > far * hyper["sigma"]:
-            sentences.append(
-                f"mass of {body.name}: commands and accelerations of the recording show some"
-                f" {shown:.1g} kg, and its prior has the median {np.exp(hyper['mu']):.2g} kg;"
-                f" declare prior = {{ mass = {{ mu = {np.log(shown):.1f}, sigma ="
-                f" {hyper['sigma']:g} }} }} (mu is the logarithm), or known = {{ mass = ... }}; or"
-                " check the units of the commands"
-            )
-    return sentences
 
 
 def unit_mismatches(history: History) -> tuple[str, ...]:

@@ -40,11 +40,6 @@ class Contradiction:
     row: int
     factor: float = 0.0
 
-    @property
-    def impossible(self) -> bool:
-        """Return whether the position is faster there than the column can say."""
-        return self.kind.startswith(("wraps", "is clipped"))
-
 
 @dataclass(frozen=True)
 class UnusedVelocity:
@@ -151,7 +146,7 @@ def unused_velocities(history: History) -> tuple[UnusedVelocity, ...]:
             fault = contradiction(*pair, dt, angle=d == THETA)
             if fault and not np.nan_to_num(pair[1]).any():
                 unused.append(replace(one, zero=True))
-            elif fault and fault.impossible:
+            elif fault and fault.kind.startswith(("wraps", "is clipped")):
                 unused.append(replace(one, fault=fault))
             elif (late := computed_lag(runs, dt)) is not None:
                 late = late if abs(late) > 0.05 * dt else 0.0
@@ -182,8 +177,8 @@ def measured_alone(history: History, unused: Sequence[UnusedVelocity] | None = N
     return History(history.dataset.assign(observed=observed))
 
 
-def velocity_lag(runs: Runs, dt: float, *, material: float = 0.05) -> float:
-    """Return by how much (s) velocities are late; 0 where that is negligible or not significant.
+def velocity_lag(runs: Runs, dt: float) -> float:
+    """Return by how much (s) velocities are late; 0 where that is not significant, or < 0.05 dt.
 
     The position's change in an interval is its mean velocity; of a velocity that is late by ``tau``
     it differs by ``tau`` times the acceleration. Of differences of velocities that bracket the
@@ -197,8 +192,6 @@ def velocity_lag(runs: Runs, dt: float, *, material: float = 0.05) -> float:
         Positions and velocities of rows without gaps, shape (n,) each.
     dt : float
         Time step (s).
-    material : float
-        Smaller lags, in time steps, are negligible.
 
     Examples
     --------
@@ -208,24 +201,22 @@ def velocity_lag(runs: Runs, dt: float, *, material: float = 0.05) -> float:
     >>> velocity_lag([(np.sin(5 * t), 5 * np.cos(5 * t))], 0.02)
     0.0
     """
-    (lag, differs), shift = _shifted(runs, dt, 0, material), 0
+    (lag, differs), shift = _shifted(runs, dt, 0), 0
     if not differs:
         return 0.0
     for _ in range(20):  # it is linear in the lag only near it
         if np.isfinite(lag) and abs(lag - shift) > 0.5:
             shift = int(np.clip(round(lag), shift - 1, shift + 1))
-            lag = _shifted(runs, dt, shift, material)[0]
+            lag = _shifted(runs, dt, shift)[0]
     return float(lag) * dt if np.isfinite(lag) else 0.0
 
 
-def _shifted(
-    runs: Runs, dt: float, shift: int, material: float, alarm: float = 1e-4, enough: int = 12
-) -> tuple[float, bool]:
+def _shifted(runs: Runs, dt: float, shift: int, material: float = 0.05) -> tuple[float, bool]:
     """Return the lag (rows) linearised about ``shift`` rows, and whether it differs materially.
 
     The instrument's covariance with the residual at the least lag that matters is tested, which
-    needs no accurate lag (Anderson and Rubin's test). ``alarm`` is the test's size, ``enough`` the
-    least number of intervals.
+    needs no accurate lag (Anderson and Rubin's test of size 1e-4, in 12 intervals or more).
+    Lags of less than ``material`` rows do not matter.
     """
     parts: list[Floats] = []
     for position, rate in runs:
@@ -235,7 +226,7 @@ def _shifted(
             mean, off = (one + two) / 2, (position[k + 1] - position[k]) / dt
             curve = before - one - two + after
             parts.append(np.stack([off - mean, mean, curve, two - one, after - before]))
-    if sum(part.shape[1] for part in parts) < enough:
+    if sum(part.shape[1] for part in parts) < 12:
         return np.nan, False
     y, mean, curve, x, z = np.concatenate(parts, axis=1)
     basis = np.linalg.svd(np.stack([np.ones(len(y)), mean, curve], axis=1), full_matrices=False)[0]
@@ -248,7 +239,7 @@ def _shifted(
     residual = rest - float(z @ rest) / square * z
     # the second in collisions
     spread = max(float(residual @ residual) / dof * square, float(((z * residual) ** 2).sum()))
-    bound = float(t_distribution.isf(alarm / 2, dof)) * np.sqrt(2 * spread)
+    bound = float(t_distribution.isf(0.5e-4, dof)) * np.sqrt(2 * spread)
     # rounding alone leaves a millionth of a row, without any noise
     differs = abs(lag) > material and abs(float(z @ rest)) > max(bound, 1e-6 * slope)
     return lag + shift, bool(differs)
@@ -328,16 +319,15 @@ def position_noise(runs: Runs, dt: float) -> tuple[float, float]:
     return place * dt**2, max(0.0, square - 20 * place)
 
 
-def computed_lag(
-    runs: Runs, dt: float, *, alarm: float = 1e-5, most: float = 0.25, widest: int = 20
-) -> float | None:
+def computed_lag(runs: Runs, dt: float, *, widest: int = 20) -> float | None:
     """Return by how much (s) velocities computed from positions are late; None for measured ones.
 
     Velocities are regressed on the positions of rows before and after. A velocity with independent
     noise differs from any sum of noisy positions with weights ``w`` by a variance of at least
     ``|w|^2 s^2``, ``s`` being the positions' noise. A computed velocity does not. The ratio of the
-    residual variance to that bound is compared with the lower tail of the F distribution, degrees
-    of freedom corrected for serial correlation. The lag is the group delay of the weights at low
+    residual variance to that bound is compared with the lower tail (1e-5) of the F distribution,
+    degrees of freedom corrected for serial correlation; however many rows there are, it is less
+    than a quarter. The lag is the group delay of the weights at low
     frequency.
 
     Parameters
@@ -346,10 +336,6 @@ def computed_lag(
         Positions and velocities of rows without gaps, shape (n,) each.
     dt : float
         Time step (s).
-    alarm : float
-        Size of the test.
-    most : float
-        Largest ratio of the variances, however many rows there are.
     widest : int
         Rows before and after, at most; in short logs fewer, for two windows a weight.
 
@@ -365,11 +351,8 @@ def computed_lag(
     if not reach or not any(rate.any() for _, rate in runs):
         return None
     place = np.arange(-reach, reach + 1)
-    windows = [
-        sliding_window_view(np.stack(run), len(place), axis=1)
-        for run in runs
-        if len(run[0]) >= len(place)
-    ]
+    long = [np.stack(run) for run in runs if len(run[0]) >= len(place)]
+    windows = [sliding_window_view(run, len(place), axis=1) for run in long]
     x, rates = np.concatenate(windows, axis=1)
     y = rates[:, reach]
     inverse = np.linalg.pinv(np.delete(x - x[:, [reach]], reach, axis=1), rcond=1e-9)
@@ -383,8 +366,8 @@ def computed_lag(
     variance = float(((y - x @ b) ** 2).sum()) / dof
     square = float(b @ b) - variance * float((inverse**2).sum())  # less the weights' errors
     shown = sum(np.maximum(lengths - 3, 0)) / _correlation([-1, 3, -3, 1])
-    tail = f_distribution.ppf(alarm, dof / _correlation(b), max(shown, 1.0))
-    bound = min(most, float(tail)) * square * _noise(runs, dt)
+    tail = f_distribution.ppf(1e-5, dof / _correlation(b), max(shown, 1.0))
+    bound = min(0.25, float(tail)) * square * _noise(runs, dt)
     exact = len(y) > 8 * reach and abs(slope * dt - 1) < 1e-6
     total = float(np.concatenate([rate for _, rate in runs]).var())
     lag = round(-curve / (2 * slope), 6) * dt + 0.0
@@ -413,9 +396,8 @@ def _correlation(weights: Floats | list[int]) -> float:
 
 
 def contradiction(
-    position: Floats, rate: Floats, dt: float, *, angle: bool = False,
-    least: float = 0.03, few: int = 10, material: float = 0.3,
-) -> Contradiction | None:  # fmt: skip
+    position: Floats, rate: Floats, dt: float, *, angle: bool = False, few: int = 10
+) -> Contradiction | None:
     """Return how measured velocities contradict the changes of their position; None if they agree.
 
     A velocity lies between the difference quotients before and after its row, an impact's as well,
@@ -430,10 +412,9 @@ def contradiction(
         Time step (s).
     angle : bool
         Whether the position may have been wrapped at a turn (rad).
-    least, few : float, int
-        Fewer rows, as a share and in number, are no contradiction.
-    material : float
-        What differs by a smaller share of the typical speed is none, unless it is impossible.
+    few : int
+        Fewer rows are no contradiction, nor is a share of less than 3 %, or what differs by less
+        than 30 % of the typical speed, unless it is impossible.
 
     Examples
     --------
@@ -450,7 +431,7 @@ def contradiction(
     middle, found, tolerance = _wrong(quotient, rate, position, dt)
     seen = np.isfinite(middle)
     share = float(found.sum()) / max(int(seen.sum()), 1)
-    if share < least or found.sum() < few:
+    if share < 0.03 or found.sum() < few:
         return None
     inner = rate[:, 1:-1]
     kind, factor = _kind(middle, inner, found, tolerance), 0.0
@@ -458,7 +439,7 @@ def contradiction(
         bias = np.median((middle - inner)[seen])
         found = _wrong(quotient, rate + bias, position, dt)[1]
         off = np.sqrt(np.mean((middle - inner - bias)[found] ** 2)) if found.sum() >= few else 0.0
-        if off < material * np.sqrt(np.mean(middle[seen] ** 2)):
+        if off < 0.3 * np.sqrt(np.mean(middle[seen] ** 2)):
             return None
         share = float(found.sum()) / float(seen.sum())
         factor = _factor(middle[seen], inner[seen])

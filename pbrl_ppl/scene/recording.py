@@ -78,8 +78,7 @@ class Recording:
         :func:`pbrl_ppl.history.trimmed` does.
     cut : tuple of (str, float)
         Where trajectories are cut: ``every`` so many seconds, at ``gaps`` longer than so many
-        seconds, at ``rests`` of at least so many seconds, at ``jumps`` of a velocity by more than
-        so many m/s between rows.
+        seconds, at ``jumps`` of a velocity by more than so many m/s between rows.
     camera : bool, optional
         Whether places come from a camera, whose laws are then tried; by default where x and y are
         measured.
@@ -169,7 +168,7 @@ def _clocks(value: object, where: str) -> object:
     return entries(_name_or_number)(value, where)
 
 
-_CUTS = dict.fromkeys(("every", "gaps", "rests", "jumps"), positive)
+_CUTS = dict.fromkeys(("every", "gaps", "jumps"), positive)
 #: The check of each attribute.
 _CHECKS: Mapping[str, Check] = {
     **dict.fromkeys(("hold", "header", "resample", "trim", "camera"), flag),

@@ -187,9 +187,6 @@ def test_cuts() -> None:
     bounced = moving(x=1.45 - np.abs(frame["time"] - 1.45))
     first, second = pieces(bounced, jumps=1.0)
     assert first + second >= 27 and first <= 15 and second <= 15  # the rows beside the jump go
-    rested = moving(x=np.where(frame["time"] < 1.0, frame["time"], 1.0))
-    rested.loc[20:, "x"] += 0.1 * np.arange(1, 11)
-    assert pieces(rested, rests=0.5) == [10, 10]
     # a saved history that is cut already stays as it is
     history = History.from_dataframe(moving(), PUCK, layout=Recording())
     again = history.to_dataframe()
@@ -204,7 +201,7 @@ def test_a_recording_without_bodies_or_with_nothing_between_cuts(tmp_path: Path)
     with pytest.raises(HistoryError, match=r"missing column.s. body"):
         History.load(tmp_path / "a.csv", two)
     with pytest.raises(HistoryError, match="nothing is left between its cuts"):
-        load("time,x\n0,1\n0.1,1\n0.2,1\n0.3,1\n", tmp_path / "b.csv", cut={"rests": 0.1})
+        load("time,x\n0,1\n0.1,1\n0.2,1\n0.3,1\n", tmp_path / "b.csv", cut={"gaps": 0.05})
 
 
 @pytest.mark.parametrize(

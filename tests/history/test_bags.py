@@ -45,9 +45,9 @@ def test_odometry_and_wrench_in_every_format(form: str, tmp_path) -> None:
             "time", "body",
             *(f"pose.pose.position.{axis}" for axis in "xyz"),
             *(f"pose.pose.orientation.{axis}" for axis in "xyzw"),
-            "yaw",
             *(f"twist.twist.linear.{axis}" for axis in "xyz"),
             *(f"twist.twist.angular.{axis}" for axis in "xyz"),
+            "yaw",
         ]  # fmt: skip
         assert set(odometry.body) == {"cart"}
         np.testing.assert_allclose(odometry.time, 0.1 * i, atol=1e-6)
@@ -125,7 +125,6 @@ def test_arrays_by_the_names_of_their_elements(tmp_path) -> None:
     efforts = read_bag(path, {"": ["/joint_states", "/efforts"]})
     np.testing.assert_array_equal(efforts["data[1]"], [1, 2, 3])
     assert "data[0]" not in read_bag(path, {"": "/map"})
-    assert "data[49]" in read_bag(path, {"": "/map"}, longest_array=50)
     sides = read_bag(path, {"": ["/left", "/right"]})
     np.testing.assert_array_equal(sides[["data", "data (/right)"]], [[0, 0], [1, -1], [2, -2]])
 

@@ -155,20 +155,9 @@ def test_a_finer_log_is_thinned_without_interpolation() -> None:
 
 
 def test_the_warning_says_what_becomes_of_the_noise() -> None:
-    frame, _, states = uneven(n=4000)
-    rng = np.random.default_rng(5)
-    noisy = frame.copy()
-    noisy[list(STATE)] = states + rng.normal(0.0, NOISE, states.shape)
-    with pytest.warns(ResamplingWarning) as caught:
-        got = History.from_dataframe(noisy, DISC, resample=True)
-    with pytest.warns(ResamplingWarning):
-        true = History.from_dataframe(frame, DISC, resample=True)
-    off = (got.dataset["observed"] - true.dataset["observed"]).to_numpy()[0, :, 0]
-    left = off[:, 3:].std(axis=0) / NOISE[3:]
-    said = float(str(caught[0].message).partition("leaves ")[2].partition("%")[0]) / 100
-    np.testing.assert_allclose(left, said, atol=0.04)
-    assert 0.75 < said < 0.95
-    assert "neighbouring rows share a sample" in str(caught[0].message)
+    frame, *_ = uneven()
+    with pytest.warns(ResamplingWarning, match="are interpolated .* less independent than they"):
+        History.from_dataframe(frame, DISC, resample=True)
 
 
 def test_gaps_are_left_empty_or_refused() -> None:

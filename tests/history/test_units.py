@@ -4,8 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pbrl_ppl.history import History, mass_contradictions, with_units
-from pbrl_ppl.history.units import shown_mass
+from pbrl_ppl.history import History, with_units
 from pbrl_ppl.scene import Body, Scene, Shape, units_of
 
 pytestmark = pytest.mark.one_stack
@@ -42,25 +41,6 @@ def test_stated_units_are_kept() -> None:
     once = with_units(stated, pushed(2.0))
     assert units_of(once, "sled").speed == 7.0
     assert with_units(once, pushed(5.0)) == once
-
-
-@pytest.mark.parametrize("mass", [0.002, 2.0, 2e4])
-def test_the_mass_shows_in_accelerations(mass) -> None:
-    assert shown_mass(scene(), pushed(mass), "sled") == pytest.approx(mass, rel=0.1)
-
-
-def test_a_contradicted_mass_is_said() -> None:
-    assert mass_contradictions(scene(), pushed(2.0)) == []
-    (sentence,) = mass_contradictions(scene(), pushed(2e4))
-    assert "2e+04 kg" in sentence and "median 2.7 kg" in sentence
-    # as declared, it is the user's
-    assert mass_contradictions(scene(known={"mass": 2.0}), pushed(2e4)) == []
-    assert mass_contradictions(scene(prior={"mass": {"mu": 9.9}}), pushed(2e4)) == []
-
-
-def test_no_command_shows_no_mass() -> None:
-    frame = pushed(2.0).to_dataframe().assign(force_x=0.0)
-    assert shown_mass(scene(), History.from_dataframe(frame, scene()), "sled") is None
 
 
 def test_an_angle_that_nobody_saw_may_turn() -> None:
