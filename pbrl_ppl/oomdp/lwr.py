@@ -121,22 +121,20 @@ class LocalRegression:
 class Experience:
     """Observed transitions of a body or a class, with one regression per condition.
 
-    See section 3.1.3 of the paper. Inputs are triples of two planar components and an angular one,
+    See section 3.1.3 of the paper. Distances are in units of each input's standard deviation over
+    all conditions. Inputs are triples of two planar components and an angular one,
     the last of them the wrench.
 
     Parameters
     ----------
     reach : float
         Bounding radius of the body (m).
-    standardise : bool
-        Whether distances are in units of each input's standard deviation over all conditions;
-        otherwise in SI units.
     **options
         Of :class:`LocalRegression`.
     """
 
-    def __init__(self, reach: float, *, standardise: bool, **options: Any) -> None:
-        self._reach, self._standardise, self._options = reach, standardise, options
+    def __init__(self, reach: float, **options: Any) -> None:
+        self._reach, self._options = reach, options
         self._x: list[Floats] = []
         self._y: list[Floats] = []
         self._rows: dict[Key, list[int]] = {}
@@ -175,10 +173,9 @@ class Experience:
     def _model(self, key: Key) -> LocalRegression:
         if key not in self._models:
             x, y = self._joined()
-            scale = np.ones(x.shape[1])
-            if self._standardise:  # a column that is constant, up to rounding errors, by its size
-                scale, size = x.std(axis=0), self._sizes(x)
-                scale = np.where(scale > 1e-9 * size, scale, size)
+            # a column that is constant, up to rounding errors, by its size
+            scale, size = x.std(axis=0), self._sizes(x)
+            scale = np.where(scale > 1e-9 * size, scale, size)
             rows = self._rows[key]
             self._models[key] = LocalRegression(x[rows], y[rows], scale=scale, **self._options)
         return self._models[key]
@@ -224,12 +221,9 @@ class Learner:
     neighbours : int
         Number of nearest transitions used, k.
     bandwidth : float
-        Bandwidth of the kernel, lambda.
+        Bandwidth of the kernel, lambda; without a unit, as in the paper.
     ridge : float
         See :class:`pbrl_ppl.oomdp.LocalRegression`.
-    standardise : bool
-        Whether distances between inputs are in units of each input's standard deviation in the
-        data, so that lambda has no unit, as in the paper; otherwise in SI units.
     pose_invariant : bool
         Whether a body's transitions are learned in its own frame, without its pose.
     share_classes : bool
@@ -248,6 +242,9 @@ class Learner:
         Number of observed transitions.
     """
 
+    #: Number of draws of a point estimate.
+    draws: int = 1
+
     def __init__(
         self,
         scene: Scene,
@@ -255,7 +252,6 @@ class Learner:
         neighbours: int = 1000,
         bandwidth: float = 1.5,
         ridge: float = 1e-3,
-        standardise: bool = True,
         pose_invariant: bool = True,
         share_classes: bool = False,
         relations: Sequence[Relation] = (),
@@ -265,13 +261,14 @@ class Learner:
             checks.positive(bandwidth, "bandwidth")
             checks.not_negative(ridge, "ridge")
         self.scene, self.pose_invariant, self.relations = scene, pose_invariant, tuple(relations)
+        #: Wrenches before the first interval, shape (body, 3): the model does not remember any.
+        self.before: Floats = np.zeros((len(scene.moving), len(WRENCH)))
         options = {"neighbours": neighbours, "bandwidth": bandwidth, "ridge": ridge}
         self._experience: dict[int, Experience] = {}
         of_class: dict[str, Experience] = {}
         for i, body in enumerate(scene.moving):
             if not body.kinematic:
-                reach = body.shape.bounding_radius
-                experience = Experience(reach, standardise=standardise, **options)
+                experience = Experience(body.shape.bounding_radius, **options)
                 if share_classes and body.object_class is not None:
                     experience = of_class.setdefault(body.object_class, experience)
                 self._experience[i] = experience
@@ -308,13 +305,9 @@ class Learner:
         HistoryError
             If shapes do not fit together, or a value is not finite.
         """
-        k = len(self.scene.moving)
-        arrays = []
-        for name, array, width in (
-            ("state", state, len(STATE)),
-            ("action", action, len(WRENCH)),
-            ("next_state", next_state, len(STATE)),
-        ):
+        k, arrays = len(self.scene.moving), []
+        given = {"state": (state, 6), "action": (action, 3), "next_state": (next_state, 6)}
+        for name, (array, width) in given.items():
             values = np.asarray(array, dtype=float)
             if values.ndim not in (2, 3) or values.shape[-2:] != (k, width):
                 raise HistoryError(
@@ -375,16 +368,6 @@ class Learner:
 
     # -- planning ----------------------------------------------------------------------------------
 
-    @property
-    def draws(self) -> int:
-        """Return the number of draws: 1, a point estimate."""
-        return 1
-
-    @property
-    def before(self) -> Floats:
-        """Return the wrench before the first interval: zeros, shape (body, 3)."""
-        return np.zeros((len(self.scene.moving), len(WRENCH)))
-
     def single(self) -> Self:
         """Return itself."""
         return self
@@ -420,14 +403,7 @@ class Learner:
         angular = force * np.hypot(*gains[:2, 2]) + torque * abs(gains[2, 2])
         return np.array([linear]), np.array([angular])
 
-    def step(
-        self,
-        states: Floats,
-        wrenches: Floats,
-        previous: Floats | None = None,
-        *,
-        diverged: float = 1e6,
-    ) -> Floats:
+    def step(self, states: Floats, wrenches: Floats, previous: Floats | None = None) -> Floats:
         """Return the states after one sampling interval (Eqs. 5 and 6).
 
         Parameters
@@ -438,9 +414,6 @@ class Learner:
             Shape (n, body, 3), world frame, N and N m.
         previous : ndarray, optional
             Ignored.
-        diverged : float
-            States beyond this many times the largest learned are of extrapolations that have
-            diverged.
 
         Returns
         -------
@@ -476,7 +449,7 @@ class Learner:
             if self.pose_invariant:
                 added = _turned(added, state[:, THETA])
             out[rows, i] = state + added
-        out[abs(out) > diverged * self._largest] = np.nan
+        out[abs(out) > 1e6 * self._largest] = np.nan  # an extrapolation has diverged
         return np.asarray(out[None])
 
     def experience(self, body: str) -> Experience:
@@ -527,8 +500,6 @@ class LWR(Learner):
         Bandwidth of the kernel, lambda.
     ridge : float
         See :class:`pbrl_ppl.oomdp.LocalRegression`; 0 is Eq. 4.
-    standardise : bool
-        Whether distances are in units of each input's standard deviation; otherwise in SI units.
     pose_invariant : bool
         Whether a body's transitions are learned in its own frame, without its pose.
 
@@ -620,9 +591,7 @@ class OOLWR(Learner):
                     f"OO-LWR: relations has {relation!r}, expected objects with labels() and of(),"
                     " such as SectorContacts()"
                 )
-        self.labels = tuple(
-            label for predicate in self.relations for label in predicate.labels(scene)
-        )
+        self.labels = tuple(name for one in self.relations for name in one.labels(scene))
         for label, count in Counter(self.labels).items():
             if count > 1:
                 raise FitError(

@@ -191,15 +191,12 @@ class _Paths:
         last = np.broadcast_to(dynamics.before, (len(wrenches), *dynamics.before.shape))
         earlier = np.moveaxis(wrenches, 1, 0)[:-1]
         past = accumulate(earlier, lambda last, wrench: remembered(wrench, last), initial=last)
-        before = np.stack(list(past), axis=1)
-        return cls(
-            states[:, :, :-1].reshape(-1, *start.shape),
-            states[:, :, 1:].reshape(-1, *start.shape),
-            np.tile(wrenches, (dynamics.draws, 1, 1, 1)).reshape(-1, *wrenches.shape[2:]),
-            np.tile(before, (dynamics.draws, 1, 1, 1)).reshape(-1, *before.shape[2:]),
-            wrenches.shape[1],
-            lost.ravel(),
+        ends = (part.reshape(-1, *start.shape) for part in (states[:, :, :-1], states[:, :, 1:]))
+        inputs = (
+            np.tile(one, (dynamics.draws, 1, 1, 1)).reshape(-1, *one.shape[2:])
+            for one in (wrenches, np.stack(list(past), axis=1))
         )
+        return cls(*ends, *inputs, wrenches.shape[1], lost.ravel())
 
 
 class Separation:
@@ -218,10 +215,6 @@ class Separation:
         Initial state of the experiment, shape (body, 6), SI units; known to measurement noise.
     before : ndarray
         Wrenches before it, shape (body, 3).
-    threads : int
-        Engine worlds side by side.
-    substeps : int
-        Engine steps an interval at most: models are compared with each other, in the same engine.
 
     Attributes
     ----------
@@ -229,26 +222,17 @@ class Separation:
         Those of each rival at its mode.
     """
 
-    def __init__(
-        self,
-        rivals: Sequence[Rival],
-        start: Floats,
-        before: Floats,
-        threads: int = 2,
-        substeps: int = 10,
-    ) -> None:
+    def __init__(self, rivals: Sequence[Rival], start: Floats, before: Floats) -> None:
         self.rivals, self.start = rivals, start
         # the rivals differ in the effects that bodies declare
         scene = rivals[0].mode.problem.scene
         self.scene = scene.replace(bodies=tuple(replace(body, effects=()) for body in scene.bodies))
-        every = [rival.mode.problem.physics for rival in rivals]
-        self.dynamics = [
-            Dynamics(
-                self.scene, rival.mode.phi, physics.effects, threads=threads, declared=(),
-                substeps=min(substeps, physics.substeps),
-            ).after(before)
-            for rival, physics in zip(rivals, every, strict=True)
-        ]  # fmt: skip
+        self.dynamics = []
+        for mode in (rival.mode for rival in rivals):
+            # steps an interval at most: models are compared with each other, in the same engine
+            steps, effects = min(10, mode.problem.physics.substeps), mode.problem.physics.effects
+            dynamics = Dynamics(self.scene, mode.phi, effects, substeps=steps, declared=())
+            self.dynamics.append(dynamics.after(before))
 
     def __call__(self, wrenches: Floats, draws: int) -> tuple[Floats, Bools]:
         """Return the expected log Bayes factors of experiments.
@@ -293,12 +277,12 @@ class Separation:
 
         def predict(phi: Floats, states: Floats) -> Floats:
             """Return the states after an interval, shape (point, transition, body, 6)."""
+            begin = np.broadcast_to(states, (len(phi), *paths.begin.shape))
             dynamics = self.dynamics[number].at(phi)
-            return np.nan_to_num(dynamics.step(states, paths.wrenches, paths.before))
+            return np.nan_to_num(dynamics.step(begin, paths.wrenches, paths.before))
 
         def by_phi(points: Floats) -> Floats:
-            states = np.broadcast_to(paths.begin, (len(points), *paths.begin.shape))
-            return coordinates.of(predict(points, states))
+            return coordinates.of(predict(points, paths.begin))
 
         def by_state(states: Floats) -> Floats:
             return predict(np.tile(mode.phi, (len(states), 1)), states)
@@ -324,8 +308,7 @@ class Separation:
             sensitivity=None,
         )
         rows = np.concatenate([residual[None], -np.moveaxis(slopes, -1, 0)])
-        white = noise.filtered(rows, rival.sigma)[0]
-        white = white.reshape(len(rows), len(paths.lost), -1)
+        white = noise.filtered(rows, rival.sigma)[0].reshape(len(rows), len(paths.lost), -1)
         r, jacobian = white[0], np.moveaxis(white[1:], 0, -1)
         scaled = jacobian @ mode.factor  # by a posterior standard deviation of each direction
         precision = np.eye(len(mode.phi)) + scaled.transpose(0, 2, 1) @ scaled
@@ -417,8 +400,7 @@ class Suggestion:
         OutputError
             If it cannot be written there.
         """
-        table = self.to_dataframe()
-        write_atomically(Path(path), lambda to: table.to_csv(to, index=False))
+        write_atomically(Path(path), lambda to: self.to_dataframe().to_csv(to, index=False))
 
 
 @one_blas_thread
@@ -516,9 +498,8 @@ def suggest_actions(
     last = np.zeros((len(first), len(WRENCH)))
     if before is not None:
         last = np.asarray(before, dtype=float).reshape(last.shape)
-    allowed = allowed_wrenches(
-        scene, ActionSet.recorded(posterior) if actions is None else actions, steps, hold
-    )
+    actions = ActionSet.recorded(posterior) if actions is None else actions
+    allowed = allowed_wrenches(scene, actions, steps, hold)
     progress("fitting each effect to the recording")
     rivals = fit_rivals(posterior, chosen, catalogue, draws, seed)
     judge = Separation(rivals, first, last)
@@ -540,29 +521,21 @@ def suggest_actions(
 
 
 def _evolved(
-    judge: Separation,
-    allowed: Allowed,
-    rng: np.random.Generator,
-    progress: Say,
-    *,
-    population: int = 40,
-    n_parents: int = 10,
-    generations: int = 8,
-    draws: int = 3,
-    new_share: float = 0.2,
-    leaders: int = 4,
+    judge: Separation, allowed: Allowed, rng: np.random.Generator, progress: Say
 ) -> tuple[Floats, float]:
     """Return the leading sequences of the last generation, and the mean value of the first.
 
-    Children take pieces from two parents, and a share of new ones from the allowed set.
+    Children take pieces from two parents, and a fifth of them new from the allowed set.
     """
+    population, n_parents, generations = 40, 10, 8
     genes = allowed.random(rng, population)
     at_random, parents, values = np.nan, genes[:0], np.zeros(0)
     # a piece of a sequence is taken whole
     shape = (population, allowed.pieces, *(1,) * (genes.ndim - 2))
     for generation in range(generations):
         progress(f"looking for actions that tell them apart, {generation + 1} of {generations}")
-        separation, meeting = judge(allowed.wrenches(genes, judge.dynamics[0], judge.start), draws)
+        wrenches = allowed.wrenches(genes, judge.dynamics[0], judge.start)
+        separation, meeting = judge(wrenches, draws=3)
         if generation == 0:
             usable = _weakest(separation)
             at_random = float(np.nanmean(usable)) if np.isfinite(usable).any() else np.nan
@@ -573,8 +546,8 @@ def _evolved(
         pairs = rng.integers(n_parents, size=(2, population))
         mixed = np.where(rng.random(shape) < 0.5, parents[pairs[0]], parents[pairs[1]])
         fresh = allowed.extreme(rng, population)
-        genes = np.where(rng.random(shape) < new_share, fresh, mixed)
-    return parents[:leaders], at_random
+        genes = np.where(rng.random(shape) < 0.2, fresh, mixed)
+    return parents[:4], at_random
 
 
 def _weakest(separation: Floats) -> Floats:

@@ -177,16 +177,10 @@ if __name__ == "__main__":
 
 
 @pytest.mark.one_stack
-def test_a_plan_prints_as_a_sentence_and_a_short_table() -> None:
+def test_a_plan_prints_as_a_sentence() -> None:
     found = planned(load_posterior(file("5")))
-    sentence, head, *rows = str(found).splitlines()
-    assert sentence == found.in_words()
-    assert head.split() == ["time", "body", "force_x", "force_y", "torque", "x", "y", "theta"]
-    assert 1 < len(rows) <= 8
-    first, last = rows[0].split(), rows[-1].split()
-    assert first[:2] == ["0", "puck"] and first[5:] == ["0", "0", "0"]
-    assert float(last[0]) == pytest.approx(found.duration - found.scene.time_step, rel=0.01)
-    np.testing.assert_allclose([float(x) for x in last[2:5]], found.wrenches[-1, 0], rtol=0.01)
+    assert str(found) == found.in_words()
+    assert str(found).startswith(f"the goal is reached: {len(found.wrenches)} intervals")
     assert repr(found) == (
         f"Plan({len(found.wrenches)} intervals, {found.duration:.3g} s, goal reached)"
     )
