@@ -179,10 +179,8 @@ def _shown(scene: Scene, body: str, history: History | None) -> set[str]:
     shown = {name for d, name in enumerate(STATE) if (far[[d % 3, d % 3 + 3]] > 0).any()}
     if np.nan_to_num(of_body["action"].to_numpy()).any():
         shown.add("commands")
-    layout = scene.recording
-    if layout is not None and layout.camera is not None:
-        shown |= {"camera"} if layout.camera else set()
-    elif {"x", "y"} <= shown:
+    camera = scene.recording.camera if scene.recording is not None else None
+    if {"x", "y"} <= shown if camera is None else camera:
         shown.add("camera")
     poses = of_body["start"].to_numpy()
     turns = is_pivoted(scene, scene.body(body))

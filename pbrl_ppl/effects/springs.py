@@ -45,17 +45,12 @@ def _spring(state: Floats, command: Floats, parameters: Floats, wrench: Floats) 
     wrench[1] -= parameters[0] * (state[1] - parameters[2])
 
 
-def _scan_anchors(
-    scene: Scene, history: History, body: Body, *, quantiles: tuple[float, ...] = (0.1, 0.5, 0.9)
-) -> Floats:
-    """Return anchors among the measured positions; the derivative is taken by the stiffness.
-
-    ``quantiles``: anchors of a spring along each axis, as quantiles of the measured positions.
-    """
+def _scan_anchors(scene: Scene, history: History, body: Body) -> Floats:
+    """Return anchors among the measured positions; the derivative is taken by the stiffness."""
     places = _poses(history, body, 2)
     if not len(places):
         return np.empty((0, 3))
-    x, y = np.quantile(places, quantiles, axis=0).T
+    x, y = np.quantile(places, (0.1, 0.5, 0.9), axis=0).T
     return np.array([(np.nan, *anchor) for anchor in product(np.unique(x), np.unique(y))])
 
 

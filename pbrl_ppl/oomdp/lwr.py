@@ -376,16 +376,6 @@ class Learner:
         """Return itself: the model has no memory of wrenches."""
         return self
 
-    def noisy(self, states: Floats, rng: np.random.Generator) -> Floats:
-        """Raise an error: the regression has no noise model.
-
-        Raises
-        ------
-        FitError
-            Always.
-        """
-        raise FitError("noise: LWR predicts a mean alone; plan without noise")
-
     def acceleration(self, body: str, force: float, torque: float) -> tuple[Floats, Floats]:
         """Return the acceleration of a body under a push, shape (1,) each, m/s^2 and rad/s^2.
 

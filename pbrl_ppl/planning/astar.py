@@ -60,8 +60,7 @@ def astar(task: SearchTask, *, weight: float = 3.0, improve: bool = False) -> Fo
     nodes = task.nodes
     if weight < 1 or nodes < 1:
         raise GoalError(f"A*: weight is {weight} and nodes {nodes}, expected at least 1 of each")
-    rng = (task.rng or np.random.default_rng(0)) if task.noise else None
-    search = _Search(task, weight, rng)
+    search = _Search(task, weight)
     begin = reported = time.monotonic()
     stopped, share = "exhausted", 0.5  # of the limits, for the search that guides the other
     try:
@@ -119,11 +118,9 @@ class Node(NamedTuple):
 class _Search:
     """State of the search: the tree, the open queue and the closed set."""
 
-    def __init__(
-        self, task: SearchTask, weight: float, rng: np.random.Generator | None = None
-    ) -> None:
+    def __init__(self, task: SearchTask, weight: float) -> None:
         self.dynamics, self.goal, self.actions = task.dynamics, task.goal, task.actions
-        self.tail, self.weight, self.rng = task.tail, weight, rng
+        self.tail, self.weight = task.tail, weight
         self.scene = task.dynamics.scene
         self.counts = task.actions.intervals(self.scene)
         self.to_go = TimeToGo(task.dynamics, task.goal, task.actions, task.start)
@@ -191,8 +188,6 @@ class _Search:
             wrenches = self.actions.wrenches(self.scene, which, mean_angle(states[..., 2]))
             states = self.dynamics.step(states, wrenches, last)
             last = remembered(wrenches, last)
-            if self.rng is not None:
-                states = self.dynamics.noisy(states, self.rng)
             self.generated += len(tried) * self.dynamics.draws
             cost = cost + self.scene.time_step * (1.0 + contact_cost(self.goal, self.scene, states))
             edges = [Edge(*each, interval) for each in tried]
@@ -280,7 +275,8 @@ class TimeToGo:
     def __init__(
         self, dynamics: TransitionModel, goal: Goal, actions: ActionSet, start: Floats
     ) -> None:
-        self.goal, self.scene = goal, (scene := dynamics.scene)
+        self.goal, self.scene = goal, dynamics.scene
+        scene = self.scene
         anyone = max(actions.strongest(body.name)[0] for body in scene.dynamic)
         self._bounds = []
         places, tolerances = goal.places(scene), goal.tolerances(scene)

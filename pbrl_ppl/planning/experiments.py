@@ -25,7 +25,7 @@ from pbrl_ppl.planning.goals import ActionSet, Allowed, Bounds, allowed_wrenches
 from pbrl_ppl.planning.planner import labelled, start_state, table_of_plan
 from pbrl_ppl.posterior import Fit, Idata, scene_of, stored_fields
 from pbrl_ppl.scene import Scene, body_sizes, nearest
-from pbrl_ppl.state import WRENCH, WRENCH_UNITS, Bools, Floats
+from pbrl_ppl.state import WRENCH_UNITS, Bools, Floats
 from pbrl_ppl.threads import Say, one_blas_thread, silent
 
 
@@ -213,8 +213,6 @@ class Separation:
         Two or more.
     start : ndarray
         Initial state of the experiment, shape (body, 6), SI units; known to measurement noise.
-    before : ndarray
-        Wrenches before it, shape (body, 3).
 
     Attributes
     ----------
@@ -222,7 +220,7 @@ class Separation:
         Those of each rival at its mode.
     """
 
-    def __init__(self, rivals: Sequence[Rival], start: Floats, before: Floats) -> None:
+    def __init__(self, rivals: Sequence[Rival], start: Floats) -> None:
         self.rivals, self.start = rivals, start
         # the rivals differ in the effects that bodies declare
         scene = rivals[0].mode.problem.scene
@@ -231,8 +229,8 @@ class Separation:
         for mode in (rival.mode for rival in rivals):
             # steps an interval at most: models are compared with each other, in the same engine
             steps, effects = min(10, mode.problem.physics.substeps), mode.problem.physics.effects
-            dynamics = Dynamics(self.scene, mode.phi, effects, substeps=steps, declared=())
-            self.dynamics.append(dynamics.after(before))
+            one = Dynamics(self.scene, mode.phi, effects, substeps=steps, declared=())
+            self.dynamics.append(one)
 
     def __call__(self, wrenches: Floats, draws: int) -> tuple[Floats, Bools]:
         """Return the expected log Bayes factors of experiments.
@@ -411,10 +409,8 @@ def suggest_actions(
     *,
     effects: Sequence[str] | None = None,
     steps: int = 20,
-    hold: int | None = None,
     draws: int = 16,
     seed: int = 0,
-    before: ArrayLike | None = None,
     catalogue: Iterable[Effect] = catalogue,
     progress: Say | None = None,
 ) -> Suggestion:
@@ -444,15 +440,11 @@ def suggest_actions(
         Two or more, such as ``spring`` or ``spring on cart``. By default the first group that the
         loop reported as not separable.
     steps : int
-        Sampling intervals of the experiment.
-    hold : int, optional
-        Intervals for which a wrench within bounds is held; an eighth of ``steps`` by default.
+        Sampling intervals of the experiment; a wrench within bounds is held for an eighth of them.
     draws : int
         Posterior draws of each rival.
     seed : int
         The same seed gives the same sequence.
-    before : array_like, optional
-        Wrenches in the interval before the start, shape (body, 3), N and N m.
     catalogue : iterable of Effect
         Where the names of effects are looked up.
     progress : callable, optional
@@ -492,17 +484,14 @@ def suggest_actions(
         )
     effects = groups[0] if effects is None else effects
     chosen = named_effects(effects, scene, catalogue)
-    if steps < 1 or (hold is not None and hold < 1):
-        raise GoalError(f"steps is {steps} and hold {hold}; both must be at least 1")
+    if steps < 1:
+        raise GoalError(f"steps is {steps}; it must be at least 1")
     first = start_state(scene, start)
-    last = np.zeros((len(first), len(WRENCH)))
-    if before is not None:
-        last = np.asarray(before, dtype=float).reshape(last.shape)
     actions = ActionSet.recorded(posterior) if actions is None else actions
-    allowed = allowed_wrenches(scene, actions, steps, hold)
+    allowed = allowed_wrenches(scene, actions, steps)
     progress("fitting each effect to the recording")
     rivals = fit_rivals(posterior, chosen, catalogue, draws, seed)
-    judge = Separation(rivals, first, last)
+    judge = Separation(rivals, first)
     genes, at_random = _evolved(judge, allowed, np.random.default_rng(seed), progress)
     progress("judging the best sequences")
     wrenches = allowed.wrenches(genes, judge.dynamics[0], judge.start)

@@ -482,12 +482,8 @@ def play(
 Bounds = Mapping[str, Mapping[str, Sequence[float]]]
 
 
-def allowed_wrenches(
-    scene: Scene, actions: ActionSet | Bounds, steps: int, hold: int | None, *, pieces: int = 8
-) -> Allowed:
+def allowed_wrenches(scene: Scene, actions: ActionSet | Bounds, steps: int) -> Allowed:
     """Return the sequences that an action set or bounds allow.
-
-    ``pieces``: pieces of a sequence by default.
 
     Raises
     ------
@@ -513,7 +509,7 @@ def allowed_wrenches(
                 )
     if not (high > low).any():
         raise GoalError("bounds: nothing may vary; give a lowest and a higher highest value")
-    return _Within(low, high, steps, hold or max(1, round(steps / pieces)))
+    return _Within(low, high, steps, max(1, round(steps / 8)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -134,7 +134,6 @@ def plan(
     method: str = "astar",
     draws: int | None = None,
     tail: float = 1.0,
-    noise: bool = False,
     seed: int = 0,
     nodes: int = SearchTask.nodes,
     seconds: float | None = None,
@@ -165,8 +164,6 @@ def plan(
     tail : float
         Share of the worst draws that count: 1 for the expectation, less for conditional value at
         risk.
-    noise : bool
-        Whether Eq. 13's noise is added while planning and in the predicted distribution.
     seed : int
         Of the choice of draws and of all else that is random.
     nodes : int
@@ -226,17 +223,11 @@ def plan(
     first = start_state(scene, start)
     if before is not None:
         dynamics = dynamics.after(np.asarray(before, dtype=float))
-    rng, limit = np.random.default_rng(seed), np.inf if seconds is None else seconds
-    said = progress or silent
-    task = SearchTask(dynamics, first, goal, actions, tail, nodes, limit, noise, rng, said)
+    limit, said = np.inf if seconds is None else seconds, progress or silent
+    task = SearchTask(dynamics, first, goal, actions, tail, nodes, limit, seed, said)
     result = METHODS[method](task, **options)
     states = predicted_path(dynamics, first, result.wrenches)
     distance = float(tail_mean(goal.distance(scene, states[:, -1]), tail))
-    if noise:
-        times = -(-64 // dynamics.draws)  # so many draws of Eq. 13's noise, at least
-        states = np.concatenate(
-            [predicted_path(dynamics, first, result.wrenches, rng) for _ in range(times)]
-        )
     values = labelled(scene, states, ("draw", "time", "body", "state"))
     predicted = values.to_dataset(name="predicted")
     return Plan(

@@ -39,10 +39,8 @@ class SearchTask:
         States to generate at most, counting each draw's; by default 15 s or so for one body.
     seconds : float
         Limit of time; with it, the plan depends on how busy the machine is.
-    noise : bool
-        Whether Eq. 13's noise is added to every transition.
-    rng : Generator
-        Source of randomness.
+    seed : int
+        Of the search's random numbers.
     progress : callable
         Called with a text on how far the search is.
     """
@@ -54,8 +52,7 @@ class SearchTask:
     tail: float = 1.0
     nodes: int = 2_000_000
     seconds: float = np.inf
-    noise: bool = False
-    rng: np.random.Generator | None = None
+    seed: int = 0
     progress: Say = silent
 
 
@@ -145,8 +142,6 @@ class Horizon:
         Sequences tried at a time.
     iterations : int
         Times they are drawn about the best mean.
-    rng : Generator
-        Source of the samples.
 
     References
     ----------
@@ -158,10 +153,10 @@ class Horizon:
     horizon: int
     samples: int
     iterations: int
-    rng: np.random.Generator
 
     def __post_init__(self) -> None:
         task, scene = self.task, self.task.dynamics.scene
+        self.rng = np.random.default_rng(task.seed)
         strongest = [task.actions.strongest(body.name) for body in scene.moving]
         self.most = np.array([(force, force, torque) for force, torque in strongest])
         self.mean = np.zeros((self.horizon, *self.most.shape))
@@ -211,8 +206,6 @@ class Horizon:
         for t in range(self.horizon):
             states = task.dynamics.step(states, tried[:, t], last)
             last = remembered(tried[:, t], last)
-            if task.noise:
-                states = task.dynamics.noisy(states, self.rng)
             self.generated += len(tried) * task.dynamics.draws
             far = tail_mean(goal.distance(scene, states), task.tail)
             cost += (far + self.way * contact_cost(goal, scene, states)) / self.horizon
@@ -255,8 +248,7 @@ def mppi(
     if min(horizon, samples, iterations, intervals, nodes) < 1:
         raise GoalError("MPPI: horizon, samples, iterations, intervals, nodes must be at least 1")
     scene, begin = dynamics.scene, time.monotonic()
-    rng = task.rng or np.random.default_rng(0)
-    ahead = Horizon(task, horizon, samples, iterations, rng)
+    ahead = Horizon(task, horizon, samples, iterations)
     states = np.repeat(start[None, None], dynamics.draws, axis=0)
     wrenches, last = list[Floats](), dynamics.before
     nearest, best, stopped = np.inf, 0, "exhausted"
