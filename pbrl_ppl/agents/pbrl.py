@@ -93,7 +93,8 @@ def revise(
     table.modes |= sets
     top = max(map(table.value, sets.values()))
     near = [laws for laws, mode in sets.items() if table.value(mode) > top - least]
-    nats = _borne_out(table, highest, min(near, key=lambda laws: len(sets[laws].phi)), least)
+    fewest = min(near, key=lambda laws: len(sets[laws].phi))
+    nats = _borne_out(table, highest, fewest, least)
     mode = highest(nats)
     revisions = [
         Revision(

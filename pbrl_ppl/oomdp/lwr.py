@@ -137,36 +137,32 @@ class Experience:
         self._reach, self._options = reach, options
         self._x: list[Floats] = []
         self._y: list[Floats] = []
-        self._rows: dict[Key, list[int]] = {}
+        #: Observed transitions of each condition.
+        self.rows: dict[Key, list[int]] = {}
         self._count = 0
         self._models: dict[Key, LocalRegression] = {}
 
     def add(self, x: Floats, y: Floats, flags: Bools) -> None:
         """Add inputs (n, p), outputs (n, q) and predicates (n, ...)."""
         for key, rows in grouped(flags).items():
-            self._rows.setdefault(key, []).extend((rows + self._count).tolist())
+            self.rows.setdefault(key, []).extend((rows + self._count).tolist())
         self._x.append(x)
         self._y.append(y)
         self._count += len(x)
         self._models.clear()
 
-    @property
-    def counts(self) -> dict[Key, int]:
-        """Return the number of transitions in each observed condition."""
-        return {key: len(rows) for key, rows in self._rows.items()}
-
     def predict(self, x: Floats, flags: Bools) -> Floats:
         """Return predictions (n, q) at inputs (n, p), predicates (n, ...); NaN if unobserved."""
         out = np.full((len(x), self._y[0].shape[1]), np.nan)
         for key, rows in grouped(flags).items():
-            if key in self._rows:
+            if key in self.rows:
                 out[rows] = self._model(key)(x[rows])
         return out
 
     def gains(self) -> Floats:
         """Return the linear fit of outputs by inputs in the commonest condition, shape (p, q)."""
         x, y = self._joined()
-        most = max(self._rows.values(), key=len)
+        most = max(self.rows.values(), key=len)
         size = self._sizes(x[most])
         return np.asarray(np.linalg.lstsq(x[most] / size, y[most])[0] / size[:, None])
 
@@ -176,7 +172,7 @@ class Experience:
             # a column that is constant, up to rounding errors, by its size
             scale, size = x.std(axis=0), self._sizes(x)
             scale = np.where(scale > 1e-9 * size, scale, size)
-            rows = self._rows[key]
+            rows = self.rows[key]
             self._models[key] = LocalRegression(x[rows], y[rows], scale=scale, **self._options)
         return self._models[key]
 
@@ -599,8 +595,8 @@ class OOLWR(Learner):
         FitError
             If the scene has no such dynamic body.
         """
-        counts = self.experience(body).counts
-        return {condition(key, self.labels): n for key, n in counts.items()}
+        every = self.experience(body).rows.items()
+        return {condition(key, self.labels): len(rows) for key, rows in every}
 
 
 def _turned(triples: Floats, angle: Floats) -> Floats:

@@ -35,8 +35,6 @@ class Rival:
 
     Parameters
     ----------
-    attached : Attached
-        The effect.
     mode : FilteredMode
         Of the model with this effect and without the others, fitted to whole trajectories.
     draws : ndarray
@@ -45,15 +43,9 @@ class Rival:
         Noise parameters of the model that all rivals come from, shape (parameter,).
     """
 
-    attached: Attached
     mode: FilteredMode
     draws: Floats
     sigma: Floats
-
-    @property
-    def name(self) -> str:
-        """Return the names of the effect and of its body."""
-        return f"{self.attached.effect.name} on {self.attached.body}"
 
 
 def kept_groups(posterior: Idata) -> list[tuple[str, ...]]:
@@ -148,14 +140,13 @@ def fit_rivals(
     for attached in effects:
         if present == [attached]:
             chosen = phi[rng.choice(len(phi), draws, replace=False)]
-            fits.append(Rival(attached, declared, chosen, declared.sigma))
+            fits.append(Rival(declared, chosen, declared.sigma))
             continue
         (signature,) = rank_candidates(base, [attached])
-        estimate = signature.candidate.estimate.values()
-        sizes = dict(zip(attached.labels, estimate, strict=True))
+        sizes = dict(zip(attached.labels, signature.candidate.estimate.values(), strict=True))
         start = with_effects(base, (*base.problem.physics.effects, attached), sizes)
         mode = trajectory_mode(*start, base.sigma)
-        fits.append(Rival(attached, mode, mode.draws(rng, draws), declared.sigma))
+        fits.append(Rival(mode, mode.draws(rng, draws), declared.sigma))
     return fits
 
 
@@ -191,12 +182,14 @@ class _Paths:
         last = np.broadcast_to(dynamics.before, (len(wrenches), *dynamics.before.shape))
         earlier = np.moveaxis(wrenches, 1, 0)[:-1]
         past = accumulate(earlier, lambda last, wrench: remembered(wrench, last), initial=last)
-        ends = (part.reshape(-1, *start.shape) for part in (states[:, :, :-1], states[:, :, 1:]))
-        inputs = (
+        begin, end = (
+            part.reshape(-1, *start.shape) for part in (states[:, :, :-1], states[:, :, 1:])
+        )
+        played, before = (
             np.tile(one, (dynamics.draws, 1, 1, 1)).reshape(-1, *one.shape[2:])
             for one in (wrenches, np.stack(list(past), axis=1))
         )
-        return cls(*ends, *inputs, wrenches.shape[1], lost.ravel())
+        return cls(begin, end, played, before, wrenches.shape[1], lost.ravel())
 
 
 class Separation:
@@ -501,7 +494,7 @@ def suggest_actions(
         raise GoalError(
             "actions: the engine diverges in all sequences; allow weaker actions or fewer steps"
         )
-    names = [rival.name for rival in rivals]
+    names = [f"{one.effect.name} on {one.body}" for one in chosen]
     pairs = {"true": names, "rival": names}
     nats = xr.DataArray(separation[..., best], pairs, (*pairs,), attrs={"units": "nats"})
     played = labelled(scene, wrenches[best], ("time", "body", "wrench"))

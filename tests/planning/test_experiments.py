@@ -119,7 +119,7 @@ def test_nothing_separates_a_model_from_itself(posterior) -> None:
     (one, _) = fit_rivals(
         posterior, named_effects(DRAGS, scene_of(posterior), pp.catalogue), pp.catalogue, 8, 1
     )
-    copy = Rival(one.attached, one.mode, one.mode.draws(np.random.default_rng(2), 8), one.sigma)
+    copy = Rival(one.mode, one.mode.draws(np.random.default_rng(2), 8), one.sigma)
     pushes = np.zeros((2, 12, 1, 3))
     pushes[1, :, 0, 0] = 5.0
     found, meeting = Separation((one, copy), np.zeros((1, 6)))(pushes, 8)
