@@ -103,7 +103,7 @@ def agent(name: str, seed: int, **options: object) -> pp.Agent:
     if name == "pbrl":
         return pp.LibraryAgent(TASK, library(), seed=seed, **options)
     if name == "continuous":
-        return pp.PBRLAgent(TASK, sigma="scalar", seed=seed, **options)
+        return pp.PBRLAgent(TASK, seed=seed, **options)
     contacts = pp.SectorContacts(radius=0.2, by_object=name == "oolwr_by_object")
     return pp.OOLWRAgent(TASK, learner={"relations": (contacts,)}, seed=seed, **options)
 

@@ -170,11 +170,6 @@ def temporary_folder(folder: Path) -> Iterator[Path]:
         yield Path(made)
 
 
-def is_empty(folder: Path) -> bool:
-    """Return whether a folder holds nothing but temporary folders of this package."""
-    return all(path.name.startswith(_MAKING) for path in folder.iterdir())
-
-
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """Call ``write`` with a path of this name in a temporary folder, then rename it to ``path``.
 
@@ -261,7 +256,8 @@ def check_folder(folder: Path, overwrite: bool, files: Iterable[str] = ()) -> Pa
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder):
                 pass
-        filled = folder.is_dir() and not is_empty(folder)
+        there = folder.iterdir() if folder.is_dir() else ()
+        filled = not all(path.name.startswith(_MAKING) for path in there)
     except OSError as error:
         raise OutputError(
             f"{where} it cannot be made or written ({error.strerror}); choose another path"

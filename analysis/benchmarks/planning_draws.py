@@ -21,6 +21,7 @@ from scipy.stats import binomtest
 import pbrl_ppl as pp
 from pbrl_ppl import Dynamics, Wall
 from pbrl_ppl.physics import build_layout
+from pbrl_ppl.planning import predicted_path
 
 sys.path.insert(0, str(Path(__file__).parent))
 from engine import MODELS
@@ -153,7 +154,7 @@ def open_loop(idata: object, starts: np.ndarray, draws: int | None, nodes: int) 
             nodes=nodes, weight=1.5,
         )  # fmt: skip
         for j, truth in enumerate(truths):
-            end = truth.rollout(plan.start, plan.wrenches)[0, -1]
+            end = predicted_path(truth, plan.start, plan.wrenches)[0, -1]
             reached[i, j] = goal.shortfall(truth.scene, end) <= 1.0
     return reached
 

@@ -18,12 +18,7 @@ from pbrl_ppl.effects import Attached, Effect, Structure, attach, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, FitError, UninformedWarning
 from pbrl_ppl.history import from_segments, with_units
-from pbrl_ppl.likelihood import (
-    Problem,
-    TransitionLikelihood,
-    declared_problem,
-    try_own_effects,
-)
+from pbrl_ppl.likelihood import Problem, TransitionLikelihood, declared_problem, try_own_effects
 from pbrl_ppl.modes import Mode, choose_from_library, find_mode
 from pbrl_ppl.parameters import Layout, ParameterLibrary
 from pbrl_ppl.physics import Physics, build_layout, touching
@@ -99,7 +94,8 @@ def revise(
     top = max(map(table.value, sets.values()))
     near = [laws for laws, mode in sets.items() if table.value(mode) > top - least]
     fewest = min(near, key=lambda laws: len(sets[laws].phi))
-    mode, nats = _borne_out(table, highest, fewest, least)
+    nats = _borne_out(table, highest, fewest, least)
+    mode = highest(nats)
     revisions = [
         Revision(
             law,
@@ -118,22 +114,22 @@ def _borne_out(
     highest: Callable[[Iterable[Attached]], Mode],
     laws: Iterable[Attached],
     least: float,
-) -> tuple[Mode, dict[Attached, float]]:
-    """Return the mode without laws that lose less than some nats, and what each other one loses.
+) -> dict[Attached, float]:
+    """Return the laws that a model needs: what it loses without each is not less than some nats.
 
     ``highest`` searches from many starts: a local climb may end too low to do without a law.
     """
     kept = [*laws]
     while kept:
-        for key in (kept, *([one for one in kept if one != law] for law in kept)):
-            table.modes.setdefault(frozenset(key), highest(key))
-        mode = table.fitted(highest(()), kept)
-        nats = {law: table.value(mode) - table.value(table.without(mode, law)) for law in kept}
-        weakest = min(kept, key=lambda law: nats[law])
+        without = {law: highest(one for one in kept if one != law) for law in kept}
+        table.modes |= {frozenset(kept): highest(kept)}
+        table.modes |= {frozenset(kept) - {law}: mode for law, mode in without.items()}
+        nats = {law: table.value(highest(kept)) - table.value(without[law]) for law in kept}
+        weakest = min(nats, key=nats.__getitem__)
         if nats[weakest] >= least:
-            return mode, nats
+            return nats
         kept.remove(weakest)
-    return highest(()), {}
+    return {}
 
 
 class PhysicsAgent(Agent):
@@ -213,8 +209,6 @@ class PBRLAgent(PhysicsAgent):
         in the paper.
     growth : float
         Share by which the data grow before a refit while errors are within the noise.
-    sigma : str
-        ``scalar``, as in Eq. 11, or ``per_dimension``.
     effects : iterable of Effect or Attached
         Effects of its model in addition to those that the scene declares.
     revise : bool
@@ -252,7 +246,6 @@ class PBRLAgent(PhysicsAgent):
         *,
         draws: int | None = None,
         growth: float = 0.2,
-        sigma: str = "scalar",
         effects: Iterable[Effect | Attached] = (),
         revise: bool = False,
         catalogue: Iterable[Effect] = full_catalogue,
@@ -262,7 +255,7 @@ class PBRLAgent(PhysicsAgent):
             raise FitError(f"PBRL: draws is {draws}, growth {growth}; expected at least 1 and 0")
         super().__init__(task, **options)
         self.draws, self.growth = draws, growth
-        self._likelihood, self.revise = TransitionLikelihood.declare(sigma), revise
+        self.revise = revise
         self._catalogue = tuple(catalogue)
         declared = len(attach(task.scene, (), self._catalogue))
         self._given = attach(task.scene, effects, self._catalogue)[declared:]
@@ -316,7 +309,7 @@ class PBRLAgent(PhysicsAgent):
         there = [one for one in effects if one.body in {body.name for body in scene.moving}]
         physics = Physics.declare(with_units(scene, history), there)
         try_own_effects(physics, history)
-        return declared_problem(physics, history, likelihood=self._likelihood)
+        return declared_problem(physics, history, likelihood=TransitionLikelihood(scalar=True))
 
     def _criticise(self, *, least: int = 3, false_alarm: float = 0.01) -> Mode | None:
         """Criticise the declared model; return the mode found if it is of all data.
@@ -330,8 +323,8 @@ class PBRLAgent(PhysicsAgent):
             return None
         self.criticisms, self._criticised = self.criticisms + 1, len(free)
         level = false_alarm / (self.criticisms * (self.criticisms + 1))
-        # one sigma is of all dimensions, and so is then the coarsest precision
-        step = 2.0 * np.maximum(self._negligible, self._likelihood.scalar * self._negligible.max())
+        # one sigma is of all dimensions, and so is the coarsest precision
+        step = np.full_like(self._negligible, 2.0 * self._negligible.max())
         problem = self._problem(self._given, free, step=step)
         self.added, mode = revise(problem, self.added, self._catalogue, level, step, self.seed)
         return mode if free.all() else None

@@ -64,8 +64,6 @@ class PlanSearch:
         Of A*'s heuristic: 1 is A* itself, more is quicker; 3 if not given.
     tail
         Share of the worst draws that count; 1 is the expectation.
-    noise
-        Plan with Eq. 13's noise.
     nodes
         States that the search generates at most.
     seconds
@@ -76,7 +74,6 @@ class PlanSearch:
     draws: options.Count | None = None
     weight: float | None = None
     tail: float = 1.0
-    noise: bool = False
     nodes: options.Count | None = None
     seconds: float | None = None
     seed: options.Seed = 1
@@ -137,7 +134,6 @@ def suggest(
     effect: list[str] | None = None,
     bounds: list[str] | None = None,
     steps: options.Count = 20,
-    hold: options.Count | None = None,
     draws: options.Count = 16,
     seed: options.Seed = 1,
 ) -> Result:
@@ -157,8 +153,6 @@ def suggest(
         as were recorded if not given.
     steps
         Sampling intervals.
-    hold
-        Intervals for which a wrench within bounds is held.
     draws
         Posterior draws of each effect's model.
     """
@@ -180,7 +174,7 @@ def suggest(
     starts = options.starts_of(start, bodies)
     result = suggest_actions(
         idata, starts, _bounds(bounds, bodies) if bounds else None, effects=effect, steps=steps,
-        hold=hold, draws=draws, seed=seed, catalogue=catalogue, progress=progress,
+        draws=draws, seed=seed, catalogue=catalogue, progress=progress,
     )  # fmt: skip
     result.to_csv(to.output)
     contents = {

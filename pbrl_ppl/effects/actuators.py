@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pbrl_ppl.effects.effect import Command, Effect, EffectParameter, ScanWith
+from pbrl_ppl.effects.effect import Command, Effect, EffectParameter, With
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene
@@ -234,20 +234,13 @@ actuator_backlash = Effect(
 
 
 def _scan_levels(
-    scene: Scene,
-    history: History,
-    body: Body,
-    components: tuple[int, ...] = _FORCE,
-    most: int = 0,
-    *,
-    forces: int = 20,
-    few: int = 8,
+    scene: Scene, history: History, body: Body, components: tuple[int, ...] = _FORCE, most: int = 0
 ) -> Floats:
     """Return at most so many sizes between those commanded, shape (level, 1), N or N m.
 
-    ``forces``, ``few``: levels that are tried of a force, and of a torque.
+    By default 20 of a force, and 8 of a torque.
     """
-    most = most or (forces if components == _FORCE else few)
+    most = most or (20 if components == _FORCE else 8)
     action = history.dataset["action"].sel(body=body.name).to_numpy()[..., components]
     size = np.linalg.norm(action, axis=-1)
     size = size[size > 0]  # not NaN either
@@ -292,13 +285,9 @@ def _cut_off(state: Floats, command: Floats, parameters: Floats, wrench: Floats)
         wrench[1] = 0.0
 
 
-def _scan_cutoffs(scene: Scene, history: History, body: Body, *, levels: int = 200) -> Floats:
-    """Return thresholds to try.
-
-    ``levels``: the likelihood jumps where the cut-off passes a commanded force, and an optimiser
-    cannot follow it: many levels.
-    """
-    return _scan_levels(scene, history, body, _FORCE, levels)
+def _scan_cutoffs(scene: Scene, history: History, body: Body) -> Floats:
+    """Return many thresholds: an optimiser cannot follow the jumps at each commanded force."""
+    return _scan_levels(scene, history, body, _FORCE, most=200)
 
 
 force_cutoff = Effect(
@@ -377,7 +366,7 @@ def of_component(
         sentence=sentence,
         parameters=parameters,
         stage=replace(stage, alone=component) if isinstance(stage, Command) else stage,
-        scan=effect.scan and ScanWith(effect.scan, (place,)),
+        scan=effect.scan and With(effect.scan, (place,)),
     )
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pbrl_ppl.effects import actuators, forces, friction, sensors, springs
+from pbrl_ppl.effects import actuators, drag, forces, friction, obstacles, sensors, springs
 from pbrl_ppl.effects.actuation import actuation, laws_of_actuators
 from pbrl_ppl.effects.effect import Attached, Command, Effect, Noise, is_pivoted
 from pbrl_ppl.errors import EffectError
@@ -21,8 +21,8 @@ from pbrl_ppl.state import STATE, THETA, Floats
 catalogue: tuple[Effect, ...] = (
     friction.pivot_damping, friction.pivot_friction, friction.pivot_load_friction,
     friction.pivot_stribeck, friction.slider_damping, friction.slider_friction,
-    friction.slider_stribeck, forces.linear_drag, forces.quadratic_drag, forces.angular_drag,
-    forces.quadratic_angular_drag, forces.drag_by_axis, forces.quadratic_drag_by_axis,
+    friction.slider_stribeck, drag.linear_drag, drag.quadratic_drag, drag.angular_drag,
+    drag.quadratic_angular_drag, drag.drag_by_axis, drag.quadratic_drag_by_axis,
     forces.gravity_tilt, forces.constant_force, forces.body_force, forces.constant_torque,
     forces.push_offset, actuators.actuator_rotation, forces.inertia_scale, forces.com_offset,
     actuators.force_gain, actuators.torque_gain, actuators.anisotropic_gain,
@@ -30,9 +30,9 @@ catalogue: tuple[Effect, ...] = (
     friction.pivot_hysteresis, friction.wheel, actuators.actuator_delay, actuators.first_order_lag,
     actuators.dead_zone, actuators.torque_dead_zone, actuators.force_cutoff, actuators.saturation,
     actuators.torque_saturation, actuators.rate_limit, actuators.torque_rate_limit,
-    actuators.actuator_backlash, actuators.torque_backlash, forces.magnus_force, forces.wind,
+    actuators.actuator_backlash, actuators.torque_backlash, drag.magnus_force, drag.wind,
     springs.spring, springs.torsion_spring, springs.upper_stop, springs.lower_stop, forces.cogging,
-    forces.mass_change, springs.hidden_obstacle, springs.distance_joint, sensors.sensor_bias,
+    forces.mass_change, obstacles.hidden_obstacle, springs.distance_joint, sensors.sensor_bias,
     sensors.sensor_scale, sensors.askew_camera, sensors.encoder_eccentricity,
     sensors.frame_rotation, sensors.heavy_tails,
 )  # fmt: skip
@@ -179,10 +179,8 @@ def _shown(scene: Scene, body: str, history: History | None) -> set[str]:
     shown = {name for d, name in enumerate(STATE) if (far[[d % 3, d % 3 + 3]] > 0).any()}
     if np.nan_to_num(of_body["action"].to_numpy()).any():
         shown.add("commands")
-    layout = scene.recording
-    if layout is not None and layout.camera is not None:
-        shown |= {"camera"} if layout.camera else set()
-    elif {"x", "y"} <= shown:
+    camera = scene.recording.camera if scene.recording is not None else None
+    if {"x", "y"} <= shown if camera is None else camera:
         shown.add("camera")
     poses = of_body["start"].to_numpy()
     turns = is_pivoted(scene, scene.body(body))

@@ -5,7 +5,7 @@ Stages are a closed set of final classes, in the order of application.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import InitVar, dataclass, replace
 from typing import Any, NamedTuple, final
 
@@ -31,12 +31,10 @@ TIME, INTERVAL, MEMORY = 9, 10, 12
 MOST_MEMORY = 24
 
 
-@final
-@dataclass(frozen=True)
-class Disc:
+class Disc(NamedTuple):
     """A static disc; arrays broadcast over proposals. There is none where the radius is zero.
 
-    Parameters
+    Attributes
     ----------
     x, y : ndarray
         Its centre (m).
@@ -143,26 +141,27 @@ def _check_memory(numbers: int) -> None:
 
 
 @dataclass(frozen=True)
-class Addition:
-    """Modification that adds parameters to properties; equal to its copies in other processes.
+class With:
+    """A function with one more argument; unlike a partial it is equal in other processes too."""
 
-    Parameters
-    ----------
-    names : tuple of (str, str)
-        Names of each property and of the parameter that is added to it.
-    """
+    function: Callable[..., Any]
+    argument: Any
 
-    names: tuple[tuple[str, str], ...]
+    def __call__(self, *first: Any) -> Any:
+        """Return the function's value."""
+        return self.function(*first, self.argument)
 
-    def __call__(self, properties: dict[str, Floats], parameters: Values, clock: Clock) -> None:
-        """Change the properties; see :class:`Properties`."""
-        for name, parameter in self.names:
-            properties[name] = properties[name] + parameters[parameter]
+
+def _add(
+    properties: dict[str, Floats], parameters: Values, clock: Clock, names: Iterable[Sequence[str]]
+) -> None:
+    for name, parameter in names:
+        properties[name] = properties[name] + parameters[parameter]
 
 
 def adding(**parameters: str) -> Properties:
     """Return the stage that adds parameters to the properties of these names."""
-    return Properties(Addition(tuple(parameters.items())))
+    return Properties(With(_add, tuple(parameters.items())))
 
 
 @final
@@ -347,18 +346,6 @@ STAGES: tuple[type, ...] = (Structure, Properties, Command, Force, Friction, Sen
 Scan = Callable[[Scene, History, Body], Floats]
 
 
-@dataclass(frozen=True)
-class ScanWith:
-    """A scan with one more argument; unlike a partial it compares equal in other processes too."""
-
-    scan: Callable[..., Floats]
-    argument: Any
-
-    def __call__(self, scene: Scene, history: History, body: Body) -> Floats:
-        """Return the grid; see :data:`Scan`."""
-        return self.scan(scene, history, body, self.argument)
-
-
 #: Priors of what is positive, or has a sign, in natural units: an effect of this size is of the
 #: order of what else acts on the body. And of an angle that may be any.
 SIZE, SIGNED = Prior("half_normal", sigma=1.0), Prior("normal", sigma=1.0)
@@ -418,6 +405,11 @@ class EffectParameter:
     origin: str = ""
     hinged: bool = True
     given: bool = False
+
+    @classmethod
+    def each(cls, *names: str, unit: str, prior: Prior, **same: Any) -> tuple[EffectParameter, ...]:
+        """Return parameters that differ in their names alone."""
+        return tuple(cls(name, unit, prior, **same) for name in names)
 
     def __post_init__(self) -> None:
         """Check the scale."""
@@ -630,8 +622,7 @@ def needs_inputs(effects: tuple[Attached, ...]) -> bool:
     """Return whether any effect needs the previous command or the clock."""
     stages = [attached.effect.stage for attached in effects]
     return any(
-        (isinstance(stage, Command) and stage.memory > 0)
-        or (isinstance(stage, Command | Force | Properties | Sensor) and stage.timed)
+        getattr(stage, "timed", False) or (isinstance(stage, Command) and stage.memory > 0)
         for stage in stages
     )
 

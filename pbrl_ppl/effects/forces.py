@@ -1,4 +1,4 @@
-"""Forces: drag by the velocity, steady forces, cogging, and the mass that all of them move."""
+"""Steady forces, cogging, and the mass that all forces move."""
 
 import math
 
@@ -14,7 +14,6 @@ from pbrl_ppl.effects.effect import (
     Properties,
     Values,
     adding,
-    is_unpivoted,
     measured,
 )
 from pbrl_ppl.history import History
@@ -22,171 +21,7 @@ from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene
 from pbrl_ppl.state import Floats
 
-
-def _linear(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
-    wrench[0] -= parameters[0] * state[3]
-    wrench[1] -= parameters[0] * state[4]
-
-
-linear_drag = Effect(
-    "linear_drag",
-    (EffectParameter("coefficient", "kg/s", SIZE, scale="force/speed"),),
-    "a force against the motion that grows with the speed, as in oil or at low speed in air",
-    "Stokes' law, F = -c v",
-    Force(_linear),
-    family="drag",
-)
-
-
-def _quadratic(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
-    speed = math.sqrt(state[3] * state[3] + state[4] * state[4])
-    wrench[0] -= parameters[0] * speed * state[3]
-    wrench[1] -= parameters[0] * speed * state[4]
-
-
-quadratic_drag = Effect(
-    "quadratic_drag",
-    (EffectParameter("coefficient", "kg/m", SIZE, scale="force/speed^2"),),
-    "a force against the motion that grows with the square of the speed, as in air or water",
-    "Rayleigh's drag equation, F = -c |v| v",
-    Force(_quadratic),
-    family="drag",
-)
-
-
-def _angular(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
-    wrench[2] -= parameters[0] * state[5]
-
-
-angular_drag = Effect(
-    "angular_drag",
-    (EffectParameter("coefficient", "N m s", SIZE, scale="torque/turn_rate"),),
-    "a torque against the rotation that grows with the angular speed",
-    "viscous torque, tau = -c omega",
-    Force(_angular),
-    family="angular drag",
-)
-
-
-def _quadratic_angular(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
-    wrench[2] -= parameters[0] * abs(state[5]) * state[5]
-
-
-quadratic_angular_drag = Effect(
-    "quadratic_angular_drag",
-    (EffectParameter("coefficient", "N m s^2", SIZE, scale="torque/turn_rate^2"),),
-    "a torque against the rotation that grows with the square of the angular speed: a fan,"
-    " a stirrer",
-    "drag of a rotor, tau = -c |omega| omega",
-    Force(_quadratic_angular),
-    family="angular drag",
-)
-
-
-def _linear_by_axis(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
-    c, s = math.cos(state[2]), math.sin(state[2])
-    x = -parameters[0] * (c * state[3] + s * state[4])
-    y = -parameters[1] * (c * state[4] - s * state[3])
-    wrench[0] += c * x - s * y
-    wrench[1] += s * x + c * y
-
-
-drag_by_axis = Effect(
-    "drag_by_axis",
-    (
-        EffectParameter("along", "kg/s", SIZE, scale="force/speed"),
-        EffectParameter("across", "kg/s", SIZE, scale="force/speed"),
-    ),
-    "a force against the motion that grows with the speed and is another along the body than across"
-    " it: a hull, a skid",
-    "linear drag with two coefficients in the body's frame (T. I. Fossen, 2011)",
-    Force(_linear_by_axis),
-    log_odds=-1.0,
-    family="drag",
-    needs=("theta",),
-)
-
-
-def _quadratic_by_axis(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
-    c, s = math.cos(state[2]), math.sin(state[2])
-    x, y = c * state[3] + s * state[4], c * state[4] - s * state[3]
-    x, y = -parameters[0] * abs(x) * x, -parameters[1] * abs(y) * y
-    wrench[0] += c * x - s * y
-    wrench[1] += s * x + c * y
-
-
-quadratic_drag_by_axis = Effect(
-    "quadratic_drag_by_axis",
-    (
-        EffectParameter("along", "kg/m", SIZE, scale="force/speed^2"),
-        EffectParameter("across", "kg/m", SIZE, scale="force/speed^2"),
-    ),
-    "a force against the motion that grows with the square of the speed and is another along the"
-    " body than across it",
-    "cross-flow drag in the body's frame (T. I. Fossen, 2011)",
-    Force(_quadratic_by_axis),
-    applies=is_unpivoted,
-    log_odds=-1.0,
-    family="drag",
-    needs=("theta",),
-)
-
-
-def _wind(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
-    x, y = state[3] - parameters[1], state[4] - parameters[2]
-    speed = math.sqrt(x * x + y * y)
-    wrench[0] -= parameters[0] * speed * x
-    wrench[1] -= parameters[0] * speed * y
-
-
-def _scan_winds(scene: Scene, history: History, body: Body) -> Floats:
-    """Return winds in eight directions about the body's usual speed; the derivative is by drag."""
-    velocity = measured(history, body, "vx", "vy")
-    speed = np.sqrt((velocity**2).sum(axis=-1).mean()) if len(velocity) else 0.0
-    turns = np.arange(8) * (np.pi / 4.0)
-    winds = speed * np.outer((0.5, 1.5), np.exp(1j * turns)).ravel()
-    return np.array([(np.nan, w.real, w.imag) for w in winds if speed > 0.0]).reshape(-1, 3)
-
-
-wind = Effect(
-    "wind",
-    (
-        EffectParameter("coefficient", "kg/m", SIZE, scale="force/speed^2"),
-        EffectParameter("wind_x", "m/s", SIGNED, scale="speed"),
-        EffectParameter("wind_y", "m/s", SIGNED, scale="speed"),
-    ),
-    "drag against air or water that moves itself: it grows with the square of the speed through it",
-    "Rayleigh's drag equation, F = -c |v - w| (v - w)",
-    Force(_wind),
-    applies=is_unpivoted,
-    scan=_scan_winds,
-    log_odds=-3.0,
-    unusual="indoors there is none, and a constant force with drag is the same",
-)
-
-
-def _magnus(state: Floats, command: Floats, parameters: Floats, wrench: Floats) -> None:
-    wrench[0] -= parameters[0] * state[5] * state[4]
-    wrench[1] += parameters[0] * state[5] * state[3]
-
-
-magnus_force = Effect(
-    "magnus_force",
-    (EffectParameter("coefficient", "kg", SIGNED, scale="force/speed turn_rate"),),
-    "a force across the motion that grows with the speed and the turning: a spinning body is drawn"
-    " aside",
-    "Magnus force, F = c omega x v",
-    Force(_magnus),
-    log_odds=-4.0,
-    unusual="it needs a fast spin, and a camera that sees it",
-    needs=("theta",),
-)
-
-
-_FORCES = (
-    EffectParameter("force_x", "N", SIGNED, scale="force"),
-    EffectParameter("force_y", "N", SIGNED, scale="force"),
-)
+_FORCES = EffectParameter.each("force_x", "force_y", unit="N", prior=SIGNED, scale="force")
 
 
 def _tilt(properties: dict[str, Floats], parameters: Values, clock: Clock) -> None:
@@ -266,10 +101,7 @@ def _moment_of_push(state: Floats, command: Floats, parameters: Floats, wrench: 
 
 push_offset = Effect(
     "push_offset",
-    (
-        EffectParameter("offset_x", "m", SIGNED, scale="length"),
-        EffectParameter("offset_y", "m", SIGNED, scale="length"),
-    ),
+    EffectParameter.each("offset_x", "offset_y", unit="m", prior=SIGNED, scale="length"),
     "the push acts at a point beside the body's centre, and so turns it as well",
     "moment of a force about a point, tau = r x F",
     Force(_moment_of_push),
@@ -294,8 +126,7 @@ def _scan_counts(scene: Scene, history: History, body: Body) -> Floats:
 cogging = Effect(
     "cogging",
     (
-        EffectParameter("cosine", "N m", SIGNED, scale="torque"),
-        EffectParameter("sine", "N m", SIGNED, scale="torque"),
+        *EffectParameter.each("cosine", "sine", unit="N m", prior=SIGNED, scale="torque"),
         EffectParameter("count", "1", Prior("log_normal", mu=1.5, sigma=1.0), null=2.0),
     ),
     "a torque that repeats several times in a turn: a motor's magnets, a bearing with flat spots",
@@ -330,10 +161,7 @@ inertia_scale = Effect(
 
 com_offset = Effect(
     "com_offset",
-    (
-        EffectParameter("x", "m", _OFFSET, scale="length"),
-        EffectParameter("y", "m", _OFFSET, scale="length"),
-    ),
+    EffectParameter.each("x", "y", unit="m", prior=_OFFSET, scale="length"),
     "the centre of mass is not in the middle of the outline: mass is not spread evenly",
     "centre of mass of a rigid body, in the body's frame",
     adding(com_x="x", com_y="y"),
@@ -352,8 +180,7 @@ def _scan_begins(scene: Scene, history: History, body: Body, *, most: int = 20) 
 
     ``most``: trajectories, and times, of a change of mass, at most.
     """
-    data = history.dataset
-    numbers = data["number"].to_numpy()
+    numbers = history.dataset["number"].to_numpy()
     last = float(np.nanmax(history.elapsed))
     grid = np.linspace(0, 1, most)
     between = numbers[1:] - 0.5

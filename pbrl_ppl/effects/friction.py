@@ -14,7 +14,7 @@ from pbrl_ppl.effects.effect import (
     EffectParameter,
     Force,
     Friction,
-    ScanWith,
+    With,
     adding,
     body_points,
     is_pivoted,
@@ -42,8 +42,8 @@ def _scan_speeds(scene: Scene, history: History, body: Body, columns: tuple[str,
     return np.array([(np.nan, speed) for speed in speeds]).reshape(-1, 2)
 
 
-_SCAN_TURN_RATES = ScanWith(_scan_speeds, ("omega",))
-_SCAN_SPEEDS = ScanWith(_scan_speeds, ("vx", "vy"))
+_SCAN_TURN_RATES = With(_scan_speeds, ("omega",))
+_SCAN_SPEEDS = With(_scan_speeds, ("vx", "vy"))
 
 
 pivot_damping = Effect(
@@ -259,11 +259,9 @@ def _scan_wheels(scene: Scene, history: History, body: Body, *, n_turns: int = 3
 wheel = Effect(
     "wheel",
     (
-        EffectParameter("w_x", "m", SIGNED, scale="length"),
-        EffectParameter("w_y", "m", SIGNED, scale="length"),
+        *EffectParameter.each("w_x", "w_y", unit="m", prior=SIGNED, scale="length"),
         EffectParameter("w_theta", "rad", ANY_ANGLE),
-        EffectParameter("mu_x", "1", _FRICTION),
-        EffectParameter("mu_y", "1", _FRICTION),
+        *EffectParameter.each("mu_x", "mu_y", unit="1", prior=_FRICTION),
     ),
     "a wheel or a runner that the scene does not declare: dry friction at a point of the body,"
     " of one strength along it and another across",

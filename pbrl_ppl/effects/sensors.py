@@ -1,7 +1,6 @@
 """Measurement: bias, scale and rotation of what is measured, and heavy-tailed noise."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,6 +10,7 @@ from pbrl_ppl.effects.effect import (
     Noise,
     Sensor,
     Values,
+    With,
     is_pivoted,
     is_unpivoted,
 )
@@ -19,21 +19,17 @@ from pbrl_ppl.state import STATE, STATE_UNITS, Floats
 
 #: Natural units of a body's state; an angle has none.
 _SCALES = ("range", "range", "", "speed", "speed", "turn_rate")
+#: A measurement; see :class:`Sensor`.
+Measure = Callable[[Floats, Values], Floats]
 
 
-@dataclass(frozen=True)
-class _WithOpposites:
-    """A measurement with the opposite parameters; equal to its copies in other processes."""
-
-    measure: Callable[[Floats, Values], Floats]
-
-    def __call__(self, measured: Floats, parameters: Values) -> Floats:
-        return self.measure(measured, {name: -value for name, value in parameters.items()})
+def _with_opposites(measured: Floats, parameters: Values, measure: Measure) -> Floats:
+    return measure(measured, {name: -value for name, value in parameters.items()})
 
 
-def _undone_by_opposites(measure: Callable[[Floats, Values], Floats]) -> Sensor:
+def _undone_by_opposites(measure: Measure) -> Sensor:
     """Return the stage of a measurement that the opposite parameters undo."""
-    return Sensor(measure, _WithOpposites(measure))
+    return Sensor(measure, With(_with_opposites, measure))
 
 
 def _add_bias(state: Floats, parameters: Values) -> Floats:
@@ -122,10 +118,7 @@ _TILT = Prior("normal", sigma=0.1)
 
 askew_camera = Effect(
     "askew_camera",
-    (
-        EffectParameter("along_x", "1/m", _TILT, scale="/range"),
-        EffectParameter("along_y", "1/m", _TILT, scale="/range"),
-    ),
+    EffectParameter.each("along_x", "along_y", unit="1/m", prior=_TILT, scale="/range"),
     "places are measured too small at one end of the room and too large at the other: the camera"
     " looks askew",
     "perspective of a tilted plane, x / (1 + a x + b y)",

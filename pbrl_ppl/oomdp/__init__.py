@@ -4,7 +4,6 @@ from .lwr import LWR as LWR
 from .lwr import OOLWR as OOLWR
 from .lwr import LocalRegression as LocalRegression
 from .relations import Attributes as Attributes
-from .relations import Condition as Condition
 from .relations import Pushed as Pushed
 from .relations import Relation as Relation
 from .relations import SectorContacts as SectorContacts

@@ -121,65 +121,58 @@ class LocalRegression:
 class Experience:
     """Observed transitions of a body or a class, with one regression per condition.
 
-    See section 3.1.3 of the paper. Inputs are triples of two planar components and an angular one,
+    See section 3.1.3 of the paper. Distances are in units of each input's standard deviation over
+    all conditions. Inputs are triples of two planar components and an angular one,
     the last of them the wrench.
 
     Parameters
     ----------
     reach : float
         Bounding radius of the body (m).
-    standardise : bool
-        Whether distances are in units of each input's standard deviation over all conditions;
-        otherwise in SI units.
     **options
         Of :class:`LocalRegression`.
     """
 
-    def __init__(self, reach: float, *, standardise: bool, **options: Any) -> None:
-        self._reach, self._standardise, self._options = reach, standardise, options
+    def __init__(self, reach: float, **options: Any) -> None:
+        self._reach, self._options = reach, options
         self._x: list[Floats] = []
         self._y: list[Floats] = []
-        self._rows: dict[Key, list[int]] = {}
+        #: Observed transitions of each condition.
+        self.rows: dict[Key, list[int]] = {}
         self._count = 0
         self._models: dict[Key, LocalRegression] = {}
 
     def add(self, x: Floats, y: Floats, flags: Bools) -> None:
         """Add inputs (n, p), outputs (n, q) and predicates (n, ...)."""
         for key, rows in grouped(flags).items():
-            self._rows.setdefault(key, []).extend((rows + self._count).tolist())
+            self.rows.setdefault(key, []).extend((rows + self._count).tolist())
         self._x.append(x)
         self._y.append(y)
         self._count += len(x)
         self._models.clear()
 
-    @property
-    def counts(self) -> dict[Key, int]:
-        """Return the number of transitions in each observed condition."""
-        return {key: len(rows) for key, rows in self._rows.items()}
-
     def predict(self, x: Floats, flags: Bools) -> Floats:
         """Return predictions (n, q) at inputs (n, p), predicates (n, ...); NaN if unobserved."""
         out = np.full((len(x), self._y[0].shape[1]), np.nan)
         for key, rows in grouped(flags).items():
-            if key in self._rows:
+            if key in self.rows:
                 out[rows] = self._model(key)(x[rows])
         return out
 
     def gains(self) -> Floats:
         """Return the linear fit of outputs by inputs in the commonest condition, shape (p, q)."""
         x, y = self._joined()
-        most = max(self._rows.values(), key=len)
+        most = max(self.rows.values(), key=len)
         size = self._sizes(x[most])
         return np.asarray(np.linalg.lstsq(x[most] / size, y[most])[0] / size[:, None])
 
     def _model(self, key: Key) -> LocalRegression:
         if key not in self._models:
             x, y = self._joined()
-            scale = np.ones(x.shape[1])
-            if self._standardise:  # a column that is constant, up to rounding errors, by its size
-                scale, size = x.std(axis=0), self._sizes(x)
-                scale = np.where(scale > 1e-9 * size, scale, size)
-            rows = self._rows[key]
+            # a column that is constant, up to rounding errors, by its size
+            scale, size = x.std(axis=0), self._sizes(x)
+            scale = np.where(scale > 1e-9 * size, scale, size)
+            rows = self.rows[key]
             self._models[key] = LocalRegression(x[rows], y[rows], scale=scale, **self._options)
         return self._models[key]
 
@@ -224,12 +217,9 @@ class Learner:
     neighbours : int
         Number of nearest transitions used, k.
     bandwidth : float
-        Bandwidth of the kernel, lambda.
+        Bandwidth of the kernel, lambda; without a unit, as in the paper.
     ridge : float
         See :class:`pbrl_ppl.oomdp.LocalRegression`.
-    standardise : bool
-        Whether distances between inputs are in units of each input's standard deviation in the
-        data, so that lambda has no unit, as in the paper; otherwise in SI units.
     pose_invariant : bool
         Whether a body's transitions are learned in its own frame, without its pose.
     share_classes : bool
@@ -248,6 +238,9 @@ class Learner:
         Number of observed transitions.
     """
 
+    #: Number of draws of a point estimate.
+    draws: int = 1
+
     def __init__(
         self,
         scene: Scene,
@@ -255,7 +248,6 @@ class Learner:
         neighbours: int = 1000,
         bandwidth: float = 1.5,
         ridge: float = 1e-3,
-        standardise: bool = True,
         pose_invariant: bool = True,
         share_classes: bool = False,
         relations: Sequence[Relation] = (),
@@ -265,13 +257,14 @@ class Learner:
             checks.positive(bandwidth, "bandwidth")
             checks.not_negative(ridge, "ridge")
         self.scene, self.pose_invariant, self.relations = scene, pose_invariant, tuple(relations)
+        #: Wrenches before the first interval, shape (body, 3): the model does not remember any.
+        self.before: Floats = np.zeros((len(scene.moving), len(WRENCH)))
         options = {"neighbours": neighbours, "bandwidth": bandwidth, "ridge": ridge}
         self._experience: dict[int, Experience] = {}
         of_class: dict[str, Experience] = {}
         for i, body in enumerate(scene.moving):
             if not body.kinematic:
-                reach = body.shape.bounding_radius
-                experience = Experience(reach, standardise=standardise, **options)
+                experience = Experience(body.shape.bounding_radius, **options)
                 if share_classes and body.object_class is not None:
                     experience = of_class.setdefault(body.object_class, experience)
                 self._experience[i] = experience
@@ -308,13 +301,9 @@ class Learner:
         HistoryError
             If shapes do not fit together, or a value is not finite.
         """
-        k = len(self.scene.moving)
-        arrays = []
-        for name, array, width in (
-            ("state", state, len(STATE)),
-            ("action", action, len(WRENCH)),
-            ("next_state", next_state, len(STATE)),
-        ):
+        k, arrays = len(self.scene.moving), []
+        given = {"state": (state, 6), "action": (action, 3), "next_state": (next_state, 6)}
+        for name, (array, width) in given.items():
             values = np.asarray(array, dtype=float)
             if values.ndim not in (2, 3) or values.shape[-2:] != (k, width):
                 raise HistoryError(
@@ -375,16 +364,6 @@ class Learner:
 
     # -- planning ----------------------------------------------------------------------------------
 
-    @property
-    def draws(self) -> int:
-        """Return the number of draws: 1, a point estimate."""
-        return 1
-
-    @property
-    def before(self) -> Floats:
-        """Return the wrench before the first interval: zeros, shape (body, 3)."""
-        return np.zeros((len(self.scene.moving), len(WRENCH)))
-
     def single(self) -> Self:
         """Return itself."""
         return self
@@ -392,16 +371,6 @@ class Learner:
     def after(self, before: Floats) -> Self:
         """Return itself: the model has no memory of wrenches."""
         return self
-
-    def noisy(self, states: Floats, rng: np.random.Generator) -> Floats:
-        """Raise an error: the regression has no noise model.
-
-        Raises
-        ------
-        FitError
-            Always.
-        """
-        raise FitError("noise: LWR predicts a mean alone; plan without noise")
 
     def acceleration(self, body: str, force: float, torque: float) -> tuple[Floats, Floats]:
         """Return the acceleration of a body under a push, shape (1,) each, m/s^2 and rad/s^2.
@@ -420,14 +389,7 @@ class Learner:
         angular = force * np.hypot(*gains[:2, 2]) + torque * abs(gains[2, 2])
         return np.array([linear]), np.array([angular])
 
-    def step(
-        self,
-        states: Floats,
-        wrenches: Floats,
-        previous: Floats | None = None,
-        *,
-        diverged: float = 1e6,
-    ) -> Floats:
+    def step(self, states: Floats, wrenches: Floats, previous: Floats | None = None) -> Floats:
         """Return the states after one sampling interval (Eqs. 5 and 6).
 
         Parameters
@@ -438,9 +400,6 @@ class Learner:
             Shape (n, body, 3), world frame, N and N m.
         previous : ndarray, optional
             Ignored.
-        diverged : float
-            States beyond this many times the largest learned are of extrapolations that have
-            diverged.
 
         Returns
         -------
@@ -476,7 +435,7 @@ class Learner:
             if self.pose_invariant:
                 added = _turned(added, state[:, THETA])
             out[rows, i] = state + added
-        out[abs(out) > diverged * self._largest] = np.nan
+        out[abs(out) > 1e6 * self._largest] = np.nan  # an extrapolation has diverged
         return np.asarray(out[None])
 
     def experience(self, body: str) -> Experience:
@@ -527,8 +486,6 @@ class LWR(Learner):
         Bandwidth of the kernel, lambda.
     ridge : float
         See :class:`pbrl_ppl.oomdp.LocalRegression`; 0 is Eq. 4.
-    standardise : bool
-        Whether distances are in units of each input's standard deviation; otherwise in SI units.
     pose_invariant : bool
         Whether a body's transitions are learned in its own frame, without its pose.
 
@@ -620,9 +577,7 @@ class OOLWR(Learner):
                     f"OO-LWR: relations has {relation!r}, expected objects with labels() and of(),"
                     " such as SectorContacts()"
                 )
-        self.labels = tuple(
-            label for predicate in self.relations for label in predicate.labels(scene)
-        )
+        self.labels = tuple(name for one in self.relations for name in one.labels(scene))
         for label, count in Counter(self.labels).items():
             if count > 1:
                 raise FitError(
@@ -640,8 +595,8 @@ class OOLWR(Learner):
         FitError
             If the scene has no such dynamic body.
         """
-        counts = self.experience(body).counts
-        return {condition(key, self.labels): n for key, n in counts.items()}
+        every = self.experience(body).rows.items()
+        return {condition(key, self.labels): len(rows) for key, rows in every}
 
 
 def _turned(triples: Floats, angle: Floats) -> Floats:

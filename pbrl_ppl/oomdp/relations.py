@@ -192,9 +192,7 @@ class SectorContacts:
         angle = 2 * np.pi * middle / (self.sectors * self.rays)
         return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
-    def of(
-        self, scene: Scene, states: Floats, wrenches: Floats | None = None, *, share: float = 0.4
-    ) -> Bools:
+    def of(self, scene: Scene, states: Floats, wrenches: Floats | None = None) -> Bools:
         """Return the predicates contact_theta(obj) of every moving body.
 
         Parameters
@@ -205,8 +203,6 @@ class SectorContacts:
             States or poses, shape (n, body, 6 or 3), SI units, bodies as in ``scene.moving``.
         wrenches : ndarray, optional
             Ignored: contacts do not depend on the action.
-        share : float
-            Collision radius by default, in bounding radii of the smallest moving body.
 
         Returns
         -------
@@ -235,10 +231,8 @@ class SectorContacts:
         flags = np.zeros((len(states), count, len(names), self.sectors), dtype=bool)
         if not world.pairs:
             return flags
+        radius = 0.4 * smallest_radius(scene) if self.radius is None else self.radius
         # along a ray solids are no nearer than their bounding circles
-        radius = self.radius
-        if radius is None:
-            radius = share * smallest_radius(scene)
         near = circles(world.solids, world.pairs, poses) > -radius
         for (i, j), rows in zip(world.pairs, near.T, strict=True):
             at = np.flatnonzero(rows)

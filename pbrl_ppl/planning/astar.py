@@ -24,14 +24,7 @@ from pbrl_ppl.scene import Body, Scene, Shape
 from pbrl_ppl.state import Bools, Floats
 
 
-def astar(
-    task: SearchTask,
-    *,
-    weight: float = 3.0,
-    improve: bool = False,
-    share: float = 0.5,
-    every: float = 0.5,
-) -> FoundPlan:
+def astar(task: SearchTask, *, weight: float = 3.0, improve: bool = False) -> FoundPlan:
     """Search for the quickest actions that bring bodies to the goal.
 
     The cost of a plan is its time and the penalties for contact. A node holds the states under all
@@ -52,10 +45,6 @@ def astar(
         :class:`pbrl_ppl.planning.astar.TimeToGo` for where it is.
     improve : bool
         Whether to go on for a cheaper plan until a limit, or until there is none.
-    share : float
-        Share of the limits for the search under one draw that guides the search under all.
-    every : float
-        Seconds between reports of progress.
 
     Returns
     -------
@@ -71,10 +60,9 @@ def astar(
     nodes = task.nodes
     if weight < 1 or nodes < 1:
         raise GoalError(f"A*: weight is {weight} and nodes {nodes}, expected at least 1 of each")
-    rng = (task.rng or np.random.default_rng(0)) if task.noise else None
-    search = _Search(task, weight, rng)
+    search = _Search(task, weight)
     begin = reported = time.monotonic()
-    stopped = "exhausted"
+    stopped, share = "exhausted", 0.5  # of the limits, for the search that guides the other
     try:
         if task.dynamics.draws > 1:
             guide = _Search(replace(task, dynamics=task.dynamics.single()), weight)
@@ -86,16 +74,19 @@ def astar(
             search.generated += guide.generated
         while search.open():
             now = time.monotonic()
-            if search.best and not improve and (weight > 1 or search.is_optimal()):
+            # with the weight 1, until no node in the queue can lead to a cheaper plan
+            enough = weight > 1 or search.queue[0][0] >= search.least_cost
+            if search.best and enough and not improve:
                 break
             if search.generated >= nodes or now - begin > task.seconds:
                 stopped = "nodes" if search.generated >= nodes else "time"
                 break
             search.expand()
-            if now - reported > every:
+            if now - reported > 0.5:
                 reported = now
-                far = search.least_distance
-                task.progress(f"{search.generated} states, nearest to the goal {far:.3g} m")
+                task.progress(
+                    f"{search.generated} states, nearest to the goal {search.least_distance:.3g} m"
+                )
     except KeyboardInterrupt:
         stopped = "interrupted"
     reached = search.best is not None
@@ -127,11 +118,9 @@ class Node(NamedTuple):
 class _Search:
     """State of the search: the tree, the open queue and the closed set."""
 
-    def __init__(
-        self, task: SearchTask, weight: float, rng: np.random.Generator | None = None
-    ) -> None:
+    def __init__(self, task: SearchTask, weight: float) -> None:
         self.dynamics, self.goal, self.actions = task.dynamics, task.goal, task.actions
-        self.tail, self.weight, self.rng = task.tail, weight, rng
+        self.tail, self.weight = task.tail, weight
         self.scene = task.dynamics.scene
         self.counts = task.actions.intervals(self.scene)
         self.to_go = TimeToGo(task.dynamics, task.goal, task.actions, task.start)
@@ -158,10 +147,6 @@ class _Search:
             self.refined += 1
             self.begin()
         return bool(self.queue)
-
-    def is_optimal(self) -> bool:
-        """Return whether no node in the queue can lead to a cheaper plan."""
-        return self.queue[0][0] >= self.least_cost
 
     def begin(self) -> None:
         """Reset tree, queue and closed set to the root."""
@@ -203,8 +188,6 @@ class _Search:
             wrenches = self.actions.wrenches(self.scene, which, mean_angle(states[..., 2]))
             states = self.dynamics.step(states, wrenches, last)
             last = remembered(wrenches, last)
-            if self.rng is not None:
-                states = self.dynamics.noisy(states, self.rng)
             self.generated += len(tried) * self.dynamics.draws
             cost = cost + self.scene.time_step * (1.0 + contact_cost(self.goal, self.scene, states))
             edges = [Edge(*each, interval) for each in tried]
@@ -244,24 +227,12 @@ class _Search:
                     Node(states[:, row].copy(), last[row].copy(), float(cost[row]), edges[row])
                 )
 
-    def _cells(
-        self,
-        states: Floats,
-        far: Floats,
-        *,
-        tolerances: float = 10.0,
-        least: float = 0.25,
-        most: float = 2.0,
-    ) -> NDArray[np.int32]:
-        """Return the cell of the closed set of each node, shape (n, number).
-
-        ``tolerances``: distance from the goal at which cells have their usual size, in tolerances.
-        ``least``: cells shrink nearer to the goal in proportion, down to this.
-        ``most``: cells grow further away, up to this.
-        """
+    def _cells(self, states: Floats, far: Floats) -> NDArray[np.int32]:
+        """Return the cell of the closed set of each node, shape (n, number)."""
         mean = np.nan_to_num(states.mean(axis=0))
         mean[..., 2] = mean_angle(np.nan_to_num(states[..., 2]))
-        level = np.floor(np.log2(np.clip(far / (tolerances * self.near), least, most)))
+        # cells have their usual size ten tolerances from the goal; a quarter nearer, or twice it
+        level = np.floor(np.log2(np.clip(far / (10.0 * self.near), 0.25, 2.0)))
         size = self.cells * 2.0 ** (level[:, None, None] - self.refined)
         cell = np.floor(mean / size).reshape(len(mean), -1)
         return np.concatenate([level[:, None], cell], axis=1).astype(np.int32)
@@ -299,28 +270,22 @@ class TimeToGo:
         Says the strongest pushes.
     start : ndarray
         Shape (body, 6); the grid covers it.
-    least : float
-        Acceleration in bounding radii (or rad) an interval squared, at least: without a push, the
-        time to the goal is long but finite, because others may hit the body.
     """
 
     def __init__(
-        self,
-        dynamics: TransitionModel,
-        goal: Goal,
-        actions: ActionSet,
-        start: Floats,
-        least: float = 1e-6,
+        self, dynamics: TransitionModel, goal: Goal, actions: ActionSet, start: Floats
     ) -> None:
-        scene = dynamics.scene
-        self.goal, self.scene = goal, scene
+        self.goal, self.scene = goal, dynamics.scene
+        scene = self.scene
         anyone = max(actions.strongest(body.name)[0] for body in scene.dynamic)
         self._bounds = []
         places, tolerances = goal.places(scene), goal.tolerances(scene)
         for target, i, tolerance in zip(goal.targets, places, tolerances, strict=True):
             force, torque = actions.strongest(target.body)
             push, turn = dynamics.acceleration(target.body, force or anyone, torque)
-            body, slow = scene.body(target.body), least / scene.time_step**2
+            # least acceleration, in radii (or rad) an interval squared: without a push the time is
+            # long but finite, because others may hit the body
+            body, slow = scene.body(target.body), 1e-6 / scene.time_step**2
             push = np.maximum(push, slow * body.shape.bounding_radius)[:, None]
             turn = np.maximum(turn, slow)[:, None]
             around = _distances(scene, body, target, start[i])
@@ -357,29 +322,18 @@ def _time(way: Floats, speed: Floats, push: Floats) -> Floats:
 
 
 def _distances(
-    scene: Scene,
-    body: Body,
-    target: Target,
-    start: Floats,
-    *,
-    cells: int = 160,
-    margin: float = 4.0,
+    scene: Scene, body: Body, target: Target, start: Floats
 ) -> Callable[[Floats], Floats] | None:
-    """Return distances of a body's origin from its target around obstacles; None without any.
-
-    ``cells``: cells along the longer side of the grid.
-    ``margin``: margin of the grid in bounding radii: a body can go around the end of a wall.
-    """
+    """Return distances of a body's origin from its target around obstacles; None without any."""
     static = tuple(obstacle for obstacle in scene.bodies if obstacle.static)
     if (not scene.walls and not static) or target.x is None or target.y is None:
         return None
     points = np.array([start[:2], [target.x, target.y]])
     if scene.extent is not None:
-        corners = np.reshape(scene.extent, (2, 2)).T
-        points = np.vstack([points, corners])
-    room = margin * body.shape.bounding_radius
+        points = np.vstack([points, np.reshape(scene.extent, (2, 2)).T])
+    room = 4.0 * body.shape.bounding_radius  # a body can go around the end of a wall
     low, high = points.min(axis=0) - room, points.max(axis=0) + room
-    cell = float((high - low).max()) / cells
+    cell = float((high - low).max()) / 160  # along the longer side
     shape = tuple(int(n) + 1 for n in np.ceil((high - low) / cell))
     centres = low + cell * np.indices(shape).reshape(2, -1).T
     # a circle that fits into the body wherever it turns, about its origin

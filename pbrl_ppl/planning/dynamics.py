@@ -1,21 +1,19 @@
-"""Transition models for planning: Eqs. 7 and 13 at posterior draws."""
+"""Transition models for planning: Eq. 7 at posterior draws."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from copy import copy
-from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 
 from pbrl_ppl.effects import Attached, Command, Effect, attach, catalogue, needs_inputs
 from pbrl_ppl.errors import PosteriorError
-from pbrl_ppl.likelihood import Coordinates, degrees_of_freedom, next_state_random, tail_places
 from pbrl_ppl.physics import Physics, after_recording
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import STATE, WRENCH, Floats
+from pbrl_ppl.state import WRENCH, Floats
 
 if TYPE_CHECKING:
     from pbrl_ppl.posterior import Idata
@@ -28,16 +26,11 @@ class TransitionModel(Protocol):
     :class:`pbrl_ppl.Dynamics` is one, and so are :class:`pbrl_ppl.LWR` and :class:`pbrl_ppl.OOLWR`.
     """
 
-    @property
-    def scene(self) -> Scene:
-        """Known geometry, with the order of the bodies."""
-
-    @property
-    def before(self) -> Floats:
-        """Wrenches that acted before the start, shape (body, 3) or more, N and N m.
-
-        The last interval's first; three numbers more for each one before that a model remembers.
-        """
+    #: Known geometry, with the order of the bodies.
+    scene: Scene
+    #: Wrenches that acted before the start, shape (body, 3) or more, N and N m: the last interval's
+    #: first; three numbers more for each one before that a model remembers.
+    before: Floats
 
     @property
     def draws(self) -> int:
@@ -65,9 +58,6 @@ class TransitionModel(Protocol):
             Those before, shape (n, body, 3) or more: as :attr:`before`.
         """
 
-    def noisy(self, states: Floats, rng: np.random.Generator) -> Floats:
-        """Return states (draw, n, body, 6) with the noise of a step."""
-
 
 def remembered(wrenches: Floats, before: Floats) -> Floats:
     """Return the wrenches before the next interval: these, and those before but for the oldest.
@@ -80,12 +70,8 @@ def remembered(wrenches: Floats, before: Floats) -> Floats:
     return np.concatenate([wrenches, before[..., : -len(WRENCH)]], axis=-1)
 
 
-def predicted_path(
-    model: TransitionModel, start: Floats, wrenches: Floats, rng: np.random.Generator | None = None
-) -> Floats:
+def predicted_path(model: TransitionModel, start: Floats, wrenches: Floats) -> Floats:
     """Play wrenches (..., time, body, 3) from a state (body, 6).
-
-    With a generator, the noise of a step is added after each interval.
 
     Returns
     -------
@@ -98,38 +84,8 @@ def predicted_path(
     path, last = [states], np.broadcast_to(model.before, (in_time.shape[1], *model.before.shape))
     for wrench in in_time:
         states, last = model.step(states, wrench, last), remembered(wrench, last)
-        if rng is not None:
-            states = model.noisy(states, rng)
         path.append(states)
     return np.stack(path, axis=2).reshape(model.draws, *lead, len(path), *start.shape)
-
-
-#: Noise of a step under one draw, added to states (n, body, 6) in place.
-StepNoise = Callable[[Floats, np.random.Generator], None]
-
-
-def _noise_of_states(
-    states: Floats,
-    rng: np.random.Generator,
-    *,
-    sigma: Floats,
-    columns: tuple[int, ...],
-    nu: float | Floats | None,
-) -> None:
-    """Add noise to each state dimension, as in Eq. 11."""
-    states[..., columns] = next_state_random(states[..., columns], sigma, rng, nu=nu)
-
-
-def _noise_of_accelerations(
-    states: Floats, rng: np.random.Generator, *, sigma: Floats, coordinates: Coordinates
-) -> None:
-    """Add an unexplained acceleration, held over an interval; measurement errors disturb no body.
-
-    Without what a contact adds, which is not predicted.
-    """
-    flat = states.reshape(len(states), -1)
-    apart = np.zeros(len(states), dtype=bool)
-    flat[:, coordinates.places] += coordinates.pushes(sigma, apart, rng)
 
 
 #: Intervals that an actuator with a state of its own is followed back to.
@@ -150,9 +106,6 @@ class Dynamics:
         Parameter draws in the layout's order, shape (draw, p).
     effects : iterable of Effect or Attached
         Effects beside those that the scene declares.
-    noise : sequence of callable, optional
-        For each draw, what adds the noise of a step to states (n, body, 6) in place: then
-        :meth:`noisy` works.
     substeps, threads, tolerance
         Settings of the engine: fields of :class:`pbrl_ppl.Physics`.
     declared : iterable of Effect
@@ -165,7 +118,6 @@ class Dynamics:
         phi: Floats,
         effects: Iterable[Effect | Attached] = (),
         *,
-        noise: Sequence[StepNoise] | None = None,
         substeps: int | None = None,
         threads: int = 2,
         tolerance: float = Physics.tolerance,
@@ -174,7 +126,7 @@ class Dynamics:
         attached = attach(scene, effects, declared)
         substeps = scene.substeps if substeps is None else substeps
         self._physics = Physics(scene, attached, substeps, threads, tolerance=tolerance)
-        self.scene, self.layout, self._noise = scene, self._physics.layout, noise
+        self.scene, self.layout = scene, self._physics.layout
         self.phi = np.atleast_2d(np.asarray(phi, dtype=float))
         self._whole = needs_inputs(attached)
         #: Wrenches that acted before the start, shape (body, 3); three more columns for each older
@@ -231,36 +183,17 @@ class Dynamics:
         physics = record.physics(effects)
         layout = physics.layout
         if draws is None:
-            phi, sigma = (vector[None] for vector in record.mode_vectors(layout))
+            phi = record.mode_vectors(layout)[0][None]
         else:
-            phi, sigma = vectors(idata, layout, record.noise_variables)
+            phi, _ = vectors(idata, layout, record.noise_variables)
             if not 1 <= draws <= len(phi):
                 raise PosteriorError(
                     f"posterior: {draws} draws were asked for, expected 1 to {len(phi)}"
                 )
-            chosen = np.random.default_rng(seed).choice(len(phi), draws, replace=False)
-            phi, sigma = phi[chosen], sigma[chosen]
-        noise: list[StepNoise]
-        if record.cells is not None:
-            noise = [
-                partial(_noise_of_accelerations, sigma=one, coordinates=record.cells)
-                for one in sigma
-            ]
-        else:
-            columns = tuple(STATE.index(name) for name in record.measured)
-            nu: Iterable[float | Floats | None] = [record.nu] * len(phi)
-            if tail_places(physics):
-                nu = degrees_of_freedom(physics, phi, record.nu)[:, 0]
-            if record.likelihood == "simulation":  # measurement errors disturb no body
-                sigma = np.zeros_like(sigma)
-            noise = [
-                partial(_noise_of_states, sigma=one, columns=columns, nu=tail)
-                for one, tail in zip(sigma, nu, strict=True)
-            ]
+            phi = phi[np.random.default_rng(seed).choice(len(phi), draws, replace=False)]
         return cls(
             record.scene,
             phi,
-            noise=noise,
             substeps=physics.substeps,
             tolerance=physics.tolerance,
             threads=threads,
@@ -277,10 +210,7 @@ class Dynamics:
         spread = self.phi.std(axis=0)
         offset = (self.phi - self.phi.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
         i = int(np.argmin((offset**2).sum(axis=1)))
-        chosen = self.at(self.phi[i : i + 1])
-        if self._noise is not None:
-            chosen._noise = self._noise[i : i + 1]
-        return chosen
+        return self.at(self.phi[i : i + 1])
 
     def at(self, phi: Floats) -> Dynamics:
         """Return the same dynamics at other parameters, shape (draw, p), with the same worlds."""
@@ -348,27 +278,3 @@ class Dynamics:
         out = np.stack([self._physics.predict(p, s, actions)[:, 0] for p, s in pairs])
         out[lost] = np.nan
         return out
-
-    def noisy(self, states: Floats, rng: np.random.Generator) -> Floats:
-        """Return states of shape (draw, n, body, 6) with Eq. 13's noise.
-
-        Raises
-        ------
-        PosteriorError
-            If the dynamics are known, and so without noise.
-        """
-        if self._noise is None:
-            raise PosteriorError("noise: these parameters are known, and have no sigma; omit it")
-        out = np.ascontiguousarray(states).copy()
-        for under_draw, add in zip(out, self._noise, strict=True):
-            add(under_draw, rng)
-        return out
-
-    def rollout(
-        self, start: Floats, wrenches: Floats, rng: np.random.Generator | None = None
-    ) -> Floats:
-        """Play wrenches (time, body, 3) from a state (body, 6): shape (draw, time + 1, body, 6).
-
-        With a generator, Eq. 13's noise is added after each interval.
-        """
-        return predicted_path(self, start, wrenches, rng)

@@ -25,7 +25,7 @@ from pbrl_ppl.planning.goals import ActionSet, Allowed, Bounds, allowed_wrenches
 from pbrl_ppl.planning.planner import labelled, start_state, table_of_plan
 from pbrl_ppl.posterior import Fit, Idata, scene_of, stored_fields
 from pbrl_ppl.scene import Scene, body_sizes, nearest
-from pbrl_ppl.state import WRENCH, WRENCH_UNITS, Bools, Floats
+from pbrl_ppl.state import WRENCH_UNITS, Bools, Floats
 from pbrl_ppl.threads import Say, one_blas_thread, silent
 
 
@@ -35,8 +35,6 @@ class Rival:
 
     Parameters
     ----------
-    attached : Attached
-        The effect.
     mode : FilteredMode
         Of the model with this effect and without the others, fitted to whole trajectories.
     draws : ndarray
@@ -45,15 +43,9 @@ class Rival:
         Noise parameters of the model that all rivals come from, shape (parameter,).
     """
 
-    attached: Attached
     mode: FilteredMode
     draws: Floats
     sigma: Floats
-
-    @property
-    def name(self) -> str:
-        """Return the names of the effect and of its body."""
-        return f"{self.attached.effect.name} on {self.attached.body}"
 
 
 def kept_groups(posterior: Idata) -> list[tuple[str, ...]]:
@@ -148,14 +140,13 @@ def fit_rivals(
     for attached in effects:
         if present == [attached]:
             chosen = phi[rng.choice(len(phi), draws, replace=False)]
-            fits.append(Rival(attached, declared, chosen, declared.sigma))
+            fits.append(Rival(declared, chosen, declared.sigma))
             continue
         (signature,) = rank_candidates(base, [attached])
-        estimate = signature.candidate.estimate.values()
-        sizes = dict(zip(attached.labels, estimate, strict=True))
+        sizes = dict(zip(attached.labels, signature.candidate.estimate.values(), strict=True))
         start = with_effects(base, (*base.problem.physics.effects, attached), sizes)
         mode = trajectory_mode(*start, base.sigma)
-        fits.append(Rival(attached, mode, mode.draws(rng, draws), declared.sigma))
+        fits.append(Rival(mode, mode.draws(rng, draws), declared.sigma))
     return fits
 
 
@@ -191,15 +182,14 @@ class _Paths:
         last = np.broadcast_to(dynamics.before, (len(wrenches), *dynamics.before.shape))
         earlier = np.moveaxis(wrenches, 1, 0)[:-1]
         past = accumulate(earlier, lambda last, wrench: remembered(wrench, last), initial=last)
-        before = np.stack(list(past), axis=1)
-        return cls(
-            states[:, :, :-1].reshape(-1, *start.shape),
-            states[:, :, 1:].reshape(-1, *start.shape),
-            np.tile(wrenches, (dynamics.draws, 1, 1, 1)).reshape(-1, *wrenches.shape[2:]),
-            np.tile(before, (dynamics.draws, 1, 1, 1)).reshape(-1, *before.shape[2:]),
-            wrenches.shape[1],
-            lost.ravel(),
+        begin, end = (
+            part.reshape(-1, *start.shape) for part in (states[:, :, :-1], states[:, :, 1:])
         )
+        played, before = (
+            np.tile(one, (dynamics.draws, 1, 1, 1)).reshape(-1, *one.shape[2:])
+            for one in (wrenches, np.stack(list(past), axis=1))
+        )
+        return cls(begin, end, played, before, wrenches.shape[1], lost.ravel())
 
 
 class Separation:
@@ -216,12 +206,6 @@ class Separation:
         Two or more.
     start : ndarray
         Initial state of the experiment, shape (body, 6), SI units; known to measurement noise.
-    before : ndarray
-        Wrenches before it, shape (body, 3).
-    threads : int
-        Engine worlds side by side.
-    substeps : int
-        Engine steps an interval at most: models are compared with each other, in the same engine.
 
     Attributes
     ----------
@@ -229,26 +213,17 @@ class Separation:
         Those of each rival at its mode.
     """
 
-    def __init__(
-        self,
-        rivals: Sequence[Rival],
-        start: Floats,
-        before: Floats,
-        threads: int = 2,
-        substeps: int = 10,
-    ) -> None:
+    def __init__(self, rivals: Sequence[Rival], start: Floats) -> None:
         self.rivals, self.start = rivals, start
         # the rivals differ in the effects that bodies declare
         scene = rivals[0].mode.problem.scene
         self.scene = scene.replace(bodies=tuple(replace(body, effects=()) for body in scene.bodies))
-        every = [rival.mode.problem.physics for rival in rivals]
-        self.dynamics = [
-            Dynamics(
-                self.scene, rival.mode.phi, physics.effects, threads=threads, declared=(),
-                substeps=min(substeps, physics.substeps),
-            ).after(before)
-            for rival, physics in zip(rivals, every, strict=True)
-        ]  # fmt: skip
+        self.dynamics = []
+        for mode in (rival.mode for rival in rivals):
+            # steps an interval at most: models are compared with each other, in the same engine
+            steps, effects = min(10, mode.problem.physics.substeps), mode.problem.physics.effects
+            one = Dynamics(self.scene, mode.phi, effects, substeps=steps, declared=())
+            self.dynamics.append(one)
 
     def __call__(self, wrenches: Floats, draws: int) -> tuple[Floats, Bools]:
         """Return the expected log Bayes factors of experiments.
@@ -293,12 +268,12 @@ class Separation:
 
         def predict(phi: Floats, states: Floats) -> Floats:
             """Return the states after an interval, shape (point, transition, body, 6)."""
+            begin = np.broadcast_to(states, (len(phi), *paths.begin.shape))
             dynamics = self.dynamics[number].at(phi)
-            return np.nan_to_num(dynamics.step(states, paths.wrenches, paths.before))
+            return np.nan_to_num(dynamics.step(begin, paths.wrenches, paths.before))
 
         def by_phi(points: Floats) -> Floats:
-            states = np.broadcast_to(paths.begin, (len(points), *paths.begin.shape))
-            return coordinates.of(predict(points, states))
+            return coordinates.of(predict(points, paths.begin))
 
         def by_state(states: Floats) -> Floats:
             return predict(np.tile(mode.phi, (len(states), 1)), states)
@@ -324,8 +299,7 @@ class Separation:
             sensitivity=None,
         )
         rows = np.concatenate([residual[None], -np.moveaxis(slopes, -1, 0)])
-        white = noise.filtered(rows, rival.sigma)[0]
-        white = white.reshape(len(rows), len(paths.lost), -1)
+        white = noise.filtered(rows, rival.sigma)[0].reshape(len(rows), len(paths.lost), -1)
         r, jacobian = white[0], np.moveaxis(white[1:], 0, -1)
         scaled = jacobian @ mode.factor  # by a posterior standard deviation of each direction
         precision = np.eye(len(mode.phi)) + scaled.transpose(0, 2, 1) @ scaled
@@ -417,8 +391,7 @@ class Suggestion:
         OutputError
             If it cannot be written there.
         """
-        table = self.to_dataframe()
-        write_atomically(Path(path), lambda to: table.to_csv(to, index=False))
+        write_atomically(Path(path), lambda to: self.to_dataframe().to_csv(to, index=False))
 
 
 @one_blas_thread
@@ -429,10 +402,8 @@ def suggest_actions(
     *,
     effects: Sequence[str] | None = None,
     steps: int = 20,
-    hold: int | None = None,
     draws: int = 16,
     seed: int = 0,
-    before: ArrayLike | None = None,
     catalogue: Iterable[Effect] = catalogue,
     progress: Say | None = None,
 ) -> Suggestion:
@@ -462,15 +433,11 @@ def suggest_actions(
         Two or more, such as ``spring`` or ``spring on cart``. By default the first group that the
         loop reported as not separable.
     steps : int
-        Sampling intervals of the experiment.
-    hold : int, optional
-        Intervals for which a wrench within bounds is held; an eighth of ``steps`` by default.
+        Sampling intervals of the experiment; a wrench within bounds is held for an eighth of them.
     draws : int
         Posterior draws of each rival.
     seed : int
         The same seed gives the same sequence.
-    before : array_like, optional
-        Wrenches in the interval before the start, shape (body, 3), N and N m.
     catalogue : iterable of Effect
         Where the names of effects are looked up.
     progress : callable, optional
@@ -510,18 +477,14 @@ def suggest_actions(
         )
     effects = groups[0] if effects is None else effects
     chosen = named_effects(effects, scene, catalogue)
-    if steps < 1 or (hold is not None and hold < 1):
-        raise GoalError(f"steps is {steps} and hold {hold}; both must be at least 1")
+    if steps < 1:
+        raise GoalError(f"steps is {steps}; it must be at least 1")
     first = start_state(scene, start)
-    last = np.zeros((len(first), len(WRENCH)))
-    if before is not None:
-        last = np.asarray(before, dtype=float).reshape(last.shape)
-    allowed = allowed_wrenches(
-        scene, ActionSet.recorded(posterior) if actions is None else actions, steps, hold
-    )
+    actions = ActionSet.recorded(posterior) if actions is None else actions
+    allowed = allowed_wrenches(scene, actions, steps)
     progress("fitting each effect to the recording")
     rivals = fit_rivals(posterior, chosen, catalogue, draws, seed)
-    judge = Separation(rivals, first, last)
+    judge = Separation(rivals, first)
     genes, at_random = _evolved(judge, allowed, np.random.default_rng(seed), progress)
     progress("judging the best sequences")
     wrenches = allowed.wrenches(genes, judge.dynamics[0], judge.start)
@@ -531,7 +494,7 @@ def suggest_actions(
         raise GoalError(
             "actions: the engine diverges in all sequences; allow weaker actions or fewer steps"
         )
-    names = [rival.name for rival in rivals]
+    names = [f"{one.effect.name} on {one.body}" for one in chosen]
     pairs = {"true": names, "rival": names}
     nats = xr.DataArray(separation[..., best], pairs, (*pairs,), attrs={"units": "nats"})
     played = labelled(scene, wrenches[best], ("time", "body", "wrench"))
@@ -540,29 +503,21 @@ def suggest_actions(
 
 
 def _evolved(
-    judge: Separation,
-    allowed: Allowed,
-    rng: np.random.Generator,
-    progress: Say,
-    *,
-    population: int = 40,
-    n_parents: int = 10,
-    generations: int = 8,
-    draws: int = 3,
-    new_share: float = 0.2,
-    leaders: int = 4,
+    judge: Separation, allowed: Allowed, rng: np.random.Generator, progress: Say
 ) -> tuple[Floats, float]:
     """Return the leading sequences of the last generation, and the mean value of the first.
 
-    Children take pieces from two parents, and a share of new ones from the allowed set.
+    Children take pieces from two parents, and a fifth of them new from the allowed set.
     """
+    population, n_parents, generations = 40, 10, 8
     genes = allowed.random(rng, population)
     at_random, parents, values = np.nan, genes[:0], np.zeros(0)
     # a piece of a sequence is taken whole
     shape = (population, allowed.pieces, *(1,) * (genes.ndim - 2))
     for generation in range(generations):
         progress(f"looking for actions that tell them apart, {generation + 1} of {generations}")
-        separation, meeting = judge(allowed.wrenches(genes, judge.dynamics[0], judge.start), draws)
+        wrenches = allowed.wrenches(genes, judge.dynamics[0], judge.start)
+        separation, meeting = judge(wrenches, draws=3)
         if generation == 0:
             usable = _weakest(separation)
             at_random = float(np.nanmean(usable)) if np.isfinite(usable).any() else np.nan
@@ -573,8 +528,8 @@ def _evolved(
         pairs = rng.integers(n_parents, size=(2, population))
         mixed = np.where(rng.random(shape) < 0.5, parents[pairs[0]], parents[pairs[1]])
         fresh = allowed.extreme(rng, population)
-        genes = np.where(rng.random(shape) < new_share, fresh, mixed)
-    return parents[:leaders], at_random
+        genes = np.where(rng.random(shape) < 0.2, fresh, mixed)
+    return parents[:4], at_random
 
 
 def _weakest(separation: Floats) -> Floats:

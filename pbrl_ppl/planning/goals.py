@@ -166,14 +166,10 @@ class Goal:
         moving = [body.name for body in scene.moving]
         return [moving.index(target.body) for target in self.targets]
 
-    def tolerances(self, scene: Scene, *, share: float = 0.2) -> list[float]:
-        """Return the position tolerance of each target (m).
-
-        ``share``: position tolerance by default, as a share of the body's bounding radius.
-        """
-        return [
-            t.tolerance or share * scene.body(t.body).shape.bounding_radius for t in self.targets
-        ]
+    def tolerances(self, scene: Scene) -> list[float]:
+        """Return the position tolerance of each target (m): by default a fifth of its radius."""
+        radii = (scene.body(target.body).shape.bounding_radius for target in self.targets)
+        return [t.tolerance or 0.2 * r for t, r in zip(self.targets, radii, strict=True)]
 
     def errors(self, scene: Scene, states: Floats) -> Floats:
         """Return offsets from the targets, 0 where free, shape (..., target, 3): m, m, rad.
@@ -186,9 +182,7 @@ class Goal:
             Shape (..., body, 6).
         """
         poses = states[..., self.places(scene), :3]
-        wanted = np.array(
-            [[np.nan if v is None else v for v in (t.x, t.y, t.theta)] for t in self.targets]
-        )
+        wanted = np.array([(t.x, t.y, t.theta) for t in self.targets], dtype=float)  # None: NaN
         offset = poses - wanted
         offset[..., 2] = np.mod(offset[..., 2] + np.pi, 2 * np.pi) - np.pi
         return np.where(np.isnan(wanted), 0.0, offset)
@@ -354,22 +348,16 @@ class ActionSet:
         return cls(tuple(actions), **options)
 
     @classmethod
-    def recorded(
-        cls, idata: Idata, *, quantile: float = 0.9, intervals: tuple[int, ...] = (2, 5)
-    ) -> ActionSet:
+    def recorded(cls, idata: Idata) -> ActionSet:
         """Return actions like those in the posterior's data, whose effects the model knows.
 
         For each body that was pushed: forces along x and y and torques, in both directions, alone
-        and together, of a size that a tenth of the recorded ones exceed.
+        and together, of a size that a tenth of the recorded ones exceed, for two intervals or five.
 
         Parameters
         ----------
         idata : InferenceData or DataTree
             A posterior.
-        quantile : float
-            Quantile of the recorded pushes that a plan pushes with.
-        intervals : tuple of float
-            For how many intervals a plan pushes.
 
         Raises
         ------
@@ -386,7 +374,7 @@ class ActionSet:
                 continue
             sizes = np.hypot(pushes[..., i, 0], pushes[..., i, 1]).ravel(), abs(pushes[..., i, 2])
             force, torque = (
-                float(np.quantile(s[s > 0], quantile)) if (s > 0).any() else 0.0 for s in sizes
+                float(np.quantile(s[s > 0], 0.9)) if (s > 0).any() else 0.0 for s in sizes
             )
             if not (force or torque):
                 continue
@@ -398,7 +386,7 @@ class ActionSet:
             ]
         if not actions:
             raise GoalError("actions: nothing was pushed in the posterior's data; give actions")
-        return cls(tuple(actions), tuple(scene.time_step * n for n in intervals))
+        return cls(tuple(actions), (scene.time_step * 2, scene.time_step * 5))
 
     def check(self, scene: Scene) -> None:
         """Check that the scene has the bodies, and that durations are whole sampling intervals.
@@ -494,12 +482,8 @@ def play(
 Bounds = Mapping[str, Mapping[str, Sequence[float]]]
 
 
-def allowed_wrenches(
-    scene: Scene, actions: ActionSet | Bounds, steps: int, hold: int | None, *, pieces: int = 8
-) -> Allowed:
+def allowed_wrenches(scene: Scene, actions: ActionSet | Bounds, steps: int) -> Allowed:
     """Return the sequences that an action set or bounds allow.
-
-    ``pieces``: pieces of a sequence by default.
 
     Raises
     ------
@@ -525,7 +509,7 @@ def allowed_wrenches(
                 )
     if not (high > low).any():
         raise GoalError("bounds: nothing may vary; give a lowest and a higher highest value")
-    return _Within(low, high, steps, hold or max(1, round(steps / pieces)))
+    return _Within(low, high, steps, max(1, round(steps / 8)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -553,9 +537,7 @@ class _Within:
         ends = np.where(rng.random(inner.shape) < 0.5, self.low, self.high)
         nothing = np.clip(0.0, self.low, self.high)
         kind = rng.integers(3, size=inner.shape)
-        return np.select(
-            [kind == 0, kind == 1], [inner, np.broadcast_to(nothing, inner.shape)], ends
-        )
+        return np.where(kind == 0, inner, np.where(kind == 1, nothing, ends))
 
     def wrenches(self, genes: Floats, dynamics: TransitionModel, start: Floats) -> Floats:
         """Return world-frame wrenches of sequences, shape (n, time, body, 3)."""

@@ -22,7 +22,7 @@ from pbrl_ppl.planning.dynamics import Dynamics, TransitionModel, predicted_path
 from pbrl_ppl.planning.goals import ActionSet, Goal
 from pbrl_ppl.planning.search import FoundPlan, SearchTask, mppi, tail_mean
 from pbrl_ppl.scene import Scene, checks, nearest
-from pbrl_ppl.state import POSE, STATE, WRENCH, Floats
+from pbrl_ppl.state import STATE, WRENCH, Floats
 from pbrl_ppl.threads import Say, silent
 
 if TYPE_CHECKING:
@@ -88,31 +88,14 @@ class Plan(FoundPlan):
         OutputError
             If it cannot be written there.
         """
-        table = self.to_dataframe()
-        write_atomically(Path(path), lambda to: table.to_csv(to, index=False))
+        write_atomically(Path(path), lambda to: self.to_dataframe().to_csv(to, index=False))
 
     def __repr__(self) -> str:
         reached = "reached" if self.reached else "not reached"
         return f"Plan({len(self.wrenches)} intervals, {self.duration:.3g} s, goal {reached})"
 
-    def __str__(self, *, most_rows: int = 8) -> str:
-        """Return the plan's sentence, and a table of at most eight rows, with mean predictions.
-
-        ``most_rows``: rows that are shown, at most.
-        """
-        bodies = [body.name for body in self.scene.moving]
-        times = self.scene.time_step * np.arange(len(self.wrenches))
-        mean = self.predicted["predicted"].mean("draw").transpose("time", "body", "state")
-        states = mean.to_numpy()[: len(times), :, : len(POSE)]
-        table = pd.DataFrame(
-            np.concatenate([self.wrenches, states], axis=2).reshape(-1, len(WRENCH + POSE)),
-            columns=[*WRENCH, *POSE],
-        )
-        table.insert(0, "time", np.repeat(times, len(bodies)))
-        table.insert(1, "body", bodies * len(times))
-        rows = np.unique(np.linspace(0, len(table) - 1, most_rows).round().astype(int))
-        shown = table.iloc[rows if len(table) else []]
-        return f"{self.in_words()}\n{shown.to_string(index=False, float_format='%.3g')}"
+    def __str__(self) -> str:
+        return self.in_words()
 
     def in_words(self) -> str:
         """Return a sentence: whether the plan reaches the goal, how, and how far off it ends."""
@@ -151,7 +134,6 @@ def plan(
     method: str = "astar",
     draws: int | None = None,
     tail: float = 1.0,
-    noise: bool = False,
     seed: int = 0,
     nodes: int = SearchTask.nodes,
     seconds: float | None = None,
@@ -182,8 +164,6 @@ def plan(
     tail : float
         Share of the worst draws that count: 1 for the expectation, less for conditional value at
         risk.
-    noise : bool
-        Whether Eq. 13's noise is added while planning and in the predicted distribution.
     seed : int
         Of the choice of draws and of all else that is random.
     nodes : int
@@ -243,25 +223,15 @@ def plan(
     first = start_state(scene, start)
     if before is not None:
         dynamics = dynamics.after(np.asarray(before, dtype=float))
-    rng, limit = np.random.default_rng(seed), np.inf if seconds is None else seconds
-    said = progress or silent
-    task = SearchTask(dynamics, first, goal, actions, tail, nodes, limit, noise, rng, said)
+    limit, said = np.inf if seconds is None else seconds, progress or silent
+    task = SearchTask(dynamics, first, goal, actions, tail, nodes, limit, seed, said)
     result = METHODS[method](task, **options)
     states = predicted_path(dynamics, first, result.wrenches)
     distance = float(tail_mean(goal.distance(scene, states[:, -1]), tail))
-    if noise:
-        times = -(-64 // dynamics.draws)  # so many draws of Eq. 13's noise, at least
-        states = np.concatenate(
-            [predicted_path(dynamics, first, result.wrenches, rng) for _ in range(times)]
-        )
-    predicted = labelled(scene, states, ("draw", "time", "body", "state"))
+    values = labelled(scene, states, ("draw", "time", "body", "state"))
+    predicted = values.to_dataset(name="predicted")
     return Plan(
-        **vars(result),
-        scene=scene,
-        goal=goal,
-        start=first,
-        predicted=predicted.to_dataset(name="predicted"),
-        distance=distance,
+        **vars(result), scene=scene, goal=goal, start=first, predicted=predicted, distance=distance
     )
 
 

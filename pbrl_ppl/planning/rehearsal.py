@@ -314,26 +314,19 @@ def parameters_of(physics: Physics, given: Mapping[str, float]) -> Floats:
 
 
 def measured(
-    scene: Scene,
-    commands: History,
-    states: Floats,
-    rng: np.random.Generator,
-    *,
-    unknown: float = 1e-3,
+    scene: Scene, commands: History, states: Floats, rng: np.random.Generator
 ) -> tuple[History, dict[str, float]]:
     """Return the recording of simulated states, and its noise by dimension, SI units.
 
     What the commands' file measures after the first rows is measured; if nothing, the dimensions of
-    the scene's noise, or else x, y and theta.
-
-    ``unknown``: measurement noise where none is known, as a share of the motion.
+    the scene's noise, or else x, y and theta. Unknown noise is a thousandth of the motion.
     """
     dataset, known = commands.dataset.copy(), dict(scene.noise)
     seen = np.isfinite(dataset["observed"].to_numpy())
     if not seen[:, 1:].any():
         seen = np.isin(STATE, list(known) or STATE[:3]) & np.isfinite(states)
     motion = np.nanstd(states, axis=(0, 1)).max(axis=0)
-    sd = unknown * np.where(motion > 0, motion, state_sizes(scene))
+    sd = 1e-3 * np.where(motion > 0, motion, state_sizes(scene))
     sd = np.array([known.get(name, size) for name, size in zip(STATE, sd, strict=True)])
     free = ~dataset["kinematic"].to_numpy()[:, None]
     noisy = states + free * sd * rng.standard_normal(states.shape)
@@ -364,20 +357,12 @@ def simulated(
     return tried, states
 
 
-def _proposed(
-    scene: Scene,
-    rng: np.random.Generator,
-    push: float,
-    *,
-    trajectories: int = 4,
-    intervals: int = 100,
-    turn: float = 0.2,
-) -> History:
+def _proposed(scene: Scene, rng: np.random.Generator, push: float) -> History:
     """Return pushes, pauses and pushes back of random sizes, from rest at the scene's poses.
 
     Each is held for the time in which a typical force changes the motion. A body in a hinge is
     turned with ``push`` typical torques at most, another is pushed with as many typical forces and
-    turned with a share ``turn`` of them.
+    turned with a fifth of them.
 
     Raises
     ------
@@ -387,12 +372,13 @@ def _proposed(
     bodies = scene.moving
     if any(body.kinematic for body in bodies):
         raise HistoryError("rehearse: a body follows a path; give a file of commands that has it")
+    trajectories, intervals = 4, 100
     hold = max(2, round(motion_time(scene) / scene.time_step))
     states = np.full((trajectories, intervals + 1, len(bodies), len(STATE)), np.nan)
     most = np.zeros((len(bodies), 3))
     for i, body in enumerate(bodies):
         units, hinged = units_of(scene, body.name), is_pivoted(scene, body)
-        shares = (0.0, 0.0, 1.0) if hinged else (1.0, 1.0, turn)
+        shares = (0.0, 0.0, 1.0) if hinged else (1.0, 1.0, 0.2)
         most[i] = push * np.array(shares) * (units.force, units.force, units.torque)
         states[:, 0, i] = (*(body.pose or (0.0, 0.0, 0.0)), 0.0, 0.0, 0.0)
         if hinged:  # the hinge says where it is

@@ -39,10 +39,8 @@ class SearchTask:
         States to generate at most, counting each draw's; by default 15 s or so for one body.
     seconds : float
         Limit of time; with it, the plan depends on how busy the machine is.
-    noise : bool
-        Whether Eq. 13's noise is added to every transition.
-    rng : Generator
-        Source of randomness.
+    seed : int
+        Of the search's random numbers.
     progress : callable
         Called with a text on how far the search is.
     """
@@ -54,8 +52,7 @@ class SearchTask:
     tail: float = 1.0
     nodes: int = 2_000_000
     seconds: float = np.inf
-    noise: bool = False
-    rng: np.random.Generator | None = None
+    seed: int = 0
     progress: Say = silent
 
 
@@ -129,6 +126,7 @@ def contact_cost(goal: Goal, scene: Scene, states: Floats, *, near: float = 0.01
     return np.where(share > 0, goal.contact_penalty * np.maximum(share, 1e-9), 0.0)
 
 
+@dataclass(eq=False)
 class Horizon:
     """Receding horizon: wrenches for the next intervals, improved and shifted at every step.
 
@@ -144,8 +142,6 @@ class Horizon:
         Sequences tried at a time.
     iterations : int
         Times they are drawn about the best mean.
-    rng : Generator
-        Source of the samples.
 
     References
     ----------
@@ -153,35 +149,24 @@ class Horizon:
     model-based reinforcement learning", ICRA 2017.
     """
 
-    def __init__(
-        self,
-        task: SearchTask,
-        horizon: int,
-        samples: int,
-        iterations: int,
-        rng: np.random.Generator,
-    ) -> None:
-        self.task, self.rng = task, rng
-        self.samples, self.iterations = samples, iterations
-        scene = task.dynamics.scene
+    task: SearchTask
+    horizon: int
+    samples: int
+    iterations: int
+
+    def __post_init__(self) -> None:
+        task, scene = self.task, self.task.dynamics.scene
+        self.rng = np.random.default_rng(task.seed)
         strongest = [task.actions.strongest(body.name) for body in scene.moving]
         self.most = np.array([(force, force, torque) for force, torque in strongest])
-        self.mean = np.zeros((horizon, *self.most.shape))
+        self.mean = np.zeros((self.horizon, *self.most.shape))
         self.bodies = task.goal.places(scene)
         # the penalty of contact is in seconds: over the horizon, they count as the way at the start
         reach = min(scene.moving[i].shape.bounding_radius for i in self.bodies)
         self.way = max(float(task.goal.distance(scene, task.start)), reach)
         self.generated = 0
 
-    def improve(
-        self,
-        start: Floats,
-        before: Floats,
-        *,
-        persistence: float = 0.7,
-        first_spread: float = 0.5,
-        elite: float = 0.05,
-    ) -> None:
+    def improve(self, start: Floats, before: Floats) -> None:
         """Draw sequences about the mean; weigh them by their cost.
 
         Parameters
@@ -190,52 +175,43 @@ class Horizon:
             States that they begin from, shape (draw, body, 6).
         before : ndarray
             Wrenches in the interval before, shape (body, 3).
-        persistence : float
-            Correlation of the noise from one interval to the next.
-        first_spread : float
-            Standard deviation of the wrenches that are tried, as a share of the strongest.
-        elite : float
-            Share of the samples that have about as much weight as all others.
         """
+        persistence = 0.7  # correlation of the noise from one interval to the next
         size = (self.samples, *self.mean.shape)
         for iteration in range(self.iterations):
-            spread = first_spread * self.most * 0.7**iteration
+            # standard deviation of the wrenches that are tried: half of the strongest at first
+            spread = 0.5 * self.most * 0.7**iteration
             noise = self.rng.standard_normal(size)
             for t in range(1, size[1]):
-                noise[:, t] = (
-                    persistence * noise[:, t - 1] + np.sqrt(1 - persistence**2) * noise[:, t]
-                )
+                noise[:, t] *= np.sqrt(1 - persistence**2)
+                noise[:, t] += persistence * noise[:, t - 1]
             tried = np.clip(self.mean + spread * noise, -self.most, self.most)
             tried[0] = self.mean
             cost = self._cost(start, tried, before)
             worst = np.max(cost[np.isfinite(cost)], initial=0.0)
             cost = np.where(np.isfinite(cost), cost, 1e3 * worst)
-            few = np.sort(cost)[: max(2, int(elite * self.samples))]
+            # share of the samples that have about as much weight as all others: a twentieth
+            few = np.sort(cost)[: max(2, int(0.05 * self.samples))]
             least = 1e-9 * few[-1] + np.finfo(float).tiny
             weight = np.exp(-(cost - few[0]) / max(few[-1] - few[0], least))
             self.mean = np.tensordot(weight / weight.sum(), tried, axes=1)
 
-    def _cost(self, start: Floats, tried: Floats, before: Floats, *, at_end: float = 0.8) -> Floats:
-        """Return L2 distance from the goal (mean and last), last speed, and contacts.
-
-        ``at_end``: cost of the speed at the end of the horizon, in sampling intervals at it: a fast
-        body does not stay there.
-        """
-        task, horizon = self.task, tried.shape[1]
+    def _cost(self, start: Floats, tried: Floats, before: Floats) -> Floats:
+        """Return L2 distance from the goal (mean and last), last speed, and contacts."""
+        task = self.task
         scene, goal = task.dynamics.scene, task.goal
         states = np.repeat(start[:, None], len(tried), axis=1)
         cost = np.zeros(len(tried))
         last = np.broadcast_to(before, (len(tried), *before.shape))
-        for t in range(horizon):
+        for t in range(self.horizon):
             states = task.dynamics.step(states, tried[:, t], last)
             last = remembered(tried[:, t], last)
-            if task.noise:
-                states = task.dynamics.noisy(states, self.rng)
             self.generated += len(tried) * task.dynamics.draws
             far = tail_mean(goal.distance(scene, states), task.tail)
-            cost += (far + self.way * contact_cost(goal, scene, states)) / horizon
+            cost += (far + self.way * contact_cost(goal, scene, states)) / self.horizon
         speed = np.sqrt((states[..., self.bodies, 3:5] ** 2).sum(axis=(-2, -1)))
-        arrival = at_end * scene.time_step * tail_mean(speed, task.tail)
+        # cost of the speed at the end, in sampling intervals at it: a fast body does not stay
+        arrival = 0.8 * scene.time_step * tail_mean(speed, task.tail)
         return np.asarray(cost + far + arrival)
 
 
@@ -270,12 +246,9 @@ def mppi(
     """
     nodes, dynamics, goal, start = task.nodes, task.dynamics, task.goal, task.start
     if min(horizon, samples, iterations, intervals, nodes) < 1:
-        raise GoalError(
-            "MPPI: horizon, samples, iterations, intervals and nodes must be at least 1"
-        )
+        raise GoalError("MPPI: horizon, samples, iterations, intervals, nodes must be at least 1")
     scene, begin = dynamics.scene, time.monotonic()
-    rng = task.rng or np.random.default_rng(0)
-    ahead = Horizon(task, horizon, samples, iterations, rng)
+    ahead = Horizon(task, horizon, samples, iterations)
     states = np.repeat(start[None, None], dynamics.draws, axis=0)
     wrenches, last = list[Floats](), dynamics.before
     nearest, best, stopped = np.inf, 0, "exhausted"
@@ -303,5 +276,5 @@ def mppi(
     except KeyboardInterrupt:
         stopped = "interrupted"
     chosen = np.array(wrenches[:best]).reshape(-1, len(start), 3)
-    took = time.monotonic() - begin
-    return FoundPlan(chosen, stopped == "goal", stopped, ahead.generated, took)
+    seconds = time.monotonic() - begin
+    return FoundPlan(chosen, stopped == "goal", stopped, ahead.generated, seconds)

@@ -43,11 +43,10 @@ from pbrl_ppl.posterior import (
     parameter_draws,
     stored_mode,
 )
-from pbrl_ppl.progress import Progress
 from pbrl_ppl.sampling.methods import METHODS, SamplerRun, posterior_dataset
 from pbrl_ppl.sampling.mixture import mix, most_frequent, most_probable, summed
 from pbrl_ppl.state import STATE, Floats
-from pbrl_ppl.threads import Say, one_blas_thread, silent
+from pbrl_ppl.threads import Progress, Say, one_blas_thread, silent
 
 if TYPE_CHECKING:
     import pymc as pm

@@ -16,7 +16,6 @@ from .recording import SEPARATORS as SEPARATORS
 from .recording import Recording as Recording
 from .recording import column_of as column_of
 from .scene import Scene as Scene
-from .scene import check_substeps as check_substeps
 from .scene import toml_of as toml_of
 from .units import MASS_PRIOR as MASS_PRIOR
 from .units import Units as Units

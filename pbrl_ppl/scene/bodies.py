@@ -39,8 +39,8 @@ class Shape:
 
     Examples
     --------
-    >>> Shape.box(1.0, 0.6).area
-    0.6
+    >>> Shape.circle(0.5).unit_moment
+    0.125
     """
 
     kind: str
@@ -100,15 +100,6 @@ class Shape:
             return (-radius, radius, -radius, radius)
         x, y = zip(*self.outline, strict=True)
         return (min(x), max(x), min(y), max(y))
-
-    @property
-    def area(self) -> float:
-        """Area (m^2)."""
-        if self.size is not None:
-            return self.size[0] * self.size[1]
-        if self.radius is not None:
-            return float(np.pi * self.radius**2)
-        return abs(_moments(self.vertices or ())[0])
 
     @property
     def unit_moment(self) -> float:

@@ -8,20 +8,8 @@ from functools import partial
 from typing import Any
 
 from pbrl_ppl.errors import SceneError
-from pbrl_ppl.scene.checks import (
-    Check,
-    choice,
-    entries,
-    finite,
-    flag,
-    is_number,
-    items,
-    names,
-    positive,
-    settle,
-    table,
-    text,
-)
+from pbrl_ppl.scene import checks
+from pbrl_ppl.scene.checks import Check
 
 #: Separators by name; others are a single character.
 SEPARATORS = {"blank": r"\s+", "tab": "\t", "comma": ",", "semicolon": ";"}
@@ -113,7 +101,7 @@ class Recording:
     topics: Pairs = ()
 
     def __post_init__(self) -> None:
-        settle(self, "[recording]", **_CHECKS)
+        checks.settle(self, "[recording]", **_CHECKS)
 
     def table(self) -> dict[str, object]:
         """Return the entries of the TOML table: those that are not the defaults."""
@@ -130,7 +118,7 @@ class Recording:
 
 def _name_or_number(value: object, where: str) -> object:
     """Return a name of a column, or a number, as it is."""
-    if not (is_number(value) or isinstance(value, str)):
+    if not (checks.is_number(value) or isinstance(value, str)):
         raise SceneError(f"{where} is {value!r}, expected a name or a number")
     return value
 
@@ -139,7 +127,7 @@ def _column(value: object, where: str) -> object:
     """Return a name or a number, or a column with its zero as pairs."""
     if not isinstance(value, Mapping | tuple):
         return _name_or_number(value, where)
-    column = items(value, where)
+    column = checks.items(value, where)
     if {"column", "zero"} != {*column}:
         raise SceneError(
             f'{where} is {column}, expected a table such as {{ column = "knee", zero = "hanging" }}'
@@ -149,12 +137,12 @@ def _column(value: object, where: str) -> object:
 
 def _topics(value: object, where: str) -> object:
     """Return a topic, or several."""
-    return value if isinstance(value, str) else names(value, where)
+    return value if isinstance(value, str) else checks.names(value, where)
 
 
 def _separator(value: object, where: str) -> object:
     """Return a separator's name, a character, or nothing."""
-    if value not in (*SEPARATORS, "") and len(text(value, where)) != 1:
+    if value not in (*SEPARATORS, "") and len(checks.text(value, where)) != 1:
         raise SceneError(
             f"{where} is {value!r}, expected one of {', '.join(SEPARATORS)} or one character"
         )
@@ -163,19 +151,21 @@ def _separator(value: object, where: str) -> object:
 
 def _clocks(value: object, where: str) -> object:
     """Return the clocks, of which a rate is positive."""
-    if "rate" in (given := items(value, where)):
-        positive(given["rate"], f"{where}: rate")
-    return entries(_name_or_number)(value, where)
+    if "rate" in (given := checks.items(value, where)):
+        checks.positive(given["rate"], f"{where}: rate")
+    return checks.entries(_name_or_number)(value, where)
 
 
-_CUTS = dict.fromkeys(("every", "gaps", "jumps"), positive)
+_CUTS = dict.fromkeys(("every", "gaps", "jumps"), checks.positive)
 #: The check of each attribute.
 _CHECKS: Mapping[str, Check] = {
-    **dict.fromkeys(("hold", "header", "resample", "trim", "camera"), flag),
-    **{"columns": entries(_column), "units": entries(text), "not_seen": entries(finite)},
-    **{"time": _clocks, "cut": partial(table, checks=_CUTS), "topics": entries(_topics)},
-    **{"commands": text, "separator": _separator, "forces": choice(("world", "body"))},
-    "velocities": choice(("measured", "computed", "estimate")),
+    **dict.fromkeys(("hold", "header", "resample", "trim", "camera"), checks.flag),
+    **{"columns": checks.entries(_column), "units": checks.entries(checks.text)},
+    **{"time": _clocks, "not_seen": checks.entries(checks.finite)},
+    **{"cut": partial(checks.table, checks=_CUTS), "topics": checks.entries(_topics)},
+    **{"commands": checks.text, "separator": _separator},
+    "forces": checks.choice(("world", "body")),
+    "velocities": checks.choice(("measured", "computed", "estimate")),
 }
 
 

@@ -99,15 +99,8 @@ def check_product(product: str) -> None:
         _factor(factor)
 
 
-def units_of(
-    scene: Scene, name: str, *, reach: float = 10.0, duration: int = 100, largest: float = 30.0
-) -> Units:
+def units_of(scene: Scene, name: str) -> Units:
     """Return the natural units of a body: its ``typical``, and from the scene what that lacks.
-
-    ``reach``: range of the motion in body lengths where neither the scene nor a recording shows it.
-    ``duration``: that of the motion, likewise, in samples.
-    ``largest``: logarithm of a mass; more leaves the floating-point numbers, and such a prior is
-    refused later.
 
     Raises
     ------
@@ -118,29 +111,20 @@ def units_of(
     mass = dict(body.known).get("mass")
     if mass is None:  # the median of Table 1's log-normal
         mu = dict(dict(body.prior).get("mass", ())).get("mu", MASS_PRIOR[0])
-        mass = math.exp(min(mu, largest))
+        # more leaves the floating-point numbers, and such a prior is refused later
+        mass = math.exp(min(mu, 30.0))
     length = max([body.shape.bounding_radius, *_levers(scene, name)])
     gravity = max(math.hypot(*scene.gravity), scene.normal_gravity)
-    speed = math.sqrt(gravity * length) or length / (duration * scene.time_step)
-    extent, centre = reach * length, (0.0, 0.0)
+    # range and duration of the motion where neither the scene nor a recording shows them
+    extent, time, x, y = 10.0 * length, 100 * scene.time_step, 0.0, 0.0
+    speed = math.sqrt(gravity * length) or length / time
     if scene.extent is not None:
         x_min, x_max, y_min, y_max = scene.extent
-        centre = (x_min + x_max) / 2, (y_min + y_max) / 2
+        x, y = (x_min + x_max) / 2, (y_min + y_max) / 2
         extent = max(length, math.hypot(x_max - x_min, y_max - y_min) / 2)
     force = mass * (gravity or speed**2 / length)
-    units = Units(
-        mass=mass,
-        length=length,
-        time=duration * scene.time_step,
-        force=force,
-        torque=force * length,
-        speed=speed,
-        turn_rate=speed / length,
-        range=extent,
-        interval=scene.time_step,
-        x=centre[0],
-        y=centre[1],
-    )
+    torque, turn_rate, interval = force * length, speed / length, scene.time_step
+    units = Units(mass, length, time, force, torque, speed, turn_rate, extent, interval, x, y)
     return replace(units, **dict(body.typical))
 
 

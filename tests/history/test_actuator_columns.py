@@ -11,7 +11,7 @@ from pbrl_ppl.cli import main
 from pbrl_ppl.errors import HistoryError, RecordingWarning
 from pbrl_ppl.history import History
 from pbrl_ppl.physics import Physics
-from pbrl_ppl.planning import Dynamics
+from pbrl_ppl.planning import Dynamics, predicted_path
 from pbrl_ppl.posterior import load_posterior, save_posterior
 from pbrl_ppl.scene import Actuator, Body, Recording, Scene, Shape
 
@@ -143,6 +143,6 @@ def test_a_fit_is_planned_with(tmp_path: Path) -> None:
     dynamics = Dynamics.of(load_posterior(tmp_path / "craft.nc"))
     both = np.zeros((10, 1, 3))
     both[..., :2] = 1.0
-    x, y, *_ = dynamics.rollout(np.zeros((1, 6)), both)[0, -1, 0]
+    x, y, *_ = predicted_path(dynamics, np.zeros((1, 6)), both)[0, -1, 0]
     assert x == pytest.approx(0.5 * (2 * 0.5 / 0.5) * 1.0**2, rel=1e-6)  # F t^2 / 2 m
     assert abs(y) < 1e-9

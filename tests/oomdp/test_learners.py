@@ -257,8 +257,6 @@ def test_bad_transitions() -> None:
         model.step(good[0], good[1])
     with pytest.raises(FitError, match=r'no moving body "puk".*did you mean "puck"'):
         model.conditions("puk")
-    with pytest.raises(FitError, match="plan without noise"):
-        model.noisy(good[0][None], np.random.default_rng(1))
 
 
 def test_rounding_errors_are_no_input() -> None:

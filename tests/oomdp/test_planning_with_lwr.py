@@ -6,7 +6,7 @@ import pytest
 from pbrl_ppl.agents import act
 from pbrl_ppl.errors import FitError, GoalError
 from pbrl_ppl.oomdp import LWR, OOLWR
-from pbrl_ppl.planning import plan
+from pbrl_ppl.planning import plan, predicted_path
 from tests.helpers.pucks import ACROSS, FREE, PUSHES, ROOM, known
 from tests.helpers.transitions import transitions
 
@@ -24,7 +24,7 @@ def test_reaches_a_free_goal(free) -> None:
     """And the plan does in the world what the model says it does."""
     found = plan(free, *ACROSS, PUSHES)
     assert found.reached and found.distance < 0.1
-    played = known(FREE).rollout(found.start, found.wrenches)[0, -1, 0]
+    played = predicted_path(known(FREE), found.start, found.wrenches)[0, -1, 0]
     np.testing.assert_allclose(found.predicted["predicted"].to_numpy()[0, -1, 0], played, atol=1e-9)
     np.testing.assert_allclose(played[:2], (1.5, -1.0), atol=0.1)
 
@@ -42,7 +42,7 @@ def test_lwr_plans_through_walls() -> None:
     assert found.reached
     where = found.predicted["predicted"].isel(draw=0, body=0)
     assert where.sel(state="y").max() < 0.8  # the wall ends at y = 1
-    played = known(ROOM).rollout(found.start, found.wrenches)[0, :, 0]
+    played = predicted_path(known(ROOM), found.start, found.wrenches)[0, :, 0]
     assert played[:, 0].max() < 0.0  # the wall is at x = 0
 
 
@@ -77,7 +77,5 @@ def test_acts_on_it(free) -> None:
 def test_bad_requests(free) -> None:
     with pytest.raises(GoalError, match="give actions"):
         plan(free, *ACROSS)
-    with pytest.raises(FitError, match="plan without noise"):
-        plan(free, *ACROSS, PUSHES, noise=True)
     with pytest.raises(FitError, match="nothing was observed yet"):
         plan(OOLWR(FREE), *ACROSS, PUSHES)

@@ -98,7 +98,7 @@ def test_a_random_sequence_separates_less(posterior, suggestion) -> None:
     rivals = fit_rivals(
         posterior, named_effects(DRAGS, scene_of(posterior), pp.catalogue), pp.catalogue, 8, 99
     )
-    judge = Separation(rivals, suggestion.start, np.zeros((1, 3)))
+    judge = Separation(rivals, suggestion.start)
     rng = np.random.default_rng(99)
     held = np.repeat(rng.uniform(-6, 6, (30, 6, 1, 2)), 2, axis=1)
     others = np.concatenate([held, np.zeros((30, 12, 1, 1))], axis=-1)
@@ -119,10 +119,10 @@ def test_nothing_separates_a_model_from_itself(posterior) -> None:
     (one, _) = fit_rivals(
         posterior, named_effects(DRAGS, scene_of(posterior), pp.catalogue), pp.catalogue, 8, 1
     )
-    copy = Rival(one.attached, one.mode, one.mode.draws(np.random.default_rng(2), 8), one.sigma)
+    copy = Rival(one.mode, one.mode.draws(np.random.default_rng(2), 8), one.sigma)
     pushes = np.zeros((2, 12, 1, 3))
     pushes[1, :, 0, 0] = 5.0
-    found, meeting = Separation((one, copy), np.zeros((1, 6)), np.zeros((1, 3)))(pushes, 8)
+    found, meeting = Separation((one, copy), np.zeros((1, 6)))(pushes, 8)
     assert not meeting.any()
     # what draws of one posterior differ by, its own width absorbs: 0 but for their number
     assert (np.abs(found) < 1.5).all()
@@ -138,7 +138,7 @@ def test_expected_is_what_bayes_factors_are_in_the_mean(posterior) -> None:
     # so little is known of each that it must show in both
     start = np.array([[0.0, 0.0, 0.0, 1.3, 0.0, 0.0]])
     pushes = np.zeros((1, 6, 1, 3))
-    judge = Separation(rivals, start, np.zeros((1, 3)))
+    judge = Separation(rivals, start)
     expected = judge(pushes, 16)[0][:, :, 0]
     assert (expected[~np.eye(2, dtype=bool)] > 0).all()
     rng, noise = np.random.default_rng(4), _noise(judge, 6)

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from pbrl_ppl.agents import act
-from pbrl_ppl.errors import GoalError, PosteriorError
+from pbrl_ppl.errors import GoalError
 from pbrl_ppl.history import History
 from pbrl_ppl.physics import Transition, overlap
-from pbrl_ppl.planning import ActionSet, Dynamics, Goal, astar, plan, search
+from pbrl_ppl.planning import ActionSet, Dynamics, Goal, astar, plan, predicted_path, search
 from pbrl_ppl.planning.astar import TimeToGo
 from pbrl_ppl.scene import Actuator, Joint, Scene, Shape, Wall
 from tests.helpers.pucks import ACROSS, FORCE, FREE, MASS, PUSHES, ROOM, known
@@ -50,11 +50,6 @@ def test_what_diverged_stays_lost() -> None:
     after = known().step(states, np.zeros((2, 1, 3)))
     assert np.isfinite(after[0, 0]).all()
     assert np.isnan(after[0, 1]).all()
-
-
-def test_known_parameters_have_no_noise() -> None:
-    with pytest.raises(PosteriorError, match="have no sigma"):
-        plan(known(), *ACROSS, PUSHES, noise=True)
 
 
 # -- the bound -------------------------------------------------------------------------------------
@@ -286,7 +281,7 @@ def test_caution_reaches_under_the_worst_draw() -> None:
     ends = found.predicted["predicted"].values[:, -1]
     assert (goal.shortfall(FREE, ends) <= 1.0).all()
     sure = plan(known(), {"puck": (0, 0, 0)}, goal, PUSHES)
-    others = known(FREE, 1.8, 2.2).rollout(sure.start, sure.wrenches)[:, -1]
+    others = predicted_path(known(FREE, 1.8, 2.2), sure.start, sure.wrenches)[:, -1]
     assert sure.reached
     assert goal.shortfall(FREE, others).max() > 1.0
 

@@ -35,7 +35,7 @@ def test_both_stacks_plan_alike(generation: str) -> None:
         np.testing.assert_allclose(found[column], there[column], atol=1e-9)
 
 
-@pytest.mark.filterwarnings("ignore:the chains have not converged")  # few draws, on purpose
+@pytest.mark.filterwarnings("ignore:the draws are too few")  # few draws, on purpose
 def test_a_fresh_process_with_the_file_plans_as_memory_does(tmp_path: Path) -> None:
     idata = fitted(draws=100)
     here = planned(idata)
@@ -65,17 +65,6 @@ def test_map_is_the_stored_mode_and_draws_are_seeded() -> None:
     assert len(np.unique(one)) == 8
     with pytest.raises(PosteriorError, match="expected 1 to 1000"):
         Dynamics.of(idata, 1001)
-
-
-def test_noise_widens_what_is_predicted() -> None:
-    """By Eq. 13: after the first interval, sigma about the predictions without noise."""
-    idata = load_posterior(file("5"))
-    exact, noisy = (planned(idata, noise=noise).predicted["predicted"] for noise in (False, True))
-    sigma = draws(idata)["sigma"].mean(axis=0)
-    assert noisy.sizes["draw"] == 64
-    spread = noisy.isel(time=1).std("draw").values[0] - exact.isel(time=1).std("draw").values[0]
-    # 64 draws: a spread is within 40 % but for one in a million
-    assert (abs(spread / sigma - 1) < 0.4).all()
 
 
 def test_actions_are_such_as_were_recorded() -> None:
@@ -177,16 +166,10 @@ if __name__ == "__main__":
 
 
 @pytest.mark.one_stack
-def test_a_plan_prints_as_a_sentence_and_a_short_table() -> None:
+def test_a_plan_prints_as_a_sentence() -> None:
     found = planned(load_posterior(file("5")))
-    sentence, head, *rows = str(found).splitlines()
-    assert sentence == found.in_words()
-    assert head.split() == ["time", "body", "force_x", "force_y", "torque", "x", "y", "theta"]
-    assert 1 < len(rows) <= 8
-    first, last = rows[0].split(), rows[-1].split()
-    assert first[:2] == ["0", "puck"] and first[5:] == ["0", "0", "0"]
-    assert float(last[0]) == pytest.approx(found.duration - found.scene.time_step, rel=0.01)
-    np.testing.assert_allclose([float(x) for x in last[2:5]], found.wrenches[-1, 0], rtol=0.01)
+    assert str(found) == found.in_words()
+    assert str(found).startswith(f"the goal is reached: {len(found.wrenches)} intervals")
     assert repr(found) == (
         f"Plan({len(found.wrenches)} intervals, {found.duration:.3g} s, goal reached)"
     )
