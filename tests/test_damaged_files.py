@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from pbrl_ppl.errors import GoalError, HistoryError, PbrlError, PosteriorError, SceneError
-from pbrl_ppl.files import is_as_sealed, seal
 from pbrl_ppl.history import History
 from pbrl_ppl.planning import Goal
 from pbrl_ppl.posterior import load_posterior, save_posterior
 from pbrl_ppl.posterior.store import from_groups
 from pbrl_ppl.scene import Scene
+from pbrl_ppl.system.files import is_as_sealed, seal
 from tests.helpers.puck import SCENE
 
 pytestmark = pytest.mark.one_stack

@@ -12,10 +12,10 @@ from types import SimpleNamespace
 import pytest
 import xarray as xr
 
-from pbrl_ppl import files
 from pbrl_ppl.criticism import Loop, results
 from pbrl_ppl.errors import OutputError
-from pbrl_ppl.files import check_folder, check_survives, write_atomically, write_text
+from pbrl_ppl.system import files
+from pbrl_ppl.system.files import check_folder, check_survives, write_atomically, write_text
 
 pytestmark = pytest.mark.one_stack
 

@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from pbrl_ppl.criticism import Stage
-from pbrl_ppl.threads import Progress, Work, counted, in_parallel
+from pbrl_ppl.system.threads import Progress, Work, counted, in_parallel
 
 pytestmark = pytest.mark.one_stack
 

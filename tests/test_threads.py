@@ -2,7 +2,7 @@
 
 import threading
 
-from pbrl_ppl.threads import Work, in_parallel, in_worker
+from pbrl_ppl.system.threads import Work, in_parallel, in_worker
 
 
 def test_values_come_in_the_order_of_their_arguments() -> None:

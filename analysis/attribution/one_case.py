@@ -18,7 +18,7 @@ from attribution.baselines import ask_baselines
 from attribution.cases import CATALOGUED, Case
 from attribution.oracle import Oracle, ask, declared_mode, sized, true_parameters
 from pbrl_ppl import close_loop
-from pbrl_ppl.threads import Work
+from pbrl_ppl.criticism import Stage
 
 #: Parameters of which more than one value is the truth: any number between two trajectories.
 _AMBIGUOUS = {("mass_change", "trajectory")}
@@ -171,7 +171,7 @@ def _loop(
     stages: list[tuple[float, str]] = []
 
     def begun(stage: str) -> None:
-        if not isinstance(stage, Work):
+        if stage in tuple(Stage):
             stages.append((time.perf_counter() - begin, stage))
 
     found = close_loop(

@@ -26,7 +26,6 @@ import pandas as pd
 from PIL import Image
 
 from pbrl_ppl import PbrlError, cli, load_posterior
-from pbrl_ppl.files import json_values
 from pbrl_ppl.posterior.store import groups
 
 if str(Path(__file__).parents[2]) not in sys.path:  # helpers are shared with the tests
@@ -353,7 +352,7 @@ def mutate(kind: str, path: Path, draw: random.Random, base: Path) -> str:
 def contents(path: Path) -> dict[str, object]:
     """Return all values of a posterior file, as text."""
     idata = load_posterior(path)
-    values = {name: json.dumps(json_values(data.to_dict())) for name, data in groups(idata).items()}
+    values = {name: json.dumps(data.to_dict(), default=str) for name, data in groups(idata).items()}
     return values | {str(key): repr(value) for key, value in idata.attrs.items()}
 
 

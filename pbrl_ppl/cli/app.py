@@ -22,7 +22,7 @@ from pbrl_ppl import __version__
 from pbrl_ppl.cli import options, terminal
 from pbrl_ppl.cli.terminal import Result, in_a_line
 from pbrl_ppl.errors import OutputError, PbrlError, printable
-from pbrl_ppl.files import only_writer
+from pbrl_ppl.system.files import only_writer
 
 F = TypeVar("F", bound=Callable[..., Result])
 

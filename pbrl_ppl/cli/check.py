@@ -111,14 +111,12 @@ def _compared(
     scene: Scene, history: History, catalogue: Sequence[Effect], draws: int, seed: int
 ) -> PriorCheck:
     """Return how the data compare with draws from the prior."""
-    from pbrl_ppl.criticism import informative_horizon, prior_predictive_check
+    from pbrl_ppl.criticism import check_prior
     from pbrl_ppl.effects import attach
-    from pbrl_ppl.likelihood import Problem
     from pbrl_ppl.physics import Physics
 
     physics = Physics(scene, attach(scene, (), catalogue))
-    problem = Problem.of(physics, history, horizon=informative_horizon(history))
-    return prior_predictive_check(problem, draws=draws, seed=seed)
+    return check_prior(physics, history, draws=draws, seed=seed)
 
 
 def _contents(scene: Scene, history: History) -> dict[str, str]:

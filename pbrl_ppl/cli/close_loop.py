@@ -19,8 +19,8 @@ from pbrl_ppl.cli.app import command
 from pbrl_ppl.cli.new import models_folder
 from pbrl_ppl.cli.terminal import Progress, Result
 from pbrl_ppl.errors import HistoryError, PbrlError
-from pbrl_ppl.files import check_folder, write_text
-from pbrl_ppl.threads import Work, counted, obey_parent
+from pbrl_ppl.system.files import check_folder, write_text
+from pbrl_ppl.system.threads import Work, counted, obey_parent
 
 if TYPE_CHECKING:
     from pbrl_ppl.criticism import Loop

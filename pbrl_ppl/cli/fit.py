@@ -13,7 +13,7 @@ from pbrl_ppl import errors
 from pbrl_ppl.cli import options, terminal
 from pbrl_ppl.cli.app import command
 from pbrl_ppl.cli.terminal import Progress, Result, check_file
-from pbrl_ppl.files import write_text
+from pbrl_ppl.system.files import write_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -103,15 +103,14 @@ def fit(
     declared, (loaded,) = reading.read(scene, [history])
     declared, effects = options.added_effects(declared, options.own_effects(reading.effect_file))
     progress("loading the sampler")
-    from pbrl_ppl import sampling
-    from pbrl_ppl.model import physics_model
+    import pbrl_ppl as pp
     from pbrl_ppl.physics import check_history
     from pbrl_ppl.posterior import load_posterior, save_posterior
 
     check_history(declared, loaded, loaded.segments(1))
     earlier = None if resume is None else load_posterior(resume)
     try:
-        made = physics_model(
+        made = pp.physics_model(
             declared, loaded, effects, likelihood=model.likelihood, horizon=model.horizon,
             nu=model.nu, sigma="scalar" if model.scalar else "per_dimension",
         )  # fmt: skip
@@ -121,7 +120,7 @@ def fit(
         interrupts.keep()  # the draws of chains so far
     progress("looking for the mode, then sampling")
     with terminal.noted_warnings("was interrupted") as caught:
-        idata = sampling.fit(made, resume=earlier, progress=progress, **vars(sampler))
+        idata = pp.fit(made, resume=earlier, progress=progress, **vars(sampler))
         save_posterior(idata, to.output)
     return _fitted(idata, to.output, {type(warning) for warning in caught}, interrupts.seen)
 
@@ -200,10 +199,10 @@ def update(
     scene = posteriors.scene_of(idata)
     new = reading.recording(history, scene, resample=reading.resample)
     progress("updating")
-    from pbrl_ppl.sampling import updating
+    import pbrl_ppl as pp
 
     with terminal.noted_warnings() as caught:
-        idata = updating.update(idata, new, effects=catalogue, seed=seed, progress=progress)
+        idata = pp.update(idata, new, effects=catalogue, seed=seed, progress=progress)
     record = posteriors.PosteriorRecord.of(idata)
     if record.interrupted is not None:  # half a posterior is no prior for the next update
         raise KeyboardInterrupt

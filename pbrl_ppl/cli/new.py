@@ -25,9 +25,9 @@ from pbrl_ppl.errors import (
     RecordingWarning,
     SceneError,
 )
-from pbrl_ppl.files import write_atomically, write_text
 from pbrl_ppl.scene import WORLD, Actuator, Body, Joint, Recording, Scene, Shape, nearest, toml_of
 from pbrl_ppl.state import STATE, VELOCITY, Floats
+from pbrl_ppl.system.files import write_atomically, write_text
 
 if TYPE_CHECKING:
     import pandas as pd

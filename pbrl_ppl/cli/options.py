@@ -41,7 +41,7 @@ import typer
 
 from pbrl_ppl.cli.terminal import check_file
 from pbrl_ppl.errors import EffectError, GoalError
-from pbrl_ppl.files import check_folder, check_regular
+from pbrl_ppl.system.files import check_folder, check_regular
 
 if TYPE_CHECKING:
     from pbrl_ppl.effects import Attached, Effect

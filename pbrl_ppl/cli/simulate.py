@@ -19,7 +19,6 @@ from pbrl_ppl.state import STATE, Floats
 if TYPE_CHECKING:
     from pbrl_ppl.effects import Effect
     from pbrl_ppl.history import History
-    from pbrl_ppl.parameters import Layout
     from pbrl_ppl.physics import Physics
     from pbrl_ppl.planning.rehearsal import RehearsedLaw
 
@@ -121,12 +120,13 @@ def _parameters(
         substeps = scene.substeps
     physics = Physics(scene, attach(scene, (), catalogue), substeps, threads=2)
     phi = dynamics.phi.copy() if dynamics else np.full((1, physics.layout.size), np.nan)
-    _set(physics.layout, phi, values)
+    _set(physics, phi, values)
     return physics, phi
 
 
-def _set(layout: Layout, phi: Floats, values: Mapping[str, float]) -> None:
+def _set(physics: Physics, phi: Floats, values: Mapping[str, float]) -> None:
     """Set values in parameter vectors, in place: by label, or by name for all bodies."""
+    layout = physics.layout
     labels = np.array(layout.labels)
     names = np.array([label.partition("[")[0] for label in layout.labels])
     for name, value in values.items():

@@ -23,8 +23,8 @@ from rich.text import Text
 
 from pbrl_ppl.errors import OutputError, printable
 from pbrl_ppl.errors import in_a_line as in_a_line
-from pbrl_ppl.files import json_values
-from pbrl_ppl.threads import Progress as Progress
+from pbrl_ppl.system.files import json_values
+from pbrl_ppl.system.threads import Progress as Progress
 
 #: Exit codes: a failed log, a goal that was not reached, or effects that stay inseparable; bad
 #: input or usage; chains that have not converged, so no verdict; an interrupt, as shells report it.

@@ -14,13 +14,14 @@ from .misfit import LARGEST_SHARE as LARGEST_SHARE
 from .misfit import acceleration_in_words as acceleration_in_words
 from .misfit import share_in_words as share_in_words
 from .prior_check import PriorCheck as PriorCheck
-from .prior_check import informative_horizon as informative_horizon
+from .prior_check import check_prior as check_prior
 from .prior_check import prior_predictive_check as prior_predictive_check
 from .results import ADEQUATE as ADEQUATE
 from .results import FILES as FILES
 from .results import NOT_CONVERGED as NOT_CONVERGED
 from .results import ONE_TRAJECTORY as ONE_TRAJECTORY
 from .results import UNEXPLAINED as UNEXPLAINED
+from .results import ComparedModel as ComparedModel
 from .results import Errors as Errors
 from .results import Estimate as Estimate
 from .results import Law as Law

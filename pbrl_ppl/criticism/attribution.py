@@ -13,11 +13,11 @@ from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.criticism.search import Search
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.effects import catalogue as full_catalogue
-from pbrl_ppl.files import json_fields
 from pbrl_ppl.history import MOST_TRANSITIONS, History
 from pbrl_ppl.likelihood import is_simulated
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.threads import one_blas_thread, silent
+from pbrl_ppl.system.files import json_fields
+from pbrl_ppl.system.threads import one_blas_thread, silent
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from pbrl_ppl.criticism.innovations import (
     unexplained_acceleration,
 )
 from pbrl_ppl.criticism.misfit import find_misfit, forecast_test, score_test, simulation_test
-from pbrl_ppl.criticism.prior_check import informative_horizon, prior_predictive_check
+from pbrl_ppl.criticism.prior_check import check_prior
 from pbrl_ppl.criticism.refinement import Declared, checked_histories, outliers, shift
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.criticism.search import Search, SearchResult
@@ -35,7 +35,7 @@ from pbrl_ppl.history import (
     with_units,
     without_measurements,
 )
-from pbrl_ppl.likelihood import Problem, is_simulated, single_transitions
+from pbrl_ppl.likelihood import is_simulated, single_transitions
 from pbrl_ppl.modes import (
     FilteredMode,
     Mode,
@@ -58,7 +58,7 @@ from pbrl_ppl.posterior import (
 )
 from pbrl_ppl.sampling import WeightsError, sample
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.threads import one_blas_thread
+from pbrl_ppl.system.threads import one_blas_thread
 
 
 @one_blas_thread
@@ -102,7 +102,7 @@ def close_loop(
         Thresholds of the decisions.
     progress : callable, optional
         Called with each :class:`Stage`, with sentences on what was found, and with
-        ``pbrl_ppl.threads.Work``, what is done now and how much of it.
+        ``pbrl_ppl.system.threads.Work``, what is done now and how much of it.
 
     Returns
     -------
@@ -341,10 +341,8 @@ def _tested(task: _Task, fitted: _Fitted, prior: results.ResidualTest) -> _Judge
 def _prior_test(task: _Task, train: History) -> results.ResidualTest:
     """Test whether the declared prior could have made the data, and warn before the long fit."""
     task.say(results.Stage.CHECK_PRIOR)
-    problem = Problem.of(
-        Physics(task.scene, task.effects, threads=2), train, horizon=informative_horizon(train)
-    )
-    checked = prior_predictive_check(problem, seed=task.seed, criteria=task.criteria.prior)
+    physics = Physics(task.scene, task.effects, threads=2)
+    checked = check_prior(physics, train, seed=task.seed, criteria=task.criteria.prior)
     share = float(checked.dataset["share_beyond"].max())
     sentence, *more = checked.summary
     if more:

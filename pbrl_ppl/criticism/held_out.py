@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from pbrl_ppl.criticism.results import Errors, Rollout
-from pbrl_ppl.history import History, longest_gap
+from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import FilteredProblem, TrajectoryNoise, along_trajectories, in_pieces
 from pbrl_ppl.modes import MOST_GROWTH, FilteredMode, fit_pieces, growth
 from pbrl_ppl.posterior import Fit
@@ -233,7 +233,7 @@ def rollout_horizon(history: History, scene: Scene, motion_times: float = 4.0) -
     More where bodies are seen less often.
     """
     intervals = math.ceil(motion_times * motion_time(scene) / scene.time_step)
-    return longest_rollout(history, max(longest_gap(history), intervals))
+    return longest_rollout(history, max(history.longest_gap, intervals))
 
 
 def longest_rollout(history: History, intervals: int) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -14,13 +15,13 @@ from pbrl_ppl.criticism.criteria import DEFAULT, PriorCriteria
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.history import (
     History,
-    longest_gap,
     measured_alone,
     measurement_noise,
     unused_velocities,
     wrong_clock,
 )
 from pbrl_ppl.likelihood import Problem, draw_prior
+from pbrl_ppl.physics import Physics
 from pbrl_ppl.posterior import HDI_PROB
 from pbrl_ppl.state import POSE, STATE, STATE_UNITS, THETA, Bools, Floats, Ints, wrapped
 
@@ -258,6 +259,12 @@ def _at(states: Floats, step: Ints) -> Floats:
     return np.asarray(np.take_along_axis(states, picked, axis=-3)[..., 0, :, :])
 
 
+def check_prior(physics: Physics, history: History, **options: Any) -> PriorCheck:
+    """Compare a history with draws from the prior over the horizon that its noise asks for."""
+    problem = Problem.of(physics, history, horizon=informative_horizon(history))
+    return prior_predictive_check(problem, **options)
+
+
 def informative_horizon(history: History, signal: float = 5.0) -> int:
     """Return the intervals in which bodies move well beyond the measurement noise: often one.
 
@@ -276,7 +283,7 @@ def informative_horizon(history: History, signal: float = 5.0) -> int:
     angle = np.tile(np.arange(len(POSE)) == THETA, len(places) // len(POSE))
     longest = int(history.dataset["n_rows"].min()) - 1
 
-    steps = [longest_gap(history)]
+    steps = [history.longest_gap]
     while steps[-1] < longest:
         steps.append(min(2 * steps[-1], longest))
     noise = _mean_square(places, angle, 1, 3) / 20.0

@@ -16,12 +16,12 @@ from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import OutputError
-from pbrl_ppl.files import check_folder, json_values, temporary_folder
 from pbrl_ppl.history import History, UnusedVelocity
 from pbrl_ppl.modes import FilteredMode
 from pbrl_ppl.posterior import Comparison, Fit, Idata, Identifiability, save_posterior
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats
+from pbrl_ppl.system.files import check_folder, json_values, temporary_folder
 
 #: The verdicts. NOT_CONVERGED: chains disagree; no verdict.
 ADEQUATE, EFFECTS_ADDED, UNEXPLAINED = "adequate", "effects-added", "unexplained"

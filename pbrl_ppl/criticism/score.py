@@ -16,7 +16,7 @@ from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import Mode, posterior_slopes
 from pbrl_ppl.parameters import box, prior_residual, prior_slopes
 from pbrl_ppl.state import Floats, Ints
-from pbrl_ppl.threads import Say, in_parallel, silent
+from pbrl_ppl.system.threads import Say, in_parallel, silent
 
 
 @dataclass(frozen=True, eq=False)

@@ -47,7 +47,7 @@ from pbrl_ppl.modes import (
     with_robust_covariance,
 )
 from pbrl_ppl.state import Bools, Floats
-from pbrl_ppl.threads import Say, in_parallel, silent
+from pbrl_ppl.system.threads import Say, in_parallel, silent
 
 
 @dataclass(frozen=True, eq=False)

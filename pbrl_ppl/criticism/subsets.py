@@ -22,7 +22,7 @@ from pbrl_ppl.criticism.score import (
 )
 from pbrl_ppl.effects import Attached
 from pbrl_ppl.state import Floats, Ints
-from pbrl_ppl.threads import Say, in_parallel, silent
+from pbrl_ppl.system.threads import Say, in_parallel, silent
 
 
 @dataclass(frozen=True, eq=False)

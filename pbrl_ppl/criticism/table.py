@@ -14,7 +14,7 @@ from pbrl_ppl.modes import Mode, find_mode, fit_pieces, is_simulated_mode
 from pbrl_ppl.parameters import inside, prior_residual, prior_slopes, stepped
 from pbrl_ppl.scene import state_sizes
 from pbrl_ppl.state import Bools, Floats
-from pbrl_ppl.threads import Say, in_parallel, silent
+from pbrl_ppl.system.threads import Say, in_parallel, silent
 
 
 def moving(mode: Mode, *, still: float = 1e-4) -> Bools:

@@ -25,7 +25,6 @@ from .history import History as History
 from .history import Segments as Segments
 from .history import check_start as check_start
 from .history import from_segments as from_segments
-from .history import longest_gap as longest_gap
 from .history import unseen as unseen
 from .history import with_paths as with_paths
 from .kinematics import column_noise as column_noise

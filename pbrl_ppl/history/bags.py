@@ -16,11 +16,11 @@ import numpy as np
 import pandas as pd
 
 from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.files import reason
 from pbrl_ppl.history.clocks import Say
 from pbrl_ppl.history.files import FOLDER, reads
 from pbrl_ppl.history.guesses import with_derived
 from pbrl_ppl.scene import Recording, nearest
+from pbrl_ppl.system.files import reason
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader

@@ -23,7 +23,10 @@ import pandas as pd
 import xarray as xr
 
 from pbrl_ppl.errors import HistoryError, OutputError, printable
-from pbrl_ppl.files import (
+from pbrl_ppl.history.measures import SAME
+from pbrl_ppl.scene import SEPARATORS, Recording
+from pbrl_ppl.state import STATE, WRENCH, Floats
+from pbrl_ppl.system.files import (
     check_hdf5,
     check_regular,
     check_survives,
@@ -32,9 +35,6 @@ from pbrl_ppl.files import (
     seal,
     write_atomically,
 )
-from pbrl_ppl.history.measures import SAME
-from pbrl_ppl.scene import SEPARATORS, Recording
-from pbrl_ppl.state import STATE, WRENCH, Floats
 
 COLUMNS = ("trajectory", "step", "time", "body", *STATE, *WRENCH)
 #: Suffixes of files that `History.save` writes.

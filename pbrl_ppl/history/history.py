@@ -376,6 +376,18 @@ class History:
         return np.asarray(data["clock"].to_numpy() - data["began"].to_numpy()[:, None])
 
     @property
+    def longest_gap(self) -> int:
+        """Return the most intervals between rows with all bodies in a sparse recording, else 1.
+
+        A recording is sparse if more than half of the steps from one such row to the next skip
+        rows: a block that is seen before and after a push, say.
+        """
+        complete = np.asarray(~unseen(self).any(axis=-1))
+        both = zip(complete, self.dataset["n_rows"].to_numpy(), strict=True)
+        gaps = np.concatenate([np.diff(np.flatnonzero(seen[:n])) for seen, n in both])
+        return int(gaps.max()) if len(gaps) and np.median(gaps) > 1 else 1
+
+    @property
     def complete(self) -> Bools:
         """Whether the state is complete, so that pieces may start, shape (trajectory, time)."""
         return np.asarray(np.isfinite(self.dataset["start"].to_numpy()).all(axis=(-1, -2)))
@@ -489,18 +501,6 @@ def unseen(history: History) -> Bools:
     hidden[..., dataset["kinematic"].to_numpy()] = False
     rows = np.arange(hidden.shape[1]) < dataset["n_rows"].to_numpy()[:, None]
     return np.asarray(hidden & rows[..., None])
-
-
-def longest_gap(history: History) -> int:
-    """Return the most intervals between rows with all bodies in a sparse recording, else 1.
-
-    A recording is sparse if more than half of the steps from one such row to the next skip rows: a
-    block that is seen before and after a push, say.
-    """
-    complete = np.asarray(~unseen(history).any(axis=-1))
-    both = zip(complete, history.dataset["n_rows"].to_numpy(), strict=True)
-    gaps = np.concatenate([np.diff(np.flatnonzero(seen[:n])) for seen, n in both])
-    return int(gaps.max()) if len(gaps) and np.median(gaps) > 1 else 1
 
 
 def check_start(history: History, scene: Scene) -> None:

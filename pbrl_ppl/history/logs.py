@@ -9,10 +9,10 @@ from pathlib import Path
 import pandas as pd
 
 from pbrl_ppl.errors import HistoryError, printable
-from pbrl_ppl.files import reason
 from pbrl_ppl.history.files import FOLDER, read_table, readers
 from pbrl_ppl.history.rows import with_clean_names
 from pbrl_ppl.scene import Recording
+from pbrl_ppl.system.files import reason
 
 #: A log, a folder of logs, or several.
 Paths = str | Path | Sequence[str | Path]

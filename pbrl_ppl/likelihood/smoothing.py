@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pbrl_ppl.history import longest_gap, unseen
+from pbrl_ppl.history import unseen
 from pbrl_ppl.likelihood.coordinates import Coordinates, first_states, observed_coordinates
 from pbrl_ppl.likelihood.data import SPREAD, least_noise
 from pbrl_ppl.likelihood.likelihood import LikelihoodT, TransitionLikelihood
@@ -96,7 +96,7 @@ def as_measured(
 
 def single_transitions(problem: Problem) -> Problem[TransitionLikelihood]:
     """Return the problem with the likelihood of single transitions (Eq. 11)."""
-    horizon = longest_gap(problem.data.history)
+    horizon = problem.data.history.longest_gap
     single = problem.with_data(horizon=horizon, states=None, columns=None)
     return single.with_likelihood(prior=None)
 
@@ -178,7 +178,7 @@ def with_predicted_gaps(problem: Problem[LikelihoodT], phi: Floats) -> Problem[L
         Parameters to predict with, shape (p,).
     """
     history = problem.data.history
-    if longest_gap(history) == 1:
+    if history.longest_gap == 1:
         return problem
     hidden, states = unseen(history), problem.data.smoothed_states.copy()
     segments, inputs = problem.segments, problem.inputs

@@ -22,7 +22,7 @@ from pbrl_ppl.parameters import Layout, change_from, covariance_factor
 from pbrl_ppl.physics import Memory
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Bools, Floats
-from pbrl_ppl.threads import in_parallel, processors
+from pbrl_ppl.system.threads import in_parallel, processors
 
 #: Predicts next states from phi, initial states and inputs, as a simulator does.
 Engine = Callable[[Floats, Floats, Floats], Floats]

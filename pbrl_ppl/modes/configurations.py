@@ -21,7 +21,7 @@ from pbrl_ppl.parameters import JOINT_ANCHORS, Prior, inside, prior_draws
 from pbrl_ppl.physics import index_priors
 from pbrl_ppl.scene import WORLD, Joint, Scene
 from pbrl_ppl.state import Floats
-from pbrl_ppl.threads import Say, counted, silent
+from pbrl_ppl.system.threads import Say, counted, silent
 
 #: Two names in the order of ``scene.joinable``, or None where there is no joint.
 Pair = tuple[str, str] | None

@@ -22,7 +22,7 @@ from pbrl_ppl.modes.search import Mode
 from pbrl_ppl.modes.space import Space
 from pbrl_ppl.parameters import covariance_factor
 from pbrl_ppl.state import Floats
-from pbrl_ppl.threads import Say, Work, silent
+from pbrl_ppl.system.threads import Say, Work, silent
 
 ProposalT = TypeVar("ProposalT", bound="Proposal")
 

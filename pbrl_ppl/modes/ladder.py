@@ -12,7 +12,6 @@ from dataclasses import replace
 import numpy as np
 
 from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.history import longest_gap
 from pbrl_ppl.likelihood import (
     SimulatedProblem,
     autocovariance,
@@ -26,7 +25,7 @@ from pbrl_ppl.modes.noise import finite
 from pbrl_ppl.modes.search import Mode, SimulatedMode, covariance_of, near_mode, sandwich
 from pbrl_ppl.parameters import box, inside, prior_residual, prior_slopes, stepped
 from pbrl_ppl.state import Floats
-from pbrl_ppl.threads import one_blas_thread
+from pbrl_ppl.system.threads import one_blas_thread
 
 #: Largest magnification of initial states, beyond growth in proportion to time, of pieces that are
 #: not too long to tell a law from.
@@ -90,7 +89,7 @@ def piece_lengths(mode: Mode) -> list[int]:
             f" {unknown} unknown initial coordinates and parameters; record more rows of each"
             " trajectory"
         )
-    return lengths(longest, longest_gap(history))
+    return lengths(longest, history.longest_gap)
 
 
 def lengths(longest: int, gap: int = 1, *, shortest: int = 4, ratio: int = 4) -> list[int]:

@@ -42,7 +42,7 @@ from pbrl_ppl.parameters import (
 )
 from pbrl_ppl.physics import PartedSimulator
 from pbrl_ppl.state import Floats
-from pbrl_ppl.threads import one_blas_thread
+from pbrl_ppl.system.threads import one_blas_thread
 
 #: Gain in log-posterior (nats) below which a climb ends.
 _STALLED = 0.02

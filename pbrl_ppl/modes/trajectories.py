@@ -33,7 +33,7 @@ from pbrl_ppl.modes.search import (
 )
 from pbrl_ppl.parameters import change_from, inside
 from pbrl_ppl.state import Floats
-from pbrl_ppl.threads import one_blas_thread
+from pbrl_ppl.system.threads import one_blas_thread
 
 #: Most linearisations, and change of phi (standard deviations) below which one is the last.
 _ROUNDS, _CONVERGED = 6, 0.2

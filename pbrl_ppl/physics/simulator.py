@@ -28,7 +28,7 @@ from pbrl_ppl.physics.tree import MOST, tree_of
 from pbrl_ppl.physics.world import JOINT, World
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import INPUT, STATE, THETA, VELOCITY, WRENCH, Bools, Floats, Ints
-from pbrl_ppl.threads import in_worker
+from pbrl_ppl.system.threads import in_worker
 
 #: For each joint of unknown bodies, which of ``scene.joinable`` it holds.
 Joined = tuple[tuple[int, int], ...]

@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike
 from pbrl_ppl.criticism import Loop, rank_candidates, with_effects
 from pbrl_ppl.effects import Attached, Effect, Noise, catalogue
 from pbrl_ppl.errors import EffectError, GoalError, PosteriorError
-from pbrl_ppl.files import write_atomically
 from pbrl_ppl.likelihood import is_independent
 from pbrl_ppl.modes import FilteredMode, trajectory_mode
 from pbrl_ppl.parameters import differentiate
@@ -26,7 +25,8 @@ from pbrl_ppl.planning.planner import labelled, start_state, table_of_plan
 from pbrl_ppl.posterior import Fit, Idata, scene_of, stored_fields
 from pbrl_ppl.scene import Scene, body_sizes, nearest
 from pbrl_ppl.state import WRENCH_UNITS, Bools, Floats
-from pbrl_ppl.threads import Say, one_blas_thread, silent
+from pbrl_ppl.system.files import write_atomically
+from pbrl_ppl.system.threads import Say, one_blas_thread, silent
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike
 
 from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.errors import GoalError
-from pbrl_ppl.files import write_atomically
 from pbrl_ppl.history import table_of_arrays, with_paths
 from pbrl_ppl.physics import check_placement, overlap
 from pbrl_ppl.planning.astar import astar
@@ -23,7 +22,8 @@ from pbrl_ppl.planning.goals import ActionSet, Goal
 from pbrl_ppl.planning.search import FoundPlan, SearchTask, mppi, tail_mean
 from pbrl_ppl.scene import Scene, checks, nearest
 from pbrl_ppl.state import STATE, WRENCH, Floats
-from pbrl_ppl.threads import Say, silent
+from pbrl_ppl.system.files import write_atomically
+from pbrl_ppl.system.threads import Say, silent
 
 if TYPE_CHECKING:
     from pbrl_ppl.posterior import Idata

@@ -20,7 +20,7 @@ from pbrl_ppl.modes import MOST_GROWTH, SimulatedMode, corrected, fit_pieces, gr
 from pbrl_ppl.physics import Physics, simulated_recording, touching
 from pbrl_ppl.scene import Scene, motion_time, nearest, state_sizes, units_of
 from pbrl_ppl.state import STATE, Floats
-from pbrl_ppl.threads import Say, in_parallel, one_blas_thread, silent
+from pbrl_ppl.system.threads import Say, in_parallel, one_blas_thread, silent
 
 
 @dataclass(frozen=True)

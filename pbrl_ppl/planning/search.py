@@ -17,7 +17,7 @@ from pbrl_ppl.planning.dynamics import TransitionModel, remembered
 from pbrl_ppl.planning.goals import ActionSet, Goal
 from pbrl_ppl.scene import Scene, smallest_radius
 from pbrl_ppl.state import Floats
-from pbrl_ppl.threads import Say, silent
+from pbrl_ppl.system.threads import Say, silent
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,8 +20,8 @@ import numpy as np
 import xarray as xr
 
 from pbrl_ppl.errors import OutputError, PosteriorError
-from pbrl_ppl.files import check_hdf5, is_as_sealed, seal, write_atomically
 from pbrl_ppl.state import Floats
+from pbrl_ppl.system.files import check_hdf5, is_as_sealed, seal, write_atomically
 
 #: ArviZ 1.x stores groups in an xarray.DataTree, 0.x in an InferenceData.
 DATATREE = not version("arviz").startswith("0.")

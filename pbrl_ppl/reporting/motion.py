@@ -7,14 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pbrl_ppl.criticism import Loop, diverged_after, whole_rollouts
-from pbrl_ppl.files import json_values
-from pbrl_ppl.history import History
+from pbrl_ppl.criticism import ComparedModel, Loop, diverged_after, whole_rollouts
 from pbrl_ppl.likelihood import along_trajectories
-from pbrl_ppl.modes import FilteredMode
 from pbrl_ppl.reporting.words import number
 from pbrl_ppl.scene import Scene, Shape
 from pbrl_ppl.state import Bools, Floats, wrapped
+from pbrl_ppl.system.files import json_values
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,9 +51,8 @@ def held_out_motions(loop: Loop, most: int = 6, most_rows: int = 3000) -> list[M
     """
     if loop.held_out is None:
         return []
-    first_mode, last_mode = loop.declared.innovations, loop.revised.innovations
-    before = _predicted(first_mode, loop.held_out)
-    after = before if last_mode is first_mode else _predicted(last_mode, loop.held_out)
+    before = _predicted(loop, loop.declared)
+    after = _predicted(loop, loop.revised) if loop.revised is not loop.declared else before
     dataset = loop.held_out.dataset
     known = dataset["start"].to_numpy()[..., :3]
     unmeasured = dataset["assumed"].to_numpy()[:, :3]
@@ -108,10 +105,11 @@ def divergence_in_words(motions: Sequence[Motion]) -> str:
     return f"{text[:1].upper()}{text[1:]}." if text else ""
 
 
-def _predicted(mode: FilteredMode, history: History) -> dict[int, Floats]:
+def _predicted(loop: Loop, model: ComparedModel) -> dict[int, Floats]:
     """Return the poses that a model predicts of whole trajectories, by trajectory."""
+    mode = model.innovations
     cells = mode.problem.likelihood.noise.coordinates
-    other = mode.problem.with_data(history=history, states=None)
+    other = mode.problem.with_data(history=loop.held_out, states=None)
     problem = along_trajectories(other, mode.phi, mode.sigma, cells)
     whole = whole_rollouts(problem, mode.phi, mode.sigma)
     return {trajectory: states[..., :3] for trajectory, states in whole.items()}

@@ -19,7 +19,6 @@ from pbrl_ppl.criticism import NOT_CONVERGED, Loop
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import PbrlError, PosteriorError
-from pbrl_ppl.files import write_text
 from pbrl_ppl.posterior import Idata, PosteriorRecord, compare, group, identify
 from pbrl_ppl.reporting import (
     loop_plots,
@@ -35,6 +34,7 @@ from pbrl_ppl.reporting.posteriors import Parameters, coverage, recorded_poses
 from pbrl_ppl.reporting.style import png
 from pbrl_ppl.reporting.tables import tabulate
 from pbrl_ppl.reporting.words import added_labels, error, listed, plain
+from pbrl_ppl.system.files import write_text
 
 T = TypeVar("T")
 

@@ -46,7 +46,7 @@ from pbrl_ppl.posterior import (
 from pbrl_ppl.sampling.methods import METHODS, SamplerRun, posterior_dataset
 from pbrl_ppl.sampling.mixture import mix, most_frequent, most_probable, summed
 from pbrl_ppl.state import STATE, Floats
-from pbrl_ppl.threads import Progress, Say, one_blas_thread, silent
+from pbrl_ppl.system.threads import Progress, Say, one_blas_thread, silent
 
 if TYPE_CHECKING:
     import pymc as pm
@@ -122,7 +122,7 @@ def fit(
         linearised as they are in it.
     progress : bool or callable
         Whether to show a progress bar; or what is called with counted work
-        (``pbrl_ppl.threads.Work``).
+        (``pbrl_ppl.system.threads.Work``).
 
     Returns
     -------

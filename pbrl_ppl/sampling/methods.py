@@ -35,7 +35,7 @@ from pbrl_ppl.posterior import (
 )
 from pbrl_ppl.sampling.importance import Reference, draw_proposals, resample
 from pbrl_ppl.state import Floats, Ints
-from pbrl_ppl.threads import Say, Work
+from pbrl_ppl.system.threads import Say, Work
 
 
 class WeightsError(FitError):

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from pbrl_ppl.errors import PbrlError, SceneError
-from pbrl_ppl.files import parse_toml, read_text, reason
+from pbrl_ppl.system.files import parse_toml, read_text, reason
 
 Value = TypeVar("Value")
 Point = tuple[float, float]

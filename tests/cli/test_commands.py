@@ -19,7 +19,8 @@ import pandas as pd
 import pytest
 import typer
 
-from pbrl_ppl import criticism, sampling
+import pbrl_ppl as pp
+from pbrl_ppl import criticism
 from pbrl_ppl.cli import main
 from pbrl_ppl.cli.app import app
 from pbrl_ppl.cli.terminal import Progress, interruptible
@@ -227,7 +228,7 @@ def test_a_position_in_other_units_than_its_velocity_is_named(
     def long_work(*args: Any, **options: Any) -> Any:
         raise FitError("the long work")
 
-    for module, name in ((sampling, "fit"), (criticism, "close_loop"), (criticism, "criticise")):
+    for module, name in ((pp, "fit"), (criticism, "close_loop"), (criticism, "criticise")):
         monkeypatch.setattr(module, name, long_work)
     name, *options = command
     output = [] if name in ("check", "criticise") else ["-o", "out.nc"]
@@ -371,14 +372,14 @@ def test_fit_without_convergence_exits_with_3(capsys: pytest.CaptureFixture[str]
 def test_an_interrupted_fit_gives_one_answer(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    whole = sampling.fit
+    whole = pp.fit
 
     def cut(*args: Any, **options: Any) -> Any:
         idata = whole(*args, **options)
         idata.attrs["interrupted"] = 1
         return idata
 
-    monkeypatch.setattr(sampling, "fit", cut)
+    monkeypatch.setattr(pp, "fit", cut)
     fit = ["fit", "scene.toml", "train.csv", "-o", "puck.nc", "-q", "--method", "map"]
     assert main(fit) == 130
     said = capsys.readouterr().err
@@ -462,14 +463,14 @@ def test_an_interrupt_that_a_sampler_swallowed_is_none_the_less_one(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """It came when all chains were at their end."""
-    whole = sampling.fit
+    whole = pp.fit
 
     def swallowed(*args: Any, **options: Any) -> Any:
         with contextlib.suppress(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
         return whole(*args, **options)
 
-    monkeypatch.setattr(sampling, "fit", swallowed)
+    monkeypatch.setattr(pp, "fit", swallowed)
     fit = ["fit", "scene.toml", "train.csv", "-o", "puck.nc", "-q", "--method", "metropolis"]
     assert main([*fit, "--draws", "40", "--tune", "40", "--thin", "1", "--chains", "2"]) == 130
     assert "40 draws of each of 2 chains are kept in puck.nc" in capsys.readouterr().err
@@ -507,7 +508,7 @@ def test_the_command_fits_what_python_fits(options: list[str]) -> None:
         history = History.load("train.csv", scene)
         settings = {} if options else {"likelihood": "trajectories"}
         model = physics_model(scene, history, **settings)
-        here = sampling.fit(model, seed=1, method="laplace", progress=False)
+        here = pp.fit(model, seed=1, method="laplace", progress=False)
     there = load_posterior("puck.nc")
     for name, values in group(here, "posterior").items():
         np.testing.assert_array_equal(values, group(there, "posterior")[name])
@@ -577,7 +578,7 @@ def messages(path: Path) -> list[str]:
 def test_convergence_is_judged_as_it_is_written(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = Scene.load("scene.toml")
     model = physics_model(scene, History.load("train.csv", scene))
-    idata = sampling.fit(model, method="laplace", draws=1000, chains=2)
+    idata = pp.fit(model, method="laplace", draws=1000, chains=2)
     expected = {
         (1.0104, 400.0): [],
         (1.0106, 400.0): ["R-hat is 1.011 for m (want <= 1.01);"],
@@ -618,7 +619,7 @@ def test_a_spreadsheet_s_commas_and_semicolons(capsys: pytest.CaptureFixture[str
 @pytest.mark.usefixtures("puck")
 def test_of_two_commands_with_one_output_one_says_so(capsys: pytest.CaptureFixture[str]) -> None:
     """The other may read and write anything else, and after its end this one."""
-    held = "from pathlib import Path; from pbrl_ppl.files import only_writer\n"
+    held = "from pathlib import Path; from pbrl_ppl.system.files import only_writer\n"
     held += "with only_writer(Path('puck.nc')): print('begun', flush=True); input()"
     fit = ["fit", "scene.toml", "train.csv", "-q", "--method", "map", "-o"]
     with subprocess.Popen(

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 
-from pbrl_ppl.threads import Work
+from pbrl_ppl.system.threads import Work
 
 
 def of_work(said: Iterable[str]) -> dict[str, int]:

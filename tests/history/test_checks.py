@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pbrl_ppl.history import History, longest_gap, unit_mismatches, unseen
+from pbrl_ppl.history import History, unit_mismatches, unseen
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.histories import COLUMNS
 from tests.helpers.pushes import SCENE, pushed, rows
@@ -106,7 +106,7 @@ def test_a_block_that_was_seen_before_and_after_a_push() -> None:
     hidden = np.zeros((2, 6, 2), dtype=bool)
     hidden[0, 1:3, 0] = hidden[1, 1:5, 0] = True  # the block; the finger's path is given
     np.testing.assert_array_equal(unseen(history), hidden)
-    assert longest_gap(history) == 5
+    assert history.longest_gap == 5
 
 
 def test_rows_that_are_lost_now_and_then_do_not_make_a_recording_sparse() -> None:
@@ -118,4 +118,4 @@ def test_rows_that_are_lost_now_and_then_do_not_make_a_recording_sparse() -> Non
     table.loc[~seen, state] = np.nan
     history = History.from_dataframe(table, SCENE)
     assert unseen(history).sum() == 7
-    assert longest_gap(history) == 1
+    assert history.longest_gap == 1
