@@ -116,7 +116,7 @@ def _cogging(state: Floats, command: Floats, parameters: Floats, wrench: Floats)
 
 
 def _scan_counts(scene: Scene, history: History, body: Body) -> Floats:
-    """Return numbers of teeth of which the body passes some; the derivative is by the torques."""
+    """Return tooth counts to scan; the derivative is by the torques."""
     theta = measured(history, body, "theta")
     reach = min(np.ptp(theta), 2.0 * np.pi) if len(theta) else 0.0
     counts = [n for n in (2, 3, 4, 6, 8, 12) if 2.0 * np.pi < n * reach < 2.0 * np.pi * 12.0]
