@@ -4,7 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from pbrl_ppl.likelihood import Problem
+from pbrl_ppl.sampling.methods import METHODS, SamplerRun
 from pbrl_ppl.scene import Joint, Scene, Shape, Wall
+from pbrl_ppl.system.threads import silent
 from tests.helpers.worlds import G, body
 
 POSES = ((0.0, 0.0, 0.0), (1.2, 0.1, 0.4), (2.5, -0.2, -0.3), (0.3, 2.0, 0.0))
@@ -38,3 +41,9 @@ def reference_anchors(first: int, second: int, point=PIN, poses=HINGED) -> list[
         dx, dy = point[0] - x, point[1] - y
         anchors += [c * dx + s * dy, -s * dx + c * dy]
     return anchors
+
+
+def run_of(problem: Problem, draws: int, seed: int = 1) -> SamplerRun:
+    """Return a sampler's run of two chains on a problem."""
+    method = replace(METHODS["laplace"], draws=draws, chains=2)
+    return SamplerRun(problem, method, None, None, seed, 1, silent)

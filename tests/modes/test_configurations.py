@@ -44,7 +44,7 @@ from pbrl_ppl.sampling import fit, mixture, updating
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene, Shape
 from pbrl_ppl.state import STATE, WRENCH
 from tests.helpers.histories import simulated_history
-from tests.helpers.joints import HINGED, reference_anchors, scene
+from tests.helpers.joints import HINGED, reference_anchors, run_of, scene
 from tests.helpers.worlds import G, body
 
 pytestmark = [pytest.mark.one_stack, pytest.mark.first(2)]
@@ -383,7 +383,7 @@ def numbered(mode: Mode, chains: int = 2, n: int = 5000):
 
 def mixed(rod: pm.Model, seed: int = 1):
     found = weighed(rod)
-    return mixture.mix(problem_in(rod), found, numbered, draws=5000, chains=2, seed=seed)
+    return mixture.mix(run_of(problem_in(rod), 5000, seed), found, numbered)
 
 
 def test_draws_are_shared_out_by_weight(rod) -> None:
@@ -445,7 +445,7 @@ def test_an_interrupt_with_others_to_come_ends_the_fit(rod) -> None:
         return numbered(mode, n=100)
 
     with pytest.raises(KeyboardInterrupt):
-        mixture.mix(problem_in(rod), weighed(rod), interrupted, draws=5000, chains=2, seed=1)
+        mixture.mix(run_of(problem_in(rod), 5000), weighed(rod), interrupted)
 
 
 @pytest.mark.parametrize(

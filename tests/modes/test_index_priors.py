@@ -23,7 +23,7 @@ from pbrl_ppl.posterior import draws, from_groups, group, updated_scene
 from pbrl_ppl.sampling import mixture
 from pbrl_ppl.scene import WORLD, Joint, Scene
 from tests.helpers.histories import simulated_history
-from tests.helpers.joints import scene
+from tests.helpers.joints import run_of, scene
 from tests.helpers.marks import OBJECT_MODE
 
 NAMES = (*"abcd", WORLD)
@@ -173,7 +173,7 @@ def test_draws_have_each_order_s_share() -> None:
         rest = dict.fromkeys(("sample_stats", "observed_data", "constant_data"), posterior)
         return from_groups({"posterior": posterior, **rest}, {})
 
-    trace = mixture.mix(problem_in(model), found, constant, draws=5000, chains=2, seed=1)
+    trace = mixture.mix(run_of(problem_in(model), 5000), found, constant)
     named = {k: v[:, 0] for k, v in draws(trace).items()}
     joined = named["i_a"] != named["i_b"]
     assert joined.sum() == 6000

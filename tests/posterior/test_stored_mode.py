@@ -12,7 +12,7 @@ from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.likelihood import log_posterior
 from pbrl_ppl.model import physics_model
 from pbrl_ppl.parameters import ParameterLibrary
-from pbrl_ppl.planning import Dynamics, plan
+from pbrl_ppl.planning import Dynamics, plan, predicted_path
 from pbrl_ppl.posterior import (
     from_groups,
     groups,
@@ -101,7 +101,7 @@ def test_a_script_plans_with_exactly_the_mode_of_the_file(idata, tmp_path: Path)
     with_mode = plan(loaded, {"cart": (0, 0, 0)}, goal, seed=1)
     with_mode.save(tmp_path / "here.csv")
     assert (tmp_path / "here.csv").read_bytes() == (tmp_path / "plan.csv").read_bytes()
-    there = known.rollout(np.zeros((1, 6)), with_mode.wrenches)
+    there = predicted_path(known, np.zeros((1, 6)), with_mode.wrenches)
     predicted = with_mode.predicted["predicted"].isel(draw=0).to_numpy()
     np.testing.assert_allclose(predicted, there[0], atol=1e-12)
 

@@ -102,7 +102,6 @@ def test_the_file_holds_the_problem(idata, tmp_path) -> None:
 
 
 def test_a_file_plans_as_memory_does(idata, tmp_path) -> None:
-    """Measurement errors disturb no body."""
     pp.save_posterior(idata, tmp_path / "ball.nc")
     goal = pp.Goal.of({"ball": (None, -1.0, None)}, tolerance=0.1)
     start = {"ball": (0.0, 0.0, 0.0)}
@@ -112,9 +111,6 @@ def test_a_file_plans_as_memory_does(idata, tmp_path) -> None:
     ]
     assert plans[0].reached
     assert plans[0].to_dataframe().equals(plans[1].to_dataframe())
-    dynamics = pp.Dynamics.of(idata, 2)
-    states = np.ones((2, 5, 1, 6))
-    np.testing.assert_array_equal(dynamics.noisy(states, np.random.default_rng(0)), states)
 
 
 def test_an_update_refits_all_data(idata) -> None:

@@ -17,7 +17,6 @@ from pbrl_ppl.likelihood import (
 )
 from pbrl_ppl.model import physics_model
 from pbrl_ppl.physics import Physics
-from pbrl_ppl.planning import Dynamics
 from pbrl_ppl.posterior import convergence, group, parameter_draws, problem_of
 from pbrl_ppl.posterior.store import scalars
 from pbrl_ppl.reporting import render_posterior
@@ -143,29 +142,6 @@ def test_an_update_is_the_fit_of_all(both, first, whole, monkeypatch) -> None:
         problem.measured,
         declared_problem(Physics.declare(SCENE), both, kind="trajectories").measured,
     )
-
-
-def test_a_plan_expects_steps_noise_and_not_the_sensors(first) -> None:
-    """Accelerations held over the interval: dt^2 / 2 in the pose, dt in the velocity."""
-    dynamics = Dynamics.of(first, 3, seed=1)
-    states = np.zeros((3, 20_000, 1, 6))
-    noisy = dynamics.noisy(states, np.random.default_rng(6))
-    _, sigma = parameter_draws(problem_of(first), first)
-    chosen = np.random.default_rng(1).choice(len(sigma), 3, replace=False)
-    dt = SCENE.time_step
-    steps = sigma[chosen, 6:]
-    # 18 standard deviations of 20 000 draws, 5 standard errors: false alarm 1e-5
-    spread = noisy[:, :, 0].std(axis=1)
-    expected = np.hstack([dt**2 / 2 * steps, dt * steps])
-    assert (np.abs(spread / expected - 1) < 5 * np.sqrt(0.5 / 20_000)).all()
-    # pose and velocity move together, and the axes apart from each other
-    np.testing.assert_allclose(noisy[..., :3], dt / 2 * noisy[..., 3:], rtol=1e-12)
-    across = np.mean(noisy[..., 3] * noisy[..., 4], axis=(1, 2))
-    assert (np.abs(across) < 5 * expected[:, 3] * expected[:, 4] / np.sqrt(20_000)).all()
-    # the sensors' error is more than all of that in x and y
-    assert (sigma[chosen, :2] > spread[:, :2]).all()
-    one = dynamics.single()
-    assert one.noisy(states[:1], np.random.default_rng(7)).shape == (1, 20_000, 1, 6)
 
 
 @pytest.mark.slow
