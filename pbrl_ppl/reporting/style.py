@@ -11,8 +11,10 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
+from PIL import Image
 
 from pbrl_ppl.state import STATE, STATE_UNITS
 
@@ -97,11 +99,18 @@ def bars(
     axes.yaxis.set_inverted(True)
 
 
-def png(figure: Figure) -> bytes:
-    """Render a figure as a PNG picture."""
-    picture = io.BytesIO()
+def png(figure: Figure, colours: int = 96) -> bytes:
+    """Render a figure as a PNG picture, which a palette makes a third as large."""
+    figure.set_dpi(130)
+    canvas: Any = FigureCanvasAgg(figure)
+    small = io.BytesIO()
     with warnings.catch_warnings():
         # a name in letters that the font lacks is in the page's text all the same
         warnings.filterwarnings("ignore", message="Glyph .* missing from", category=UserWarning)
-        figure.savefig(picture, format="png", dpi=130)
-    return picture.getvalue()
+        canvas.draw()  # once: saving a figure draws it twice
+    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+    picture = picture.quantize(colours, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+    levels = picture.getpalette() or []
+    picture.putpalette([255 if level > 251 else level for level in levels])  # means are not white
+    picture.save(small, format="png")
+    return small.getvalue()
