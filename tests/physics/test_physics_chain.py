@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from pbrl_ppl.scene import Joint, Scene, Shape
@@ -241,6 +241,7 @@ number = st.floats(-2.0, 2.0)
     st.floats(0.2, 5.0),
     st.floats(1.0, 2.0),
 )
+@example((0.0, -2.0, 0.0, 0.0, 1.0, 0.0), (0.125, 0.0, 0.0, 0.0), 1.0, 1.0)
 def test_rod_between_free_discs(motion, anchors, mass, apart) -> None:
     """It keeps its length, and the pair its linear and angular momentum."""
     masses, shape = np.array([mass, 1.0]), Shape.circle(0.2)
@@ -261,13 +262,13 @@ def test_rod_between_free_discs(motion, anchors, mass, apart) -> None:
         a, b = (world_point(states[..., i, :], p) for i, p in enumerate((anchor_a, anchor_b)))
         return np.abs(b - a)
 
-    states = predict(scene, start, horizon=25, substeps=40, extrapolate=False)
+    # impulses of the rod lie on one line: momentum is kept but for the solver's tolerance
+    states = predict(scene, start, horizon=25, substeps=40, extrapolate=False, tolerance=1e-11)
     # the anchors move in arcs: of second order in the substep, with relative speeds up to 6 m/s
     # and rates up to 2 rad/s * 0.3 m there, at a distance of 0.6 m and more
     slack = (6.0 * 0.02 / 40) ** 2 / 2 / 0.6
     np.testing.assert_allclose(separation(states), separation(start), atol=slack)
     kept, begun = momentum(states, masses, shape), momentum(start, masses, shape)
-    # the rod's two impulses lie on one line: exact
     np.testing.assert_allclose(kept, np.broadcast_to(begun, kept.shape), atol=1e-9)
 
 
