@@ -100,8 +100,10 @@ def plot_recording(scene: Scene, poses: Floats, held_out: Floats | None) -> Figu
     places = poses[..., :2].reshape(-1, 2)
     margin = 1.5 * max(body.shape.bounding_radius for body in scene.moving)
     low, high = np.nanmin(places, axis=0) - margin, np.nanmax(places, axis=0) + margin
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    axes.set_aspect("equal", adjustable="datalim")
+    panel, middle, span = axes.get_window_extent(), (low + high) / 2, high - low
+    half = max(span[0] / panel.width, span[1] / panel.height) / 2  # the panel is filled
+    (left, bottom), (right, top) = (middle + i * half * np.array(panel.size) for i in (-1, 1))
+    axes.set(xlim=(left, right), ylim=(bottom, top))
     handles = [Line2D([], [], color="black", label="fitted")]
     if held_out is not None:
         handles.append(Line2D([], [], color="black", linestyle=":", label="held out"))
