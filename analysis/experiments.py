@@ -12,9 +12,10 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 from episodes import Episode, EpisodeError
-from episodes.episode import write_netcdf
 from matplotlib.axes import Axes
 from scipy import stats
+
+from pbrl_ppl.system.files import write_atomically
 
 
 def interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -100,7 +101,7 @@ def summary(name: str, episodes: list[Episode], steps: int) -> dict[str, object]
 def save(data: xr.Dataset, path: Path) -> None:
     """Write a small NetCDF file atomically."""
     packed = {name: {"zlib": True} for name in data if data[name].dtype.kind == "f"}
-    write_netcdf(data, path, encoding=packed)
+    write_atomically(path, lambda to: data.to_netcdf(to, engine="h5netcdf", encoding=packed))
 
 
 def to_end(run: Callable[[], None], kept: str = "episodes") -> None:

@@ -12,9 +12,9 @@ import xarray as xr
 
 from episodes.world import EpisodeError
 from pbrl_ppl import History, Scene
-from pbrl_ppl.errors import OutputError
 from pbrl_ppl.history import from_segments
 from pbrl_ppl.state import STATE, STATE_UNITS, WRENCH, WRENCH_UNITS, Floats
+from pbrl_ppl.system.files import write_atomically
 
 _KIND = "episode"
 #: Variables of an episode, and their dimensions.
@@ -160,7 +160,7 @@ class Episode:
         OutputError
             If it cannot be written there.
         """
-        write_netcdf(self.dataset, Path(path))
+        write_atomically(Path(path), lambda to: self.dataset.to_netcdf(to, engine="h5netcdf"))
 
     @property
     def scene(self) -> Scene:
@@ -216,32 +216,3 @@ class Episode:
         states = self.dataset["states"].to_numpy()
         action, observed = self.dataset["action"].to_numpy(), self.dataset["observed"].to_numpy()
         return from_segments(self.scene, states[:-1], action[:, None], observed[:, None])
-
-
-def write_netcdf(data: xr.Dataset, path: Path, **options: Any) -> None:
-    """Write a NetCDF file; of one that cannot be written nothing is left.
-
-    Parameters
-    ----------
-    data : xarray.Dataset
-        What is written.
-    path : pathlib.Path
-        In an existing folder.
-    **options
-        Of xarray's ``to_netcdf``.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be written there.
-    """
-    aside = path.with_name(f".{path.name}.part")
-    try:
-        data.to_netcdf(aside, engine="h5netcdf", **options)
-        aside.replace(path)
-    except OSError as error:
-        aside.unlink(missing_ok=True)
-        raise OutputError(
-            f"{path}: cannot be written: {error.strerror or error}; choose an existing, writable"
-            " folder"
-        ) from error

@@ -7,7 +7,7 @@ from .closing import LoopInterrupted as LoopInterrupted
 from .closing import close_loop as close_loop
 from .criteria import DEFAULT as DEFAULT
 from .criteria import Criteria as Criteria
-from .held_out import whole_rollouts as whole_rollouts
+from .held_out import HeldOut as HeldOut
 from .innovations import QUANTITIES as QUANTITIES
 from .innovations import recorded_quantities as recorded_quantities
 from .misfit import LARGEST_SHARE as LARGEST_SHARE

@@ -97,33 +97,6 @@ def rollout(problem: FilteredProblem, phi: Floats, start: Floats, inputs: Floats
     return states
 
 
-def whole_rollouts(problem: FilteredProblem, phi: Floats, sigma: Floats) -> dict[int, Floats]:
-    """Predict whole trajectories, each from its filtered first state.
-
-    That state is as measured, or fitted to the first rows where its velocities were not measured.
-
-    Returns
-    -------
-    dict of int to ndarray
-        By trajectory: predicted states from the first one on, shape (time, body, 6), SI units; NaN
-        from where the prediction diverges.
-    """
-    noise, segments = problem.likelihood.noise, problem.segments
-    begins = np.flatnonzero(noise.first)
-    lengths = np.diff(np.append(begins, segments.n))
-    trajectory = segments.trajectory[begins]
-    start = filtered_states(problem, phi, sigma)[trajectory, 0]
-    # shorter trajectories repeat their last command, and what follows is left out
-    steps = np.minimum(np.arange(lengths.max()), lengths[:, None] - 1)
-    inputs = problem.inputs[begins[:, None] + steps, 0]
-    states = rollout(problem, phi, start, inputs)
-    for i in np.flatnonzero(~np.isfinite(states).all(axis=(1, 2, 3))):
-        states[i] = _finite_part(problem, phi, start[i : i + 1], inputs[i : i + 1])
-    states = np.concatenate([start[:, None], states], axis=1)
-    whole = zip(trajectory.tolist(), states, lengths.tolist(), strict=True)
-    return {which: paths[: length + 1] for which, paths, length in whole}
-
-
 def _finite_part(problem: FilteredProblem, phi: Floats, start: Floats, inputs: Floats) -> Floats:
     """Return a prediction that diverges up to there, shape (H, body, 6), then NaN.
 
@@ -263,6 +236,34 @@ class HeldOut:
         problem = mode.problem.with_data(history=history, states=None)
         return cls(mode, along_trajectories(problem, mode.phi, mode.sigma, coordinates))
 
+    def rollouts(self) -> dict[int, Floats]:
+        """Predict whole trajectories, each from its filtered first state.
+
+        That state is as measured, or fitted to the first rows where its velocities were not
+        measured.
+
+        Returns
+        -------
+        dict of int to ndarray
+            By trajectory: predicted states from the first one on, shape (time, body, 6), SI units;
+            NaN from where the prediction diverges.
+        """
+        problem, phi = self.problem, self.mode.phi
+        noise, segments = problem.likelihood.noise, problem.segments
+        begins = np.flatnonzero(noise.first)
+        lengths = np.diff(np.append(begins, segments.n))
+        trajectory = segments.trajectory[begins]
+        start = filtered_states(problem, phi, self.mode.sigma)[trajectory, 0]
+        # shorter trajectories repeat their last command, and what follows is left out
+        steps = np.minimum(np.arange(lengths.max()), lengths[:, None] - 1)
+        inputs = problem.inputs[begins[:, None] + steps, 0]
+        states = rollout(problem, phi, start, inputs)
+        for i in np.flatnonzero(~np.isfinite(states).all(axis=(1, 2, 3))):
+            states[i] = _finite_part(problem, phi, start[i : i + 1], inputs[i : i + 1])
+        states = np.concatenate([start[:, None], states], axis=1)
+        whole = zip(trajectory.tolist(), states, lengths.tolist(), strict=True)
+        return {which: paths[: length + 1] for which, paths, length in whole}
+
     def whitened(self, unit: HeldOut) -> Floats:
         """Return the linearised innovations in units of another model's noise."""
         physics = self.mode.problem.physics
@@ -365,10 +366,7 @@ def example_rollout(declared: HeldOut, revised: HeldOut) -> Rollout:
     spread /= [noise.get(STATE[d], float(sizes[d])) for d in columns]
     free = np.array([not body.kinematic for body in scene.moving])
     body = int(np.argmax(np.where(free, np.nansum(spread, axis=1), -1.0)))
-    before, after = (
-        whole_rollouts(model.problem, model.mode.phi, model.mode.sigma)[0][: length + 1, body]
-        for model in (declared, revised)
-    )
+    before, after = (model.rollouts()[0][: length + 1, body] for model in (declared, revised))
     return Rollout(
         body=scene.moving[body].name,
         time=np.arange(length + 1, dtype=float) * scene.time_step,

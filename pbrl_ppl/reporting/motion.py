@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pbrl_ppl.criticism import ComparedModel, Loop, diverged_after, whole_rollouts
-from pbrl_ppl.likelihood import along_trajectories
+from pbrl_ppl.criticism import ComparedModel, HeldOut, Loop, diverged_after
 from pbrl_ppl.reporting.words import number
 from pbrl_ppl.scene import Scene, Shape
 from pbrl_ppl.state import Bools, Floats, wrapped
@@ -49,11 +48,17 @@ def held_out_motions(loop: Loop, most: int = 6, most_rows: int = 3000) -> list[M
 
     Each model predicts with the parameters of its mode.
     """
-    if loop.held_out is None:
+    history = loop.held_out
+    if history is None:
         return []
-    before = _predicted(loop, loop.declared)
-    after = _predicted(loop, loop.revised) if loop.revised is not loop.declared else before
-    dataset = loop.held_out.dataset
+
+    def poses(model: ComparedModel) -> dict[int, Floats]:
+        whole = HeldOut.of(model.innovations, history).rollouts()
+        return {trajectory: states[..., :3] for trajectory, states in whole.items()}
+
+    before = poses(loop.declared)
+    after = before if loop.revised is loop.declared else poses(loop.revised)
+    dataset = history.dataset
     known = dataset["start"].to_numpy()[..., :3]
     unmeasured = dataset["assumed"].to_numpy()[:, :3]
     paths = [states for predicted in (before, after) for states in predicted.values()]
@@ -103,16 +108,6 @@ def divergence_in_words(motions: Sequence[Motion]) -> str:
             )
     text = "; ".join(parts)
     return f"{text[:1].upper()}{text[1:]}." if text else ""
-
-
-def _predicted(loop: Loop, model: ComparedModel) -> dict[int, Floats]:
-    """Return the poses that a model predicts of whole trajectories, by trajectory."""
-    mode = model.innovations
-    cells = mode.problem.likelihood.noise.coordinates
-    other = mode.problem.with_data(history=loop.held_out, states=None)
-    problem = along_trajectories(other, mode.phi, mode.sigma, cells)
-    whole = whole_rollouts(problem, mode.phi, mode.sigma)
-    return {trajectory: states[..., :3] for trajectory, states in whole.items()}
 
 
 def animation(loop: Loop, motions: Sequence[Motion]) -> dict[str, object] | None:

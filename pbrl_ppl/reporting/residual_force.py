@@ -7,8 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from pbrl_ppl.criticism import QUANTITIES, Loop, recorded_quantities
-from pbrl_ppl.likelihood import FilteredProblem
+from pbrl_ppl.criticism import QUANTITIES, ComparedModel, Loop, recorded_quantities
 from pbrl_ppl.state import STATE, Floats, acceleration_unit
 
 
@@ -87,9 +86,9 @@ def find_laws(loop: Loop, most: int = 3, least: float = 0.02) -> list[ForceLaw]:
     remains = loop.unexplained
     if remains is None or not remains.body or remains.depends_on not in QUANTITIES:
         return []
-    problem, phi = loop.revised.innovations.problem, loop.revised.innovations.phi
+    problem = loop.revised.innovations.problem
     body = [moving.name for moving in problem.scene.moving].index(remains.body)
-    residual = _residual_force(problem, phi, body, remains.dimension)
+    residual = _residual_force(loop.revised, body, remains.dimension)
     if residual is None:
         return []
     laws = [
@@ -103,10 +102,9 @@ def find_laws(loop: Loop, most: int = 3, least: float = 0.02) -> list[ForceLaw]:
     return [laws[0], *(law for law in laws[1:most] if law.curve.share > least)]
 
 
-def _residual_force(
-    problem: FilteredProblem, phi: Floats, body: int, dimension: str
-) -> ResidualForce | None:
+def _residual_force(model: ComparedModel, body: int, dimension: str) -> ResidualForce | None:
     """Return the process noise of a body's velocity over the time step, times its inertia."""
+    problem, phi = model.innovations.problem, model.innovations.phi
     coordinates = problem.likelihood.noise.coordinates
     added = coordinates.of_residual(problem.residual(phi)) / problem.scene.time_step
     places = zip(*np.divmod(coordinates.places, len(STATE)), strict=True)
